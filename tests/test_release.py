@@ -115,3 +115,17 @@ def test_pre_commit_downloads_nothing() -> None:
     makefile = (ROOT / "Makefile").read_text().replace("$(BIN)", ".venv/bin")
     for hook in local["hooks"]:
         assert f"\t{hook['entry']}" in makefile
+
+
+def pins(name: str) -> dict[str, str]:
+    lines = (ROOT / name).read_text().splitlines()
+    return dict(line.split("==") for line in lines if line and not line.startswith("#"))
+
+
+def test_the_versions_for_older_drivers_differ_by_cuda_only() -> None:
+    usual, older = pins("constraints.txt"), pins("constraints-cuda12.txt")
+    changed = {name for name in usual.keys() | older.keys() if usual.get(name) != older.get(name)}
+    of_cuda = {name for name in changed if name.startswith(("nvidia-", "cuda-"))}
+    assert changed - of_cuda == {"torch", "torchvision", "triton"}
+    assert not [name for name in older if name.endswith("-cu13") or name.startswith("cuda-")]
+    assert len([name for name in of_cuda if name.endswith("-cu12")]) > 10

@@ -60,6 +60,8 @@ def cuda() -> Finding:
     least = LEAST_DRIVERS.get(torch.version.cuda.partition(".")[0])
     if least:
         fix += f", and its version: this torch is built for CUDA {torch.version.cuda}, which needs {least} or newer"
+        if torch.version.cuda.partition(".")[0] == "13":
+            fix += "; with an older driver, pip install -c constraints-cuda12.txt -e ."
     return Finding("CUDA", False, "no device that torch can use", fix)
 
 

@@ -29,6 +29,8 @@ class Poses:
     photos: Path
     capture: Path
     matching: Matching
+    masks: Path | None = None
+    """Folder of masks, one for each photo."""
 
     @property
     def folder(self) -> Path:
@@ -47,9 +49,13 @@ class Poses:
 
     def check(self) -> None:
         """Name the photos that are left out; ``DataError`` if the others cannot be used."""
+        from sundae_ns.data.masks import masks_of
         from sundae_ns.data.photos import find_photos, left_out
 
-        for remark in left_out(self.photos, find_photos(self.photos)[0]):
+        photos = find_photos(self.photos)[0]
+        if self.masks is not None:
+            masks_of(photos, self.masks)
+        for remark in left_out(self.photos, photos, masked=self.masks is not None):
             print(f"# warning: {remark}", flush=True)
 
     def find(self) -> list[str]:
@@ -107,12 +113,16 @@ class Poses:
         Raises:
             DataError: COLMAP placed too few photos.
         """
-        from sundae_ns.data.photos import LEAST_PHOTOS
+        from sundae_ns.data.masks import add_masks, masks_of
+        from sundae_ns.data.photos import LEAST_PHOTOS, find_photos
         from sundae_ns.storage.atomic import flush, put_aside
 
         if not self.done:
             made = self.folder / "capture"
             with writing(f"cannot make {self.capture}"):
+                if self.masks is not None:
+                    added = add_masks(made, masks_of(find_photos(self.photos)[0], self.masks))
+                    print(f"# masks: {added}", flush=True)
                 flush(made / TRANSFORMS)  # written last; the system has written the other files meanwhile
                 put_aside(self.capture)
                 made.replace(self.capture)

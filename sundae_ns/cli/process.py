@@ -102,7 +102,9 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
         raise SundaeError(f"{Path(arguments[0]).name} failed with {code}; its log is {log}, which ends with:\n{tail}")
 
 
-def run_in_group(words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = ()) -> int:
+def run_in_group(
+    words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = (), saves: bool = True
+) -> int:
     """Run a command with its output on the terminal; returns its exit code, or 128 + n if signal n arrived.
 
     A signal reaches the command once, with all processes that it started, whether it comes from a terminal or from
@@ -112,30 +114,35 @@ def run_in_group(words: Sequence[str], *, folder: Path | None = None, locks: Seq
         words: the command; it gets no input. Its program is looked for beside this interpreter first.
         folder: to run it in; by default that of this process.
         locks: descriptors of locked files, which stay locked until the command has ended.
+        saves: whether an interrupt makes the command save its work. Others end by SIGTERM in its place, because each of
+            their processes would print a traceback.
     """
     # A training that loses its terminal saves itself too.
-    passed_on = {signal.SIGINT: signal.SIGINT, signal.SIGTERM: signal.SIGTERM, signal.SIGHUP: signal.SIGTERM}
-    received: list[int] = []
+    interrupt = signal.SIGINT if saves else signal.SIGTERM
+    passed_on = {signal.SIGINT: interrupt, signal.SIGTERM: signal.SIGTERM, signal.SIGHUP: signal.SIGTERM}
+    received: list[signal.Signals] = []
     running: list[subprocess.Popen[Any]] = []
 
     def pass_on(number: int, frame: object) -> None:
-        received.append(passed_on[signal.Signals(number)])
+        received.append(signal.Signals(number))
         for process in running:
             with suppress(ProcessLookupError):
-                os.killpg(process.pid, received[-1])
+                os.killpg(process.pid, passed_on[received[-1]])
 
     before = {number: signal.signal(number, pass_on) for number in passed_on}
     try:
         with _started(words, folder=folder, locks=locks) as process:
             running.append(process)
             for number in received:  # those that came before there was a process
-                os.killpg(process.pid, number)
+                os.killpg(process.pid, passed_on[number])
             code = process.wait()
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     if received:
-        return 128 + received[0]
+        if not saves and sys.stderr.isatty():
+            sys.stderr.write("\x1b[?25h")  # the cursor, which a spinner hides
+        return 128 + (signal.SIGINT if received[0] == signal.SIGINT else signal.SIGTERM)
     return code if code >= 0 else 128 - code
 
 

@@ -8,20 +8,35 @@ import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
+from sundae_ns.cli.forecast import measured_step, trained_size
 from sundae_ns.cli.outputs import check_folder
 from sundae_ns.cli.poses import Matching, Poses
 from sundae_ns.cli.process import quoted, run_in_group, word
 from sundae_ns.cli.results import is_evaluation, is_packed, is_page, is_report
 from sundae_ns.cli.train import command
-from sundae_ns.errors import STOPPED, CheckpointError, ConfigError, DataError, StorageError, SundaeError, writing
+from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 
 SETTINGS = "run.json"
 """File with the settings of the first command; a repeated one must share them."""
+TRAIN = "train"
+"""Name of the step that saves itself when it is interrupted."""
+Quality = Literal["draft", "normal", "best"]
+QUALITIES: dict[Quality, list[str]] = {
+    "draft": [],
+    "normal": [],
+    "best": ["--pipeline.model.pruning.max-drop", "0.03"],
+}
+"""Options of ns-train for each quality; a draft has fewer steps."""
+DRAFT_STEPS = 3000
+DECIDES = ("sundae", "sundae-auto")
+"""Methods whose trials decide the number of primitives."""
+MEGABYTE = 1_000_000
 BUSY = "works in {}; wait for it, or choose another folder"
 
 
@@ -52,11 +67,21 @@ class Project:
     keep: float | None
     steps: int | None
     matching: Matching
+    quality: Quality = "normal"
+    max_mb: float | None = None
+    masks: Path | None = None
 
     @property
     def capture(self) -> Path:
         """Folder with images and poses."""
-        return self.photos if (self.photos / "transforms.json").is_file() else self.out / "capture"
+        return self.photos if self.posed else self.out / "capture"
+
+    @cached_property
+    def posed(self) -> bool:
+        """Whether the photos have poses already."""
+        from sundae_ns.data.layouts import is_posed
+
+        return is_posed(self.photos)
 
     @property
     def run(self) -> Path:
@@ -71,12 +96,13 @@ class Project:
     @property
     def poses(self) -> Poses | None:
         """Makes the capture; None if it is given."""
-        return None if self.capture == self.photos else Poses(self.photos, self.capture, self.matching)
+        return None if self.capture == self.photos else Poses(self.photos, self.capture, self.matching, self.masks)
 
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
         evaluated, packed, page = self.out / "eval.json", self.out / "scene.sundae", self.out / "report" / "report.md"
         web, data = self.out / "scene.html", ("--data", self.capture)
+        size = () if self.max_bytes is None else ("--target-bytes", self.max_bytes)
 
         def step(name: str, result: Path, whole: Callable[[Path], bool], *words: object) -> Step:
             line = [word(part) if isinstance(part, Path) else str(part) for part in words]
@@ -84,9 +110,9 @@ class Project:
 
         report = ("sundae", "report", self.run, packed, *data, "-o", page.parent, "--overwrite")
         steps = [
-            Step("train", self.train, self.trained),
+            Step(TRAIN, self.train, self.trained),
             step("evaluate", evaluated, is_evaluation, "sundae", "eval", self.run, *data, "-o", evaluated),
-            step("pack", packed, is_packed, "sundae", "pack", self.run, "-o", packed, *data),
+            step("pack", packed, is_packed, "sundae", "pack", self.run, "-o", packed, *data, *size),
             step("report", page, is_report, *report),
             step("web page", web, is_page, "sundae", "export", packed, "-o", web),
         ]
@@ -107,11 +133,70 @@ class Project:
 
             with writing(f"cannot replace {self.run}"):
                 put_aside(self.run)
-        # Without a number of steps, a resumed run trains those that are left.
-        words = command(self.capture, self.out / "runs", self.method, self.keep, None if resumes else self.steps)
         # Curves of the report come from tensorboard's files. The name may begin with a dash.
-        words += [f"--experiment-name={self.name}", "--timestamp", self.run.name, "--vis", "viewer+tensorboard"]
-        return [*words, "--load-dir", word(saved)] if resumes else words
+        more = [f"--experiment-name={self.name}", "--timestamp", self.run.name, "--vis", "viewer+tensorboard"]
+        more += ["--load-dir", word(saved)] if resumes else []
+        if not resumes:
+            more += self.options
+        # Without a number of steps, a resumed run trains those that are left.
+        steps = None if resumes else self.num_steps
+        return command(self.capture, self.out / "runs", self.method, self.keep, steps, more)
+
+    @property
+    def num_steps(self) -> int | None:
+        """Number of training steps; None for that of the method."""
+        return DRAFT_STEPS if self.quality == "draft" else self.steps
+
+    @property
+    def max_bytes(self) -> int | None:
+        """Most bytes of the packed scene."""
+        return None if self.max_mb is None else round(self.max_mb * MEGABYTE)
+
+    @property
+    def options(self) -> list[str]:
+        """Options of ns-train for the quality and the size."""
+        size = [] if self.max_bytes is None else ["--pipeline.model.pruning.max-bytes", str(self.max_bytes)]
+        return [*QUALITIES[self.quality], *size]
+
+    def check(self) -> None:
+        """Raise ``ConfigError`` for options that contradict each other."""
+        if self.max_mb is not None and not 0.01 <= self.max_mb <= 1e6:
+            raise ConfigError(f"max-mb is {self.max_mb:g}; give at least 0.01")
+        if self.masks is not None and not self.masks.is_dir():
+            raise DataError(f"{self.masks} is no folder of masks; give one with an image for each photo")
+        if self.masks is not None and self.posed:
+            raise ConfigError(
+                f"{self.photos} has poses already; give each frame of transforms.json its mask_path, or a COLMAP model "
+                "its masks with `sundae train CAPTURE -- colmap --masks-path`"
+            )
+        if self.quality == "draft" and self.steps is not None:
+            raise ConfigError(f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality")
+        for name, given in (("--max-mb", self.max_mb is not None), ("--quality best", self.quality == "best")):
+            if given and (self.keep is not None or self.method not in DECIDES):
+                raise ConfigError(
+                    f"{name} needs a method that decides the number of primitives; leave out --keep and --method"
+                )
+        if self.quality == "draft" and self.method == "sundae-tiny":
+            raise ConfigError("sundae-tiny is shorter than a draft; leave out --quality")
+
+    def forecast(self) -> None:
+        """Print how long the training takes on this machine, if it starts anew; on a CPU, with what is faster."""
+        from sundae_ns.training.duration import LONG, duration
+
+        size = None if self._steps_left() is not None else trained_size(self.photos)
+        found = None if size is None else measured_step(self.method, *size)
+        if size is None or found is None:
+            return
+        steps, cpu = self.num_steps or found.steps, found.device == "cpu"
+        took = f"{'at least' if cpu else 'about'} {duration(steps * found.step_s)}"
+        told = f"{steps:,} training steps take {took} on this {'CPU' if cpu else 'GPU'}"
+        told += f", {1000 * found.step_s:.0f} ms each at {size[0]} x {size[1]} px"
+        if not cpu or steps * found.step_s <= LONG:
+            print(f"# forecast: {told}", flush=True)
+            return
+        faster = [] if steps <= DRAFT_STEPS else [f"--quality draft ({duration(DRAFT_STEPS * found.step_s)})"]
+        faster += ["--method sundae-tiny"] if self.method != "sundae-tiny" else []
+        print(f"# warning: {told}; faster are {', '.join([*faster, 'smaller photos and a GPU'])}", flush=True)
 
     def trained(self) -> bool:
         """Whether the last step of the schedule is saved."""
@@ -119,15 +204,9 @@ class Project:
         return left is not None and left <= 0
 
     def _steps_left(self) -> int | None:
-        """Number of steps after the newest whole checkpoint; None if there is nothing to resume."""
-        from sundae_ns.storage.runs.checkpoint import newest_step
-        from sundae_ns.storage.runs.config_file import schedule_length
+        from sundae_ns.storage.runs.unfinished import steps_left
 
-        try:
-            step, length = newest_step(self.run), schedule_length(self.run / "config.yml")
-        except CheckpointError:
-            return None
-        return None if step is None else length - step - 1
+        return steps_left(self.run)
 
     def claim(self) -> int:
         """Make the folder and lock it, or check that an earlier command with the same settings made it.
@@ -143,6 +222,7 @@ class Project:
         from sundae_ns.storage.runs.folder import LOCK, reserve
 
         settings = {**asdict(self), "photos": str(self.photos.resolve())}
+        settings["masks"] = None if self.masks is None else str(self.masks.resolve())
         del settings["out"]
         path = self.out / SETTINGS
         if self.out.resolve().is_relative_to(self.photos.resolve()):
@@ -157,8 +237,8 @@ class Project:
             write_text(path, json.dumps(settings, indent=1) + "\n")
             return lock
         try:
-            before = dict(json.loads(path.read_bytes()).items())
-        except (ValueError, AttributeError) as error:
+            before = {"quality": "normal", **json.loads(path.read_bytes())}
+        except (ValueError, TypeError) as error:
             raise StorageError(f"{path} is damaged; choose another folder") from error
         for name, value in settings.items():
             if before.get(name) != value:
@@ -177,6 +257,9 @@ def run(
     keep: float | None = None,
     steps: int | None = None,
     matching: Matching = "exhaustive",
+    quality: Quality = "normal",
+    max_mb: float | None = None,
+    masks: Path | None = None,
 ) -> int:
     """Turn photos into a packed scene: find camera poses, train, evaluate, pack, and write a report and a web page.
 
@@ -191,13 +274,18 @@ def run(
         steps: number of training steps; by default that of the method.
         matching: photos that COLMAP compares: all pairs, neighbours by name (for frames of a video), or similar ones
             (for thousands of photos; downloads a vocabulary).
+        quality: draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03).
+        max_mb: most megabytes of the packed scene; fewer primitives and coarser steps keep to it.
+        masks: folder with a mask for each photo, under its name; training leaves out what is black.
     """
     _check_input(photos)
     command(photos, out, method, keep, steps)  # refuses numbers out of range before the first step
-    project = Project(photos, out, method, keep, steps, matching)
+    project = Project(photos, out, method, keep, steps, matching, quality, max_mb, masks)
+    project.check()
     if project.poses is not None and not project.poses.found:
         project.poses.check()
     lock = project.claim()
+    project.forecast()
     plan = project.plan()
     for number, step in enumerate(plan, start=1):
         heading = f"# step {number} of {len(plan)}, {step.name}"
@@ -210,7 +298,7 @@ def run(
                     later.result.unlink(missing_ok=True)
             place = "" if step.folder is None else f"cd {quoted(step.folder)} && "
             print(f"{heading}:\n{place}{shlex.join(words)}", flush=True)
-            code = run_in_group(words, folder=step.folder, locks=[lock])
+            code = run_in_group(words, folder=step.folder, locks=[lock], saves=step.name == TRAIN)
             if code in STOPPED:
                 print("sundae: interrupted; the same command continues here", file=sys.stderr)
                 return code
@@ -228,12 +316,16 @@ def run(
 
 def _check_input(photos: Path) -> None:
     """Raise ``DataError`` for a path that is neither a capture nor a folder that may hold photos."""
-    from sundae_ns.data.advice import models_in, no_transforms
+    from sundae_ns.data.advice import no_transforms
+    from sundae_ns.data.layouts import colmap_layout, is_model, is_posed
 
     if not photos.exists():
         raise DataError(f"{photos} does not exist; give a folder of photos, or a capture")
-    if (photos / "transforms.json").is_file():
+    if is_posed(photos):
+        layout = colmap_layout(photos)
+        if layout is not None:
+            print(f"# capture in COLMAP layout: {layout}", flush=True)
         return
-    posed = (photos / "sparse").is_dir() or (photos / "transforms_train.json").is_file()
-    if photos.is_file() or posed or models_in(photos):
+    blender = (photos / "transforms_train.json").is_file()
+    if photos.is_file() or (photos / "sparse").is_dir() or blender or is_model(photos):
         raise no_transforms(photos)  # says how to use a video, or a capture in another layout

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
@@ -22,34 +23,66 @@ def methods() -> list[str]:
 
 def train(
     capture: Annotated[Path, tyro.conf.Positional],
+    further: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs"),
     method: str = "sundae",
     keep: float | None = None,
     steps: int | None = None,
+    resume: bool = False,
 ) -> int:
-    """Print a command of ns-train and run it; copy the command to add further options.
+    """Print a command of ns-train and run it.
 
     Args:
-        capture: folder of the capture, as ns-process-data writes it.
+        capture: folder of the capture: a transforms.json, or a COLMAP model (sparse/0, dense/sparse) beside its images.
+        further: behind --, any options of ns-train, as in sundae train CAPTURE -- --pipeline.model.sh-degree 2
         out: folder of runs.
         method: one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU.
         keep: share of the primitives to keep, in (0, 1]; by default as many as the scene needs, or
             that of the method.
         steps: number of training steps; by default that of the method.
+        resume: train the remaining steps of the newest unfinished run of this method on this capture.
     """
-    words = command(capture, out, method, keep, steps)
+    from sundae_ns.storage.runs.unfinished import unfinished_run
+
+    if further and not (further[0].startswith("-") or _is_parser(further[0])):
+        raise ConfigError(f"{further[0]} is no option; options of ns-train follow a --")
+    if resume and steps is not None:
+        raise ConfigError("a resumed run trains its remaining steps; leave out --steps or --resume")
+    command(capture, out, method, keep, steps)  # refuses what cannot be used before it looks for runs
+    unfinished, more = unfinished_run(out, method, capture), list(further)
+    if resume and unfinished is None:
+        raise ConfigError(f"{out} has no unfinished run of {method} on {capture}; leave out --resume")
+    if unfinished is not None:
+        folder, done, length = unfinished
+        if resume:
+            more[:0] = [f"--experiment-name={folder.parent.parent.name}", "--timestamp", folder.name]
+            more[:0] = ["--load-dir", word(folder / "nerfstudio_models")]
+        else:
+            again = ["sundae", "train", word(capture), "--resume"]
+            again += ["-o", word(out)] if out != Path("outputs") else []
+            again += ["--method", method] if method != "sundae" else []
+            print(f"# {folder} ended after {done:,} of {length:,} steps; this is a new run. To resume the other:")
+            print(f"#     {shlex.join(again)}")
+    words = command(capture, out, method, keep, steps, more)
     print(shlex.join(words), flush=True)
     # The same process: an interrupt reaches the training, and its exit code is ours.
     os.execvp(console_script(words[0]), words)
 
 
-def command(capture: Path, out: Path, method: str, keep: float | None, steps: int | None) -> list[str]:
+def command(
+    capture: Path, out: Path, method: str, keep: float | None, steps: int | None, more: Sequence[str] = ()
+) -> list[str]:
     """The words of the command; options as in :func:`train`.
+
+    Args:
+        more: further words of ns-train; a parser of captures may stand among them.
 
     Raises:
         ConfigError: there is no such method, or a number is out of range.
-        DataError: the capture does not exist.
+        DataError: the capture does not exist, or is in COLMAP's layout and damaged.
     """
+    from sundae_ns.data.layouts import colmap_layout
+
     if not capture.exists():
         raise DataError(f"{capture} does not exist; give the folder of a capture")
     if method not in methods():
@@ -63,4 +96,12 @@ def command(capture: Path, out: Path, method: str, keep: float | None, steps: in
         words += ["--pipeline.model.pruning.keep-ratio", f"{keep:g}"]
     if steps is not None:
         words += ["--max-num-iterations", str(steps)]
-    return words
+    words += more
+    # The parser and its options come last.
+    layout = None if any(_is_parser(one) for one in more) else colmap_layout(capture)
+    return words if layout is None else [*words, *layout.words]
+
+
+def _is_parser(word: str) -> bool:
+    """Whether a word of ns-train names a parser of captures."""
+    return word in ("colmap", "minimal-parser") or (word.endswith("-data") and not word.startswith("-"))

@@ -6,12 +6,8 @@ import shlex
 from pathlib import Path
 
 from sundae_ns.data.beside import beside, entries
-from sundae_ns.data.colmap import images_of, num_images
+from sundae_ns.data.layouts import colmap_options, is_model, model_folders, models_in
 from sundae_ns.errors import DataError
-
-_MODELS = ("sparse", "colmap/sparse", "dense/sparse", "dense", "distorted/sparse", "sparse/aligned")
-"""Where programs put COLMAP's models, which may lie in numbered folders there."""
-_FILES = ("cameras.bin", "cameras.txt")
 
 
 def no_transforms(data: Path) -> DataError:
@@ -23,6 +19,8 @@ def no_transforms(data: Path) -> DataError:
             f"{data} has no transforms.json; it is in Blender's layout (transforms_train.json): add `blender-data` "
             "to ns-train"
         )
+    if is_model(data):
+        return DataError(f"{data} is a COLMAP model without its images; give the folder that holds both")
     found = models_in(data)
     if found:
         best = max(found, key=found.__getitem__)
@@ -38,33 +36,7 @@ def no_transforms(data: Path) -> DataError:
 
 
 def _options(data: Path, model: str) -> str:
-    """Options of nerfstudio's ``colmap`` parser for a model and the images that belong to it."""
-    words = f"--colmap-path {shlex.quote(model)}"
-    folder = (data / model).parent
-    while folder != data and not (folder / "images").is_dir():
-        folder = folder.parent
-    if folder != data:  # undistorted images lie beside their model
-        words += f" --images-path {shlex.quote((folder / 'images').relative_to(data).as_posix())}"
-    return words
-
-
-def models_in(data: Path) -> dict[str, int]:
-    """COLMAP models in the usual places of a folder: their paths in it, and their numbers of images."""
-    found: dict[str, int] = {}
-    for folder in _model_folders(data):
-        try:
-            text = (folder / "cameras.txt").is_file()
-            count = len(images_of(folder)) if text else num_images(folder)
-        except DataError:
-            count = 0
-        found[folder.relative_to(data).as_posix()] = count
-    return found
-
-
-def _model_folders(data: Path) -> list[Path]:
-    places = [data / place for place in _MODELS]
-    numbered = [path for place in places for path in entries(place) if path.name.isdigit()]
-    return [folder for folder in (*places, *numbered) if any((folder / name).is_file() for name in _FILES)]
+    return shlex.join(colmap_options(data, model))
 
 
 def no_model(data: Path, model: Path) -> DataError:
@@ -80,7 +52,7 @@ def no_model(data: Path, model: Path) -> DataError:
 
 def larger_model(data: Path, model: Path) -> str | None:
     """A remark on a COLMAP model beside ``model`` that has placed more images; None if there is none."""
-    found = models_in(data) if len(_model_folders(data)) > 1 else {}  # counting may take long
+    found = models_in(data) if len(model_folders(data)) > 1 else {}  # counting may take long
     own = found.get(model.as_posix())
     if own is None:
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -32,18 +33,20 @@ def find_photos(folder: Path) -> tuple[list[Path], str]:
     :func:`left_out` names. Only headers are read.
 
     Raises:
-        DataError: the folder cannot be read, holds fewer than :data:`LEAST_PHOTOS` photos, a file with the suffix of a
-            photo that is none, or photos of several formats.
+        DataError: the folder cannot be read, has photos in several subfolders only, holds fewer than
+            :data:`LEAST_PHOTOS` photos, a file with the suffix of a photo that is none, or photos of several formats.
     """
-    photos: dict[Path, str] = {}
+    paths: list[Path] = []
     with reading(folder, "a folder of photos"):
         for place, folders, files in os.walk(folder, onerror=_raise):
             folders[:] = [name for name in folders if not name.startswith(".") and name.lower() not in MASKS]
             for name in files:
                 path = Path(place, name)
                 if not name.startswith(".") and path.suffix.lower() in SUFFIXES:
-                    photos[path] = _suffix_of(path)
-    paths = sorted(photos)
+                    paths.append(path)
+    paths.sort()
+    _check_one_scene(folder, paths)
+    photos = {path: _suffix_of(path) for path in paths}
     if not paths and (others := _other_formats(folder)):
         raise DataError(f"{folder} holds only photos that cannot be read ({_counted(others)}); {_CONVERT}")
     if not paths:
@@ -60,12 +63,26 @@ def find_photos(folder: Path) -> tuple[list[Path], str]:
     return paths, photos[first]
 
 
-def left_out(folder: Path, photos: Sequence[Path]) -> list[str]:
+def _check_one_scene(folder: Path, photos: Sequence[Path]) -> None:
+    """Raise ``DataError`` for photos that lie in several subfolders only, which are probably several scenes."""
+    counts = Counter(path.parent for path in photos)
+    if len(counts) < 2 or folder in counts:
+        return
+    shown = ", ".join(f"{place.relative_to(folder)}: {count:,}" for place, count in list(counts.items())[:3])
+    shown += ", ..." if len(counts) > 3 else ""
+    raise DataError(
+        f"{folder} holds {len(photos):,} photos in {len(counts)} folders ({shown}); "
+        "give the folder of one scene, or move the photos of one scene into one folder"
+    )
+
+
+def left_out(folder: Path, photos: Sequence[Path], *, masked: bool = False) -> list[str]:
     """Remarks on photos that no scene is made of, one each: of other formats, of an odd size, and masks.
 
     Args:
         folder: of the photos.
         photos: from :func:`find_photos`.
+        masked: whether masks are given.
     """
     remarks = []
     if others := _other_formats(folder):
@@ -85,10 +102,10 @@ def left_out(folder: Path, photos: Sequence[Path]) -> list[str]:
         )
     for place, folders, _ in os.walk(folder):
         for name in sorted(folders):
-            if name.lower() in MASKS:
+            if name.lower() in MASKS and not masked:
                 remarks.append(
                     f"{Path(place, name)} is left out, as masks are not used for camera poses; to leave out what they "
-                    "hide in training, give each frame of transforms.json its mask_path"
+                    "hide in training, give --masks, or each frame of transforms.json its mask_path"
                 )
     return remarks
 

@@ -2,18 +2,50 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
 from nerfstudio.utils.writer import EVENT_STORAGE, GLOBAL_BUFFER, EventName, LocalWriter
+
+from sundae_ns.training.duration import LONG, duration
 
 METRICS_EVENT = "Train Metrics Dict"
 """Event of nerfstudio's trainer with the metrics of a training image."""
 LINE_EVERY = 10.0
 """Seconds between two lines."""
 
-LONG = 1800.0
-"""Seconds of a training on a CPU that are worth a warning."""
+
+class TimeLeft:
+    """Smooths the time of a step: evaluations, saves and a busy machine change it by the minute.
+
+    Intervals between two lines count by their steps, those of the last :data:`SHARE` of a run the most. A step counts
+    :data:`MOST` times the usual one at most.
+    """
+
+    SHARE = 0.1
+    MOST = 3.0
+
+    def __init__(self) -> None:
+        self.step_s: float | None = None
+        """Seconds of a step; None before the second line, as the first step also compiles."""
+        self._at: tuple[int, float] | None = None
+        self._steps = 0.0
+
+    def update(self, done: int, total: int, now: float) -> float | None:
+        """Seconds left after ``done`` of ``total`` steps at the time ``now``; None if it is not known yet."""
+        before, self._at = self._at, (done, now)
+        if before is not None and done > before[0]:
+            steps = done - before[0]
+            found = (now - before[1]) / steps
+            if self.step_s is None:
+                self.step_s, self._steps = found, steps
+            else:
+                found = min(max(found, self.step_s / self.MOST), self.step_s * self.MOST)
+                kept = self._steps * math.exp(-steps / max(self.SHARE * total, 1))
+                self.step_s = (kept * self.step_s + steps * found) / (kept + steps)
+                self._steps = kept + steps
+        return None if self.step_s is None else (total - done) * self.step_s
 
 
 class ProgressWriter(LocalWriter):
@@ -25,6 +57,7 @@ class ProgressWriter(LocalWriter):
             print(line, flush=True)
         self._printed_at = -LINE_EVERY
         self._metrics: Any = None
+        self._time_left = TimeLeft()
 
     def write_stats_log(self, step: int) -> None:
         """Print a line if it is due.
@@ -39,11 +72,13 @@ class ProgressWriter(LocalWriter):
         trained = events.get(EventName.ITER_TRAIN_TIME.value)
         if trained is not None and self._metrics is not None and time.monotonic() - self._printed_at >= LINE_EVERY:
             self._printed_at = time.monotonic()
-            done, seconds, total = trained["step"] + 1, float(trained["event"]), GLOBAL_BUFFER["max_iter"]
-            left = duration((total - done) * seconds)
+            done, total = trained["step"] + 1, GLOBAL_BUFFER["max_iter"]
+            left = self._time_left.update(done, total, self._printed_at)
+            speed = 1000 * (self._time_left.step_s or 0.0)
+            pace = "" if left is None else f"{duration(left)} left at {speed:.0f} ms a step  "
             print(
-                f"{done} ({100 * done / max(total, 1):.2f}%)  {left} left at {1000 * seconds:.0f} ms a step  "
-                f"PSNR {float(self._metrics['psnr']):.2f} dB  {self._metrics['gaussian_count']:,} primitives",
+                f"{done} ({100 * done / max(total, 1):.2f}%)  {pace}PSNR {float(self._metrics['psnr']):.2f} dB  "
+                f"{self._metrics['gaussian_count']:,} primitives",
                 flush=True,
             )
 
@@ -62,12 +97,3 @@ def long_on_cpu(seconds: float, left: int) -> str | None:
         "step). sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and smaller images "
         "are faster: end the command with nerfstudio-data --downscale-factor 4"
     )
-
-
-def duration(seconds: float) -> str:
-    """A duration in two units at most: ``1 h 5 min``, ``2 min``, ``40 s``."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

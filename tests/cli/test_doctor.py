@@ -189,7 +189,9 @@ def test_nvcc_is_searched_like_torch_and_gsplat_do(no_compiler: Path, monkeypatc
 
 def test_the_oldest_driver_is_named(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    assert "built for CUDA 13.0, which needs 580 or newer" in finding("CUDA").fix
+    assert "built for CUDA 13.0, which needs 580 or newer; with an older driver, pip install -c" in finding("CUDA").fix
+    monkeypatch.setattr(torch.version, "cuda", "12.8")
+    assert finding("CUDA").fix.endswith("needs 525 or newer")
     monkeypatch.setattr(torch.version, "cuda", "99.0")
     assert "needs" not in finding("CUDA").fix
 

@@ -64,6 +64,33 @@ def test_a_signal_reaches_the_whole_group_once(tmp_path: Path, sent: signal.Sign
     assert _ends(int((tmp_path / "grandchild").read_text()))
 
 
+TREE = """
+import pathlib, subprocess, sys, time
+subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+pathlib.Path(sys.argv[1], "ready").touch()
+time.sleep(600)
+"""
+INTERRUPTED = """
+import sys
+from sundae_ns.cli.process import run_in_group
+sys.exit(run_in_group([sys.executable, "-c", sys.argv[1], sys.argv[2]], saves=sys.argv[3] == "saves"))
+"""
+
+
+@pytest.mark.parametrize(("saves", "lines"), [("saves", True), ("ends", False)])
+def test_an_interrupt_prints_nothing_where_nothing_is_saved(tmp_path: Path, saves: str, lines: bool) -> None:
+    words = [sys.executable, "-c", INTERRUPTED, TREE, str(tmp_path), saves]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        while not (tmp_path / "ready").exists():
+            time.sleep(0.01)
+        time.sleep(0.3)  # the grandchild starts
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert ("Traceback" in said) == lines
+    assert bool(said) == lines
+
+
 def _ends(pid: int) -> bool:
     """Whether a process ends, or has ended and waits for its parent."""
     for _ in range(1000):

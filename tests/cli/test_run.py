@@ -12,12 +12,17 @@ import sys
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+import tyro
+from colmap_models import write_model
 from PIL import Image
 
+from sundae_ns import method_configs
 from sundae_ns.cli import main
+from sundae_ns.cli.forecast import Forecast, trained_size
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
 
@@ -39,8 +44,19 @@ class Commands:
         self.saved_at = {0: 99, 130: 39}
         """Step of the checkpoint, by the exit code of the training."""
         self.silent = False
+        self.framed = False
+        """Whether images and frames have the names that the program gives, and there are smaller images."""
+        self.forecast: Forecast | None = None
+        self.asked: list[tuple[str, int, int]] = []
 
-    def __call__(self, words: list[str], *, folder: Path | None = None, locks: Sequence[int] = ()) -> int:
+    def measured(self, *asked: Any) -> Forecast | None:
+        """Stands for the process that times steps."""
+        self.asked.append(asked)
+        return self.forecast
+
+    def __call__(
+        self, words: list[str], *, folder: Path | None = None, locks: Sequence[int] = (), saves: bool = True
+    ) -> int:
         self.ran.append(list(words))
         self.folders.append(folder)
         name = self.names[-1]
@@ -84,7 +100,14 @@ class Commands:
                     model = capture / "colmap" / "sparse" / str(index)
                     model.mkdir(parents=True)
                     (model / "images.bin").write_bytes(struct.pack("<Q", images) + bytes(100 * images))
-            (capture / "transforms.json").write_text(json.dumps({"frames": [{}] * placed}))
+            frames: list[dict[str, str]] = [{}] * placed
+            if self.framed:
+                frames = [{"file_path": f"images/frame_{number:05d}.jpg"} for number in range(1, placed + 1)]
+                (capture / "images_2").mkdir()
+                for path in sorted((capture / "images").glob("0*")):
+                    path.rename(path.with_name(f"frame_{path.name}"))
+                    Image.new("RGB", (8, 6)).save(capture / "images_2" / f"frame_{path.name}")
+            (capture / "transforms.json").write_text(json.dumps({"frames": frames}))
         elif name == "sundae eval":
             Path(self.option("-o")).write_text('{"results": {"psnr": 20.0}}')
         elif name == "sundae pack":
@@ -117,6 +140,7 @@ def commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Commands:
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     made = Commands()
     monkeypatch.setattr("sundae_ns.cli.run.run_in_group", made)
+    monkeypatch.setattr("sundae_ns.cli.run.measured_step", made.measured)
     return made
 
 
@@ -247,6 +271,29 @@ def test_a_capture_needs_no_poses_and_no_colmap(commands: Commands, tmp_path: Pa
     assert not Path("again/capture").exists()
 
 
+def test_a_capture_in_colmap_layout_needs_no_poses(
+    commands: Commands, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(tmp_path / "bin")
+    shutil.copytree("photos", "scene/dense/images")
+    write_model(tmp_path / "scene" / "dense" / "sparse", [f"{index}.JPG" for index in range(PHOTOS)], (16, 12))
+    assert run("scene", "-o", "my scene") == 0
+    assert commands.names == STEPS[1:]
+    said = "# capture in COLMAP layout: 8 images in dense/images, poses of dense/sparse\n"
+    assert capsys.readouterr().out.startswith(said)
+    parser = ["colmap", "--colmap-path", "dense/sparse", "--images-path", "dense/images", "--downscale-factor", "1"]
+    assert commands.ran[0][-len(parser) :] == parser
+    assert commands.option("--output-dir", 0) == "my scene/runs"
+    commands.ran.clear()
+    shutil.rmtree("my scene/runs")
+    commands.codes["ns-train"] = 130
+    assert run("scene", "-o", "my scene") == 130
+    commands.codes.clear()
+    assert run("scene", "-o", "my scene") == 0
+    assert commands.ran[1][-len(parser) :] == parser, "a resumed training reads the same"
+    assert "--load-dir" in commands.ran[1]
+
+
 @pytest.mark.parametrize("missing", ["colmap", "ffmpeg"])
 def test_a_missing_program_is_named(
     commands: Commands, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str
@@ -298,14 +345,21 @@ def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.Captur
         (["gone", "-o", "out"], "gone does not exist"),
         (["empty", "-o", "out"], "holds no photos"),
         (["video.mp4", "-o", "out"], "ns-process-data video"),
-        (["model", "-o", "out"], "colmap --colmap-path sparse/0"),
-        (["undistorted", "-o", "out"], "colmap --colmap-path dense/sparse --images-path dense/images"),
+        (["model", "-o", "out"], "model/sparse/0: cameras.bin ends early"),
+        (["model/sparse/0", "-o", "out"], "is a COLMAP model without its images"),
+        (["undistorted", "-o", "out"], "undistorted has no image 0.png, which its model dense/sparse states"),
         (["blender", "-o", "out"], "add `blender-data` to ns-train"),
         (["photos", "-o", "photos/out"], "lies in photos"),
         (["photos", "-o", "."], "holds what the command reads"),
         (["photos", "-o", "used"], "holds files"),
         (["photos", "-o", "out", "--keep", "2"], "keep is 2.0"),
         (["photos", "-o", "out", "--steps", "0"], "steps is 0"),
+        (["photos", "-o", "out", "--max-mb", "0"], "max-mb is 0; give at least 0.01"),
+        (["photos", "-o", "out", "--max-mb", "2", "--keep", "0.1"], "--max-mb needs a method that decides"),
+        (["photos", "-o", "out", "--quality", "best", "--method", "sundae-fast"], "--quality best needs a method that"),
+        (["photos", "-o", "out", "--quality", "draft", "--steps", "9"], "a draft has 3,000 steps"),
+        (["photos", "-o", "out", "--masks", "gone"], "gone is no folder of masks"),
+        (["photos", "-o", "out", "--masks", "empty"], "photos/0.JPG has no mask 0.png in empty"),
     ],
 )
 def test_refusals_come_before_anything_is_written(
@@ -315,9 +369,7 @@ def test_refusals_come_before_anything_is_written(
     (tmp_path / "video.mp4").touch()
     (tmp_path / "model" / "sparse" / "0").mkdir(parents=True)
     (tmp_path / "model" / "sparse" / "0" / "cameras.bin").touch()
-    (tmp_path / "undistorted" / "dense" / "sparse").mkdir(parents=True)
-    (tmp_path / "undistorted" / "dense" / "sparse" / "cameras.bin").touch()
-    (tmp_path / "undistorted" / "dense" / "images").mkdir()
+    write_model(tmp_path / "undistorted" / "dense" / "sparse", ["0.png"], (20, 16))
     (tmp_path / "blender").mkdir()
     (tmp_path / "blender" / "transforms_train.json").touch()
     (tmp_path / "used").mkdir()
@@ -341,6 +393,85 @@ def test_other_settings_are_refused(
 ) -> None:
     assert run("photos", "-o", "out") == 0
     assert cause in refusal(capsys, "photos", "-o", "out", *more)
+
+
+def test_a_size_and_a_quality(commands: Commands) -> None:
+    assert run("photos", "-o", "out", "--max-mb", "2", "--quality", "best") == 0
+    usual = method_configs.sundae.config
+    words = commands.ran[1]
+    config = tyro.cli(type(usual), default=usual, args=words[2:])
+    assert config.pipeline.model.pruning.max_bytes == 2_000_000
+    assert config.pipeline.model.pruning.max_drop == 0.03
+    config.pipeline.model.pruning.validate()
+    assert commands.option("--target-bytes", 3) == "2000000"
+    commands.ran.clear()
+    assert run("photos", "-o", "draft", "--quality", "draft") == 0
+    assert commands.option("--max-num-iterations", 1) == "3000"
+    assert "--target-bytes" not in commands.ran[3]
+
+
+def test_a_folder_of_an_earlier_version_has_the_normal_quality(
+    commands: Commands, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("photos", "-o", "out") == 0
+    settings = json.loads(Path("out/run.json").read_text())
+    for name in ("quality", "max_mb"):
+        del settings[name]
+    Path("out/run.json").write_text(json.dumps(settings))
+    assert run("photos", "-o", "out") == 0
+    assert "quality normal, not draft" in refusal(capsys, "photos", "-o", "out", "--quality", "draft")
+
+
+def test_a_training_of_hours_on_a_cpu_is_foretold_before_it_starts(
+    commands: Commands, capsys: pytest.CaptureFixture[str]
+) -> None:
+    commands.forecast = Forecast(2.0, 30000, "cpu")
+    commands.codes["ns-train"] = 130
+    assert run("photos", "-o", "out") == 130
+    said, rest = capsys.readouterr().out.split("\n", 1)
+    assert said.startswith(
+        "# warning: 30,000 training steps take at least 16 h 40 min on this CPU, 2000 ms each at 16 x 12"
+    )
+    assert "--quality draft (1 h 40 min), --method sundae-tiny" in said
+    assert "# step 1 of 7" in rest
+    assert run("photos", "-o", "out") == 130
+    assert len(commands.asked) == 1, "a resumed training has a forecast of its own"
+    commands.forecast = Forecast(0.004, 30000, "cuda")
+    commands.codes.clear()
+    assert run("photos", "-o", "other") == 0
+    assert "# forecast: 30,000 training steps take about 2 min 0 s on this GPU" in capsys.readouterr().out
+
+
+def test_the_size_of_training_images(tmp_path: Path) -> None:
+    assert trained_size(tmp_path) is None
+    for index in range(3):
+        Image.new("RGB", (4000, 30), "grey").save(tmp_path / f"{index}.png")
+    assert trained_size(tmp_path) == (1000, 7)
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{"file_path": "1.png"}]}))
+    assert trained_size(tmp_path) == (1000, 7)
+    (tmp_path / "transforms.json").unlink()
+    write_model(tmp_path / "sparse" / "0", ["0.png"], (4000, 30))
+    assert trained_size(tmp_path) == (4000, 30), "there are no smaller images"
+
+
+def test_masks_reach_the_capture(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("photos/masks").mkdir()
+    for index in range(PHOTOS):
+        mask = Image.new("L", (16, 12), 255)
+        mask.putpixel((index, 0), 0)
+        mask.save(f"photos/masks/{index}.png")
+    commands.framed = True
+    assert run("photos", "-o", "out", "--masks", "photos/masks") == 0
+    said = capsys.readouterr().out
+    assert f"# masks: {PHOTOS} of {PHOTOS}\n" in said
+    assert "is left out" not in said
+    frames = json.loads(Path("out/capture/transforms.json").read_text())["frames"]
+    assert frames[2]["mask_path"] == "masks/frame_00003.png"
+    with Image.open("out/capture/masks/frame_00003.png") as stored:
+        assert (stored.getpixel((2, 0)), stored.getpixel((3, 0))) == (0, 255)
+    with Image.open("out/capture/masks_2/frame_00003.png") as stored:
+        assert (stored.size, stored.mode) == ((8, 6), "L")
+    assert "not left out; repeat the first command" in refusal(capsys, "photos", "-o", "out")
 
 
 def test_damaged_settings(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shlex
+import zipfile
 from pathlib import Path
 
 import pytest
 import tyro
+from colmap_models import write_model
+from PIL import Image
 
 from sundae_ns import method_configs
 from sundae_ns.cli import main
 from sundae_ns.cli.train import methods
+from sundae_ns.storage.runs.folder import LOCK
+from sundae_ns.storage.runs.unfinished import unfinished_run
 
 
 class Replaced(Exception):
@@ -78,3 +84,88 @@ def test_refusals_are_one_line(
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert cause in line
     assert ran == []
+
+
+def test_further_options_and_the_parser_of_a_capture(tmp_path: Path, ran: list[list[str]]) -> None:
+    capture = tmp_path / "my scene"
+    (capture / "images").mkdir(parents=True)
+    Image.new("RGB", (20, 16), "grey").save(capture / "images" / "0.png")
+    write_model(capture / "sparse" / "0", ["0.png"], (20, 16))
+    own = ["--pipeline.model.sh-degree", "1", "--vis", "tensorboard"]
+    with pytest.raises(Replaced):
+        main(["train", str(capture), "--steps", "9", "--", *own])
+    usual = method_configs.sundae.config
+    assert ran[0][-9:] == [*own, "colmap", "--colmap-path", "sparse/0", "--downscale-factor", "1"]
+    with pytest.raises(Replaced):
+        main(["train", str(capture), "--", *own, "colmap", "--colmap-path", "sparse/0", "--eval-mode", "all"])
+    assert ran[1].count("colmap") == 1, "the user's parser takes the place of ours"
+    config = tyro.cli(type(usual), default=usual, args=ran[1][2 : ran[1].index("colmap")])
+    assert config.pipeline.model.sh_degree == 1
+
+
+def test_a_stray_word_is_no_option(tmp_path: Path, ran: list[list[str]], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", str(tmp_path), "photos"])
+    assert "photos is no option; options of ns-train follow a --" in capsys.readouterr().err
+    assert ran == []
+
+
+def run_of(folder: Path, capture: Path, step: int, *, source: Path | None = None) -> Path:
+    """Write a run of 30,000 steps with a checkpoint of a step."""
+    (folder / "nerfstudio_models").mkdir(parents=True)
+    part = "\n".join(f"- {part}" for part in capture.absolute().parts)
+    text = "!!python/object:sundae_ns.trainer.SundaeTrainerConfig\nschedule_length: 30000\n"
+    text += f"data: !!python/object/apply:pathlib.PosixPath\n{part}\n"
+    if source is not None:
+        text += "load_dir: !!python/object/apply:pathlib.PosixPath\n" + "".join(f"- {one}\n" for one in source.parts)
+    (folder / "config.yml").write_text(text)
+    with zipfile.ZipFile(folder / "nerfstudio_models" / f"step-{step:09d}.ckpt", "w") as archive:
+        archive.writestr("data.pkl", bytes(500))
+    return folder
+
+
+def test_an_unfinished_run_is_named_and_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ran: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("my scene", "other"):
+        (tmp_path / name).mkdir()
+    run_of(Path("outputs/my scene/sundae/first"), Path("my scene"), 1999)
+    run_of(Path("outputs/my scene/sundae/whole"), Path("my scene"), 29999)
+    run_of(Path("outputs/other/sundae/first"), Path("other"), 2999)
+    with pytest.raises(Replaced):
+        main(["train", "my scene"])
+    first, second, command = capsys.readouterr().out.splitlines()
+    assert first.startswith("# outputs/my scene/sundae/first ended after 2,000 of 30,000 steps")
+    assert "--load-dir" not in command
+    words = shlex.split(second.lstrip("# "))
+    assert words == ["sundae", "train", "my scene", "--resume"]
+    with pytest.raises(Replaced):
+        main([*words[1:], "--", "--vis", "tensorboard"])
+    usual = method_configs.sundae.config
+    config = tyro.cli(type(usual), default=usual, args=ran[1][2:])
+    assert config.load_dir == Path("outputs/my scene/sundae/first/nerfstudio_models")
+    assert (config.experiment_name, config.timestamp, config.vis) == ("my scene", "first", "tensorboard")
+    assert len(capsys.readouterr().out.splitlines()) == 1
+    # Another method or folder has no such run.
+    for more in (["--method", "sundae-tiny"], ["-o", "elsewhere"]):
+        with pytest.raises(SystemExit):
+            main(["train", "my scene", "--resume", *more])
+        assert "no unfinished run" in capsys.readouterr().err
+
+
+def test_a_run_that_another_one_has_resumed_or_that_is_trained_is_not_named(tmp_path: Path) -> None:
+    out, capture = tmp_path / "outputs", tmp_path / "scene"
+    first = run_of(out / "scene" / "sundae" / "first", capture, 1999)
+    assert unfinished_run(out, "sundae", capture) == (first, 2000, 30000)
+    with (first / LOCK).open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert unfinished_run(out, "sundae", capture) is None
+    run_of(out / "scene" / "sundae" / "second", capture, 29999, source=first / "nerfstudio_models")
+    assert unfinished_run(out, "sundae", capture) is None
+
+
+def test_a_resumed_run_has_its_length(tmp_path: Path, ran: list[list[str]], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", str(tmp_path), "--resume", "--steps", "5"])
+    assert "leave out --steps or --resume" in capsys.readouterr().err

@@ -140,3 +140,17 @@ def test_masks_are_no_photos(photos: Path) -> None:
     (remark,) = left_out(photos, found)
     assert f"{photos / 'masks'} is left out" in remark
     assert "mask_path" in remark
+
+
+def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path: Path) -> None:
+    for name, count in (("a", 4), ("b/c", 2), ("masks", 3)):
+        for index in range(count):
+            (tmp_path / name).mkdir(parents=True, exist_ok=True)
+            (tmp_path / name / f"{index}.png").touch()
+    with pytest.raises(DataError, match=r"holds 6 photos in 2 folders \(a: 4, b/c: 2\); give the folder of one scene"):
+        find_photos(tmp_path)
+
+
+def test_photos_in_one_folder_further_in(tmp_path: Path) -> None:
+    paths = [photo(tmp_path / "DCIM" / "100" / f"{index}.png") for index in range(3)]
+    assert find_photos(tmp_path)[0] == paths

@@ -128,6 +128,7 @@ def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> No
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sundae_ns.cli.run.run_in_group", start)
+    monkeypatch.setattr("sundae_ns.cli.run.measured_step", lambda *_: None)
     monkeypatch.setattr("sundae_ns.cli.demo.run_logged", start)
     monkeypatch.setattr(os, "execvp", lambda program, words: start(words))
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", stop)

@@ -35,8 +35,9 @@ def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     shutil.copytree(tiny.scene / "images", "photos")
     monkeypatch.setattr("sundae_ns.cli.poses.shutil.which", lambda _: "/bin/true")
     monkeypatch.setattr("sundae_ns.cli.poses._colmap_uses_gpu", lambda: False)
+    monkeypatch.setattr("sundae_ns.cli.run.measured_step", lambda *_: None)
 
-    def here(words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = ()) -> int:
+    def here(words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = (), saves: bool = True) -> int:
         if words[0] == "ns-process-data":
             assert folder is not None
             shutil.copytree(tiny.scene, folder / words[words.index("--output-dir") + 1])
@@ -127,6 +128,7 @@ def poses(open3d: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list
         return run_in_group(words, **options) if words[0] == "ns-process-data" else 3
 
     monkeypatch.setattr("sundae_ns.cli.run.run_in_group", only_poses)
+    monkeypatch.setattr("sundae_ns.cli.run.measured_step", lambda *_: None)
     return asked
 
 

@@ -10,7 +10,8 @@ from nerfstudio.utils import writer
 
 from sundae_ns.cli.process import percent_of
 from sundae_ns.training import progress
-from sundae_ns.training.progress import METRICS_EVENT, ProgressWriter, duration, long_on_cpu
+from sundae_ns.training.duration import duration
+from sundae_ns.training.progress import METRICS_EVENT, ProgressWriter, TimeLeft, long_on_cpu
 
 
 def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
@@ -24,12 +25,54 @@ def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, caps
     ]
     monkeypatch.setattr(progress, "EVENT_STORAGE", events)
     made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10), ["Viewer at: somewhere"])
+    clock = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
     made.write_stats_log(0)
     made.write_stats_log(0)
-    banner, line = capsys.readouterr().out.splitlines()
+    clock[0] += 10
+    events[1]["step"] = 199
+    made.write_stats_log(0)
+    banner, first, line = capsys.readouterr().out.splitlines()
     assert banner == "Viewer at: somewhere"
-    assert line == "160 (40.00%)  1 min 0 s left at 250 ms a step  PSNR 21.46 dB  12,345 primitives"
-    assert percent_of(line) == 40, "sundae demo reads it"
+    assert first == "160 (40.00%)  PSNR 21.46 dB  12,345 primitives", "the first step compiles"
+    assert line == "200 (50.00%)  50 s left at 250 ms a step  PSNR 21.46 dB  12,345 primitives"
+    assert percent_of(line) == 50, "sundae demo reads it"
+
+
+def test_the_time_left_does_not_jump() -> None:
+    """Intervals of ten seconds in which a step takes 16 or 124 ms, which would be 8 and 62 minutes of 30,000 steps."""
+    watch, total, done, now = TimeLeft(), 30000, 0, 0.0
+    found: list[tuple[float, float]] = []
+    while done < total:
+        steps = round(10 / (0.016 if len(found) % 2 else 0.124))
+        done, now = min(done + steps, total), now + 10
+        left = watch.update(done, total, now)
+        if left is not None:
+            found.append((left, now))
+        else:
+            found.append((float("nan"), now))
+    later = [left for left, _ in found[10:-6]]
+    assert all(1 / 1.5 < after / before < 1.5 for before, after in zip(later, later[1:]))
+    half = len(found) // 2
+    assert 0.6 < found[half][0] / (now - found[half][1]) < 1.5, "and it is right"
+
+
+def test_one_long_interval_does_not_change_the_time_left() -> None:
+    watch = TimeLeft()
+    for done in (0, 100, 200):
+        watch.update(done, 3000, done / 10)
+    usual = watch.update(300, 3000, 30.0)
+    assert usual == pytest.approx(270)
+    after = watch.update(310, 3000, 150.0)
+    assert after == pytest.approx(269, rel=0.2)
+
+
+def test_a_lasting_change_is_followed() -> None:
+    watch, now = TimeLeft(), 0.0
+    for done in range(0, 3001, 10):
+        now += 10 * (0.1 if done < 500 else 1.0)
+        watch.update(done, 3000, now)
+    assert watch.step_s == pytest.approx(1.0, rel=0.05)
 
 
 def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

@@ -151,6 +151,19 @@ def check_run(run: Path) -> None:
     model_options(config_of(run))
 
 
+def capture_and_source(path: Path) -> tuple[Path | None, Path | None]:
+    """Paths of a run's capture and of the checkpoints that it resumes, from its ``config.yml``; imports nothing.
+
+    Raises:
+        CheckpointError: it cannot be read, or is no configuration of a run.
+    """
+    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
+    found = found if isinstance(found, dict) else {}
+    paths = (found.get(name) for name in ("data", "load_dir"))
+    capture, source = (Path(*map(str, parts)) if isinstance(parts, list) and parts else None for parts in paths)
+    return capture, source
+
+
 def schedule_length(path: Path) -> int:
     """Number of steps of a run's schedule, from its ``config.yml``; imports nothing.
 

@@ -1,0 +1,131 @@
+"""Captures in COLMAP's layout: where a folder has its models, and the options of nerfstudio's parser that read one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sundae_ns.data.beside import entries
+from sundae_ns.data.capture import check_image
+from sundae_ns.data.colmap import images_of, num_images
+from sundae_ns.errors import DataError
+
+_MODELS = ("sparse", "colmap/sparse", "dense/sparse", "dense", "distorted/sparse", "sparse/aligned")
+"""Where programs put COLMAP's models, which may lie in numbered folders there."""
+_FILES = ("cameras.bin", "cameras.txt")
+_IMAGES = ("images", "input", "photos", "image", "rgb")
+"""Usual names of the folder of images; COLMAP's programs use the first."""
+_LONGEST = 1600
+"""Longest side in pixels that images are trained at where smaller ones are there, as nerfstudio does."""
+
+
+@dataclass(frozen=True)
+class ColmapLayout:
+    """The largest model of a capture, with its images."""
+
+    model: str
+    """Folder of the model, relative to the capture."""
+    images: str
+    """Folder of the images, relative to the capture."""
+    num_images: int
+    num_models: int
+    size: tuple[int, int]
+    """Width and height of the first image, pixels."""
+    downscale: int
+    """Scale of the images to train on: those of ``images_4`` for 4."""
+
+    @property
+    def words(self) -> list[str]:
+        """The words of ``ns-train`` that read the capture, behind all other options."""
+        words = ["colmap", "--colmap-path", self.model]
+        if self.images != "images":
+            words += ["--images-path", self.images]
+        return [*words, "--downscale-factor", str(self.downscale)]
+
+    def __str__(self) -> str:
+        several = f", the largest of {self.num_models} models" if self.num_models > 1 else ""
+        smaller = f", at 1/{self.downscale} of their size" if self.downscale > 1 else ""
+        return f"{self.num_images:,} images in {self.images}{smaller}, poses of {self.model}{several}"
+
+
+def is_posed(data: Path) -> bool:
+    """Whether a folder has a ``transforms.json`` or a COLMAP model in one of the usual places."""
+    return (data / "transforms.json").is_file() or bool(model_folders(data))
+
+
+def colmap_layout(data: Path) -> ColmapLayout | None:
+    """The largest COLMAP model of a capture; None if it has a ``transforms.json`` or no model.
+
+    Raises:
+        DataError: the model is damaged, or its images are in none of the usual places.
+    """
+    if (data / "transforms.json").is_file() or not model_folders(data):
+        return None
+    found = models_in(data)
+    model = max(found, key=found.__getitem__)
+    try:
+        names = [image.name for image in images_of(data / model)]
+    except DataError as error:
+        raise DataError(f"{data / model}: {error}") from error
+    folder = _folder_of(data, model, names[0])
+    size = check_image(data / folder / names[0])
+    return ColmapLayout(model, folder, len(names), len(found), size, _downscale(data / folder, names[0], size))
+
+
+def _folder_of(data: Path, model: str, name: str) -> str:
+    """The folder with an image of a model; undistorted images lie beside their model."""
+    places = [data / model, *(place for place in (data / model).parents if place.is_relative_to(data))]
+    candidates = [*(place / usual for place in places for usual in _IMAGES), data]
+    for folder in candidates:
+        if (folder / name).is_file():
+            return folder.relative_to(data).as_posix()
+    raise DataError(
+        f"{data} has no image {name}, which its model {model} states, in {', '.join(_IMAGES)}; put the images into "
+        f"{data / 'images'}"
+    )
+
+
+def _downscale(images: Path, name: str, size: tuple[int, int]) -> int:
+    """The least factor with a longest side of at most :data:`_LONGEST` for which there are smaller images; else 1."""
+    longest, factor = max(size), 1
+    while longest / factor > _LONGEST:
+        if not (images.with_name(f"{images.name}_{2 * factor}") / name).is_file():
+            return factor
+        factor *= 2
+    return factor
+
+
+def colmap_options(data: Path, model: str) -> list[str]:
+    """Options of nerfstudio's ``colmap`` parser for a model and the images that belong to it."""
+    words = ["--colmap-path", model]
+    folder = (data / model).parent
+    while folder != data and not (folder / "images").is_dir():
+        folder = folder.parent
+    if folder != data:  # undistorted images lie beside their model
+        words += ["--images-path", (folder / "images").relative_to(data).as_posix()]
+    return words
+
+
+def models_in(data: Path) -> dict[str, int]:
+    """COLMAP models in the usual places of a folder: their paths in it, and their numbers of images."""
+    found: dict[str, int] = {}
+    for folder in model_folders(data):
+        try:
+            text = (folder / "cameras.txt").is_file()
+            count = len(images_of(folder)) if text else num_images(folder)
+        except DataError:
+            count = 0
+        found[folder.relative_to(data).as_posix()] = count
+    return found
+
+
+def model_folders(data: Path) -> list[Path]:
+    """Folders of the COLMAP models in the usual places of a folder."""
+    places = [data / place for place in _MODELS]
+    numbered = [path for place in places for path in entries(place) if path.name.isdigit()]
+    return [folder for folder in (*places, *numbered) if is_model(folder)]
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder has the cameras of a COLMAP model."""
+    return any((folder / name).is_file() for name in _FILES)

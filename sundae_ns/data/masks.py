@@ -1,0 +1,83 @@
+"""Masks of photos, put into the capture that is made of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from sundae_ns.data.capture import check_image, read_json
+from sundae_ns.errors import DataError, one_line
+
+_ORIENTATION = 0x0112
+"""EXIF entry; 1 is upright."""
+
+
+def masks_of(photos: Sequence[Path], folder: Path) -> list[Path]:
+    """The mask of each photo: an image in ``folder`` with the photo's name, or with ``.png`` behind it or in its place.
+
+    Raises:
+        DataError: a photo has no mask, or one of another size, or is turned by EXIF.
+    """
+    found = []
+    for photo in photos:
+        names = (photo.name, f"{photo.name}.png", f"{photo.stem}.png", f"{photo.stem}.jpg")
+        mask = next((folder / name for name in names if (folder / name).is_file()), None)
+        if mask is None:
+            raise DataError(f"{photo} has no mask {photo.stem}.png in {folder}; add it, white where pixels count")
+        if _turned(photo):
+            raise DataError(f"{photo} is turned by its EXIF entry, and its mask is not; save both upright")
+        size, wanted = check_image(mask, mask=True), check_image(photo)
+        if size != wanted:
+            raise DataError(f"{mask} has {size[0]} x {size[1]} px and its photo {wanted[0]} x {wanted[1]}; scale it")
+        found.append(mask)
+    return found
+
+
+def _turned(photo: Path) -> bool:
+    """Whether viewers turn a photo, by its EXIF entry for orientation."""
+    try:
+        with Image.open(photo) as image:
+            return image.getexif().get(_ORIENTATION, 1) > 1
+    except (OSError, ValueError, SyntaxError):
+        return False
+
+
+def add_masks(capture: Path, masks: Sequence[Path]) -> str:
+    """Copy masks into a capture of ns-process-data, at the sizes of its images, and name them in its frames.
+
+    Args:
+        capture: whose images are named ``frame_00001`` and so on, in the order of the masks.
+        masks: one for each photo.
+
+    Returns:
+        How many frames have theirs, ``24 of 24``.
+    """
+    meta: dict[str, Any] = dict(read_json(capture / "transforms.json"))
+    by_name = {f"frame_{number:05d}": mask for number, mask in enumerate(masks, start=1)}
+    for frame in meta["frames"]:
+        name = Path(frame["file_path"]).stem
+        if name in by_name:
+            frame["mask_path"] = f"masks/{name}.png"
+    for images in sorted(capture.glob("images*")):
+        folder = capture / images.name.replace("images", "masks", 1)
+        folder.mkdir(exist_ok=True)
+        _write_masks(images, folder, by_name)
+    partial = capture / "transforms.json.partial"  # a killed command must not cost the poses
+    partial.write_text(json.dumps(meta, indent=4), encoding="utf-8")
+    partial.replace(capture / "transforms.json")
+    return f"{sum('mask_path' in frame for frame in meta['frames'])} of {len(meta['frames'])}"
+
+
+def _write_masks(images: Path, folder: Path, masks: Mapping[str, Path]) -> None:
+    for image in images.iterdir():
+        if image.stem in masks:
+            try:
+                with Image.open(masks[image.stem]) as mask:
+                    scaled = mask.convert("L").resize(check_image(image), Image.Resampling.NEAREST)
+            except (OSError, ValueError, SyntaxError) as error:
+                raise DataError(f"{masks[image.stem]} cannot be decoded ({one_line(error)}); save it again") from error
+            scaled.save(folder / f"{image.stem}.png")

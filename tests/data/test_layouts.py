@@ -1,0 +1,83 @@
+"""Captures in COLMAP's layout: the largest model with its images, as words of ns-train."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from colmap_models import write_model
+from PIL import Image
+
+from sundae_ns.data.layouts import colmap_layout, is_posed
+from sundae_ns.errors import DataError
+
+
+def photos(folder: Path, count: int = 3, size: tuple[int, int] = (20, 16)) -> list[str]:
+    folder.mkdir(parents=True)
+    names = [f"{index}.png" for index in range(count)]
+    for name in names:
+        Image.new("RGB", size, "grey").save(folder / name)
+    return names
+
+
+@pytest.mark.parametrize(
+    ("model", "images", "words"),
+    [
+        ("sparse/0", "images", ["sparse/0"]),
+        ("colmap/sparse/0", "images", ["colmap/sparse/0"]),
+        ("sparse", "images", ["sparse"]),
+        ("dense/sparse", "dense/images", ["dense/sparse", "--images-path", "dense/images"]),
+        ("dense", "dense/images", ["dense", "--images-path", "dense/images"]),
+        ("dense/sparse/0", "images", ["dense/sparse/0"]),
+        ("distorted/sparse/0", "input", ["distorted/sparse/0", "--images-path", "input"]),
+        ("sparse/0", ".", ["sparse/0", "--images-path", "."]),
+    ],
+)
+def test_a_model_and_its_images(tmp_path: Path, model: str, images: str, words: list[str]) -> None:
+    data = tmp_path / "my scene"
+    write_model(data / model, photos(data / images), (20, 16))
+    assert is_posed(data)
+    layout = colmap_layout(data)
+    assert layout is not None
+    assert layout.words == ["colmap", "--colmap-path", *words, "--downscale-factor", "1"]
+
+
+def test_the_largest_of_several_models(tmp_path: Path) -> None:
+    names = photos(tmp_path / "images", 20)
+    for number, count in ((0, 3), (1, 20), (10, 7)):
+        write_model(tmp_path / "sparse" / str(number), names[:count], (20, 16))
+    layout = colmap_layout(tmp_path)
+    assert str(layout) == "20 images in images, poses of sparse/1, the largest of 3 models"
+
+
+@pytest.mark.parametrize(("made", "factor"), [([], 1), ([4], 1), ([2], 2), ([2, 4, 8], 4)])
+def test_smaller_images_are_taken_where_there_are_some(tmp_path: Path, made: list[int], factor: int) -> None:
+    names = photos(tmp_path / "images", 3, (6000, 40))
+    write_model(tmp_path / "sparse" / "0", names, (6000, 40))
+    for one in made:
+        photos(tmp_path / f"images_{one}", 3, (6000 // one, 40 // one))
+    layout = colmap_layout(tmp_path)
+    assert layout is not None
+    assert layout.downscale == factor
+
+
+def test_a_transforms_json_comes_first(tmp_path: Path) -> None:
+    write_model(tmp_path / "sparse" / "0", photos(tmp_path / "images"), (20, 16))
+    (tmp_path / "transforms.json").write_text("{}")
+    assert is_posed(tmp_path)
+    assert colmap_layout(tmp_path) is None
+
+
+def test_a_folder_of_photos_has_no_poses(tmp_path: Path) -> None:
+    photos(tmp_path / "images")
+    assert not is_posed(tmp_path)
+    assert colmap_layout(tmp_path) is None
+
+
+def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
+    write_model(tmp_path / "sparse" / "0", ["gone.png"], (20, 16))
+    with pytest.raises(DataError, match=r"no image gone\.png, which its model sparse/0 states, in images, input"):
+        colmap_layout(tmp_path)
+    (tmp_path / "sparse" / "0" / "images.bin").write_bytes(b"\0")
+    with pytest.raises(DataError, match=r"sparse/0: images\.bin ends early"):
+        colmap_layout(tmp_path)
