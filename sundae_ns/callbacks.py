@@ -162,15 +162,14 @@ class NerfstudioRun:
         """Print quality, size and the next command, on the first rank."""
         if self._trainer is None:
             return
-        results = self.evaluate() if self.model.config.evaluate_prune else {}  # every rank takes part
+        results = self.evaluate() if self.model.config.evaluate_prune else {}  # collective
         if self.folder is None:
             return
-        state = self.state
-        numbers = sum(value[:1].numel() for value in state.field.values())
-        size = BYTES_PER_FLOAT * self.source.total * numbers
-        size += bytes_of_module(state.head) if state.head is not None and state.head_enabled else 0
-        head = "with" if state.head is not None and state.head_enabled else "without"
-        lines = [f"{self.source.total:,} primitives, {head} a head: {megabytes(size)} before packing"]
+        head = self.state.head if self.state.head_enabled else None
+        numbers = sum(value[:1].numel() for value in self.state.field.values())
+        size = BYTES_PER_FLOAT * self.source.total * numbers + (0 if head is None else bytes_of_module(head))
+        kind = "without" if head is None else "with"
+        lines = [f"{self.source.total:,} primitives, {kind} a head: {megabytes(size)} before packing"]
         if results:
             quality = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
             lines.insert(0, f"trained: {quality} on {len(self._datamanager.eval_dataset)} test views")

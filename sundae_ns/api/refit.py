@@ -24,8 +24,6 @@ JUDGES = 8
 """Views that no step uses, if there are twice as many. The refit stays only if their error shrinks."""
 _RATES = {"means": 0.014, "scales": 0.007, "quats": 0.007, "opacities": 0.035, "features_dc": 0.014}
 """Size of the first steps; centres move in sizes of their primitive. The rates fall to zero."""
-
-
 FULL_RATES = 0.15
 """Largest share of the primitives at which the rates are those above; with more of them less is left to fit."""
 

@@ -15,8 +15,6 @@ from sundae_ns.errors import SundaeError
 
 PRIMITIVES = {"cpu": 50_000, "cuda": 300_000}
 """Size of the field that is measured, by device."""
-_LONGEST = 1600
-"""Longest side of training images in pixels; nerfstudio takes smaller ones where there are some."""
 _PATIENCE = 300
 """Seconds after which there is no forecast."""
 _TIMED = 3
@@ -47,7 +45,7 @@ def measured_step(method: str, width: int, height: int) -> Forecast | None:
 def trained_size(photos: Path) -> tuple[int, int] | None:
     """Width and height in pixels of the training images of a capture or of photos; None if they are not known."""
     from sundae_ns.data.capture import check_image, read_json
-    from sundae_ns.data.layouts import colmap_layout
+    from sundae_ns.data.layouts import LONGEST_SIDE, colmap_layout
     from sundae_ns.data.lenses import size_of_first_image
     from sundae_ns.data.photos import find_photos
 
@@ -65,7 +63,7 @@ def trained_size(photos: Path) -> tuple[int, int] | None:
     if found is None:
         return None
     width, height = found
-    while max(width, height) > _LONGEST:
+    while max(width, height) > LONGEST_SIDE:
         width, height = width // 2, height // 2
     return width, height
 

@@ -113,8 +113,8 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> None:
-    """Check the ``transforms.json`` of a capture.
+def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any]:
+    """Check the ``transforms.json`` of a capture; returns its contents.
 
     Args:
         path: the file.
@@ -162,6 +162,7 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> None:
         lens_of(meta, frame, f"{path.name}, frame {index} ({_short(frame['file_path'])})")
     _check_splits(meta, names, splits, path.name)
     _check_frame_of_capture(meta, path.name)
+    return meta
 
 
 def _check_camera(entry: Mapping[str, Any], keys: Collection[str], where: str) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 STRAY = 10.0
-"""Distance from which a camera is a stray one: so many times as far from the middle as the others."""
+"""A camera is stray if it stands more than this many times as far from the middle as the others."""
 MOST_STRAYS = 5
 """At most one camera in this many is a stray one; where there are more, they are part of the capture."""
 LEAST_CAMERAS = 4

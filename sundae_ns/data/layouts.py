@@ -15,7 +15,7 @@ _MODELS = ("sparse", "colmap/sparse", "dense/sparse", "dense", "distorted/sparse
 _FILES = ("cameras.bin", "cameras.txt")
 _IMAGES = ("images", "input", "photos", "image", "rgb")
 """Usual names of the folder of images; COLMAP's programs use the first."""
-_LONGEST = 1600
+LONGEST_SIDE = 1600
 """Longest side in pixels that images are trained at where smaller ones are there, as nerfstudio does."""
 
 
@@ -86,9 +86,9 @@ def _folder_of(data: Path, model: str, name: str) -> str:
 
 
 def _downscale(images: Path, name: str, size: tuple[int, int]) -> int:
-    """The least factor with a longest side of at most :data:`_LONGEST` for which there are smaller images; else 1."""
+    """The least factor, with smaller images, that brings the longest side to :data:`LONGEST_SIDE` at most; else 1."""
     longest, factor = max(size), 1
-    while longest / factor > _LONGEST:
+    while longest / factor > LONGEST_SIDE:
         if not (images.with_name(f"{images.name}_{2 * factor}") / name).is_file():
             return factor
         factor *= 2

@@ -10,10 +10,8 @@ from typing import Any
 from PIL import Image
 
 from sundae_ns.data.capture import check_image, read_json
+from sundae_ns.data.orientation import exif_orientation
 from sundae_ns.errors import DataError, one_line
-
-_ORIENTATION = 0x0112
-"""EXIF entry; 1 is upright."""
 
 
 def masks_of(photos: Sequence[Path], folder: Path) -> list[Path]:
@@ -28,22 +26,13 @@ def masks_of(photos: Sequence[Path], folder: Path) -> list[Path]:
         mask = next((folder / name for name in names if (folder / name).is_file()), None)
         if mask is None:
             raise DataError(f"{photo} has no mask {photo.stem}.png in {folder}; add it, white where pixels count")
-        if _turned(photo):
+        if exif_orientation(photo) != 1:
             raise DataError(f"{photo} is turned by its EXIF entry, and its mask is not; save both upright")
         size, wanted = check_image(mask, mask=True), check_image(photo)
         if size != wanted:
             raise DataError(f"{mask} has {size[0]} x {size[1]} px and its photo {wanted[0]} x {wanted[1]}; scale it")
         found.append(mask)
     return found
-
-
-def _turned(photo: Path) -> bool:
-    """Whether viewers turn a photo, by its EXIF entry for orientation."""
-    try:
-        with Image.open(photo) as image:
-            return image.getexif().get(_ORIENTATION, 1) > 1
-    except (OSError, ValueError, SyntaxError):
-        return False
 
 
 def add_masks(capture: Path, masks: Sequence[Path]) -> str:

@@ -86,7 +86,7 @@ def scales_and_quaternions(covariance: Tensor) -> tuple[Tensor, Tensor]:
 def _eigenvectors(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Ascending eigenvalues ``[N, 3]``, and rotations whose columns are the eigenvectors ``[N, 3, 3]``.
 
-    By Jacobi's rotations of all matrices at once: LAPACK takes one matrix after the other, CUDA's solver not so many.
+    Jacobi's rotations treat all matrices at once. LAPACK takes them one by one, and CUDA's solver limits their number.
     """
     a = [list(row.unbind(dim=1)) for row in matrices.unbind(dim=1)]
     v = [list(row.unbind(dim=1)) for row in torch.eye(3).to(matrices).expand_as(matrices).unbind(dim=1)]

@@ -62,9 +62,9 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
         path = data if data.suffix == ".json" else data / "transforms.json"
         if not path.is_file():
             raise no_transforms(data)
-        check_transforms(path, splits=splits)
+        frames = check_transforms(path, splits=splits)["frames"]
         if images and parser.downscale_factor in (None, 1):
-            first = path.parent / read_json(path)["frames"][0]["file_path"]  # nerfstudio looks at its size
+            first = path.parent / frames[0]["file_path"]  # nerfstudio looks at its size
             if not first.exists():
                 raise DataError(f"{first} does not exist{beside(first)}; correct file_path in {path.name}")
 
