@@ -14,8 +14,9 @@ while True:
         if path.name in done or path.name in busy: continue
         text = path.read_text(); need = [l.split()[2] for l in text.splitlines() if l.startswith("# after ")]
         if any(not any(d.endswith(n + ".sh") for d in done) for n in need): continue
-        free = [s for s in slots if s not in running]
-        if not free: break
+        only = [int(l.split()[2]) for l in text.splitlines() if l.startswith("# gpu ")]
+        free = [s for s in slots if s not in running and (not only or s[0] in only)]
+        if not free: continue
         load = {g: sum(1 for s in running if s[0] == g) for g in (0, 1)}
         slot = min(free, key=lambda s: load[s[0]])
         env = dict(os.environ, CUDA_VISIBLE_DEVICES=str(slot[0]))

@@ -58,15 +58,15 @@ def distill_file(
     check_file(out, reads=[source, cameras], overwrite=overwrite)
     scene = opening.load(source)
     with loading():
-        import torch
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+        from sundae_ns.rasterization.select import fastest_device
         from sundae_ns.scenes.distill import Distillation
         from sundae_ns.training.interruption import Interruption
         from sundae_ns.training.progress import duration
 
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = fastest_device()
     scene = scene.to(device)
     partial = out.with_name(f"{out.name}.partial")
     console = Console(stderr=True)

@@ -180,7 +180,9 @@ def prune_file(
     from sundae_ns.api.cost import prune_cost, require_memory, state
     from sundae_ns.api.virtual import VIRTUAL_SIZE
     from sundae_ns.errors import ConfigError
+    from sundae_ns.gpu.memory import naming_full_memory
     from sundae_ns.pruning import PruneRule
+    from sundae_ns.rasterization.select import fastest_device
     from sundae_ns.storage.kinds import kind_of
     from sundae_ns.storage.ply import has_own_columns, keep_vertices, stated_size
 
@@ -195,8 +197,8 @@ def prune_file(
     redistribution: Literal["merge", "none"] = "merge" if merge else "none"
     rule = PruneRule(selection, score, signal, redistribution=redistribution, gamma=gamma, seed=seed)
     rule.validate()
-    stated = False
-    if kind_of(source) == "ply":  # its header has the size; reading takes minutes
+    stated, device = False, fastest_device()
+    if kind_of(source) == "ply" and device.type == "cpu":  # its header has the size; reading takes minutes
         n, numbers = stated_size(source)
         share = keep if keep is not None else (count or 0) / max(n, 1)
         looks = views if rule.uses_contribution and cameras is None else 0
@@ -206,26 +208,30 @@ def prune_file(
             stated = True
             state(cost, n, looks)
     scene, usable = opening.load_with_mask(source)
-    seen = None
-    if rule.uses_contribution or target_drop is not None:
-        seen = cameras_for(scene, cameras, views, seed)
-    if target_drop is not None:
-        from sundae_ns.api.target import count_for_drop
+    with naming_full_memory(lambda: scene.num_primitives):
+        scene, seen = scene.to(device), None
+        if rule.uses_contribution or target_drop is not None:
+            seen = cameras_for(scene, cameras, views, seed)
+        if target_drop is not None:
+            from sundae_ns.api.target import count_for_drop
 
-        assert seen is not None
-        found = count_for_drop(scene, target_drop, seen, rule, progress=True)
-        count = found.kept
-        for number, psnr in found.curve:
-            print(f"{number:12,} primitives: {psnr:.2f} dB against the full field, on held-out cameras")
-    pruned = pruning.prune_with_mask(scene, keep=keep, count=count, views=seen, rule=rule, progress=True, stated=stated)
+            assert seen is not None
+            found = count_for_drop(scene, target_drop, seen, rule, progress=True)
+            count = found.kept
+            for number, psnr in found.curve:
+                print(f"{number:12,} primitives: {psnr:.2f} dB against the full field, on held-out cameras")
+        pruned = pruning.prune_with_mask(
+            scene, keep=keep, count=count, views=seen, rule=rule, progress=True, stated=stated
+        )
+    small = pruned.scene.to("cpu")
     if usable is not None and out.suffix.lower() == ".ply" and kind_of(source) == "ply" and has_own_columns(source):
         rows = usable.clone()
         rows[usable] = pruned.mask.cpu()
-        keep_vertices(source, out, rows, pruned.scene.field if merge else None)
+        keep_vertices(source, out, rows, small.field if merge else None)
     else:
-        saving.save(pruned.scene, out)
+        saving.save(small, out)
     total = scene.num_primitives if usable is None else len(usable)
-    print(f"{out}: {pruned.scene.num_primitives:,} of {total:,} primitives")
+    print(f"{out}: {small.num_primitives:,} of {total:,} primitives")
     if pruned.seen is not None and seen:
         print(f"{len(seen)} cameras see {pruned.seen:.1%} of the primitives")
     return 0

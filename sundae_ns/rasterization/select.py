@@ -44,6 +44,13 @@ def select_backend(name: BackendName, device: torch.device | str) -> Backend:
     raise ConfigError(f"unknown rasterizer {name!r}; use auto, gsplat, cpu or reference")
 
 
+def fastest_device() -> torch.device:
+    """A CUDA device where gsplat's kernels run, else the CPU: where commands put a scene."""
+    if torch.cuda.is_available() and _gsplat_problem_on(torch.device("cuda")) is None:
+        return torch.device("cuda")
+    return torch.device("cpu")
+
+
 def _cpu_problem_on(device: torch.device) -> str | None:
     if device.type != "cpu":
         return f"the tensors are on the device '{device}'; move them to 'cpu'"

@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 import sundae_ns as sn
+from sundae_ns.api import pruning
 from sundae_ns.cli import main
 from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.parameters import SH_C0, SPLAT_NAMES
@@ -385,3 +387,20 @@ def test_prune_by_the_cameras_of_files(tmp_path: Path, capsys: pytest.CaptureFix
     assert (
         run("prune", tmp_path / "a.ply", "-o", tmp_path / "transforms.json", "--cameras", tmp_path, "--overwrite") == 2
     )
+
+
+@pytest.mark.gpu
+def test_prune_uses_the_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    devices: list[str] = []
+    whole = pruning.prune_with_mask
+
+    def noted(scene: sn.Scene, **options: Any) -> pruning.PrunedScene:
+        devices.append(scene.device.type)
+        return whole(scene, **options)
+
+    monkeypatch.setattr(pruning, "prune_with_mask", noted)
+    sn.save(sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3)), tmp_path / "a.ply")
+    for name in ("out.ply", "out.sundae"):
+        assert run("prune", tmp_path / "a.ply", "-o", tmp_path / name, "--count", "50", "--views", "8") == 0
+        assert sn.load(tmp_path / name).num_primitives == 50
+    assert devices == ["cuda", "cuda"]

@@ -136,8 +136,9 @@ def test_trials_choose_the_count_and_leave_nothing_else_behind(make: Make, judge
     assert (prune["before"], prune["after"], prune["step"]) == (full, chosen, record["step"])
 
 
-@pytest.mark.parametrize(("gain", "decision"), [(0.2, "head"), (0.05, "plain"), (-0.3, "plain")])
+@pytest.mark.parametrize(("gain", "decision"), [(4.0, "head"), (0.2, "plain"), (-0.3, "plain")])
 def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make: Make, judge: Any, gain: float, decision: str) -> None:
+    """If it gains enough for its bytes, which are several times those of this field."""
     judge(LEVEL, gain)
     trainer = make(head="auto")
     model: Any = trainer.pipeline.model

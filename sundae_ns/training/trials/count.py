@@ -43,6 +43,7 @@ from sundae_ns.training.trials.curve import (
     affordable,
     choose,
     curve_of,
+    head_pays,
     is_lost,
     still_climbs,
     with_head,
@@ -54,7 +55,6 @@ from sundae_ns.training.trials.head import (
     MOST_HELD_OUT,
     RISE_SHARE,
     TrialPlan,
-    pays,
     plan_trials,
     spread_views,
 )
@@ -98,32 +98,32 @@ class CountTrialProgress:
     """The same as in ``measured`` for the finished trials without and with a head."""
     head_bytes: list[list[int] | None] = field(default_factory=list)
     """Estimated bytes of both packed fields, and of the head of each; None if they cannot be packed."""
+    head_pays: bool | None = None
+    """Whether the head gains enough; None without trials of it."""
     chosen: int = 0
     """The chosen number; 0 before the decision."""
-
-    @property
-    def head_pays(self) -> bool | None:
-        """Whether the head gains enough; None without trials of it."""
-        if len(self.head) < 2:
-            return None
-        plain, head = map(from_values, self.head)
-        return pays(plain, head)
 
     def curve(self) -> list[CurvePoint]:
         """The points of the finished trials, largest count first, with a head if it pays.
 
         There are none if masks leave no pixel of the views.
         """
+        curve = self.plain_curve()
+        return with_head(curve, self.head_gain()) if curve and self.head_pays else curve
+
+    def plain_curve(self) -> list[CurvePoint]:
+        """The same without a head."""
         done = len(self.measured)
-        curve = curve_of(self.counts[:done], self.measured, self.sizes) if done and self.measured[0] else []
-        if not curve or not self.head_pays:
-            return curve
+        return curve_of(self.counts[:done], self.measured, self.sizes) if done and self.measured[0] else []
+
+    def head_gain(self) -> HeadGain:
+        """What both trials of the head have shown."""
         plain, head = (mean_quality(from_values(trial)) for trial in self.head)
         gain = HeadGain(kept_count(USUAL_SHARE, self.full), head[0] - plain[0], head[1] - plain[1])
         if len(self.head_bytes) == 2 and None not in self.head_bytes:
             (fewer, _), (more, fixed) = self.head_bytes  # type: ignore[misc]
             gain = gain._replace(features=more - fewer, head=fixed)
-        return with_head(curve, gain)
+        return gain
 
 
 class CountTrials(Extension):
@@ -277,6 +277,8 @@ class CountTrials(Extension):
             progress.head.append([list(view) for view in self._engine.measure(run)])
             size = packed_size(state.field, state.head if state.head_enabled else None)
             progress.head_bytes.append(None if size is None else list(size))
+            if len(progress.head) == 2:
+                progress.head_pays = head_pays(progress.plain_curve(), progress.head_gain(), self._tolerance)
         else:
             progress.measured.append([list(view) for view in self._engine.measure(run, with_fitted=True)])
             size = packed_size(state.field)

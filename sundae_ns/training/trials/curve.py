@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sundae_ns.evaluation.count_curve import CurvePoint
+from sundae_ns.training.trials.head import least_gain
 
 PSNR_WEIGHTS = (0.75, 0.1)
 """Weight of the PSNR at the end of a trial, and dB that each halving of the count gains after it."""
@@ -58,6 +59,14 @@ class HeadGain(NamedTuple):
     """Estimated bytes of the features of these primitives in a packed scene; None if unknown."""
     head: int = 0
     """Bytes of the packed head."""
+
+    def falls_by(self, count: int, power: float) -> float:
+        """Factor of the gain at another count. Fewer primitives than in the trials were not tried with a head."""
+        return (self.primitives / max(count, self.primitives)) ** power
+
+    def bytes_of(self, count: int) -> int | None:
+        """Estimated bytes of features and head with this number of primitives; None if unknown."""
+        return None if self.features is None else round(self.features * count / self.primitives) + self.head
 
 
 def excess(point: CurvePoint, tolerance: Tolerance) -> float:
@@ -105,19 +114,36 @@ def with_head(curve: Sequence[CurvePoint], gain: HeadGain) -> list[CurvePoint]:
     """The curve of a field with a head, from one without."""
     found = []
     for point in curve:
-        # Fewer primitives than in its trials were not tried with a head.
-        share = gain.primitives / max(point.count, gain.primitives)
         psnr, ssim = (
-            factor * gained * share**power
+            factor * gained * gain.falls_by(point.count, power)
             for gained, (factor, power) in ((gain.psnr, HEAD_PSNR), (gain.ssim, HEAD_SSIM))
         )
-        size = None
-        if point.bytes is not None and gain.features is not None:
-            size = point.bytes + round(gain.features * point.count / gain.primitives) + gain.head
-        more = {"psnr": point.psnr + psnr, "ssim": point.ssim + ssim, "bytes": size}
-        found.append(replace(point, psnr_loss=point.psnr_loss - psnr, ssim_loss=point.ssim_loss - ssim, **more))
+        added = gain.bytes_of(point.count)
+        size = None if point.bytes is None or added is None else point.bytes + added
+        point = replace(point, bytes=size, psnr=point.psnr + psnr, ssim=point.ssim + ssim)
+        found.append(replace(point, psnr_loss=point.psnr_loss - psnr, ssim_loss=point.ssim_loss - ssim))
     psnr, ssim = min(point.psnr_loss for point in found), min(point.ssim_loss for point in found)
     return [replace(one, psnr_loss=one.psnr_loss - psnr, ssim_loss=one.ssim_loss - ssim) for one in found]
+
+
+def head_pays(curve: Sequence[CurvePoint], gain: HeadGain, tolerance: Tolerance) -> bool:
+    """Whether a head gains enough for its bytes in a packed scene, and loses no SSIM.
+
+    What counts is the field that would be kept with the head: in a larger one it gains less, and takes a smaller part
+    of the bytes.
+
+    Args:
+        curve: of the field without a head.
+        gain: what its trials have shown.
+        tolerance: by which the count is chosen.
+    """
+    count = choose(with_head(curve, gain), tolerance)
+    near = min(curve, key=lambda point: abs(math.log(point.count / count)))
+    more, doublings = gain.bytes_of(count), 0.0
+    if near.bytes and more is not None:
+        doublings = math.log2(1 + more / (near.bytes * count / near.count))
+    gained = gain.psnr * gain.falls_by(count, HEAD_PSNR[1])
+    return math.inf > gained >= least_gain(doublings) and gain.ssim >= 0  # false if a figure is not finite
 
 
 def _paired(differences: NDArray[np.float64], pixels: NDArray[np.float64]) -> tuple[float, float]:

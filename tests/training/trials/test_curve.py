@@ -17,6 +17,7 @@ from sundae_ns.training.trials.curve import (
     affordable,
     choose,
     curve_of,
+    head_pays,
     is_lost,
     still_climbs,
     with_head,
@@ -126,6 +127,26 @@ def test_a_head_gains_less_the_more_primitives_there_are() -> None:
     for a, b in itertools.pairwise(found):
         assert b.psnr - a.psnr == pytest.approx(a.psnr_loss - b.psnr_loss)
     assert choose(found, Tolerance()) < choose(curve, Tolerance())
+
+
+def test_a_head_must_be_worth_its_bytes_in_the_field_that_is_kept() -> None:
+    """0.4 dB for each doubling of the bytes, by what the head gains among as many primitives."""
+    curve = [point(1000, size=9000), point(400, size=4000), point(200, 0.5, 0.02, size=2000)]
+    kept = choose(with_head(curve, HeadGain(100, 0.3, 0.01)), Tolerance())
+    assert 200 < kept <= 400
+    gained = 0.3 * (100 / kept) ** 0.4  # 0.17 to 0.23 dB
+
+    def pays(features: int | None, psnr: float = 0.3, ssim: float = 0.01) -> bool:
+        return head_pays(curve, HeadGain(100, psnr, ssim, features, head=0), Tolerance())
+
+    enough = round(1000 * (2 ** (gained / 0.4) - 1))  # bytes of the features of 100 primitives; of these 1,000
+    assert pays(enough - 20)
+    assert not pays(enough + 20)
+    assert pays(None)
+    assert not pays(10, psnr=0.12)  # below the least gain of any head, 0.1 dB, in the field that is kept
+    assert not pays(10, ssim=-0.001)
+    assert not pays(10, psnr=math.nan)
+    assert not pays(10, psnr=math.inf)
 
 
 def test_a_budget_in_bytes_is_a_count_between_the_tried_ones() -> None:
