@@ -70,8 +70,8 @@ def prune_cost(
         seconds = primitives * _SECONDS
     seen = primitives * views * _SECONDS_OF_VIEW + pixels * _SECONDS_OF_PIXEL
     if rule.refits and views:
-        fitted = keep * primitives * _SECONDS_OF_FIT + min(pixels / views, MOST_PIXELS) * _SECONDS_OF_FIT_PIXEL
-        seen += STEPS * VIEWS * fitted
+        fitted = keep * primitives * _SECONDS_OF_FIT + min(pixels / views, MOST_PIXELS["cpu"]) * _SECONDS_OF_FIT_PIXEL
+        seen += STEPS["cpu"] * VIEWS * fitted
     seconds += seen / torch.get_num_threads()
     return PruneCost(field + added * primitives, field, seconds, field + drawn * primitives)
 

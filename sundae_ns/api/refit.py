@@ -10,16 +10,17 @@ import torch
 from torch import Tensor
 
 from sundae_ns.gaussians.field import Field
+from sundae_ns.rasterization import rasterize_views
 from sundae_ns.rendering import LocalField, View
-from sundae_ns.rendering.render import RenderSettings, splat
+from sundae_ns.rendering.render import RenderSettings, pass_options
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-STEPS, VIEWS = 64, 4
-"""Steps, and the views of each."""
-MOST_PIXELS = 256 * 256
-"""Most pixels of a view; larger ones are rendered smaller."""
+STEPS, VIEWS = {"cpu": 64, "cuda": 128}, 4
+"""Steps by the device, and the views of each."""
+MOST_PIXELS = {"cpu": 256 * 256, "cuda": 512 * 512}
+"""Most pixels of a view by the device; larger ones are rendered smaller."""
 JUDGES = 8
 """Views that no step uses, if there are twice as many. The refit stays only if their error shrinks."""
 _RATES = {"means": 0.014, "scales": 0.007, "quats": 0.007, "opacities": 0.035, "features_dc": 0.014}
@@ -54,7 +55,9 @@ def refit(
     Returns:
         A field of as many primitives. It is ``small`` if the refit matches no better.
     """
-    views = [view.zoomed(min(1.0, math.sqrt(MOST_PIXELS / (view.width * view.height)))) for view in views]
+    device = small["means"].device.type
+    most, count = (limits.get(device, limits["cpu"]) for limits in (MOST_PIXELS, STEPS))
+    views = [view.zoomed(min(1.0, math.sqrt(most / (view.width * view.height)))) for view in views]
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(seed)).tolist()
     images: dict[int, Tensor] = {}
     judges = order[:JUDGES] if len(order) >= 2 * JUDGES else order
@@ -68,32 +71,46 @@ def refit(
     def fitted() -> Field:
         return small.replaced({n: small[n] + (size * step if n == "means" else step) for n, step in moved.items()})
 
-    def error(field: Field, i: int) -> Tensor:
-        if i not in images:
-            with torch.no_grad():
-                images[i] = _images(full, views[i], settings)
-        return (_images(field, views[i], settings) - images[i]).square().mean()
+    def error(field: Field, chosen: Sequence[int]) -> Tensor:
+        """Sum of the mean squared errors of some views."""
+        new = [i for i in dict.fromkeys(chosen) if i not in images]
+        with torch.no_grad():
+            images.update(zip(new, _images(full, [views[i] for i in new], settings), strict=True))
+        shown = zip(_images(field, [views[i] for i in chosen], settings), chosen, strict=True)
+        return torch.stack([(image - images[i]).square().mean() for image, i in shown]).sum()
 
-    steps = range(STEPS)
+    steps = range(count)
     if console is not None:
         from rich.progress import track
 
         steps = track(steps, "Refit of primitives", transient=True, console=console)  # type: ignore[assignment]
     for step in steps:
-        for i in range(step * VIEWS, (step + 1) * VIEWS):
+        chosen = [shown[i % len(shown)] for i in range(step * VIEWS, (step + 1) * VIEWS)]
+        for some in [chosen] if device == "cuda" else [[i] for i in chosen]:  # a GPU takes small images together
             with torch.enable_grad():
-                error(fitted(), shown[i % len(shown)]).backward()
+                error(fitted(), some).backward()
         for group in optimizer.param_groups:
-            group["lr"] = group["first"] * (1 - step / STEPS)
+            group["lr"] = group["first"] * (1 - step / count)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
     found = fitted()
-    before, after = (torch.stack([error(field, i) for i in judges]).sum() for field in (small, found))
+    before, after = (error(field, judges) for field in (small, found))
     return found if bool(after < before) else small  # so is a field that is not finite
 
 
-def _images(field: Field, view: View, settings: RenderSettings) -> Tensor:
-    """Blended colours and accumulation, without background ``[H, W, 4]``."""
-    primitives = LocalField(field).primitives(view, settings, features=False)
-    splatted = splat(primitives, view, primitives["colors"], settings)
-    return torch.cat([splatted.colors, splatted.alpha], dim=2)
+def _images(field: Field, views: Sequence[View], settings: RenderSettings) -> list[Tensor]:
+    """Blended colours and accumulation of each view, without background ``[H, W, 4]``."""
+    if len({(view.width, view.height) for view in views}) > 1:
+        return [image for view in views for image in _images(field, [view], settings)]
+    if not views:
+        return []
+    primitives = [LocalField(field).primitives(view, settings, features=False) for view in views]
+    colors = torch.stack([each["colors"] for each in primitives])
+    options = pass_options(primitives[0], views[0], settings)
+    options |= {
+        "viewmats": torch.stack([view.viewmat for view in views]),
+        "Ks": torch.stack([view.K for view in views]),
+    }
+    del options["viewmat"], options["K"]
+    # What blends to the accumulation is 1 everywhere.
+    return list(rasterize_views(colors=torch.cat([colors, torch.ones_like(colors[..., :1])], dim=2), **options))

@@ -23,8 +23,10 @@ from sundae_ns.rendering.views import poses_looking_at
 NEAREST, FARTHEST = 0.3, 2.0
 """Distances of the eyes from the middle of the scene, as multiples of the median distance of its primitives."""
 FOV = 40.0
-VIRTUAL_SIZE = 256
-"""Default width and height of the images, pixels."""
+VIEWS = {"cpu": 128, "cuda": 256}
+"""Default number of cameras by the device: a GPU has the time to look closer."""
+SIDES = {"cpu": 256, "cuda": 512}
+"""Default width and height of their images, pixels."""
 FIRST, ROUNDS, MOVED = 4, 4, 3
 """Cameras that are drawn for each one that is kept; then rounds, and the moved ones of a round."""
 STEP = 0.3
@@ -41,7 +43,7 @@ _PROBES = 64
 """Images that are rendered at once."""
 
 
-def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = VIRTUAL_SIZE) -> list[View]:
+def virtual_views(scene: Scene, n: int | None = None, *, seed: int = 0, size: int | None = None) -> list[View]:
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
     A field shows where its photographs were taken: training splits primitives until each covers few pixels of the
@@ -57,9 +59,9 @@ def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = VIRT
 
     Args:
         scene: its finite primitives count.
-        n: number of cameras.
+        n: number of cameras; by default 128 for a scene on a CPU and 256 for one on a GPU.
         seed: of the random draws, which are the same on every device up to rounding.
-        size: width and height of the images, pixels.
+        size: width and height of the images, pixels; by default 256 on a CPU and 512 on a GPU.
 
     Raises:
         ConfigError: ``n`` or ``size`` is less than 1.
@@ -70,6 +72,11 @@ def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = VIRT
     >>> len(sn.virtual_views(scene, 8))
     8
     """
+    device = scene.device.type
+    n, size = (
+        VIEWS.get(device, VIEWS["cpu"]) if n is None else n,
+        SIDES.get(device, SIDES["cpu"]) if size is None else size,
+    )
     if n < 1 or size < 1:
         raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
     field = _usable(scene)

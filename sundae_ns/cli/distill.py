@@ -70,7 +70,7 @@ def distill_file(
     scene = scene.to(device)
     partial = out.with_name(f"{out.name}.partial")
     console = Console(stderr=True)
-    views = cameras_for(scene, cameras, 128, seed) if cameras is not None else None
+    views = cameras_for(scene, cameras, None, seed) if cameras is not None else None
     made = Distillation(scene, keep=keep, count=count, views=views, steps=steps, seed=seed, head=head, progress=True)
     if partial.exists():
         made.load(partial)

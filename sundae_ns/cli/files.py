@@ -104,11 +104,11 @@ def check_one(amounts: Mapping[str, float | None]) -> None:
         raise ConfigError(f"{given[0]} and {given[1]} exclude each other; give one")
 
 
-def cameras_for(scene: Scene, cameras: Path | None, views: int, seed: int) -> Sequence[View]:
+def cameras_for(scene: Scene, cameras: Path | None, views: int | None, seed: int) -> Sequence[View]:
     """Cameras that preserve a scene: of a file or a run, else those stored with the scene, else virtual ones."""
     from sundae_ns.api import opening
     from sundae_ns.api.views import views_of
-    from sundae_ns.api.virtual import virtual_views
+    from sundae_ns.api.virtual import VIEWS, virtual_views
     from sundae_ns.storage.kinds import kind_of
     from sundae_ns.storage.runs.folder import find_config
 
@@ -126,7 +126,7 @@ def cameras_for(scene: Scene, cameras: Path | None, views: int, seed: int) -> Se
     from sundae_ns.scenes.packed import contents_of_run
 
     with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
-        return views_of_arrays(contents_of_run(cameras, max_cameras=views).cameras)
+        return views_of_arrays(contents_of_run(cameras, max_cameras=views or VIEWS["cpu"]).cameras)
 
 
 def prune_file(
@@ -142,16 +142,16 @@ def prune_file(
     merge: bool = True,
     signal: Literal["attributes", "positions"] = "attributes",
     gamma: float = 0.5,
-    views: int = 128,
+    views: int | None = None,
     cameras: Path | None = None,
     seed: int = 0,
     overwrite: Overwrite = False,
 ) -> int:
     """Prune a scene of any program, without its photos.
 
-    Kept are the primitives that virtual cameras see most of; the others are merged into them, and 64 steps fit pairs to
-    the scene's own images. A million primitives with three bands of harmonics take about 1.7 GB; a prune of more than a
-    minute states its cost first.
+    Kept are the primitives that virtual cameras see most of; the others are merged into them, and some steps fit pairs
+    to the scene's own images. On a CPU a million primitives with three bands of harmonics take about 1.7 GB; a prune of
+    more than a minute states its cost first.
 
     Args:
         source: a .ply, .spz, .sog, .splat or gsplat's .pt, a packed scene, or a run.
@@ -170,7 +170,7 @@ def prune_file(
         merge: merge dropped primitives into the kept ones of their groups, or nearest along the neighbour graph.
         signal: graph signal to filter: position, colour, opacity and size, or positions only.
         gamma: share of the kept primitives that the band selection takes from the highest scores.
-        views: number of virtual cameras, for scenes that come without cameras.
+        views: number of virtual cameras, for scenes that come without cameras; by default 128, on a GPU 256.
         cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, in place of the
             scene's own or virtual cameras.
         seed: random seed.
@@ -178,7 +178,7 @@ def prune_file(
     """
     from sundae_ns.api import opening, pruning, saving
     from sundae_ns.api.cost import prune_cost, require_memory, state
-    from sundae_ns.api.virtual import VIRTUAL_SIZE
+    from sundae_ns.api.virtual import SIDES, VIEWS
     from sundae_ns.errors import ConfigError
     from sundae_ns.gpu.memory import naming_full_memory
     from sundae_ns.pruning import PruneRule
@@ -201,8 +201,8 @@ def prune_file(
     if kind_of(source) == "ply" and device.type == "cpu":  # its header has the size; reading takes minutes
         n, numbers = stated_size(source)
         share = keep if keep is not None else (count or 0) / max(n, 1)
-        looks = views if rule.uses_contribution and cameras is None else 0
-        cost = prune_cost(n, numbers, rule, share, looks, looks * VIRTUAL_SIZE**2)
+        looks = (VIEWS["cpu"] if views is None else views) if rule.uses_contribution and cameras is None else 0
+        cost = prune_cost(n, numbers, rule, share, looks, looks * SIDES["cpu"] ** 2)
         require_memory(cost, n, loaded=False)
         if cameras is None and target_drop is None:
             stated = True

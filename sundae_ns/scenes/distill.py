@@ -22,7 +22,7 @@ from sundae_ns.api.pruning import prune_with_mask
 from sundae_ns.api.rendering import render
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.target import split
-from sundae_ns.api.virtual import of_unit_size, resized, size_of, virtual_views
+from sundae_ns.api.virtual import VIEWS, of_unit_size, resized, size_of, virtual_views
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError, reading
 from sundae_ns.gaussians import FEATURES, initial_features, mend
@@ -59,8 +59,8 @@ HEAD_RATE = 1e-3
 LAST_MEANS = 0.01
 """Rate of the centres after the last step, as a share of the first."""
 STEPS = 3000
-CAMERAS, PRUNED_BY = 256, 128
-"""Virtual cameras that the steps begin from, and most of the cameras that the prune asks."""
+CAMERAS = 256
+"""Virtual cameras that the steps begin from."""
 HELD_OUT = 16
 """Most cameras that no step sees."""
 SHIFT, TURN = 0.05, 0.1
@@ -116,7 +116,7 @@ class Distillation:
         self.cameras = [view.to(teacher.device) for view in seen[: len(given)]]
         self.held_out = [view.to(teacher.device) for view in seen[len(given) :]][:HELD_OUT]
         self._steps, self._seed = steps, seed
-        seen = self.cameras[:PRUNED_BY]
+        seen = self.cameras[: VIEWS.get(teacher.device.type, VIEWS["cpu"])]
         cut = prune_with_mask(self._teacher, keep, count, seen, None, progress=progress, trains=True)
         self._config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
         self._head_config = None

@@ -63,13 +63,13 @@ def test_a_refit_that_diverges_is_dropped(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MOST_PIXELS", 24 * 24)
+    monkeypatch.setitem(module.MOST_PIXELS, "cpu", 24 * 24)
     full, sizes = scene(), set()
     images = module._images
 
-    def spy(field: Field, view: sn.View, settings: object) -> torch.Tensor:
-        sizes.add((view.width, view.height))
-        return images(field, view, settings)  # type: ignore[arg-type]
+    def spy(field: Field, views: list[sn.View], settings: object) -> list[torch.Tensor]:
+        sizes.update((view.width, view.height) for view in views)
+        return images(field, views, settings)  # type: ignore[arg-type]
 
     monkeypatch.setattr(module, "_images", spy)
     refit(
@@ -79,6 +79,35 @@ def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None
         full.settings(),
     )
     assert sizes == {(24, 24), (12, 12)}
+
+
+def test_images_are_those_of_the_renderer() -> None:
+    """Also of views of several sizes."""
+    full = scene()
+    views = [*sn.virtual_views(full, 2, size=24), *sn.virtual_views(full, 1, size=12)]
+    for view, image in zip(views, module._images(full.field, views, full.settings()), strict=True):
+        truth = sn.render(full, view)
+        torch.testing.assert_close(image[..., 3:], truth.accumulation)
+        torch.testing.assert_close(image[..., :3] + (1 - image[..., 3:]) * full.background, truth.rgb)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("encoding", ["harmonics", "logits"])
+def test_a_gpu_takes_the_views_of_a_step_together(encoding: Encoding) -> None:
+    full = scene(encoding).to("cuda")
+    settings, views = full.settings(), [view.to("cuda") for view in sn.virtual_views(full, 40, size=48)]
+    field = full.field.replaced({name: value.clone().requires_grad_() for name, value in full.field.items()})
+    weights = torch.rand(4, 48, 48, 4, device="cuda")
+    together = (torch.stack(module._images(field, views[:4], settings)) * weights).sum()
+    apart = sum((module._images(field, [v], settings)[0] * w).sum() for v, w in zip(views[:4], weights, strict=True))
+    names = ("means", "scales", "quats", "opacities", "features_dc")
+    gradients = [torch.autograd.grad(loss, [field[name] for name in names]) for loss in (together, apart)]
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3 * float(other.abs().max()))
+    small = prune_field(full.field, sn.PruneRule(selection="pairs"), 150, torch.ones(N, device="cuda")).field
+    found = refit(small, full.field, views, settings)
+    before, after = (sn.measure(sn.Scene(one), full, views[:8]).psnr for one in (small, found))
+    assert after > before + 1
 
 
 def test_prune_refits_after_merges_by_pairs_alone(monkeypatch: pytest.MonkeyPatch) -> None:
