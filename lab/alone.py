@@ -1,19 +1,18 @@
-"""Where the seconds of a prune go on this GPU."""
+"""Where the seconds of a prune go on this GPU, alone."""
 import time, torch
 t = time.monotonic(); import sundae_ns as sn; print("import", time.monotonic() - t)
 t = time.monotonic(); scene = sn.load("/tmp/full/bonsai.sundae", device="cuda"); torch.cuda.synchronize(); print("load", time.monotonic() - t)
-from sundae_ns.api import pruning, refit
-true = refit.refit
-def timed(*a, **k):
-    torch.cuda.synchronize(); t = time.monotonic(); r = true(*a, **k); torch.cuda.synchronize(); print("  refit", time.monotonic() - t); return r
-pruning.refit = timed
-for name in ("contribution", "prune_field"):
-    def wrap(f, name):
-        def g(*a, **k):
-            torch.cuda.synchronize(); t = time.monotonic(); r = f(*a, **k); torch.cuda.synchronize(); print(" ", name, time.monotonic() - t); return r
-        return g
+from sundae_ns.api import pruning, refit, virtual
+held = sn.virtual_views(scene, 32, seed=10_000, size=256)
+def wrap(f, name):
+    def g(*a, **k):
+        torch.cuda.synchronize(); t = time.monotonic(); r = f(*a, **k); torch.cuda.synchronize(); parts.append(f"{name} {time.monotonic() - t:.2f}"); return r
+    return g
+for name in ("contribution", "prune_field", "refit"):
     setattr(pruning, name, wrap(getattr(pruning, name), name))
-for i in range(3):
-    t = time.monotonic(); views = sn.virtual_views(scene); torch.cuda.synchronize(); print("views", time.monotonic() - t)
-    t = time.monotonic(); small = sn.prune(scene, keep=0.1, views=views); torch.cuda.synchronize(); print("prune", time.monotonic() - t)
-    t = time.monotonic(); sn.save(small, f"/tmp/alone-{i}.sundae"); print("save", time.monotonic() - t)
+for steps, number, side in ((128, 256, 512), (128, 256, 512), (64, 256, 512), (256, 256, 512), (128, 128, 512), (128, 256, 384), (64, 128, 256)):
+    refit.STEPS["cuda"], virtual.VIEWS["cuda"], virtual.SIDES["cuda"], parts = steps, number, side, []
+    t = time.monotonic(); views = sn.virtual_views(scene); torch.cuda.synchronize(); looked = time.monotonic() - t
+    t = time.monotonic(); small = sn.prune(scene, keep=0.1, views=views); torch.cuda.synchronize(); whole = time.monotonic() - t
+    print(steps, number, side, f"views {looked:.2f} prune {whole:.2f}", *parts, f"held out {sn.measure(small, scene, held).psnr:.2f}", flush=True)
+t = time.monotonic(); sn.save(small, "/tmp/alone.sundae"); print("save", time.monotonic() - t)
