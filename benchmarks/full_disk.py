@@ -88,9 +88,9 @@ class Disk:
 
 def call(*words: object) -> tuple[int, str]:
     """Run an installed command; its exit code, and what it wrote to stdout and stderr."""
-    command = Path(sys.executable).parent / str(words[0])
+    command = shutil.which(str(words[0]), path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     environment = {**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1"}
-    arguments = [str(command), *map(str, words[1:])]
+    arguments = [command or str(words[0]), *map(str, words[1:])]
     done = subprocess.run(
         arguments, capture_output=True, text=True, env=environment, stdin=subprocess.DEVNULL, check=False
     )

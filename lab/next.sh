@@ -32,3 +32,5 @@ c3) cp -r .gpu/scenes/* /tmp/scenes/; cp .gpu/full/* /tmp/full/; GPU=1 full sout
 c4) cp -r .gpu/scenes/* /tmp/scenes/; cp .gpu/full/* /tmp/full/; AFTER=03-distill; mkdir -p /tmp/node; tar -xJf .gpu/node/nodepack.tar.xz -C /tmp/node; rows fox 13; rows dinosaur 14 dec; rows stone_horse 15
   wait_for "${2:-330}"; tail -n 3 /tmp/logs/03*.log; for f in /tmp/logs/2[012]*.log; do tail -n 3 $f | cut -c1-600; done ;;
 esac
+# where a load takes its time
+[ "$1" != c3 ] || (cd /tmp; CUDA_VISIBLE_DEVICES=1 python3 -X importtime -c "import time; t=time.monotonic(); import torch; print('torch', time.monotonic()-t); t=time.monotonic(); torch.zeros(1).cuda(); print('cuda', time.monotonic()-t); t=time.monotonic(); import sundae_ns as sn; s=sn.load('/tmp/full/bonsai.sundae'); print('load', time.monotonic()-t); t=time.monotonic(); s.to('cuda'); print('to', time.monotonic()-t); t=time.monotonic(); sn.load('/tmp/full/bonsai.sundae'); print('again', time.monotonic()-t)" 2>/tmp/logs/import.txt; sort -t'|' -k2 -n /tmp/logs/import.txt | tail -n 12)
