@@ -34,7 +34,7 @@ KEPT_RULES = {
 
 def plot_curve() -> Any:
     """PSNR and SSIM of packed scenes against their size: fixed shares as a line, and what the default has chosen."""
-    rows = [row for row in lines_of("curve.csv") if row["seed"] == "42" and row["packed_psnr"]]
+    rows = [row for row in lines_of("curve.csv") if row["seed"] == "42"]
     stock = {row["capture"]: row for row in lines_of("formats.csv") if row["method"] == "splatfacto"}
     stock = {row["capture"]: row for row in stock.values() if row["format"] == ".sundae"}
     captures = list(dict.fromkeys(row["capture"] for row in rows))
@@ -43,7 +43,8 @@ def plot_curve() -> Any:
     )
     for column, capture in zip(panels.T, captures, strict=True):
         own = [row for row in rows if row["capture"] == capture]
-        fixed = sorted((row for row in own if row["chosen"] == "no"), key=lambda row: float(row["share"]))
+        fixed = [row for row in own if row["chosen"] == "no" and row["prune_at"] == "15000"]
+        fixed.sort(key=lambda row: float(row["share"]))
         for panel, metric in zip(column, ("psnr", "ssim"), strict=True):
             sizes = [int(row["packed_bytes"]) / MB for row in fixed]
             values = [float(row[f"packed_{metric}"]) for row in fixed]

@@ -328,24 +328,27 @@ def gpu(name: str) -> str:
 
 
 PRUNES = {
-    ("opacity", "none"): "highest opacity",
-    ("decimate", "none"): "`--decimate`",
-    ("decimate-adaptive", "none"): "`--decimate-adaptive`",
-    ("pairs", "none"): "`sundae prune`",
-    ("pairs", "distill"): "`sundae distill`",
+    ("opacity", "none", "gpu"): "highest opacity",
+    ("decimate", "none", ""): "`--decimate`",
+    ("decimate-adaptive", "none", ""): "`--decimate-adaptive`",
+    ("pairs", "none", "cpu"): "`prune`, CPU",
+    ("pairs", "none", "gpu"): "`prune`, GPU",
+    ("pairs", "distill", "gpu"): "`distill`, GPU",
 }
-"""Rules and trainings of prune.csv in the order of a table, by the heads that readers see."""
+"""Rules, trainings and devices of prune.csv in the order of a table, by the heads that readers see."""
 
 
 def prune() -> list[str]:
     """PSNR against the full field, and against the photographs, of scenes that were made small without photographs."""
-    cells: dict[tuple[str, float], dict[tuple[str, str], str]] = {}
+    cells: dict[tuple[str, float], dict[tuple[str, str, str], str]] = {}
     for row in lines_of("prune.csv"):
         pair = f"{float(row['psnr_to_field']):.1f}, {float(row['psnr']):.1f}"
-        cells.setdefault((row["capture"], float(row["share"])), {})[row["rule"], row["training"]] = pair
+        device = "" if row["tool"] == "splat-transform" else "cpu" if row["device"] == "cpu" else "gpu"
+        cells.setdefault((row["capture"], float(row["share"])), {})[row["rule"], row["training"], device] = pair
     made = [
         [f"{capture}, {share:.0%}", *(found.get(name, "") for name in PRUNES)]
         for (capture, share), found in cells.items()
+        if share in (0.5, 0.1)
     ]
     return table(["capture, kept", *PRUNES.values()], made)
 
