@@ -2,8 +2,9 @@
 
     python benchmarks/bench_viewers.py scene.sundae                     # a .ply of all primitives
     python benchmarks/bench_viewers.py scene.sundae --kind spz --central
+    python benchmarks/bench_viewers.py scene.sundae --kind glb --central    # by three.js's own loader
 
-The viewers are Spark and GaussianSplats3D, in a Chromium that renders in software; ``make browser`` installs them. Six
+The viewers are Spark, GaussianSplats3D and, for a .glb, three.js, in a Chromium that renders in software; ``make browser`` installs them. Six
 cameras, a black background, base colours. Each setting of a viewer adds to the one before. ``--central`` keeps the
 primitives whose centres lie in all six images: beside the image the viewers project and drop primitives differently.
 Lines belong in results/viewers.jsonl.
@@ -46,6 +47,8 @@ Options = dict[str, dict[str, Any]]
 
 def settings(kind: str, antialiased: bool) -> dict[str, dict[str, Options]]:
     """Settings of each viewer of a file by name, beginning with its own defaults; each contains those before."""
+    if kind == "glb":
+        return {"three": {"default": {}}}
     blur = {"preBlurAmount": 0.0, "blurAmount": 0.3} if antialiased else {"preBlurAmount": 0.3, "blurAmount": 0.0}
     ladders: dict[str, dict[str, Options]] = {
         "spark": {
@@ -126,7 +129,7 @@ class Viewers:
 
 @contextmanager
 def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
-    """The viewers with an export of a scene; ``kind`` is ``ply`` or ``spz``."""
+    """The viewers with an export of a scene; ``kind`` is ``ply``, ``spz`` or ``glb``."""
     chromium = find_chromium()
     if chromium is None or not has_packages():
         sys.exit("no Chromium or no viewers here: apt-get install chromium, then make browser")
@@ -167,7 +170,7 @@ def rows(scene: Path, *, kind: str = "ply", side: int = SIDE, center: bool = Fal
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="written by sundae pack")
-    parser.add_argument("--kind", choices=("ply", "spz"), default="ply", help="of the export")
+    parser.add_argument("--kind", choices=("ply", "spz", "glb"), default="ply", help="of the export")
     parser.add_argument("--side", type=int, default=SIDE, help="longest side of the images, pixels")
     parser.add_argument("--central", action="store_true", help="only primitives whose centres lie in all images")
     options = parser.parse_args()

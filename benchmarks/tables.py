@@ -333,7 +333,7 @@ PRUNES = {
     ("decimate-adaptive", "none", ""): "`--decimate-adaptive`",
     ("pairs", "none", "cpu"): "`prune`, CPU",
     ("pairs", "none", "gpu"): "`prune`, GPU",
-    ("pairs", "distill", "gpu"): "`distill`, GPU",
+    ("pairs", "distill", "gpu"): "`distill`",
 }
 """Rules, trainings and devices of prune.csv in the order of a table, by the heads that readers see."""
 

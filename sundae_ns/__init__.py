@@ -4,7 +4,7 @@ The library needs no nerfstudio:
 
     import sundae_ns as sn
 
-    scene = sn.load("garden.ply")                          # .ply, .spz, .sog, .sundae, or a run of ns-train
+    scene = sn.load("garden.ply")                          # .ply, .spz, .sog, .glb, .sundae, or a run of ns-train
     views = sn.virtual_views(scene)                        # or sn.views_of("transforms.json")
     small = sn.prune(scene, keep=0.1, views=views)         # a new scene; dropped primitives are merged into kept ones
     image = sn.render(small, views[0]).rgb                 # [H, W, 3], on a CPU or a GPU

@@ -20,12 +20,13 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
     """Write a scene in the format of the file's suffix, atomically; an existing file is replaced.
 
     ``.sundae`` holds everything that a render needs, quantised. ``.html`` is a web page that renders it. ``.ply``
-    (exact), ``.spz`` and ``.sog`` (quantised) hold base colours only, for other viewers.
+    and ``.glb`` (exact), ``.spz`` and ``.sog`` (quantised) hold base colours only, for other viewers.
 
     Args:
         scene: any device.
         path: file to write; a missing folder of it is made.
-        upright: turn from nerfstudio's z-up axes to the -y-up axes of viewers; ``.ply``, ``.spz`` and ``.sog`` only.
+        upright: turn from nerfstudio's z-up axes to the -y-up axes of viewers; ``.ply``, ``.spz`` and ``.sog`` only. A
+            ``.glb`` is upright in any case.
 
     Raises:
         ConfigError: the suffix is not supported, or the format is not turned.
@@ -72,7 +73,7 @@ def _packed(scene: Scene) -> bytes:
 
 
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:
-    """Write base colours as ``.ply``, ``.spz`` or ``.sog``; returns what was left out or clamped. See :func:`save`."""
+    """Write base colours in a format of other viewers; returns what was left out or clamped. See :func:`save`."""
     return write_for_viewers(
         path,
         scene.field,

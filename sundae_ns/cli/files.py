@@ -25,15 +25,15 @@ def export(
     data: Path | None = None,
     overwrite: Overwrite = False,
 ) -> int:
-    """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz or .sog.
+    """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz, .sog or .glb.
 
     The page needs no network and no server. The other formats hold no features and no head; antialiased scenes are
     marked as such.
 
     Args:
-        scene: a run (its folder or config.yml), a packed scene, or a .ply, .spz, .sog, .splat or gsplat's .pt.
-        out: file to write; its suffix selects the format: .html, .ply (exact), .spz or .sog (quantised, much smaller).
-            A name without a suffix is a folder of page and scene, for a web server.
+        scene: a run (its folder or config.yml), a packed scene, or a .ply, .spz, .sog, .glb, .splat or gsplat's .pt.
+        out: file to write; its suffix selects the format: .html, .ply or .glb (exact), .spz or .sog (quantised,
+            much smaller). A name without a suffix is a folder of page and scene, for a web server.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
             Do not use the rotated file for a warm start.
         data: folder of the capture, if it moved; for a page of a run.
@@ -154,8 +154,8 @@ def prune_file(
     more than a minute states its cost first.
 
     Args:
-        source: a .ply, .spz, .sog, .splat or gsplat's .pt, a packed scene, or a run.
-        out: file to write, in the format of its suffix: .ply, .spz, .sog or .sundae. A .ply of a .ply keeps all
+        source: a .ply, .spz, .sog, .glb, .splat or gsplat's .pt, a packed scene, or a run.
+        out: file to write, in the format of its suffix: .ply, .spz, .sog, .glb or .sundae. A .ply of a .ply keeps all
             properties and comments.
         keep: share of the primitives to keep, in (0, 1]; by default 0.1.
         count: number of primitives to keep, in place of a share.

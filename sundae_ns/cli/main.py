@@ -58,7 +58,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "distill": (distill_file, "prune, then train on the full scene's own images, without photos"),
     "pack": (pack, "pack a scene into one file; says what that costs"),
     "unpack": (unpack, "unpack a scene into a run, for the commands of nerfstudio"),
-    "export": (export, "write a scene as a web page, .ply, .spz or .sog"),
+    "export": (export, "write a scene as a web page, .ply, .spz, .sog or .glb"),
     "view": (view, "show a scene with its head in the browser"),
     "render": (render_file, "render a scene to an image, or a camera path to a video"),
     "report": (report, "measure and compare finished runs: quality, speed, size"),

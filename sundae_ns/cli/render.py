@@ -30,7 +30,7 @@ def render_file(
     """Render a scene to an image, or along a camera path to a video.
 
     Args:
-        scene: a packed scene, a run, or a .ply, .spz, .sog, .splat or gsplat's .pt.
+        scene: a packed scene, a run, or a .ply, .spz, .sog, .glb, .splat or gsplat's .pt.
         out: image (.png, .jpg or .webp) or video (.mp4) to write.
         camera: a transforms.json or a camera path of the viewer; by default the cameras stored with the scene.
         view: index of the camera for an image; needed if there are several.

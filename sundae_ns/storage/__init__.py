@@ -1,4 +1,4 @@
-"""Files: .ply, .spz, .sog and packed scenes; runs; atomic writes, sizes in bytes, similarity transforms."""
+"""Files: .ply, .spz, .sog, .glb and packed scenes; runs; atomic writes, sizes in bytes, similarity transforms."""
 
 from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module, megabytes, stored_bytes
 from sundae_ns.storage.atomic import replacing, write_text

@@ -7,11 +7,12 @@ from typing import Literal
 
 from sundae_ns.errors import CheckpointError, regular
 
-Kind = Literal["packed", "ply", "spz", "sog", "splat", "gsplat"]
+Kind = Literal["packed", "ply", "spz", "sog", "glb", "splat", "gsplat"]
 PRIMITIVES: dict[Kind, str] = {
     "ply": ".ply file",
     "spz": ".spz file",
     "sog": ".sog file",
+    "glb": ".glb file",
     "splat": ".splat file",
     "gsplat": "checkpoint of gsplat",
 }
@@ -25,16 +26,18 @@ _FIRST_BYTES: dict[bytes, Kind] = {
     b"\x1f\x8b": "spz",
     b"NGSP": "spz",
     b"PK\x03\x04": "sog",
+    b"glTF": "glb",
 }
 _ZIPS: dict[str, Kind] = {".sog": "sog", ".pt": "gsplat"}
-_BY_SUFFIX: dict[str, Kind] = {".ply": "ply", ".spz": "spz", ".sog": "sog", ".splat": "splat", ".pt": "gsplat"}
+_BY_SUFFIX: dict[str, Kind] = {
+    **{".ply": "ply", ".spz": "spz", ".sog": "sog", ".glb": "glb", ".splat": "splat", ".pt": "gsplat"},
+}
 _CONVERT = "convert it to .ply with SuperSplat or splat-transform"
 _UNREAD = {
     ".ksplat": f"is a scene of GaussianSplats3D; {_CONVERT}",
     ".lcc": f"is a scene of XGRIDS; {_CONVERT}",
     ".rad": "is a scene of Spark; convert the .ply that it was made of",
-    ".glb": "is a glTF scene; export the primitives as .ply",
-    ".gltf": "is a glTF scene; export the primitives as .ply",
+    ".gltf": "is a glTF scene in several files; export it as .glb",
     ".pth": "is a checkpoint of another trainer; give its .ply, such as point_cloud/iteration_*/point_cloud.ply",
 }
 

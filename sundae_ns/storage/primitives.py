@@ -1,4 +1,4 @@
-"""The one reader of files of primitives: .ply, .spz, .sog, .splat, and checkpoints of gsplat."""
+"""The one reader of files of primitives: .ply, .spz, .sog, .glb, .splat, and checkpoints of gsplat."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.mending import Mended, mend
+from sundae_ns.storage.gltf import read_glb
 from sundae_ns.storage.kinds import kind_of_primitives
 from sundae_ns.storage.ply import is_nerfstudio_ply, ply_comments, read_ply
 from sundae_ns.storage.sog import read_sog
@@ -38,22 +39,25 @@ def read_primitives(path: Path) -> StoredPrimitives:
     Raises:
         DataError: the file is missing, damaged, of another kind, or has no finite primitive.
     """
-    kind, antialiased = kind_of_primitives(path), False
+    kind, antialiased, in_model_frame = kind_of_primitives(path), False, False
     if kind == "spz":
         params, antialiased = read_spz(path)
     elif kind == "sog":
         params, antialiased = read_sog(path)
+    elif kind == "glb":
+        params, antialiased, in_model_frame = read_glb(path)
     elif kind == "splat":
         params = read_splat(path)
     elif kind == "gsplat":
         params = read_gsplat(path)
     else:
         params, antialiased = read_ply(path), ANTIALIASED in ply_comments(path)
+        in_model_frame = is_nerfstudio_ply(path)
     mended = mend(params)
     if not mended.field.num_primitives:
         raise DataError(f"{path} has {len(mended.mask):,} primitives, and none is finite; export it again")
     _state(mended, path)
-    return StoredPrimitives(mended, antialiased, kind == "ply" and is_nerfstudio_ply(path))
+    return StoredPrimitives(mended, antialiased, in_model_frame)
 
 
 def mended_of(params: Mapping[str, Any], path: Path) -> Field:

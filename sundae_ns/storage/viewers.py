@@ -1,4 +1,4 @@
-"""Write a field for other viewers, in the format of the file's suffix: .ply, .spz or .sog."""
+"""Write a field for other viewers, in the format of the file's suffix: .ply, .spz, .sog or .glb."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from torch import Tensor
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians import mend
 from sundae_ns.gaussians.parameters import sh_degree_of
+from sundae_ns.storage.gltf import write_glb
 from sundae_ns.storage.ply import MODEL_FRAME, write_ply
 from sundae_ns.storage.primitives import ANTIALIASED
 from sundae_ns.storage.sog import write_sog
 from sundae_ns.storage.spz import MAX_SH_DEGREE, clamped, write_spz
 from sundae_ns.storage.transform import similarity
 
-FORMATS = (".ply", ".spz", ".sog")
+FORMATS = (".ply", ".spz", ".sog", ".glb")
 
 # In nerfstudio, z points up; in a 3DGS .ply, -y does.
 _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
@@ -61,7 +62,8 @@ def write_for_viewers(
         path: its folder must exist.
         params: the field; see :mod:`sundae_ns.gaussians.parameters`. A :class:`Field` says how it stores colours.
         antialiased: mark the scene as trained with antialiasing.
-        upright: rotate the scene from nerfstudio's axes to those of a 3DGS .ply, so that viewers show it upright.
+        upright: rotate the scene from nerfstudio's axes to those of a 3DGS .ply, so that viewers show it upright;
+            a .glb is in any case.
         in_model_frame: the field is in the coordinates of nerfstudio's model, as a .ply then says.
 
     Raises:
@@ -72,16 +74,19 @@ def write_for_viewers(
     check_format(path)
     mended = mend(params)
     field = {name: value.detach().cpu() for name, value in mended.field.as_harmonics().items()}
-    if upright:
+    kind = path.suffix.lower()
+    if upright and kind != ".glb":  # which is upright in any case
         field = similarity(field, _UPRIGHT, 1.0)
     coefficients = field["features_rest"].shape[1]
-    kind = path.suffix.lower()
     if kind == ".ply":
         stated = {MODEL_FRAME: in_model_frame and not upright, ANTIALIASED: antialiased}
         write_ply(path, field, comments=[comment for comment, true in stated.items() if true])
     else:
         field["features_rest"] = field["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
-        (write_spz if kind == ".spz" else write_sog)(path, field, antialiased=antialiased)
+        if kind == ".glb":
+            write_glb(path, field, antialiased=antialiased, in_model_frame=in_model_frame)
+        else:
+            (write_spz if kind == ".spz" else write_sog)(path, field, antialiased=antialiased)
     kept = field["features_rest"].shape[1]
     return ViewerFile(
         primitives=len(field["means"]),

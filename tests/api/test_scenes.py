@@ -31,7 +31,7 @@ def views(n: int = 3) -> list[sn.View]:
 
 
 @pytest.mark.parametrize(
-    ("suffix", "least"), [(".ply", 80.0), (".spz", 35.0), (".sog", 33.0), (".sundae", 33.0)], ids=str
+    ("suffix", "least"), [(".ply", 80.0), (".glb", 80.0), (".spz", 35.0), (".sog", 33.0), (".sundae", 33.0)], ids=str
 )
 @pytest.mark.parametrize("degree", [0, 2])
 def test_a_file_gives_the_scene_back(suffix: str, least: float, degree: int, tmp_path: Path) -> None:
@@ -45,7 +45,7 @@ def test_a_file_gives_the_scene_back(suffix: str, least: float, degree: int, tmp
     assert sn.measure(found, truth, views()).psnr > least
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".sundae"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".glb", ".sundae"])
 def test_files_say_that_a_scene_is_antialiased(suffix: str, tmp_path: Path) -> None:
     for antialiased in (True, False):
         path = tmp_path / f"{antialiased}{suffix}"
@@ -220,7 +220,7 @@ def test_primitives_that_are_not_finite_are_dropped() -> None:
     assert len(sn.virtual_views(truth, 4)) == 4
 
 
-@pytest.mark.parametrize("kind", [".ply", ".spz", ".sog", ".sundae", ".html"])
+@pytest.mark.parametrize("kind", [".ply", ".spz", ".sog", ".glb", ".sundae", ".html"])
 def test_a_scene_of_opaque_and_flat_primitives_is_saved_whole(tmp_path: Path, kind: str) -> None:
     """One that was made in memory: files are mended when they are opened."""
     truth = scene()

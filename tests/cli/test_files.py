@@ -182,7 +182,7 @@ def test_prune_does_not_change_kept_rows(
         (["prune", "empty.ply", "-o", "a.ply"], "empty.ply has 0 primitives, and none is finite; export it again"),
         (["export", "none.ply", "-o", "a.spz"], "none.ply has 5 primitives, and none is finite; export it again"),
         (["prune", "in.ply", "-o", "in.bin/a.ply"], "in.bin is no folder"),
-        (["export", "in.ply", "-o", "a.splat"], "name it .ply or .spz or .sog"),
+        (["export", "in.ply", "-o", "a.splat"], "name it .ply or .spz or .sog or .glb"),
         (["export", "in.ply", "-o", "in.bin/new/a.sog"], "in.bin is no folder"),
         (
             ["export", "in.ply", "-o", "a.ply"],
@@ -198,7 +198,7 @@ def test_prune_does_not_change_kept_rows(
         (["pack", "in.ply", "-o", "a.sundae", "--target-drop", "1"], "leave out --target-drop, or give a run"),
         (["report", "a.ksplat", "-o", "out"], "a.ksplat is a scene of GaussianSplats3D; convert it to .ply with"),
         (["prune", "a.ksplat", "-o", "a.ply"], "a.ksplat is a scene of GaussianSplats3D; convert it to .ply with"),
-        (["export", "a.glb", "-o", "a.ply"], "a.glb is a glTF scene; export the primitives as .ply"),
+        (["export", "a.glb", "-o", "a.ply"], "a.glb is not a complete .glb with Gaussians"),
         (["render", "a.pth", "-o", "a.png"], "a.pth is a checkpoint of another trainer; give its .ply"),
         (
             ["prune", "trained", "-o", "a.ply"],
@@ -272,8 +272,8 @@ def test_every_command_reads_files_of_other_programs(
 @pytest.mark.parametrize(
     ("command", "kind"),
     [
-        *(("prune", kind) for kind in (".ply", ".spz", ".sog", ".sundae")),
-        *(("export", kind) for kind in (".spz", ".sog", ".html")),
+        *(("prune", kind) for kind in (".ply", ".spz", ".sog", ".glb", ".sundae")),
+        *(("export", kind) for kind in (".spz", ".sog", ".glb", ".html")),
         ("pack", ".sundae"),
     ],
 )

@@ -114,7 +114,7 @@ def test_upright_rotates_z_to_minus_y(tmp_path: Path) -> None:
 
 
 def test_other_suffixes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"name it .ply or .spz or .sog"):
+    with pytest.raises(ConfigError, match=r"name it .ply or .spz or .sog or .glb"):
         write_for_viewers(tmp_path / "a.splat", field())
 
 

@@ -4,6 +4,9 @@
 import { SceneRevealMode, Viewer } from "@mkkellogg/gaussian-splats-3d";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { Matrix4, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
+import { GLTFGaussianSplatLoaderExtension } from "three/addons/loaders/GLTFGaussianSplatLoaderExtension.js";
+import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+import { WebGPURenderer } from "three/webgpu";
 import type { Camera } from "../src/scene/scene";
 
 type Options = { renderer?: object; scene?: object };
@@ -37,9 +40,13 @@ function pixelsOf(renderer: WebGLRenderer): string {
   const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
   const pixels = new Uint8Array(4 * width * height);
   gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-  let text = "";
-  for (let i = 0; i < pixels.length; i += 2 ** 14) text += String.fromCharCode(...pixels.subarray(i, i + 2 ** 14));
-  return btoa(text);
+  return text(pixels);
+}
+
+function text(pixels: Uint8Array | Uint8ClampedArray): string {
+  let found = "";
+  for (let i = 0; i < pixels.length; i += 2 ** 14) found += String.fromCharCode(...pixels.subarray(i, i + 2 ** 14));
+  return btoa(found);
 }
 
 /** Prepares a viewer for a file; returns what draws a frame. */
@@ -73,8 +80,43 @@ const OPENERS: Record<string, Opener> = {
   },
 };
 
+/** Images of a .glb by three.js's own loader, as `show`; its renderer draws by WebGL here, too. */
+async function showByThree(file: string, cameras: Camera[]): Promise<string[]> {
+  const { width, height } = cameras[0]!;
+  const renderer = new WebGPURenderer({ antialias: false, forceWebGL: true });
+  await renderer.init();
+  renderer.setPixelRatio(1);
+  renderer.setSize(width, height);
+  renderer.setClearColor(0, 1);
+  document.body.replaceChildren(renderer.domElement);
+  const loader = new GLTFLoader();
+  loader.register((parser) => new GLTFGaussianSplatLoaderExtension(parser));
+  const { scene: found } = await loader.loadAsync(file);
+  // In glTF +y points up; in the model +z does.
+  found.applyMatrix4(new Matrix4().set(-1, 0, 0, 0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 1));
+  const scene = new Scene();
+  scene.add(found);
+  const camera = new CaptureCamera();
+  const copy = Object.assign(document.createElement("canvas"), { width, height }).getContext("2d")!;
+  const images: string[] = [];
+  for (const place of cameras) {
+    camera.take(place);
+    for (let i = 0; i < FRAMES; i++) {
+      renderer.render(scene, camera);
+      await new Promise((done) => setTimeout(done, PAUSE));
+    }
+    renderer.render(scene, camera);
+    copy.setTransform(1, 0, 0, -1, 0, height); // the lowest row first, as WebGL has it
+    copy.drawImage(renderer.domElement, 0, 0);
+    images.push(text(copy.getImageData(0, 0, width, height).data));
+  }
+  renderer.dispose();
+  return images;
+}
+
 /** Images of a file by one viewer, on a black background; the cameras have one size. */
 async function show(name: string, file: string, cameras: Camera[], options: Options): Promise<string[]> {
+  if (name === "three") return showByThree(file, cameras);
   const { width, height } = cameras[0]!;
   document.body.replaceChildren();
   Object.assign(document.body.style, { margin: 0, width: `${width}px`, height: `${height}px` });
