@@ -3,7 +3,7 @@
 
 import { SceneRevealMode, Viewer } from "@mkkellogg/gaussian-splats-3d";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
-import { Matrix4, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
+import { LinearSRGBColorSpace, Matrix4, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
 import { GLTFGaussianSplatLoaderExtension } from "three/addons/loaders/GLTFGaussianSplatLoaderExtension.js";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { WebGPURenderer } from "three/webgpu";
@@ -88,6 +88,7 @@ async function showByThree(file: string, cameras: Camera[]): Promise<string[]> {
   renderer.setPixelRatio(1);
   renderer.setSize(width, height);
   renderer.setClearColor(0, 1);
+  renderer.outputColorSpace = LinearSRGBColorSpace; // colours of splats are those of the display already
   document.body.replaceChildren(renderer.domElement);
   const loader = new GLTFLoader();
   loader.register((parser) => new GLTFGaussianSplatLoaderExtension(parser));
