@@ -49,12 +49,27 @@ setInterval(() => { dot.style.background = (odd ^= 1) ? 'red' : 'blue'; }, 30);
 """A pixel in the corner that changes: headless Chromium takes screenshots only of frames that differ from the last."""
 
 
+STOP = "document.getElementById('stop').textContent"
+DEVICES = """
+window.devices = [];
+const request = GPUAdapter.prototype.requestDevice;
+GPUAdapter.prototype.requestDevice = async function (...words) {
+  const device = await request.apply(this, words);
+  devices.push(device);
+  //
+  return device;
+};
+"""
+"""Keeps the devices of the page, for tests to end."""
+
+
 @contextmanager
 def opened(
-    address: str, *, state: str = "ready", flags: Any = browser.WEBGPU, size: tuple[int, int] = SIZE
+    address: str, *, state: str = "ready", flags: Any = browser.WEBGPU, size: tuple[int, int] = SIZE, before: str = ""
 ) -> Iterator[Any]:
-    """The page of an address, once it has a state."""
+    """The page of an address, once it has a state; ``before`` is a script that runs before those of the page."""
     with browser.Browser(CHROMIUM, *size, flags) as page:
+        page.call("Page.addScriptToEvaluateOnNewDocument", {"source": before})
         page.open(address)
         found = "window.sundae && window.sundae.state !== 'loading'"
         browser.wait_for(lambda: bool(page.evaluate(found)), "the page", SECONDS)
@@ -127,6 +142,19 @@ def test_the_head_in_half_precision(name: str, tmp_path: Path) -> None:
     assert min(found) > LEAST_HALF
 
 
+def rested(page: Any) -> NDArray[np.int64]:
+    """The canvas once it rests, without what lies over it."""
+    over = "'panel', 'message'"
+    page.evaluate(f"for (const id of [{over}]) document.getElementById(id).style.visibility = 'hidden'")
+    page.evaluate(f"if (!window.dot) {{ window.dot = 1; {TICKING} }}")
+    shots = [page.screenshot().astype(int)]
+    while len(shots) < 2 or np.abs(shots[-1] - shots[-2]).any():
+        assert len(shots) < 20, "the canvas does not rest"
+        shots.append(page.screenshot().astype(int))
+        shots[-1][0, 0] = 0
+    return shots[-1]
+
+
 def touch(page: Any, at: tuple[int, int], to: tuple[int, int]) -> None:
     """Drag one finger."""
     page.call("Emulation.setTouchEmulationEnabled", {"enabled": True})
@@ -153,12 +181,7 @@ def test_the_controls(tmp_path: Path) -> None:
 
     def look(page: Any) -> tuple[NDArray[np.int64], str]:
         """The canvas once it rests, and the words beside the stop."""
-        shots = [page.screenshot().astype(int)]
-        while len(shots) < 2 or np.abs(shots[-1] - shots[-2]).any():
-            assert len(shots) < 20, "the canvas does not rest"
-            shots.append(page.screenshot().astype(int))
-            shots[-1][0, 0] = 0
-        return shots[-1], page.evaluate("document.getElementById('stop').textContent")
+        return rested(page), page.evaluate(STOP)
 
     def after(page: Any, act: Callable[[], Any]) -> tuple[NDArray[np.int64], str]:
         """The same after an act has changed the canvas."""
@@ -173,7 +196,6 @@ def test_the_controls(tmp_path: Path) -> None:
 
     try:
         with opened(f"http://127.0.0.1:{server.server_port}/") as page:
-            page.evaluate(f"{{ document.getElementById('panel').style.visibility = 'hidden'; {TICKING} }}")
             first, stop = look(page)
             assert stop == "1 of 2"
             bare, _ = after(page, press(page, "head"))
@@ -256,16 +278,104 @@ def test_a_folder_is_served_and_says_so_when_opened_from_disk(tmp_path: Path) ->
         assert "serve this folder" in page.evaluate("sundae.message")
 
 
+SAID = "document.getElementById('message').textContent"
+NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null;"
+REFUSALS = {
+    "no adapter": "navigator.gpu.requestAdapter = async () => null",
+    "no answer about adapters": "navigator.gpu.requestAdapter = async () => { throw new Error('blocked') }",
+    "no device": "GPUAdapter.prototype.requestDevice = async () => { throw new Error('refused') }",
+    "a device that is lost at once": DEVICES.replace("//", "device.destroy();"),
+    "no canvas": """
+        const found = HTMLCanvasElement.prototype.getContext;
+        HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+          return kind === 'webgpu' ? null : found.call(this, kind, ...rest);
+        }""",
+}
+"""How WebGPU fails at the start, as scripts."""
+
+
+def check_base_colours(page: Any, packed: Path) -> None:
+    """The page draws by WebGL2 and says so."""
+    assert page.evaluate("[sundae.state, sundae.drawn]") == ["ready", "webgl"]
+    assert page.evaluate(SAID).endswith("base colours; the compensation head is not shown.")
+    assert page.evaluate("document.getElementById('head-label').hidden")
+    assert page.evaluate("document.getElementById('poster').hidden")
+    # Quads have no tiles, and their sums are rounded to bytes; the worst is 50.0.
+    for camera, truth in enumerate(truths(read_scene(packed))):
+        assert psnr(image(page, camera, True), truth["base_rgb"]) > 47
+
+
 @pytest.mark.browser
 def test_without_webgpu_the_page_shows_base_colours(tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
     write_page(tmp_path / "a.html", *packed_file(packed), title="a")
     with opened((tmp_path / "a.html").as_uri(), flags=["--disable-features=WebGPU"]) as page:
-        assert page.evaluate("sundae.drawn") == "webgl"
-        assert "without the compensation head" in page.evaluate("document.getElementById('message').innerText")
-        # Quads have no tiles, and their sums are rounded to bytes; the worst is 50.0.
-        for camera, truth in enumerate(truths(read_scene(packed))):
-            assert psnr(image(page, camera, False), truth["base_rgb"]) > 47
+        assert page.evaluate(SAID).startswith("This browser has no WebGPU")
+        check_base_colours(page, packed)
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("refusal", REFUSALS)
+def test_a_gpu_that_fails_at_the_start_leaves_base_colours(refusal: str, tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
+    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
+    with opened((tmp_path / "a.html").as_uri(), before=REFUSALS[refusal]) as page:
+        check_base_colours(page, packed)
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("loss", ["the device", "an error of its work", "the GPU process"])
+def test_a_lost_gpu_leaves_camera_and_controls(loss: str, tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
+    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
+    with opened((tmp_path / "a.html").as_uri(), before=DEVICES) as page:
+        assert page.evaluate("sundae.drawn") == "webgpu"
+        page.evaluate("{ head.click(); scale.value = 80; scale.dispatchEvent(new Event('input')) }")
+        rested(page)  # the panel covers so small a page
+        page.drag(80, 60, 110, 70)
+        browser.wait_for(lambda: page.evaluate(STOP) == "free", "another view", SECONDS)
+        seen = rested(page)
+        if loss == "the device":
+            page.evaluate("devices[0].destroy()")
+        elif loss == "an error of its work":
+            page.evaluate("{ devices[0].createBuffer({ size: 16, usage: 0 }); devices[0].queue.submit([]) }")
+        else:
+            page.call("Browser.crashGpuProcess", browser=True)
+        browser.wait_for(lambda: page.evaluate("sundae.drawn") == "webgl", "the other drawer", SECONDS)
+        assert "lost the GPU" in page.evaluate(SAID)
+        assert page.evaluate(f"[{STOP}, document.getElementById('scale-value').textContent]") == ["free", "80%"]
+        # Both drawers show base colours; the worst is 0.6.
+        assert np.abs(rested(page) - seen).mean() < 2
+        check_base_colours(page, packed)
+        page.drag(80, 60, 110, 70)
+        browser.wait_for(lambda: np.abs(rested(page) - seen).mean() > 4, "another view", SECONDS)
+
+
+@pytest.mark.browser
+def test_a_gpu_lost_without_webgl_leaves_the_image(tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
+    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
+    with opened((tmp_path / "a.html").as_uri(), before=DEVICES) as page:
+        page.evaluate(f"{{ {NO_WEBGL} devices[0].destroy() }}")
+        browser.wait_for(lambda: page.evaluate("sundae.state") == "failed", "the end", SECONDS)
+        assert "WebGL2 is missing too" in page.evaluate(SAID)
+        assert page.evaluate("[poster.hidden, stage.hidden, panel.hidden]") == [False, True, True]
+
+
+@pytest.mark.browser
+def test_a_lost_webgl_context_is_opened_again(tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
+    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
+    lose = "document.querySelector('canvas').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
+    with opened((tmp_path / "a.html").as_uri(), flags=["--disable-features=WebGPU"]) as page:
+        for _ in range(2):
+            frames = page.evaluate("sundae.frames")
+            page.evaluate(lose)
+            browser.wait_for(lambda: page.evaluate("sundae.frames") > frames, "a frame", SECONDS)  # noqa: B023
+            check_base_colours(page, packed)
+        page.evaluate(lose)
+        browser.wait_for(lambda: page.evaluate("sundae.state") == "failed", "the end", SECONDS)
+        assert page.evaluate("[poster.hidden, stage.hidden, panel.hidden]") == [False, True, True]
 
 
 @pytest.mark.browser
@@ -274,5 +384,5 @@ def test_without_webgl_the_page_shows_an_image(tmp_path: Path) -> None:
     write_page(tmp_path / "a.html", *packed_file(packed), title="a")
     flags = ["--disable-features=WebGPU", "--disable-3d-apis"]
     with opened((tmp_path / "a.html").as_uri(), state="failed", flags=flags) as page:
-        assert "neither WebGPU nor WebGL2" in page.evaluate("document.getElementById('message').innerText")
+        assert "no WebGPU, and WebGL2 is missing too" in page.evaluate(SAID)
         assert page.evaluate("[poster.hidden, poster.naturalWidth, poster.naturalHeight]") == [False, 50, 37]

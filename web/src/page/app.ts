@@ -1,14 +1,12 @@
 // The page: loads the scene, draws it when something changes, and connects the controls.
 
 import { decode } from "../decoding";
-import type { Drawer, Times } from "../drawer";
-import { openGpu } from "../gpu/device";
-import { Renderer } from "../gpu/renderer";
+import type { Times } from "../drawer";
 import { PackError } from "../scene/container";
 import type { Scene } from "../scene/scene";
 import { viewOf, zoomed } from "../view";
-import { openPainter } from "../webgl/painter";
 import { Navigation } from "./navigation";
+import { Stage } from "./stage";
 
 /** What scripts, and the tests of this repository, may ask of the page. */
 export type Handle = {
@@ -36,7 +34,7 @@ const element = <T extends HTMLElement>(id: string): T => {
 };
 
 const controls = () => ({
-  canvas: element<HTMLCanvasElement>("canvas"),
+  stage: element("stage"),
   poster: element<HTMLImageElement>("poster"),
   panel: element("panel"),
   message: element("message"),
@@ -83,20 +81,21 @@ export async function start(program: string): Promise<void> {
     image: () => Promise.reject(new Error("the scene is not ready")),
   };
   Object.assign(window, { sundae: handle });
-  // The first message stays: later ones follow from it.
-  const say = (text: string): void => {
-    handle.message ||= text;
+  // The first error stays: later ones follow from it. The image of the file comes back.
+  const fail = (error: unknown): void => {
+    if (handle.state === "failed") return;
+    handle.state = "failed";
+    handle.drawn = "image";
+    handle.message = error instanceof PackError ? error.message : `The page failed (${error}).`;
     page.message.textContent = handle.message;
-    page.message.hidden = false;
+    page.message.hidden = page.poster.hidden = false;
+    page.stage.hidden = page.panel.hidden = true;
   };
   try {
-    const scene = await decode(await sceneFile(), program);
-    const drawer = await openDrawer(scene, page.canvas, handle, say);
-    await show(drawer, scene, page, handle, say);
+    await show(await decode(await sceneFile(), program), page, handle, fail);
     handle.state = "ready";
   } catch (error) {
-    say(error instanceof PackError ? error.message : `The page failed (${error}).`);
-    handle.state = "failed";
+    fail(error);
   }
 }
 
@@ -104,41 +103,20 @@ const tooMany = (crowded: number): string =>
   `This view is not drawn: ${Math.round(crowded).toLocaleString("en")} primitives cover each of its pixels, ` +
   "too many for this page or for this GPU.";
 
-/** WebGPU with the head, or base colours by WebGL2. */
-async function openDrawer(
-  scene: Scene,
-  canvas: HTMLCanvasElement,
-  handle: Handle,
-  say: (text: string) => void,
-): Promise<Drawer> {
-  const gpu = await openGpu();
-  if (gpu !== null) {
-    handle.drawn = "webgpu";
-    gpu.device.lost.then(({ message }) => say(`The browser lost the GPU (${message}); reload the page.`));
-    gpu.device.addEventListener("uncapturederror", (event) => say(`The GPU failed (${event.error.message}).`));
-    return new Renderer(gpu, scene, canvas);
-  }
-  const painter = openPainter(scene, canvas);
-  if (painter === null) throw new PackError("This browser has neither WebGPU nor WebGL2, so the page shows one image.");
-  handle.drawn = "webgl";
-  say(`This browser has no WebGPU: base colours${scene.head ? ", without the compensation head" : ""}.`);
-  return painter;
-}
-
 async function show(
-  renderer: Drawer,
   scene: Scene,
   page: ReturnType<typeof controls>,
   handle: Handle,
-  say: (text: string) => void,
+  fail: (error: unknown) => void,
 ): Promise<void> {
   let dirty = true;
   const mark = (): void => {
     dirty = true;
   };
-  const navigation = new Navigation(scene, page.canvas, mark);
+  const stage = new Stage(scene, page.stage, mark);
+  await stage.open();
+  const navigation = new Navigation(scene, page.stage, mark);
   const { stops } = navigation;
-  page.headLabel.hidden = !renderer.hasHead;
   page.head.addEventListener("change", mark);
   page.scale.addEventListener("input", mark);
   page.fly.addEventListener("change", () => {
@@ -151,31 +129,38 @@ async function show(
   };
   page.before.addEventListener("click", () => visit(visited - 1));
   page.after.addEventListener("click", () => visit(visited + 1));
-  new ResizeObserver(mark).observe(page.canvas);
+  new ResizeObserver(mark).observe(page.stage);
 
   const moments: number[] = [];
   let last = 0;
   const draw = async (): Promise<void> => {
-    const { canvas } = page;
-    const [across, down] = [canvas.clientWidth * devicePixelRatio, canvas.clientHeight * devicePixelRatio];
-    const scale = (Number(page.scale.value) / 100) * renderer.limit(across, down);
-    const [width, height] = [across, down].map((length) => Math.max(Math.round(length * scale), 1)) as [number, number];
-    // Even the same size would clear the canvas. The browser enlarges a smaller one.
-    if (canvas.width !== width) canvas.width = width;
-    if (canvas.height !== height) canvas.height = height;
+    const [across, down] = [page.stage.clientWidth, page.stage.clientHeight].map((side) => side * devicePixelRatio) as [
+      number,
+      number,
+    ];
     const started = performance.now();
-    handle.times = await renderer.render(navigation.view(width, height), page.head.checked);
+    const times = await stage.use((drawer) => {
+      const { canvas } = stage;
+      const scale = (Number(page.scale.value) / 100) * drawer.limit(across, down);
+      const [width, height] = [across, down].map((side) => Math.max(Math.round(side * scale), 1)) as [number, number];
+      // Even the same size would clear the canvas. The browser enlarges a smaller one.
+      if (canvas.width !== width) canvas.width = width;
+      if (canvas.height !== height) canvas.height = height;
+      return drawer.render(navigation.view(width, height), page.head.checked);
+    });
     const ended = performance.now();
     moments.push(ended - Math.max(started, last));
     last = ended;
     if (moments.length > FRAMES) moments.shift();
     const fps = (1000 * moments.length) / moments.reduce((sum, value) => sum + value, 0);
-    const { splat, head, withoutHead, crowded } = handle.times;
+    const { splat, head, withoutHead, crowded } = times;
     const passes = Number.isNaN(splat) ? "" : ` · splat ${splat.toFixed(1)} ms · head ${head.toFixed(1)} ms`;
     const reason = withoutHead ? " · the view is too large for the head on this GPU" : "";
     page.stats.textContent = `${fps.toFixed(fps < 10 ? 1 : 0)} fps${passes}${reason}`;
-    page.message.textContent = crowded ? tooMany(crowded) : handle.message;
+    Object.assign(handle, { times, drawn: stage.drawn, message: stage.notice });
+    page.message.textContent = crowded ? tooMany(crowded) : stage.notice;
     page.message.hidden = !page.message.textContent;
+    page.headLabel.hidden = !stage.hasHead;
     page.scaleValue.textContent = `${page.scale.value}%`;
     handle.frames += 1;
     page.stop.textContent = navigation.stop === null ? "free" : `${navigation.stop + 1} of ${stops.length}`;
@@ -191,7 +176,7 @@ async function show(
   let busy: Promise<unknown> = Promise.resolve();
   handle.image = (camera, head, scale = 1) => {
     const view = zoomed(viewOf(stops[camera]!), scale);
-    const image = busy.then(() => renderer.image(view, head));
+    const image = busy.then(() => stage.use((drawer) => drawer.image(view, head)));
     busy = image.catch(() => undefined);
     return image.then((pixels) => {
       let text = "";
@@ -206,8 +191,8 @@ async function show(
       return;
     }
     dirty = false;
-    busy = busy.then(draw).catch((error) => say(`The page failed (${error}).`));
-    busy.then(() => requestAnimationFrame(loop));
+    busy = busy.then(draw);
+    busy.then(() => requestAnimationFrame(loop), fail);
   };
   requestAnimationFrame(loop);
 }

@@ -1,4 +1,4 @@
-// Base colours where there is no WebGPU: quads sorted by depth on the CPU, blended by WebGL2.
+// Base colours where there is no WebGPU, or no more: quads sorted by depth on the CPU, blended by WebGL2.
 
 import { coefficientsOf, geometryOf } from "../arrays";
 import type { Drawer, Times } from "../drawer";
@@ -64,7 +64,7 @@ class Painter implements Drawer {
     }
     gl.linkProgram(this.program);
     if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) {
-      throw new PackError("This browser has no WebGPU, and its WebGL cannot draw the scene.");
+      throw new PackError("This browser's WebGL2 cannot draw the scene, so the page shows one image.");
     }
     gl.useProgram(this.program);
     this.geometry = geometryOf(scene);
@@ -98,7 +98,7 @@ class Painter implements Drawer {
     const { gl } = this;
     const rows = Math.ceil(values.length / 4 / ROW);
     if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
-      throw new PackError("This browser has no WebGPU, and the scene is too large for its WebGL.");
+      throw new PackError("The scene is too large for this browser's WebGL2, so the page shows one image.");
     }
     const padded = new Float32Array(rows * ROW * 4);
     padded.set(values);
@@ -186,8 +186,15 @@ class Painter implements Drawer {
     return true;
   }
 
+  /** A lost context ignores all calls, so it has to be asked. */
+  private drawn(view: View): number {
+    const crowded = this.draw(view);
+    if (this.gl.isContextLost()) throw new Error("the WebGL context is lost");
+    return crowded;
+  }
+
   async render(view: View): Promise<Times> {
-    return { splat: Number.NaN, head: Number.NaN, withoutHead: false, crowded: this.draw(view) };
+    return { splat: Number.NaN, head: Number.NaN, withoutHead: false, crowded: this.drawn(view) };
   }
 
   async image(view: View): Promise<Uint8ClampedArray<ArrayBuffer>> {
@@ -195,7 +202,7 @@ class Painter implements Drawer {
     const { canvas } = gl;
     const { width, height } = canvas;
     Object.assign(canvas, { width: view.width, height: view.height });
-    this.draw(view);
+    this.drawn(view);
     const rows = new Uint8Array(4 * view.width * view.height);
     gl.readPixels(0, 0, view.width, view.height, gl.RGBA, gl.UNSIGNED_BYTE, rows);
     Object.assign(canvas, { width, height });
