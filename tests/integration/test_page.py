@@ -9,10 +9,9 @@ import base64
 import json
 import os
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ import pytest
 from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packages
 from numpy.typing import NDArray
 from packed_scenes import KINDS, write_bomb, write_kind
+from pages import SAID, SECONDS, SIZE, STOP, WEBGL, Quiet, hold, opened, rested, touch
 
 from sundae_ns.api.page import page_of, write_page
 from sundae_ns.api.saving import packed_file
@@ -35,52 +35,6 @@ LEAST = 57.0
 """Lowest PSNR of an image of the page against Python's; the worst is 58.7."""
 LEAST_HALF = 55.0
 """The same with the head in half precision; the worst is 57.6."""
-SECONDS = 180.0
-"""Shaders compile in software."""
-SIZE = (160, 120)
-
-TICKING = """
-const dot = document.createElement('div');
-dot.style = 'position: absolute; width: 1px; height: 1px';
-document.body.append(dot);
-let odd = 0;
-setInterval(() => { dot.style.background = (odd ^= 1) ? 'red' : 'blue'; }, 30);
-"""
-"""A pixel in the corner that changes: headless Chromium takes screenshots only of frames that differ from the last."""
-
-
-STOP = "document.getElementById('stop').textContent"
-DEVICES = """
-window.devices = [];
-const request = GPUAdapter.prototype.requestDevice;
-GPUAdapter.prototype.requestDevice = async function (...words) {
-  const device = await request.apply(this, words);
-  devices.push(device);
-  //
-  return device;
-};
-"""
-"""Keeps the devices of the page, for tests to end."""
-
-
-@contextmanager
-def opened(
-    address: str, *, state: str = "ready", flags: Any = browser.WEBGPU, size: tuple[int, int] = SIZE, before: str = ""
-) -> Iterator[Any]:
-    """The page of an address, once it has a state; ``before`` is a script that runs before those of the page."""
-    with browser.Browser(CHROMIUM, *size, flags) as page:
-        page.call("Page.addScriptToEvaluateOnNewDocument", {"source": before})
-        page.open(address)
-        found = "window.sundae && window.sundae.state !== 'loading'"
-        browser.wait_for(lambda: bool(page.evaluate(found)), "the page", SECONDS)
-        assert page.evaluate("sundae.state") == state, page.evaluate("sundae.message")
-        yield page
-        assert page.errors == []
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-        pass
 
 
 def check(page: Any, packed: Path, cameras: list[int]) -> None:
@@ -140,37 +94,6 @@ def test_the_head_in_half_precision(name: str, tmp_path: Path) -> None:
     images = truths(read_scene(packed))
     found = [psnr(image, truth["rgb"]) for image, truth in zip(made[1], images, strict=True)]
     assert min(found) > LEAST_HALF
-
-
-def rested(page: Any) -> NDArray[np.int64]:
-    """The canvas once it rests, without what lies over it."""
-    over = "'panel', 'message'"
-    page.evaluate(f"for (const id of [{over}]) document.getElementById(id).style.visibility = 'hidden'")
-    page.evaluate(f"if (!window.dot) {{ window.dot = 1; {TICKING} }}")
-    shots = [page.screenshot().astype(int)]
-    while len(shots) < 2 or np.abs(shots[-1] - shots[-2]).any():
-        assert len(shots) < 20, "the canvas does not rest"
-        shots.append(page.screenshot().astype(int))
-        shots[-1][0, 0] = 0
-    return shots[-1]
-
-
-def touch(page: Any, at: tuple[int, int], to: tuple[int, int]) -> None:
-    """Drag one finger."""
-    page.call("Emulation.setTouchEmulationEnabled", {"enabled": True})
-    points = [tuple(a + (b - a) * i / 4 for a, b in zip(at, to, strict=True)) for i in range(5)]
-    for i, (x, y) in enumerate(points):
-        event = {"type": "touchMove" if i else "touchStart", "touchPoints": [{"x": x, "y": y}]}
-        page.call("Input.dispatchTouchEvent", event)
-    page.call("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-
-
-def hold(page: Any, code: str) -> None:
-    """Hold a key for two frames."""
-    before = page.evaluate("sundae.frames")
-    page.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": code, "code": code})
-    browser.wait_for(lambda: page.evaluate("sundae.frames") > before + 1, "two frames", SECONDS)
-    page.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": code, "code": code})
 
 
 @pytest.mark.browser
@@ -244,7 +167,7 @@ def test_a_hostile_file_ends_in_a_message(tmp_path: Path) -> None:
     wrong = page.replace(base64.b64encode(content).decode(), base64.b64encode(content[:-1] + b"~").decode())
     (tmp_path / "a.html").write_text(wrong)
     with opened((tmp_path / "a.html").as_uri(), state="failed") as found:
-        assert "checksum" in found.evaluate("document.getElementById('message').innerText")
+        assert "checksum" in found.evaluate(SAID)
         assert found.evaluate("!document.getElementById('poster').hidden")
 
 
@@ -253,14 +176,13 @@ def test_a_hostile_file_ends_in_a_message(tmp_path: Path) -> None:
 def test_a_view_of_too_many_primitives_is_not_drawn(drawn: str, tmp_path: Path) -> None:
     packed = write_bomb(tmp_path / "a.sundae")
     write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    flags = browser.WEBGPU if drawn == "webgpu" else ["--disable-features=WebGPU"]
+    flags = browser.WEBGPU if drawn == "webgpu" else WEBGL
     with opened((tmp_path / "a.html").as_uri(), flags=flags, size=(640, 480)) as page:
         assert page.evaluate("sundae.drawn") == drawn
-        said = "document.getElementById('message').innerText"
-        assert "20,000 primitives cover each of its pixels" in page.evaluate(said)
+        assert "20,000 primitives cover each of its pixels" in page.evaluate(SAID)
         assert image(page, 1, True).min() == 1
         page.evaluate("document.getElementById('after').click()")
-        browser.wait_for(lambda: "primitives cover" not in page.evaluate(said), "another message", SECONDS)
+        browser.wait_for(lambda: "primitives cover" not in page.evaluate(SAID), "another message", SECONDS)
 
 
 @pytest.mark.browser
@@ -276,113 +198,3 @@ def test_a_folder_is_served_and_says_so_when_opened_from_disk(tmp_path: Path) ->
         page.open((tmp_path / "site" / "index.html").as_uri())
         browser.wait_for(lambda: bool(page.evaluate("window.sundae?.state === 'failed'")), "the message", SECONDS)
         assert "serve this folder" in page.evaluate("sundae.message")
-
-
-SAID = "document.getElementById('message').textContent"
-NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null;"
-REFUSALS = {
-    "no adapter": "navigator.gpu.requestAdapter = async () => null",
-    "no answer about adapters": "navigator.gpu.requestAdapter = async () => { throw new Error('blocked') }",
-    "no device": "GPUAdapter.prototype.requestDevice = async () => { throw new Error('refused') }",
-    "a device that is lost at once": DEVICES.replace("//", "device.destroy();"),
-    "no canvas": """
-        const found = HTMLCanvasElement.prototype.getContext;
-        HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
-          return kind === 'webgpu' ? null : found.call(this, kind, ...rest);
-        }""",
-}
-"""How WebGPU fails at the start, as scripts."""
-
-
-def check_base_colours(page: Any, packed: Path) -> None:
-    """The page draws by WebGL2 and says so."""
-    assert page.evaluate("[sundae.state, sundae.drawn]") == ["ready", "webgl"]
-    assert page.evaluate(SAID).endswith("base colours; the compensation head is not shown.")
-    assert page.evaluate("document.getElementById('head-label').hidden")
-    assert page.evaluate("document.getElementById('poster').hidden")
-    # Quads have no tiles, and their sums are rounded to bytes; the worst is 50.0.
-    for camera, truth in enumerate(truths(read_scene(packed))):
-        assert psnr(image(page, camera, True), truth["base_rgb"]) > 47
-
-
-@pytest.mark.browser
-def test_without_webgpu_the_page_shows_base_colours(tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    with opened((tmp_path / "a.html").as_uri(), flags=["--disable-features=WebGPU"]) as page:
-        assert page.evaluate(SAID).startswith("This browser has no WebGPU")
-        check_base_colours(page, packed)
-
-
-@pytest.mark.browser
-@pytest.mark.parametrize("refusal", REFUSALS)
-def test_a_gpu_that_fails_at_the_start_leaves_base_colours(refusal: str, tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    with opened((tmp_path / "a.html").as_uri(), before=REFUSALS[refusal]) as page:
-        check_base_colours(page, packed)
-
-
-@pytest.mark.browser
-@pytest.mark.parametrize("loss", ["the device", "an error of its work", "the GPU process"])
-def test_a_lost_gpu_leaves_camera_and_controls(loss: str, tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    with opened((tmp_path / "a.html").as_uri(), before=DEVICES) as page:
-        assert page.evaluate("sundae.drawn") == "webgpu"
-        page.evaluate("{ head.click(); scale.value = 80; scale.dispatchEvent(new Event('input')) }")
-        rested(page)  # the panel covers so small a page
-        page.drag(80, 60, 110, 70)
-        browser.wait_for(lambda: page.evaluate(STOP) == "free", "another view", SECONDS)
-        seen = rested(page)
-        if loss == "the device":
-            page.evaluate("devices[0].destroy()")
-        elif loss == "an error of its work":
-            page.evaluate("{ devices[0].createBuffer({ size: 16, usage: 0 }); devices[0].queue.submit([]) }")
-        else:
-            page.call("Browser.crashGpuProcess", browser=True)
-        browser.wait_for(lambda: page.evaluate("sundae.drawn") == "webgl", "the other drawer", SECONDS)
-        assert "lost the GPU" in page.evaluate(SAID)
-        assert page.evaluate(f"[{STOP}, document.getElementById('scale-value').textContent]") == ["free", "80%"]
-        # Both drawers show base colours; the worst is 0.6.
-        assert np.abs(rested(page) - seen).mean() < 2
-        check_base_colours(page, packed)
-        page.drag(80, 60, 110, 70)
-        browser.wait_for(lambda: np.abs(rested(page) - seen).mean() > 4, "another view", SECONDS)
-
-
-@pytest.mark.browser
-def test_a_gpu_lost_without_webgl_leaves_the_image(tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    with opened((tmp_path / "a.html").as_uri(), before=DEVICES) as page:
-        page.evaluate(f"{{ {NO_WEBGL} devices[0].destroy() }}")
-        browser.wait_for(lambda: page.evaluate("sundae.state") == "failed", "the end", SECONDS)
-        assert "WebGL2 is missing too" in page.evaluate(SAID)
-        assert page.evaluate("[poster.hidden, stage.hidden, panel.hidden]") == [False, True, True]
-
-
-@pytest.mark.browser
-def test_a_lost_webgl_context_is_opened_again(tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    lose = "document.querySelector('canvas').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
-    with opened((tmp_path / "a.html").as_uri(), flags=["--disable-features=WebGPU"]) as page:
-        for _ in range(2):
-            frames = page.evaluate("sundae.frames")
-            page.evaluate(lose)
-            browser.wait_for(lambda: page.evaluate("sundae.frames") > frames, "a frame", SECONDS)  # noqa: B023
-            check_base_colours(page, packed)
-        page.evaluate(lose)
-        browser.wait_for(lambda: page.evaluate("sundae.state") == "failed", "the end", SECONDS)
-        assert page.evaluate("[poster.hidden, stage.hidden, panel.hidden]") == [False, True, True]
-
-
-@pytest.mark.browser
-def test_without_webgl_the_page_shows_an_image(tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    flags = ["--disable-features=WebGPU", "--disable-3d-apis"]
-    with opened((tmp_path / "a.html").as_uri(), state="failed", flags=flags) as page:
-        assert "no WebGPU, and WebGL2 is missing too" in page.evaluate(SAID)
-        assert page.evaluate("[poster.hidden, poster.naturalWidth, poster.naturalHeight]") == [False, 50, 37]

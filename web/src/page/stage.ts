@@ -23,12 +23,12 @@ export class Stage {
 
   /**
    * @param place - takes the canvas, and keeps mouse and touch when the canvas is replaced
-   * @param onLost - called when the current drawer can no longer draw
+   * @param onChange - called when the canvas has to be drawn again, by the next drawer
    */
   constructor(
     private readonly scene: Scene,
     private readonly place: HTMLElement,
-    private readonly onLost: () => void,
+    private readonly onChange: () => void,
   ) {}
 
   /** Opens the first drawer; throws a PackError where there is neither WebGPU nor WebGL2. */
@@ -45,7 +45,7 @@ export class Stage {
     const lose = (reason: string): void => {
       if (this.device !== device) return;
       this.lost ??= `The browser lost the GPU (${reason})`;
-      this.onLost();
+      this.onChange();
     };
     device.lost.then(({ message }) => lose(message.trim() || "no reason given"));
     device.addEventListener("uncapturederror", ({ error }) => lose(error.message.split("\n")[0]!));
@@ -74,10 +74,11 @@ export class Stage {
     canvas.addEventListener("webglcontextlost", () => {
       if (this.drawer !== painter) return;
       this.lost ??= reason;
-      this.onLost();
+      this.onChange();
     });
     this.drawer = painter;
     this.drawn = "webgl";
+    this.onChange();
     this.notice = `${reason}: base colours${this.scene.head ? "; the compensation head is not shown" : ""}.`;
   }
 

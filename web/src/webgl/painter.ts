@@ -194,18 +194,29 @@ class Painter implements Drawer {
   }
 
   async render(view: View): Promise<Times> {
-    return { splat: Number.NaN, head: Number.NaN, withoutHead: false, crowded: this.drawn(view) };
+    const { gl } = this;
+    const crowded = this.drawn(view);
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0)!;
+    gl.flush();
+    // A fence changes only between tasks.
+    do await new Promise((resolve) => setTimeout(resolve));
+    while (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED);
+    gl.deleteSync(fence);
+    return { splat: Number.NaN, head: Number.NaN, withoutHead: false, crowded };
   }
+
+  async fade(): Promise<void> {}
 
   async image(view: View): Promise<Uint8ClampedArray<ArrayBuffer>> {
     const { gl } = this;
     const { canvas } = gl;
     const { width, height } = canvas;
-    Object.assign(canvas, { width: view.width, height: view.height });
+    const size = { width: view.width, height: view.height };
+    if (width !== size.width || height !== size.height) Object.assign(canvas, size);
     this.drawn(view);
     const rows = new Uint8Array(4 * view.width * view.height);
     gl.readPixels(0, 0, view.width, view.height, gl.RGBA, gl.UNSIGNED_BYTE, rows);
-    Object.assign(canvas, { width, height });
+    if (width !== size.width || height !== size.height) Object.assign(canvas, { width, height });
     // WebGL begins with the lowest row.
     const out = new Uint8ClampedArray(rows.length);
     const row = 4 * view.width;
