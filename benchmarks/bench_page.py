@@ -124,6 +124,8 @@ def compared(scene: Path, side: int = SIDE, *, half: bool = False) -> dict[str, 
             loaded = "window.sundae && window.sundae.state !== 'loading'"
             wait_for(lambda: bool(page.evaluate(loaded)), "the page", SECONDS)
             row["first_image_s"] = round(time.perf_counter() - began, 1)
+            # The first image has base colours; the head follows once the camera rests.
+            wait_for(lambda: bool(page.evaluate("sundae.still || sundae.state === 'failed'")), "the head", SECONDS)
             times = page.evaluate("sundae.times") or {}
             row |= {f"ms_{name}": round(times.get(name, 0)) for name in ("splat", "head")}
             row["psnr_base"], row["psnr_head"] = [], []

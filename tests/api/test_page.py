@@ -8,7 +8,6 @@ import hashlib
 import io
 import json
 import re
-import shutil
 import struct
 import subprocess
 from collections.abc import Callable
@@ -20,7 +19,7 @@ import fuzz_packs
 import numpy as np
 import pytest
 import torch
-from chromium import bench_page
+from chromium import bench_page, needs_node
 from packed_scenes import KINDS, write_bomb, write_kind
 from PIL import Image
 
@@ -37,11 +36,6 @@ from sundae_ns.storage.packing import read_scene
 ROOT = Path(__file__).parents[2]
 WEB = ROOT / "web"
 Json = dict[str, Any]
-
-needs_node = pytest.mark.skipif(
-    shutil.which("node") is None or not (WEB / "node_modules").is_dir(),
-    reason="the page's build tools are not installed (make web)",
-)
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,9 @@ import base64
 import json
 import os
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ import pytest
 from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packages
 from numpy.typing import NDArray
 from packed_scenes import KINDS, write_bomb, write_kind
+from pages import SAID, SECONDS, SIZE, STOP, WEBGL, Quiet, hold, opened, rested, touch
 
 from sundae_ns.api.page import page_of, write_page
 from sundae_ns.api.saving import packed_file
@@ -35,37 +35,6 @@ LEAST = 57.0
 """Lowest PSNR of an image of the page against Python's; the worst is 58.7."""
 LEAST_HALF = 55.0
 """The same with the head in half precision; the worst is 57.6."""
-SECONDS = 180.0
-"""Shaders compile in software."""
-SIZE = (160, 120)
-
-TICKING = """
-const dot = document.createElement('div');
-dot.style = 'position: absolute; width: 1px; height: 1px';
-document.body.append(dot);
-let odd = 0;
-setInterval(() => { dot.style.background = (odd ^= 1) ? 'red' : 'blue'; }, 30);
-"""
-"""A pixel in the corner that changes: headless Chromium takes screenshots only of frames that differ from the last."""
-
-
-@contextmanager
-def opened(
-    address: str, *, state: str = "ready", flags: Any = browser.WEBGPU, size: tuple[int, int] = SIZE
-) -> Iterator[Any]:
-    """The page of an address, once it has a state."""
-    with browser.Browser(CHROMIUM, *size, flags) as page:
-        page.open(address)
-        found = "window.sundae && window.sundae.state !== 'loading'"
-        browser.wait_for(lambda: bool(page.evaluate(found)), "the page", SECONDS)
-        assert page.evaluate("sundae.state") == state, page.evaluate("sundae.message")
-        yield page
-        assert page.errors == []
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-        pass
 
 
 def check(page: Any, packed: Path, cameras: list[int]) -> None:
@@ -127,24 +96,6 @@ def test_the_head_in_half_precision(name: str, tmp_path: Path) -> None:
     assert min(found) > LEAST_HALF
 
 
-def touch(page: Any, at: tuple[int, int], to: tuple[int, int]) -> None:
-    """Drag one finger."""
-    page.call("Emulation.setTouchEmulationEnabled", {"enabled": True})
-    points = [tuple(a + (b - a) * i / 4 for a, b in zip(at, to, strict=True)) for i in range(5)]
-    for i, (x, y) in enumerate(points):
-        event = {"type": "touchMove" if i else "touchStart", "touchPoints": [{"x": x, "y": y}]}
-        page.call("Input.dispatchTouchEvent", event)
-    page.call("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-
-
-def hold(page: Any, code: str) -> None:
-    """Hold a key for two frames."""
-    before = page.evaluate("sundae.frames")
-    page.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": code, "code": code})
-    browser.wait_for(lambda: page.evaluate("sundae.frames") > before + 1, "two frames", SECONDS)
-    page.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": code, "code": code})
-
-
 @pytest.mark.browser
 def test_the_controls(tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
@@ -153,12 +104,7 @@ def test_the_controls(tmp_path: Path) -> None:
 
     def look(page: Any) -> tuple[NDArray[np.int64], str]:
         """The canvas once it rests, and the words beside the stop."""
-        shots = [page.screenshot().astype(int)]
-        while len(shots) < 2 or np.abs(shots[-1] - shots[-2]).any():
-            assert len(shots) < 20, "the canvas does not rest"
-            shots.append(page.screenshot().astype(int))
-            shots[-1][0, 0] = 0
-        return shots[-1], page.evaluate("document.getElementById('stop').textContent")
+        return rested(page), page.evaluate(STOP)
 
     def after(page: Any, act: Callable[[], Any]) -> tuple[NDArray[np.int64], str]:
         """The same after an act has changed the canvas."""
@@ -173,7 +119,6 @@ def test_the_controls(tmp_path: Path) -> None:
 
     try:
         with opened(f"http://127.0.0.1:{server.server_port}/") as page:
-            page.evaluate(f"{{ document.getElementById('panel').style.visibility = 'hidden'; {TICKING} }}")
             first, stop = look(page)
             assert stop == "1 of 2"
             bare, _ = after(page, press(page, "head"))
@@ -222,7 +167,7 @@ def test_a_hostile_file_ends_in_a_message(tmp_path: Path) -> None:
     wrong = page.replace(base64.b64encode(content).decode(), base64.b64encode(content[:-1] + b"~").decode())
     (tmp_path / "a.html").write_text(wrong)
     with opened((tmp_path / "a.html").as_uri(), state="failed") as found:
-        assert "checksum" in found.evaluate("document.getElementById('message').innerText")
+        assert "checksum" in found.evaluate(SAID)
         assert found.evaluate("!document.getElementById('poster').hidden")
 
 
@@ -231,14 +176,13 @@ def test_a_hostile_file_ends_in_a_message(tmp_path: Path) -> None:
 def test_a_view_of_too_many_primitives_is_not_drawn(drawn: str, tmp_path: Path) -> None:
     packed = write_bomb(tmp_path / "a.sundae")
     write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    flags = browser.WEBGPU if drawn == "webgpu" else ["--disable-features=WebGPU"]
+    flags = browser.WEBGPU if drawn == "webgpu" else WEBGL
     with opened((tmp_path / "a.html").as_uri(), flags=flags, size=(640, 480)) as page:
         assert page.evaluate("sundae.drawn") == drawn
-        said = "document.getElementById('message').innerText"
-        assert "20,000 primitives cover each of its pixels" in page.evaluate(said)
+        assert "20,000 primitives cover each of its pixels" in page.evaluate(SAID)
         assert image(page, 1, True).min() == 1
         page.evaluate("document.getElementById('after').click()")
-        browser.wait_for(lambda: "primitives cover" not in page.evaluate(said), "another message", SECONDS)
+        browser.wait_for(lambda: "primitives cover" not in page.evaluate(SAID), "another message", SECONDS)
 
 
 @pytest.mark.browser
@@ -254,25 +198,3 @@ def test_a_folder_is_served_and_says_so_when_opened_from_disk(tmp_path: Path) ->
         page.open((tmp_path / "site" / "index.html").as_uri())
         browser.wait_for(lambda: bool(page.evaluate("window.sundae?.state === 'failed'")), "the message", SECONDS)
         assert "serve this folder" in page.evaluate("sundae.message")
-
-
-@pytest.mark.browser
-def test_without_webgpu_the_page_shows_base_colours(tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    with opened((tmp_path / "a.html").as_uri(), flags=["--disable-features=WebGPU"]) as page:
-        assert page.evaluate("sundae.drawn") == "webgl"
-        assert "without the compensation head" in page.evaluate("document.getElementById('message').innerText")
-        # Quads have no tiles, and their sums are rounded to bytes; the worst is 50.0.
-        for camera, truth in enumerate(truths(read_scene(packed))):
-            assert psnr(image(page, camera, False), truth["base_rgb"]) > 47
-
-
-@pytest.mark.browser
-def test_without_webgl_the_page_shows_an_image(tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    flags = ["--disable-features=WebGPU", "--disable-3d-apis"]
-    with opened((tmp_path / "a.html").as_uri(), state="failed", flags=flags) as page:
-        assert "neither WebGPU nor WebGL2" in page.evaluate("document.getElementById('message').innerText")
-        assert page.evaluate("[poster.hidden, poster.naturalWidth, poster.naturalHeight]") == [False, 50, 37]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -26,3 +27,7 @@ bench_viewers = _script("bench_viewers")  # imports both
 CHROMIUM = browser.find_chromium()
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (apt-get install chromium)")
 needs_packages = pytest.mark.skipif(not bench_page.has_packages(), reason="web/tests has no packages (make browser)")
+needs_node = pytest.mark.skipif(
+    shutil.which("node") is None or not (bench_page.WEB / "node_modules").is_dir(),
+    reason="the page's build tools are not installed (make web)",
+)

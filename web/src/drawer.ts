@@ -20,8 +20,15 @@ export interface Drawer {
   /** The largest factor, at most 1, by which an image has to shrink to be rendered. */
   limit(width: number, height: number): number;
 
-  /** Renders a view on the canvas, which has its size; the image is whole when the promise ends. */
-  render(view: View, head: boolean): Promise<Times>;
+  /**
+   * Renders a view on the canvas, which has its size; the image is whole when the promise ends.
+   *
+   * @param share - of the head's correction in the image, from 0 to 1
+   */
+  render(view: View, head: boolean, share: number): Promise<Times>;
+
+  /** Shows the last image again, with another share of the head's correction. */
+  fade(share: number): Promise<void>;
 
   /** Renders a view and returns its pixels, RGBA in bytes. */
   image(view: View, head: boolean): Promise<Uint8ClampedArray<ArrayBuffer>>;

@@ -31,6 +31,7 @@ class Frame {
     readonly head: Plan | null,
   ) {
     this.sizes = uniform(device, 32);
+    this.sizes.label = "image";
     this.texture = device.createTexture({
       size: [base.width, base.height],
       format: "rgba8unorm",
@@ -60,6 +61,8 @@ export class Renderer implements Drawer {
   private readonly queries: GPUQuerySet | null;
   private frame: Frame | null = null;
   private frameKey = "";
+  /** Weight of the whole correction in the last image; 0 if the head did not run. */
+  private weight = 0;
   private times: Times = { splat: Number.NaN, head: Number.NaN, withoutHead: false, crowded: 0 };
 
   constructor(
@@ -100,19 +103,29 @@ export class Renderer implements Drawer {
     return Math.min(1, LONGEST / Math.max(width, height), Math.sqrt(pixels / (width * height)));
   }
 
-  render(view: View, head: boolean): Promise<Times> {
-    return this.whole(view, head, true);
+  render(view: View, head: boolean, share: number): Promise<Times> {
+    return this.whole(view, head, true, share);
+  }
+
+  async fade(share: number): Promise<void> {
+    const { device, frame } = this;
+    if (frame === null) return;
+    const encoder = device.createCommandEncoder();
+    this.encodeImage(encoder, frame, share);
+    this.show(encoder, frame);
+    device.queue.submit([encoder.finish()]);
+    await device.queue.onSubmittedWorkDone();
   }
 
   /** Draws a view, and again with longer lists of tiles if it needs them. */
-  private async whole(view: View, head: boolean, shown: boolean): Promise<Times> {
-    let wanted = await this.draw(view, head, shown);
+  private async whole(view: View, head: boolean, shown: boolean, share = 1): Promise<Times> {
+    let wanted = await this.draw(view, head, shown, true, share);
     let grown = false;
     while (!this.crowded(wanted) && this.splatter.grow(Math.max(...wanted))) {
       grown = true;
       wanted = await this.measure(view, head);
     }
-    if (grown) await this.draw(view, head, shown);
+    if (grown) await this.draw(view, head, shown, true, share);
     this.times.crowded = this.crowded(wanted);
     return this.times;
   }
@@ -161,8 +174,9 @@ export class Renderer implements Drawer {
    * Draws one frame; returns how many pairs of tiles and primitives the image and what the head sees wanted.
    *
    * @param complete - whether the head runs; otherwise only its image is splatted
+   * @param share - of the correction in the image
    */
-  private async draw(view: View, head: boolean, shown: boolean, complete = true): Promise<number[]> {
+  private async draw(view: View, head: boolean, shown: boolean, complete = true, share = 1): Promise<number[]> {
     const { device } = this;
     const plan = scalePlan(view, this.scene.trainedFocal);
     const seen = zoomed(view, plan.zoom);
@@ -170,11 +184,7 @@ export class Renderer implements Drawer {
     const corrected = asked && this.network!.fits(seen.width, seen.height) && this.limit(seen.width, seen.height) === 1;
     this.times = { splat: Number.NaN, head: Number.NaN, withoutHead: asked && !corrected, crowded: 0 };
     const frame = this.frameFor(view, corrected ? seen : null);
-    const data = new ArrayBuffer(32);
-    const correction = frame.seen ?? frame.base;
-    new Uint32Array(data).set([view.width, view.height, correction.width, correction.height]);
-    new Float32Array(data, 16).set([...this.scene.background, corrected ? plan.weight : 0]);
-    device.queue.writeBuffer(frame.sizes, 0, data);
+    this.weight = corrected ? plan.weight : 0;
 
     const encoder = device.createCommandEncoder();
     this.splatter.encode(encoder, view, frame.base, this.timed(0));
@@ -185,13 +195,24 @@ export class Renderer implements Drawer {
       this.splatter.copyWanted(encoder, this.results, 260);
     }
     if (complete) frame.head?.encode(encoder, this.timed(2));
-    const pass = encoder.beginComputePass();
-    const bindings = { 0: frame.sizes, 1: frame.base.pixels, 2: frame.head?.correction ?? this.none };
-    const composing = new Step(device, this.compose, { ...bindings, 3: frame.texture.createView() });
-    composing.run(pass, blocksOf(view.width, SIDE), blocksOf(view.height, SIDE));
-    pass.end();
+    this.encodeImage(encoder, frame, share);
     if (shown) this.show(encoder, frame);
     return this.finish(encoder, corrected && complete);
+  }
+
+  /** Composes the image of a frame from its colours and a share of its correction. */
+  private encodeImage(encoder: GPUCommandEncoder, frame: Frame, share: number): void {
+    const { base } = frame;
+    const correction = frame.seen ?? base;
+    const data = new ArrayBuffer(32);
+    new Uint32Array(data).set([base.width, base.height, correction.width, correction.height]);
+    new Float32Array(data, 16).set([...this.scene.background, share * this.weight]);
+    this.device.queue.writeBuffer(frame.sizes, 0, data);
+    const pass = encoder.beginComputePass();
+    const bindings = { 0: frame.sizes, 1: base.pixels, 2: frame.head?.correction ?? this.none };
+    const composing = new Step(this.device, this.compose, { ...bindings, 3: frame.texture.createView() });
+    composing.run(pass, blocksOf(base.width, SIDE), blocksOf(base.height, SIDE));
+    pass.end();
   }
 
   private timed(first: number): GPUComputePassTimestampWrites | undefined {

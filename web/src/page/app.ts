@@ -1,58 +1,43 @@
-// The page: loads the scene, draws it when something changes, and connects the controls.
+// The page: loads the scene, opens what draws it, and tells how it goes.
 
 import { decode } from "../decoding";
-import type { Drawer, Times } from "../drawer";
-import { openGpu } from "../gpu/device";
-import { Renderer } from "../gpu/renderer";
+import type { Times } from "../drawer";
 import { PackError } from "../scene/container";
 import type { Scene } from "../scene/scene";
 import { viewOf, zoomed } from "../view";
-import { openPainter } from "../webgl/painter";
+import { connect, type Elements, element, elements, write } from "./controls";
+import { type Frame, Loop } from "./loop";
 import { Navigation } from "./navigation";
+import { Stage } from "./stage";
 
 /** What scripts, and the tests of this repository, may ask of the page. */
 export type Handle = {
   state: "loading" | "ready" | "failed";
-  /** The error message, if any. */
+  /** The error message, if any, or why only base colours are shown. */
   message: string;
   /** What draws: webgpu, webgl or image. */
   drawn: string;
+  /** Whether the image on show is the final one: the camera rests, and the head has faded in. */
+  readonly still: boolean;
   /** Milliseconds from the start of the page to the first image. */
   firstImage: number;
+  /** Of the last image. */
   times: Times | null;
-  /** Frames drawn so far. */
+  /** Images drawn so far, without those of a fade. */
   frames: number;
   cameras: number;
   /** Pixels of one camera of the capture, RGBA in bytes. */
   image: (camera: number, head: boolean, scale?: number) => Promise<{ width: number; height: number; pixels: string }>;
 };
 
+/** Images with a moving camera over which the frame rate is a mean. */
 const FRAMES = 10;
-
-const element = <T extends HTMLElement>(id: string): T => {
-  const found = document.getElementById(id);
-  if (found === null) throw new Error(`the page has no ${id}`);
-  return found as T;
-};
-
-const controls = () => ({
-  canvas: element<HTMLCanvasElement>("canvas"),
-  poster: element<HTMLImageElement>("poster"),
-  panel: element("panel"),
-  message: element("message"),
-  head: element<HTMLInputElement>("head"),
-  headLabel: element("head-label"),
-  fly: element<HTMLInputElement>("fly"),
-  scale: element<HTMLInputElement>("scale"),
-  scaleValue: element<HTMLOutputElement>("scale-value"),
-  before: element<HTMLButtonElement>("before"),
-  after: element<HTMLButtonElement>("after"),
-  stop: element<HTMLOutputElement>("stop"),
-  stats: element("stats"),
-});
+/** Shares of the loading time: a file beside the page, then decoding, then what the GPU prepares. */
+const LOADED = 0.3;
+const DECODED = 0.9;
 
 /** The bytes of the scene: in the page itself, or in a file beside it. */
-async function sceneFile(): Promise<Uint8Array<ArrayBuffer>> {
+async function sceneFile(onProgress: (share: number) => void): Promise<Uint8Array<ArrayBuffer>> {
   const place = element<HTMLScriptElement>("scene");
   const source = place.dataset.source;
   if (!source) {
@@ -67,15 +52,25 @@ async function sceneFile(): Promise<Uint8Array<ArrayBuffer>> {
     throw new PackError(`${source} cannot be loaded; ${advice}.`);
   });
   if (!answer.ok) throw new PackError(`${source} cannot be loaded (${answer.status}); put it beside this page.`);
-  return new Uint8Array(await answer.arrayBuffer());
+  const length = Number(answer.headers.get("content-length"));
+  const chunks: Uint8Array<ArrayBuffer>[] = [];
+  let loaded = 0;
+  const reader = answer.body!.getReader();
+  for (let part = await reader.read(); !part.done; part = await reader.read()) {
+    chunks.push(part.value);
+    loaded += part.value.length;
+    if (length) onProgress(Math.min(loaded / length, 1));
+  }
+  return new Uint8Array(await new Blob(chunks).arrayBuffer());
 }
 
 export async function start(program: string): Promise<void> {
-  const page = controls();
+  const page = elements();
   const handle: Handle = {
     state: "loading",
     message: "",
     drawn: "image",
+    still: false,
     firstImage: Number.NaN,
     times: null,
     frames: 0,
@@ -83,20 +78,26 @@ export async function start(program: string): Promise<void> {
     image: () => Promise.reject(new Error("the scene is not ready")),
   };
   Object.assign(window, { sundae: handle });
-  // The first message stays: later ones follow from it.
-  const say = (text: string): void => {
-    handle.message ||= text;
-    page.message.textContent = handle.message;
-    page.message.hidden = false;
+  // The first error stays: later ones follow from it. The image of the file comes back.
+  const fail = (error: unknown): void => {
+    if (handle.state === "failed") return;
+    handle.state = "failed";
+    handle.drawn = "image";
+    handle.message = error instanceof PackError ? error.message : `The page failed (${error}).`;
+    page.said.textContent = handle.message;
+    page.message.hidden = page.poster.hidden = false;
+    page.stage.hidden = page.panel.hidden = page.progress.hidden = true;
+  };
+  const progress = (from: number, to: number) => (share: number) => {
+    page.progress.value = from + share * (to - from);
   };
   try {
-    const scene = await decode(await sceneFile(), program);
-    const drawer = await openDrawer(scene, page.canvas, handle, say);
-    await show(drawer, scene, page, handle, say);
+    const file = await sceneFile(progress(0, LOADED));
+    const scene = await decode(file, program, progress(LOADED, DECODED));
+    await show(scene, page, handle, fail);
     handle.state = "ready";
   } catch (error) {
-    say(error instanceof PackError ? error.message : `The page failed (${error}).`);
-    handle.state = "failed";
+    fail(error);
   }
 }
 
@@ -104,110 +105,56 @@ const tooMany = (crowded: number): string =>
   `This view is not drawn: ${Math.round(crowded).toLocaleString("en")} primitives cover each of its pixels, ` +
   "too many for this page or for this GPU.";
 
-/** WebGPU with the head, or base colours by WebGL2. */
-async function openDrawer(
-  scene: Scene,
-  canvas: HTMLCanvasElement,
-  handle: Handle,
-  say: (text: string) => void,
-): Promise<Drawer> {
-  const gpu = await openGpu();
-  if (gpu !== null) {
-    handle.drawn = "webgpu";
-    gpu.device.lost.then(({ message }) => say(`The browser lost the GPU (${message}); reload the page.`));
-    gpu.device.addEventListener("uncapturederror", (event) => say(`The GPU failed (${event.error.message}).`));
-    return new Renderer(gpu, scene, canvas);
-  }
-  const painter = openPainter(scene, canvas);
-  if (painter === null) throw new PackError("This browser has neither WebGPU nor WebGL2, so the page shows one image.");
-  handle.drawn = "webgl";
-  say(`This browser has no WebGPU: base colours${scene.head ? ", without the compensation head" : ""}.`);
-  return painter;
-}
-
-async function show(
-  renderer: Drawer,
-  scene: Scene,
-  page: ReturnType<typeof controls>,
-  handle: Handle,
-  say: (text: string) => void,
-): Promise<void> {
-  let dirty = true;
-  const mark = (): void => {
-    dirty = true;
-  };
-  const navigation = new Navigation(scene, page.canvas, mark);
-  const { stops } = navigation;
-  page.headLabel.hidden = !renderer.hasHead;
-  page.head.addEventListener("change", mark);
-  page.scale.addEventListener("input", mark);
-  page.fly.addEventListener("change", () => {
-    navigation.fly = page.fly.checked;
-  });
-  let visited = 0;
-  const visit = (index: number): void => {
-    visited = (index + stops.length) % stops.length;
-    navigation.visit(visited);
-  };
-  page.before.addEventListener("click", () => visit(visited - 1));
-  page.after.addEventListener("click", () => visit(visited + 1));
-  new ResizeObserver(mark).observe(page.canvas);
-
-  const moments: number[] = [];
-  let last = 0;
-  const draw = async (): Promise<void> => {
-    const { canvas } = page;
-    const [across, down] = [canvas.clientWidth * devicePixelRatio, canvas.clientHeight * devicePixelRatio];
-    const scale = (Number(page.scale.value) / 100) * renderer.limit(across, down);
-    const [width, height] = [across, down].map((length) => Math.max(Math.round(length * scale), 1)) as [number, number];
-    // Even the same size would clear the canvas. The browser enlarges a smaller one.
-    if (canvas.width !== width) canvas.width = width;
-    if (canvas.height !== height) canvas.height = height;
-    const started = performance.now();
-    handle.times = await renderer.render(navigation.view(width, height), page.head.checked);
-    const ended = performance.now();
-    moments.push(ended - Math.max(started, last));
-    last = ended;
-    if (moments.length > FRAMES) moments.shift();
-    const fps = (1000 * moments.length) / moments.reduce((sum, value) => sum + value, 0);
-    const { splat, head, withoutHead, crowded } = handle.times;
-    const passes = Number.isNaN(splat) ? "" : ` · splat ${splat.toFixed(1)} ms · head ${head.toFixed(1)} ms`;
-    const reason = withoutHead ? " · the view is too large for the head on this GPU" : "";
-    page.stats.textContent = `${fps.toFixed(fps < 10 ? 1 : 0)} fps${passes}${reason}`;
-    page.message.textContent = crowded ? tooMany(crowded) : handle.message;
-    page.message.hidden = !page.message.textContent;
-    page.scaleValue.textContent = `${page.scale.value}%`;
-    handle.frames += 1;
-    page.stop.textContent = navigation.stop === null ? "free" : `${navigation.stop + 1} of ${stops.length}`;
-  };
-
-  await draw();
+/** Shows the scene, until `fail` is called. */
+async function show(scene: Scene, page: Elements, handle: Handle, fail: (error: unknown) => void): Promise<void> {
+  const stage = new Stage(scene, page.stage, () => loop.mark());
+  const navigation = new Navigation(scene, page.stage);
+  const wanted = () => ({ scale: Number(page.scale.value) / 100, head: page.head.checked });
+  const told = follow(page, handle, stage, navigation);
+  const loop: Loop = new Loop(stage, navigation, page.stage, wanted, told);
+  navigation.onChange = () => loop.moved();
+  navigation.follow(location.hash);
+  Object.defineProperty(handle, "still", { get: () => loop.still });
+  await stage.open();
+  await loop.run(fail);
   handle.firstImage = performance.now();
   handle.cameras = scene.cameras.length;
+  handle.image = async (camera, head, scale = 1) => {
+    const { pixels, ...size } = await loop.image(zoomed(viewOf(navigation.stops[camera]!), scale), head);
+    let text = "";
+    for (let i = 0; i < pixels.length; i += 2 ** 14) text += String.fromCharCode(...pixels.subarray(i, i + 2 ** 14));
+    return { ...size, pixels: btoa(text) };
+  };
+  connect(page, navigation, loop);
   page.panel.hidden = false;
-  page.poster.hidden = true;
+  page.poster.hidden = page.progress.hidden = true;
+}
 
-  // One frame at a time: frames and the images of the handle share the buffers of the renderer.
-  let busy: Promise<unknown> = Promise.resolve();
-  handle.image = (camera, head, scale = 1) => {
-    const view = zoomed(viewOf(stops[camera]!), scale);
-    const image = busy.then(() => renderer.image(view, head));
-    busy = image.catch(() => undefined);
-    return image.then((pixels) => {
-      let text = "";
-      for (let i = 0; i < pixels.length; i += 2 ** 14) text += String.fromCharCode(...pixels.subarray(i, i + 2 ** 14));
-      return { width: view.width, height: view.height, pixels: btoa(text) };
-    });
-  };
-  const loop = (now: number): void => {
-    if (navigation.move(now)) dirty = true;
-    if (!dirty) {
-      requestAnimationFrame(loop);
-      return;
+/** What tells of each image: the handle, the message and the panel. */
+function follow(page: Elements, handle: Handle, stage: Stage, navigation: Navigation): (frame: Frame) => void {
+  const spans: number[] = [];
+  return ({ times, spent, moving }) => {
+    // The first image also compiles shaders.
+    if (moving && handle.frames > 0) spans.push(spent);
+    if (spans.length > FRAMES) spans.shift();
+    const fps = (1000 * spans.length) / spans.reduce((sum, value) => sum + value, 0);
+    const { splat, head, withoutHead, crowded } = times;
+    const passes = Number.isNaN(splat)
+      ? []
+      : [`splat ${splat.toFixed(1)} ms`, head ? `head ${head.toFixed(1)} ms` : ""];
+    const reason = withoutHead ? "the view is too large for the head on this GPU" : "";
+    const rate = spans.length ? `${fps.toFixed(fps < 10 ? 1 : 0)} fps` : "";
+    const parts = [rate, ...passes, reason];
+    write(page.stats, parts.filter(Boolean).join(" · "));
+    Object.assign(handle, { times, drawn: stage.drawn, message: stage.notice, frames: handle.frames + 1 });
+    const said = crowded ? tooMany(crowded) : stage.notice;
+    // A message that was closed stays closed.
+    if (said !== page.said.textContent) {
+      page.said.textContent = said;
+      page.message.hidden = !said;
     }
-    dirty = false;
-    busy = busy.then(draw).catch((error) => say(`The page failed (${error}).`));
-    busy.then(() => requestAnimationFrame(loop));
+    page.headLabel.hidden = !stage.hasHead;
+    write(page.scaleValue, `${page.scale.value}%`);
+    write(page.stop, navigation.stop === null ? "free" : `${navigation.stop + 1} of ${navigation.stops.length}`);
   };
-  requestAnimationFrame(loop);
 }

@@ -4,6 +4,7 @@ import { Matrix4, PerspectiveCamera, Vector3 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { Camera, Scene } from "../scene/scene";
 import { type View, viewOf } from "../view";
+import { linked, linkTo } from "./link";
 
 /** Keys that move the camera, by its own axes: right, up, backwards. */
 const MOVES: Record<string, [number, number, number]> = {
@@ -14,10 +15,19 @@ const MOVES: Record<string, [number, number, number]> = {
   KeyW: [0, 0, -1],
   KeyS: [0, 0, 1],
 };
+/** Keys that turn the camera: around the scene, or in fly mode in place; left and up. */
+const TURNS: Record<string, [number, number]> = {
+  ArrowLeft: [1, 0],
+  ArrowRight: [-1, 0],
+  ArrowUp: [0, 1],
+  ArrowDown: [0, -1],
+};
 /** In fly mode the camera turns around a point this near, in units of the distance to the middle of the scene. */
 const NEAR_TARGET = 1e-3;
 /** Share of the distance to the middle of the scene that a key moves in a second. */
 const SPEED = 0.5;
+/** Angle that a key turns in a second, radian. */
+const TURN_SPEED = 1;
 const DEFAULT_FOV = 50;
 
 const median = (values: number[]): number => values.sort((a, b) => a - b)[values.length >> 1] ?? 0;
@@ -49,26 +59,24 @@ export class Navigation {
   readonly stops: Camera[];
   /** Index of the stop that is shown; null once the camera has moved. */
   stop: number | null = null;
+  /** Index of the last stop, whose lens is used. */
+  visited = 0;
   private readonly camera = new PerspectiveCamera(DEFAULT_FOV, 1, 1e-3, 1e6);
   private readonly controls: OrbitControls;
   private readonly middle: Vector3;
   private readonly pressed = new Set<string>();
   private flying = false;
   private lastMove = 0;
-  private lens: Camera;
+
+  /** Called when the camera has moved. */
+  onChange = (): void => {};
 
   /**
    * @param element - takes mouse and touch
-   * @param onChange - called when the camera has moved
    */
-  constructor(
-    scene: Scene,
-    element: HTMLElement,
-    private readonly onChange: () => void,
-  ) {
+  constructor(scene: Scene, element: HTMLElement) {
     this.middle = middleOf(scene);
     this.stops = scene.cameras.length ? scene.cameras : [outside(scene, this.middle)];
-    this.lens = this.stops[0]!;
     this.camera.up.copy(this.up());
     this.controls = new OrbitControls(this.camera, element);
     this.controls.addEventListener("change", () => this.onChange());
@@ -77,6 +85,10 @@ export class Navigation {
     window.addEventListener("keyup", (event) => this.pressed.delete(event.code));
     window.addEventListener("blur", () => this.pressed.clear());
     this.visit(0);
+  }
+
+  private get lens(): Camera {
+    return this.stops[this.visited]!;
   }
 
   /** The mean of the upward directions of the stops. */
@@ -91,10 +103,32 @@ export class Navigation {
     const stop = this.stops[index]!;
     const matrix = new Matrix4().fromArray([...stop.pose, 0, 0, 0, 1]).transpose(); // rows to columns
     matrix.decompose(this.camera.position, this.camera.quaternion, new Vector3());
-    this.lens = stop;
-    this.stop = index;
+    this.visited = this.stop = index;
     this.aim();
-    this.stop = index;
+    this.onChange();
+  }
+
+  /** The part of an address that names what the camera sees. */
+  link(): string {
+    const { position } = this.camera;
+    const ahead = this.controls.target.clone().sub(position);
+    return linkTo(this.stop, { position: position.toArray(), ahead: ahead.toArray(), lens: this.visited });
+  }
+
+  /** Goes to the view that a part of an address names; stays where it names none. */
+  follow(hash: string): void {
+    const found = linked(hash, this.stops.length);
+    if (found === null) return;
+    if (typeof found === "number") {
+      this.visit(found);
+      return;
+    }
+    this.visited = found.lens;
+    this.stop = null;
+    this.camera.position.fromArray(found.position);
+    this.controls.target.fromArray(found.ahead).add(this.camera.position);
+    this.controls.update();
+    this.aim();
     this.onChange();
   }
 
@@ -130,7 +164,9 @@ export class Navigation {
   }
 
   private press(event: KeyboardEvent): void {
-    if (!(event.code in MOVES) || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!(event.code in MOVES || event.code in TURNS) || event.ctrlKey || event.metaKey || event.altKey) return;
+    // Arrows also move the slider.
+    if (event.target instanceof HTMLInputElement && event.target.type === "range") return;
     this.pressed.add(event.code);
     this.lastMove = performance.now();
     this.leave();
@@ -143,7 +179,13 @@ export class Navigation {
     this.lastMove = now;
     if (this.pressed.size === 0) return false;
     const step = new Vector3();
-    for (const code of this.pressed) step.add(new Vector3(...MOVES[code]!));
+    for (const code of this.pressed) {
+      step.add(new Vector3(...(MOVES[code] ?? [0, 0, 0])));
+      const [left, up] = TURNS[code] ?? [0, 0];
+      const angle = (this.flying ? -TURN_SPEED : TURN_SPEED) * seconds;
+      if (left) this.controls.rotateLeft(left * angle);
+      if (up) this.controls.rotateUp(up * angle);
+    }
     step.applyQuaternion(this.camera.quaternion).multiplyScalar(SPEED * this.distance * seconds);
     this.camera.position.add(step);
     this.controls.target.add(step);

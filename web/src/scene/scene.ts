@@ -47,8 +47,11 @@ const BACKGROUNDS: Record<string, [number, number, number]> = {
   white: [1, 1, 1],
 };
 
+/** What is told of the share of a field that is decoded. */
+type OnProgress = (share: number) => void;
+
 /** Reads a packed scene, with memory bounded by its size; throws a PackError that says what is wrong. */
-export async function readScene(file: Uint8Array<ArrayBuffer>): Promise<Scene> {
+export async function readScene(file: Uint8Array<ArrayBuffer>, onProgress: OnProgress = () => {}): Promise<Scene> {
   const header = await readHeader(file);
   const wrong = violation(header.meta, "header") ?? violation(header.meta.model, "model", "model");
   if (wrong !== null) throw damaged(`its header has no valid ${wrong}`);
@@ -59,7 +62,7 @@ export async function readScene(file: Uint8Array<ArrayBuffer>): Promise<Scene> {
   const reader = new Reader(header, file.length, await readAll(file, header));
   const degree = Math.sqrt(shape.rest / 3 + 1) - 1;
   if (degree > stated.sh_degree) throw reader.refuse("its header states a lower SH degree than it has");
-  const field = readField(reader, shape);
+  const field = readField(reader, shape, onProgress);
   const head = readHead(reader, stated.head ?? null);
   if ((head?.kind.features ?? 0) !== shape.features) {
     throw reader.refuse("its header states another number of features than it has");
@@ -92,14 +95,20 @@ type Stated = {
   };
 };
 
-function readField(reader: Reader, { count, rest, features }: Shape): Field {
+function readField(reader: Reader, { count, rest, features }: Shape, onProgress: OnProgress): Field {
   const none = new Float32Array(0);
   const { bits, block } = reader.about("means");
   const blocks = Math.ceil(count / block);
   const [low, high] = ["low", "high"].map((end) => reader.array("means", end, { blocks }) as Float32Array);
   const cells = cellsOf(gaps(reader.array("means", "gaps") as Uint8Array, count, block, bits));
   const near = neighboursOf(cells, block);
-  const rows = (name: string, width: number): Float32Array => (width ? readRows(reader, name, near, width) : none);
+  // Positions and rotations come first, six columns.
+  let columns = 6;
+  const rows = (name: string, width: number): Float32Array => {
+    onProgress(columns / (13 + rest + features));
+    columns += width;
+    return width ? readRows(reader, name, near, width) : none;
+  };
   return {
     count,
     means: positions(cells, low!, high!, bits, block),

@@ -1,4 +1,4 @@
-// Base colours where there is no WebGPU: quads sorted by depth on the CPU, blended by WebGL2.
+// Base colours where there is no WebGPU, or no more: quads sorted by depth on the CPU, blended by WebGL2.
 
 import { coefficientsOf, geometryOf } from "../arrays";
 import type { Drawer, Times } from "../drawer";
@@ -64,7 +64,7 @@ class Painter implements Drawer {
     }
     gl.linkProgram(this.program);
     if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) {
-      throw new PackError("This browser has no WebGPU, and its WebGL cannot draw the scene.");
+      throw new PackError("This browser's WebGL2 cannot draw the scene, so the page shows one image.");
     }
     gl.useProgram(this.program);
     this.geometry = geometryOf(scene);
@@ -98,7 +98,7 @@ class Painter implements Drawer {
     const { gl } = this;
     const rows = Math.ceil(values.length / 4 / ROW);
     if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
-      throw new PackError("This browser has no WebGPU, and the scene is too large for its WebGL.");
+      throw new PackError("The scene is too large for this browser's WebGL2, so the page shows one image.");
     }
     const padded = new Float32Array(rows * ROW * 4);
     padded.set(values);
@@ -186,19 +186,37 @@ class Painter implements Drawer {
     return true;
   }
 
-  async render(view: View): Promise<Times> {
-    return { splat: Number.NaN, head: Number.NaN, withoutHead: false, crowded: this.draw(view) };
+  /** A lost context ignores all calls, so it has to be asked. */
+  private drawn(view: View): number {
+    const crowded = this.draw(view);
+    if (this.gl.isContextLost()) throw new Error("the WebGL context is lost");
+    return crowded;
   }
+
+  async render(view: View): Promise<Times> {
+    const { gl } = this;
+    const crowded = this.drawn(view);
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0)!;
+    gl.flush();
+    // A fence changes only between tasks.
+    do await new Promise((resolve) => setTimeout(resolve));
+    while (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED);
+    gl.deleteSync(fence);
+    return { splat: Number.NaN, head: Number.NaN, withoutHead: false, crowded };
+  }
+
+  async fade(): Promise<void> {}
 
   async image(view: View): Promise<Uint8ClampedArray<ArrayBuffer>> {
     const { gl } = this;
     const { canvas } = gl;
     const { width, height } = canvas;
-    Object.assign(canvas, { width: view.width, height: view.height });
-    this.draw(view);
+    const size = { width: view.width, height: view.height };
+    if (width !== size.width || height !== size.height) Object.assign(canvas, size);
+    this.drawn(view);
     const rows = new Uint8Array(4 * view.width * view.height);
     gl.readPixels(0, 0, view.width, view.height, gl.RGBA, gl.UNSIGNED_BYTE, rows);
-    Object.assign(canvas, { width, height });
+    if (width !== size.width || height !== size.height) Object.assign(canvas, { width, height });
     // WebGL begins with the lowest row.
     const out = new Uint8ClampedArray(rows.length);
     const row = 4 * view.width;
