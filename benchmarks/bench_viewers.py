@@ -4,10 +4,10 @@
     python benchmarks/bench_viewers.py scene.sundae --kind spz --central
     python benchmarks/bench_viewers.py scene.sundae --kind glb --central    # by three.js's own loader
 
-The viewers are Spark, GaussianSplats3D and, for a .glb, three.js, in a Chromium that renders in software; ``make browser`` installs them. Six
-cameras, a black background, base colours. Each setting of a viewer adds to the one before. ``--central`` keeps the
-primitives whose centres lie in all six images: beside the image the viewers project and drop primitives differently.
-Lines belong in results/viewers.jsonl.
+The viewers are Spark, GaussianSplats3D and, for a .glb, three.js, in a Chromium that renders in software; ``make
+browser`` installs them. Six cameras, a black background, base colours. Each setting of a viewer adds to the one before.
+``--central`` keeps the primitives whose centres lie in all six images: beside the image the viewers project and drop
+primitives differently. Lines belong in results/viewers.jsonl.
 """
 
 from __future__ import annotations
