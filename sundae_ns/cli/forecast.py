@@ -45,12 +45,12 @@ def measured_step(method: str, width: int, height: int) -> Forecast | None:
 def trained_size(photos: Path) -> tuple[int, int] | None:
     """Width and height in pixels of the training images of a capture or of photos; None if they are not known."""
     from sundae_ns.data.capture import check_image, read_json
-    from sundae_ns.data.layouts import LONGEST_SIDE, colmap_layout
+    from sundae_ns.data.layouts import LONGEST_SIDE, posed_layout
     from sundae_ns.data.lenses import size_of_first_image
     from sundae_ns.data.photos import find_photos
 
     try:
-        layout = colmap_layout(photos)
+        layout = posed_layout(photos)
         if layout is not None:
             width, height = layout.size
             return width // layout.downscale, height // layout.downscale

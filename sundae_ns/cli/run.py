@@ -19,7 +19,7 @@ from sundae_ns.cli.outputs import check_folder
 from sundae_ns.cli.poses import Matching, Poses
 from sundae_ns.cli.process import quoted, run_in_group, word
 from sundae_ns.cli.results import is_evaluation, is_packed, is_page, is_report
-from sundae_ns.cli.train import command
+from sundae_ns.cli.train import check, command
 from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 
 SETTINGS = "run.json"
@@ -279,7 +279,7 @@ def run(
         masks: folder with a mask for each photo, under its name; training leaves out what is black.
     """
     _check_input(photos)
-    command(photos, out, method, keep, steps)  # refuses numbers out of range before the first step
+    check(photos, method, keep, steps)
     project = Project(photos, out, method, keep, steps, matching, quality, max_mb, masks)
     project.check()
     if project.poses is not None and not project.poses.found:
@@ -317,15 +317,15 @@ def run(
 def _check_input(photos: Path) -> None:
     """Raise ``DataError`` for a path that is neither a capture nor a folder that may hold photos."""
     from sundae_ns.data.advice import no_transforms
-    from sundae_ns.data.layouts import colmap_layout, is_model, is_posed
+    from sundae_ns.data.layouts import ColmapLayout, is_model, is_posed, posed_layout
 
     if not photos.exists():
         raise DataError(f"{photos} does not exist; give a folder of photos, or a capture")
     if is_posed(photos):
-        layout = colmap_layout(photos)
+        layout = posed_layout(photos)
         if layout is not None:
-            print(f"# capture in COLMAP layout: {layout}", flush=True)
+            kind = "COLMAP" if isinstance(layout, ColmapLayout) else "Blender"
+            print(f"# capture in {kind} layout: {layout}", flush=True)
         return
-    blender = (photos / "transforms_train.json").is_file()
-    if photos.is_file() or (photos / "sparse").is_dir() or blender or is_model(photos):
+    if photos.is_file() or (photos / "sparse").is_dir() or is_model(photos):
         raise no_transforms(photos)  # says how to use a video, or a capture in another layout

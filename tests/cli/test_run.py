@@ -294,6 +294,20 @@ def test_a_capture_in_colmap_layout_needs_no_poses(
     assert "--load-dir" in commands.ran[1]
 
 
+def test_a_capture_of_blender_needs_no_poses(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree("photos", "lego/train")
+    for path in Path("lego/train").iterdir():
+        path.rename(path.with_suffix(".png"))
+    for split in ("train", "val", "test"):
+        frames = [{"file_path": f"./train/{index}"} for index in range(PHOTOS)]
+        Path(f"lego/transforms_{split}.json").write_text(json.dumps({"frames": frames}))
+    assert run("lego", "-o", "out") == 0
+    assert commands.names == STEPS[1:]
+    assert capsys.readouterr().out.startswith("# capture in Blender layout: 8 training images, over white\n")
+    assert commands.ran[0][-1] == "blender-data"
+    assert commands.asked[0][1:] == (16, 12), "the forecast knows the size of its images"
+
+
 @pytest.mark.parametrize("missing", ["colmap", "ffmpeg"])
 def test_a_missing_program_is_named(
     commands: Commands, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str
@@ -348,7 +362,7 @@ def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.Captur
         (["model", "-o", "out"], "model/sparse/0: cameras.bin ends early"),
         (["model/sparse/0", "-o", "out"], "is a COLMAP model without its images"),
         (["undistorted", "-o", "out"], "undistorted has no image 0.png, which its model dense/sparse states"),
-        (["blender", "-o", "out"], "add `blender-data` to ns-train"),
+        (["blender", "-o", "out"], "blender/transforms_train.json is not JSON"),
         (["photos", "-o", "photos/out"], "lies in photos"),
         (["photos", "-o", "."], "holds what the command reads"),
         (["photos", "-o", "used"], "holds files"),
