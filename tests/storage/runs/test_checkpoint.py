@@ -13,9 +13,9 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.gaussians.mending import mend
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, sh_to_rgb
-from sundae_ns.storage import MODEL_FRAME, primitives, write_ply
+from sundae_ns.gaussians import mending
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, sh_to_rgb
+from sundae_ns.storage import MODEL_FRAME, write_ply
 from sundae_ns.storage.runs import checkpoint
 
 
@@ -198,9 +198,9 @@ def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(
 
     def count(params: Any) -> Any:
         mended.append(len(params["means"]))
-        return mend(params)
+        return finite_mask(params)
 
-    monkeypatch.setattr(primitives, "mend", count)
+    monkeypatch.setattr(mending, "finite_mask", count)
     stored = stock_checkpoint(tmp_path / "step-000000001.ckpt", n=4)
     assert torch.equal(checkpoint.read_field(tmp_path)[0]["means"], stored["means"])
     assert mended == [4]
