@@ -48,6 +48,7 @@ def trained_size(photos: Path) -> tuple[int, int] | None:
     from sundae_ns.data.layouts import LONGEST_SIDE, posed_layout
     from sundae_ns.data.lenses import size_of_first_image
     from sundae_ns.data.photos import find_photos
+    from sundae_ns.poses.video import is_video, video_size
 
     try:
         layout = posed_layout(photos)
@@ -56,8 +57,10 @@ def trained_size(photos: Path) -> tuple[int, int] | None:
             return width // layout.downscale, height // layout.downscale
         if (photos / "transforms.json").is_file():
             found = size_of_first_image(read_json(photos / "transforms.json"), photos)
+        elif is_video(photos):
+            found = video_size(photos)
         else:
-            found = check_image(find_photos(photos)[0][0])
+            found = check_image(find_photos(photos)[0].path)
     except SundaeError:
         return None
     if found is None:

@@ -13,7 +13,7 @@ from sundae_ns.errors import DataError
 def no_transforms(data: Path) -> DataError:
     """The error for a path without a ``transforms.json``, with advice that fits its contents."""
     if data.is_file():
-        return DataError(f"{data} is a file, not a capture; ns-process-data video makes a capture of a video")
+        return DataError(f"{data} is a file, not a capture; sundae poses makes a capture of a video")
     if is_blender(data):
         return DataError(
             f"{data} has no transforms.json; it is in Blender's layout (transforms_train.json): add `blender-data` "
@@ -66,5 +66,5 @@ def larger_model(data: Path, model: Path) -> str | None:
 
 def how_to_make_one(images: Path) -> str:
     """Advice with the command that makes a capture of a folder of images."""
-    folder = shlex.quote(str(images))
-    return f"make a capture of images with `ns-process-data images --data {folder} --output-dir CAPTURE`"
+    folder = shlex.quote(f"./{images}" if str(images).startswith("-") else str(images))
+    return f"make a capture of images with `sundae poses {folder} -o CAPTURE`"

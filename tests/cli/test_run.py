@@ -11,7 +11,7 @@ import pytest
 import tyro
 from colmap_models import write_model
 from PIL import Image
-from run_commands import PHOTOS, STEPS, Commands, photo, refusal, run
+from run_commands import PHOTOS, STEPS, Commands, refusal, run, write_video
 
 from sundae_ns import method_configs
 from sundae_ns.cli.forecast import Forecast, trained_size
@@ -22,38 +22,36 @@ def test_photos_become_a_scene_and_a_report(commands: Commands, capsys: pytest.C
     assert commands.names == STEPS
     # Each command is printed before it runs.
     printed = [shlex.split(line) for line in capsys.readouterr().out.splitlines() if not line.startswith("#")]
-    assert printed[0] == ["cd", "out/capture.partial", "&&", *commands.ran[0]]
-    assert printed[1:-1] == commands.ran[1:]
+    assert printed[:-1] == commands.ran
     assert printed[-1] == ["sundae", "view", "out/scene.sundae"]
-    assert commands.option("--matching-method", 0) == "exhaustive"
+    assert commands.ran[0] == ["sundae", "poses", "photos", "-o", "out/capture"]
     assert commands.option("--pipeline.model.pruning.keep-ratio", 1) == "0.2"
     assert commands.option("--max-num-iterations", 1) == "100"
     for place in (1, 2, 3, 4):
         assert commands.option("--data", place) == "out/capture"
 
 
-def test_the_largest_model_of_colmap_is_trained(commands: Commands) -> None:
-    commands.models, commands.placed = [5, PHOTOS - 1, 2], 5
-    assert run("photos", "-o", "out") == 0
-    assert commands.names == [STEPS[0], *STEPS]
-    assert commands.option("--colmap-model-path", 1) == "colmap/sparse/1"
-    assert "--skip-image-processing" in commands.ran[1]
-    commands.ran.clear()
-    # Frames that a user removes stay removed.
-    Path("out/capture/transforms.json").write_text(json.dumps({"frames": [{}] * 4}))
-    assert run("photos", "-o", "out") == 0
-    assert commands.ran == []
+def test_the_options_of_poses_are_passed_on(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree("photos", "masks")
+    for path in Path("masks").iterdir():
+        Image.new("L", (16, 12), 255).save(path.with_suffix(".png"))
+        path.unlink()
+    assert run("photos", "-o", "out", "--masks", "masks", "--matching", "similar", "--frames", "99") == 0
+    assert commands.ran[0][5:] == ["--matching", "similar", "--frames", "99", "--masks", "masks"]
+    again = ["photos", "-o", "out", "--matching", "similar", "--frames", "99"]
+    assert "not left out; repeat the first command" in refusal(capsys, *again)
 
 
-def test_one_model_of_colmap_is_left_as_it_is(commands: Commands) -> None:
-    commands.models = [PHOTOS]
-    assert run("photos", "-o", "out") == 0
-    assert commands.names == STEPS
+def test_a_video_is_taken(commands: Commands, tmp_path: Path) -> None:
+    write_video(tmp_path / "my walk.mp4", 12)
+    assert run("my walk.mp4", "-o", "out") == 0
+    assert commands.ran[0] == ["sundae", "poses", "my walk.mp4", "-o", "out/capture"]
+    assert commands.option("--experiment-name", 1) == "my walk"
+    assert commands.asked[0][1:] == (64, 48), "the forecast knows the size of its frames"
 
 
-def test_a_capture_needs_no_poses_and_no_colmap(commands: Commands, tmp_path: Path) -> None:
+def test_a_capture_needs_no_poses(commands: Commands) -> None:
     assert run("photos", "-o", "out") == 0
-    shutil.rmtree(tmp_path / "bin")
     commands.ran.clear()
     assert run("out/capture", "-o", "again") == 0
     assert commands.names == STEPS[1:]
@@ -64,7 +62,6 @@ def test_a_capture_needs_no_poses_and_no_colmap(commands: Commands, tmp_path: Pa
 def test_a_capture_in_colmap_layout_needs_no_poses(
     commands: Commands, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shutil.rmtree(tmp_path / "bin")
     shutil.copytree("photos", "scene/dense/images")
     write_model(tmp_path / "scene" / "dense" / "sparse", [f"{index}.JPG" for index in range(PHOTOS)], (16, 12))
     assert run("scene", "-o", "my scene") == 0
@@ -124,7 +121,7 @@ def test_a_training_of_hours_on_a_cpu_is_foretold_before_it_starts(
         "# warning: 30,000 training steps take at least 16 h 40 min on this CPU, 2000 ms each at 16 x 12"
     )
     assert "--quality draft (1 h 40 min), --method sundae-tiny" in said
-    assert "# step 1 of 7" in rest
+    assert "# step 1 of 6" in rest
     assert run("photos", "-o", "out") == 130
     assert len(commands.asked) == 1, "a resumed training has a forecast of its own"
     commands.forecast = Forecast(0.004, 30000, "cuda")
@@ -143,40 +140,3 @@ def test_the_size_of_training_images(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").unlink()
     write_model(tmp_path / "sparse" / "0", ["0.png"], (4000, 30))
     assert trained_size(tmp_path) == (4000, 30), "there are no smaller images"
-
-
-def test_masks_reach_the_capture(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
-    Path("photos/masks").mkdir()
-    for index in range(PHOTOS):
-        mask = Image.new("L", (16, 12), 255)
-        mask.putpixel((index, 0), 0)
-        mask.save(f"photos/masks/{index}.png")
-    commands.framed = True
-    assert run("photos", "-o", "out", "--masks", "photos/masks") == 0
-    said = capsys.readouterr().out
-    assert f"# masks: {PHOTOS} of {PHOTOS}\n" in said
-    assert "is left out" not in said
-    frames = json.loads(Path("out/capture/transforms.json").read_text())["frames"]
-    assert frames[2]["mask_path"] == "masks/frame_00003.png"
-    with Image.open("out/capture/masks/frame_00003.png") as stored:
-        assert (stored.getpixel((2, 0)), stored.getpixel((3, 0))) == (0, 255)
-    with Image.open("out/capture/masks_2/frame_00003.png") as stored:
-        assert (stored.size, stored.mode) == ((8, 6), "L")
-    assert "not left out; repeat the first command" in refusal(capsys, "photos", "-o", "out")
-
-
-def test_photos_keep_their_order_under_plain_names(commands: Commands) -> None:
-    for name in ("-x.jpeg", "$(touch PWNED).JPG"):
-        photo(Path("photos", name))
-    seen: list[str] = []
-    write = commands.write
-
-    def watch(name: str, words: list[str], code: int) -> None:
-        if name == "ns-process-data":
-            folder = Path("out/capture.partial/photos")
-            seen.extend(f"{path.name} {path.resolve().name}" for path in sorted(folder.iterdir()))
-        write(name, words, code)
-
-    commands.write = watch  # type: ignore[method-assign]
-    assert run("photos", "-o", "out") == 0
-    assert seen[:3] == ["00001.jpg $(touch PWNED).JPG", "00002.jpg -x.jpeg", "00003.jpg 0.JPG"]

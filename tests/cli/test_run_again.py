@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from run_commands import NAMES, PHOTOS, STEPS, Commands, run
+from run_commands import NAMES, STEPS, Commands, run
 
 
 def test_what_is_done_is_skipped(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
@@ -16,7 +16,7 @@ def test_what_is_done_is_skipped(commands: Commands, capsys: pytest.CaptureFixtu
     capsys.readouterr()
     assert run("photos", "-o", "out") == 0
     assert commands.ran == []
-    assert capsys.readouterr().out.count(": done\n") == 7
+    assert capsys.readouterr().out.count(": done\n") == 6
 
 
 def cut(path: Path) -> None:
@@ -55,26 +55,6 @@ def test_half_a_result_is_made_again(
     commands.ran.clear()
     assert run("photos", "-o", "out") == 0
     assert commands.ran == []
-
-
-def test_half_a_capture_is_made_again(commands: Commands) -> None:
-    """The program writes its last file in place, so it may end in the middle of it."""
-    commands.models, commands.placed = [5, PHOTOS], 5
-    commands.codes["ns-process-data"] = 137
-    half = Path("out/capture.partial/capture/transforms.json")
-
-    def killed(name: str, words: list[str], code: int) -> None:
-        half.parent.mkdir(parents=True, exist_ok=True)
-        half.write_text('{"frames": [{}, {}')
-
-    write, commands.write = commands.write, killed  # type: ignore[method-assign]
-    assert run("photos", "-o", "out") == 137
-    assert not Path("out/capture").exists()
-    commands.write = write  # type: ignore[method-assign]
-    commands.codes.clear()
-    assert run("photos", "-o", "out") == 0
-    assert commands.names == ["ns-process-data"] * 2 + STEPS
-    assert not half.parent.exists()
 
 
 def test_a_checkpoint_before_a_damaged_one_is_resumed(commands: Commands) -> None:
@@ -121,7 +101,7 @@ def test_an_interrupted_training_resumes(commands: Commands, capsys: pytest.Capt
     assert "the same command continues here" in capsys.readouterr().err
     commands.codes.clear()
     assert run("photos", "-o", "out", "--steps", "100") == 0
-    assert commands.names == ["ns-process-data", "ns-train", *STEPS[1:]]
+    assert commands.names == ["sundae poses", "ns-train", *STEPS[1:]]
     saved = "out/runs/photos/sundae/run/nerfstudio_models"
     assert commands.option("--load-dir", 2) == saved
     assert "--max-num-iterations" not in commands.ran[2]

@@ -11,31 +11,7 @@ from pathlib import Path
 
 import pytest
 from colmap_models import write_model
-from run_commands import PHOTOS, Commands, program, refusal, run
-
-
-@pytest.mark.parametrize("missing", ["colmap", "ffmpeg"])
-def test_a_missing_program_is_named(
-    commands: Commands, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str
-) -> None:
-    (tmp_path / "bin" / missing).unlink()
-    line = refusal(capsys, "photos", "-o", "out")
-    assert f"{missing} is not installed" in line
-    assert f"apt-get install {missing}" in line
-    assert commands.ran == []
-
-
-@pytest.mark.parametrize(
-    ("says", "driver", "flags"), [("with CUDA", True, []), ("with CUDA", False, ["--no-gpu"]), ("", True, ["--no-gpu"])]
-)
-def test_colmap_without_a_gpu_is_told_so(
-    commands: Commands, tmp_path: Path, says: str, driver: bool, flags: list[str]
-) -> None:
-    program(tmp_path, "colmap", says)
-    if driver:
-        program(tmp_path, "nvidia-smi", "")
-    assert run("photos", "-o", "out") == 0
-    assert [word for word in commands.ran[0] if word == "--no-gpu"] == flags
+from run_commands import PHOTOS, Commands, refusal, run
 
 
 @pytest.mark.parametrize(("placed", "enough"), [(2, False), (3, False), (4, True)])
@@ -48,15 +24,15 @@ def test_too_few_placed_photos(
         return
     for _ in range(2):  # the repeated command too, which finds the poses
         line = refusal(capsys, "photos", "-o", "out")
-        assert f"COLMAP placed {placed} of {PHOTOS} photos" in line
+        assert f"COLMAP placed {placed} of {PHOTOS} photos; photograph the way from {placed - 1}.JPG to" in line
         assert "sundae run out/capture -o OTHER" in line
-    assert commands.names == ["ns-process-data"]
+    assert commands.names == ["sundae poses"]
     assert run("out/capture", "-o", "other") == 0
 
 
 def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
     commands.silent = True
-    assert "ns-process-data ended without its result" in refusal(capsys, "photos", "-o", "out")
+    assert "sundae ended without its result" in refusal(capsys, "photos", "-o", "out")
 
 
 @pytest.mark.parametrize(
@@ -64,7 +40,9 @@ def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.Captur
     [
         (["gone", "-o", "out"], "gone does not exist"),
         (["empty", "-o", "out"], "holds no photos"),
-        (["video.mp4", "-o", "out"], "ns-process-data video"),
+        (["video.mp4", "-o", "out"], "video.mp4 is not a video that OpenCV decodes"),
+        (["photos/0.JPG", "-o", "out"], "photos/0.JPG is neither a folder of photos nor a video"),
+        (["photos", "-o", "out", "--frames", "2"], "frames is 2; give at least 3"),
         (["model", "-o", "out"], "model/sparse/0: cameras.bin ends early"),
         (["model/sparse/0", "-o", "out"], "is a COLMAP model without its images"),
         (["undistorted", "-o", "out"], "undistorted has no image 0.png, which its model dense/sparse states"),
@@ -120,8 +98,9 @@ def test_a_folder_of_an_earlier_version_has_the_normal_quality(
 ) -> None:
     assert run("photos", "-o", "out") == 0
     settings = json.loads(Path("out/run.json").read_text())
-    for name in ("quality", "max_mb"):
+    for name in ("quality", "max_mb", "frames"):
         del settings[name]
+    settings["matching"] = "exhaustive"
     Path("out/run.json").write_text(json.dumps(settings))
     assert run("photos", "-o", "out") == 0
     assert "quality normal, not draft" in refusal(capsys, "photos", "-o", "out", "--quality", "draft")
@@ -142,6 +121,18 @@ reserve(Path("out"))
 print(flush=True)
 sys.stdin.read()
 """
+
+
+def test_without_pycolmap_nothing_starts(
+    commands: Commands, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    line = refusal(capsys, "photos", "-o", "out")
+    assert line == 'sundae: camera poses need pycolmap; install it with pip install "sundae_ns[photos]"'
+    assert not Path("out").exists()
+    monkeypatch.delitem(sys.modules, "pycolmap")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    assert refusal(capsys, "photos", "-o", "out") == line
 
 
 def test_photos_are_judged_before_anything_starts(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:

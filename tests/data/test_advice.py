@@ -65,7 +65,7 @@ LAYOUTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "Blender": (_blender, "it is in Blender's layout (transforms_train.json): add `blender-data` to ns-train"),
     "a folder further in": (_inner, "room has; give that folder"),
     "another name": (lambda data: (data / "Transforms.json").touch(), "(there is Transforms.json)"),
-    "nothing": (lambda _: None, "make a capture of images with `ns-process-data images --data"),
+    "nothing": (lambda _: None, "make a capture of images with `sundae poses "),
 }
 
 
@@ -76,7 +76,7 @@ def test_advice_fits_what_a_folder_holds(tmp_path: Path, kind: str) -> None:
     said = str(no_transforms(tmp_path))
     assert advice in said
     assert "\n" not in said
-    assert ("ns-process-data" in said) == (kind in ("nothing", "another name"))
+    assert ("sundae poses" in said) == (kind in ("nothing", "another name"))
 
 
 def test_the_advised_words_are_the_model_and_its_images(tmp_path: Path) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
-import struct
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -20,7 +20,7 @@ from sundae_ns.gaussians import from_points
 from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
 
 PHOTOS = 8
-STEPS = ["ns-process-data", "ns-train", "sundae eval", "sundae pack", "sundae report", "sundae export"]
+STEPS = ["sundae poses", "ns-train", "sundae eval", "sundae pack", "sundae report", "sundae export"]
 NAMES = ["camera poses", "train", "evaluate", "pack", "report", "web page"]
 
 
@@ -29,16 +29,11 @@ class Commands:
 
     def __init__(self) -> None:
         self.ran: list[list[str]] = []
-        self.folders: list[Path | None] = []
         self.codes: dict[str, int] = {}
         self.placed = PHOTOS
-        self.models: list[int] = []
-        """Number of photos of each model of COLMAP."""
         self.saved_at = {0: 99, 130: 39}
         """Step of the checkpoint, by the exit code of the training."""
         self.silent = False
-        self.framed = False
-        """Whether images and frames have the names that the program gives, and there are smaller images."""
         self.forecast: Forecast | None = None
         self.asked: list[tuple[str, int, int]] = []
 
@@ -47,11 +42,8 @@ class Commands:
         self.asked.append(asked)
         return self.forecast
 
-    def __call__(
-        self, words: list[str], *, folder: Path | None = None, locks: Sequence[int] = (), saves: bool = True
-    ) -> int:
+    def __call__(self, words: list[str], *, locks: Sequence[int] = (), saves: bool = True) -> int:
         self.ran.append(list(words))
-        self.folders.append(folder)
         name = self.names[-1]
         code = self.codes.get(name, 0)
         if not self.silent:
@@ -82,25 +74,15 @@ class Commands:
                     archive.writestr("data.pkl", bytes(500))
         elif code:
             return
-        elif name == "ns-process-data":
-            assert self.folders[-1] is not None
-            capture, placed = self.folders[-1] / self.option("--output-dir"), self.placed
-            if "--skip-colmap" in words:
-                placed = self.models[int(Path(self.option("--colmap-model-path")).name)]
-            else:
-                shutil.copytree(self.folders[-1] / self.option("--data"), capture / "images")
-                for index, images in enumerate(self.models):
-                    model = capture / "colmap" / "sparse" / str(index)
-                    model.mkdir(parents=True)
-                    (model / "images.bin").write_bytes(struct.pack("<Q", images) + bytes(100 * images))
-            frames: list[dict[str, str]] = [{}] * placed
-            if self.framed:
-                frames = [{"file_path": f"images/frame_{number:05d}.jpg"} for number in range(1, placed + 1)]
-                (capture / "images_2").mkdir()
-                for path in sorted((capture / "images").glob("0*")):
-                    path.rename(path.with_name(f"frame_{path.name}"))
-                    Image.new("RGB", (8, 6)).save(capture / "images_2" / f"frame_{path.name}")
-            (capture / "transforms.json").write_text(json.dumps({"frames": frames}))
+        elif name == "sundae poses":
+            capture = Path(self.option("-o"))
+            (capture / "images").mkdir(parents=True)
+            names = [f"{index}.JPG" for index in range(PHOTOS)]
+            for one in names[: self.placed]:
+                photo(capture / "images" / one)
+            frames = [{"file_path": f"images/{one}", "original": one} for one in names[: self.placed]]
+            meta = {"frames": frames, "left_out": names[self.placed :]}
+            (capture / "transforms.json").write_text(json.dumps(meta))
         elif name == "sundae eval":
             Path(self.option("-o")).write_text('{"results": {"psnr": 20.0}}')
         elif name == "sundae pack":
@@ -125,13 +107,6 @@ def photo(path: Path, kind: str = "jpeg") -> None:
     Image.new("RGB", (16, 12), "grey").save(path, format=kind)
 
 
-def program(folder: Path, name: str, says: str) -> None:
-    path = folder / "bin" / name
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(f"#!/bin/sh\necho '{says}'\n")
-    path.chmod(0o755)
-
-
 def run(*words: str) -> int:
     with pytest.raises(SystemExit) as caught:
         main(["run", *words])
@@ -144,3 +119,13 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("sundae: ")
     return line
+
+
+def write_video(path: Path, frames: int, size: tuple[int, int] = (64, 48)) -> None:
+    """Write a video of frames that a square crosses; every third frame is sharp, the others are blurred."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25, size)
+    for index in range(frames):
+        frame = np.full((size[1], size[0], 3), 60, np.uint8)
+        frame[10:30, index % 40 : index % 40 + 20] = (40, 200, 250)
+        writer.write(frame if index % 3 == 1 else cv2.GaussianBlur(frame, (9, 9), 4))
+    writer.release()
