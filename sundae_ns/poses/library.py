@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import sys
+import threading
 from typing import Any
 
 from sundae_ns.errors import ConfigError
@@ -19,13 +21,19 @@ SEED = 0
 
 
 def pycolmap() -> Any:
-    """The module, with its log of progress turned off; ``ConfigError`` if it is not installed or cannot be loaded."""
+    """The module, with its log of progress turned off; ``ConfigError`` if it is not installed or cannot be loaded.
+
+    The main thread imports it first: its library takes over SIGTERM, to print the stack where the process ends.
+    """
+    before = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap as module
     except ImportError as error:
         if isinstance(error, ModuleNotFoundError) and error.name == "pycolmap":
             raise ConfigError(MISSING) from error
         raise ConfigError(f"pycolmap cannot be loaded ({error}); install it again with {INSTALL}") from error
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
     module.logging.minloglevel = module.logging.Level.FATAL.value
     return module
 

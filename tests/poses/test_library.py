@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -32,6 +34,31 @@ def test_a_missing_package_and_a_broken_one(monkeypatch: pytest.MonkeyPatch, tmp
     check_installed()
     with pytest.raises(ConfigError, match=r"pycolmap cannot be loaded \(libgomp.*; install it again with"):
         pycolmap()
+
+
+LOUD = """
+import signal, sys
+from types import SimpleNamespace as Names
+signal.signal(signal.SIGTERM, lambda *_: sys.exit("a stack of thirty lines"))
+logging = Names(minloglevel=0, Level=Names(FATAL=Names(value=3)))
+"""
+TOLD = """
+import os, signal
+from sundae_ns.poses.library import pycolmap
+pycolmap()
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+
+
+@pytest.mark.parametrize("real", [False, True])
+def test_a_process_that_is_told_to_end_prints_nothing(tmp_path: Path, real: bool) -> None:
+    if real:
+        pytest.importorskip("pycolmap")
+    else:
+        (tmp_path / "pycolmap.py").write_text(LOUD)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
+    done = subprocess.run([sys.executable, "-c", TOLD], capture_output=True, text=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
 
 
 @pytest.mark.parametrize(("stated", "count"), [("3", 3), ("1", 1), ("0", None), ("", None), ("many", None)])
