@@ -268,7 +268,7 @@ def test_no_training_images(own_copy: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "advice"),
     [
-        ("a.jpg", "has no transforms.json; make a capture of images with `ns-process-data images --data"),
+        ("a.jpg", "has no transforms.json; make a capture of images with `sundae poses "),
         ("sparse/0/cameras.bin", "it is in COLMAP layout: add `colmap --colmap-path sparse/0` to ns-train"),
         ("colmap/sparse/0/cameras.txt", "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
     ],
@@ -282,7 +282,7 @@ def test_a_folder_that_is_no_capture_says_how_to_make_one_of_it(tmp_path: Path, 
 
 def test_a_file_that_is_no_capture(tmp_path: Path) -> None:
     (tmp_path / "walk.mp4").touch()
-    with pytest.raises(DataError, match="is a file, not a capture; ns-process-data video"):
+    with pytest.raises(DataError, match="is a file, not a capture; sundae poses"):
         manager(tmp_path / "walk.mp4")
 
 

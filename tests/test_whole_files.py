@@ -19,6 +19,10 @@ ELSEWHERE = {
     "cli/files.py": ["saving.save(small, out)"],  # the public function, which renames
     "data/masks.py": ["scaled.save(folder / f'{image.stem}.png')"],  # in a folder that is renamed
     "evaluation/video.py": ["av.open(str(path), 'w', format='mp4', options={'movflags': 'faststart'})"],  # in cli/
+    # In folders that are renamed, and a list that COLMAP reads at once.
+    "poses/capture.py": ["(out / CLOUD).open('wb')"],
+    "poses/reconstruction.py": ["(work / _LISTED).open('w', encoding='utf-8')"],
+    "poses/video.py": ["name.open('wb')"],
     "storage/runs/folder.py": ["(run / LOCK).open('a+', encoding='utf-8')"],  # a lock stays
     "training/pruning.py": ["run.save()"],  # checkpoints
 }

@@ -18,7 +18,7 @@ from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rendering.source import degree_in_use
 from sundae_ns.storage.kinds import kind_of, kind_of_primitives, unread
-from sundae_ns.storage.primitives import mended_of, read_primitives
+from sundae_ns.storage.primitives import read_primitives
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import model_options
 from sundae_ns.storage.runs.folder import find_config
@@ -101,7 +101,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         # Coefficients of degrees that training has not reached are not in use.
         degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))
     field["features_rest"] = field["features_rest"][:, : (degree + 1) ** 2 - 1]
-    field = mended_of(field, source)
+    field = checkpoint.usable_of(field, source)
     frame = _frame_of(config.parent)
     return Scene(
         field,

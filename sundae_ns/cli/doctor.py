@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 PACKAGES = ("sundae-ns", "nerfstudio", "gsplat", "torch", "torchvision", "numpy", "scipy", "tyro")
@@ -191,6 +192,26 @@ def installed(name: str, place: str | None, purpose: str, package: str) -> Findi
     return Finding(name, False, f"not found, for {purpose}", f"apt-get install {package}")
 
 
+def photo_packages() -> list[Finding]:
+    """Whether the packages of ``sundae poses`` are installed and can be loaded."""
+    from sundae_ns.poses.library import INSTALL
+
+    findings = []
+    for name, module, purpose in (
+        ("pycolmap", "pycolmap", "sundae poses, which finds camera poses of photos"),
+        ("pillow-heif", "pillow_heif", "HEIC photos"),
+    ):
+        try:
+            found = importlib.import_module(module)
+        except ImportError as error:
+            missing = isinstance(error, ModuleNotFoundError) and error.name == module
+            cause = "not installed" if missing else f"cannot be loaded ({error})"
+            findings.append(Finding(name, False, f"{cause}, for {purpose}", INSTALL))
+        else:
+            findings.append(Finding(name, True, f"{found.__version__}, for {purpose}"))
+    return findings
+
+
 def examine(compile_kernels: bool = False) -> list[Finding]:
     """All findings, in the order of the report."""
     kernels_finding = kernels(compile_kernels)
@@ -204,9 +225,9 @@ def examine(compile_kernels: bool = False) -> list[Finding]:
         lpips(),
         installed("libusb-1.0", ctypes.util.find_library("usb-1.0"), "ns-export", "libusb-1.0-0"),
         installed("libGL", ctypes.util.find_library("GL"), "ns-export", "libgl1"),
-        installed("COLMAP", shutil.which("colmap"), "ns-process-data, which makes captures", "colmap"),
+        *photo_packages(),
         # ns-render requires it even if it writes only images.
-        installed("ffmpeg", shutil.which("ffmpeg"), "ns-process-data and ns-render", "ffmpeg"),
+        installed("ffmpeg", shutil.which("ffmpeg"), "ns-render", "ffmpeg"),
     ]
 
 
@@ -218,11 +239,11 @@ def run_doctor(compile_kernels: bool = False) -> int:
     table = Table(show_header=False, box=None, pad_edge=False)
     for finding in findings:
         mark = "[green]ok[/]" if finding.ok else "[red]missing[/]" if finding.needed else "[yellow]-[/]"
-        table.add_row(mark, finding.name, finding.detail)
+        table.add_row(mark, finding.name, escape(finding.detail))
     console.print(table)
     fixes = [finding for finding in findings if not finding.ok and finding.fix]
     if fixes:
         console.print("\nTo fix:")
         for finding in fixes:
-            console.print(f"  {finding.name}: {finding.fix}", soft_wrap=True, highlight=False)
+            console.print(f"  {finding.name}: {finding.fix}", soft_wrap=True, highlight=False, markup=False)
     return int(any(finding.needed and not finding.ok for finding in findings))

@@ -45,19 +45,22 @@ def measured_step(method: str, width: int, height: int) -> Forecast | None:
 def trained_size(photos: Path) -> tuple[int, int] | None:
     """Width and height in pixels of the training images of a capture or of photos; None if they are not known."""
     from sundae_ns.data.capture import check_image, read_json
-    from sundae_ns.data.layouts import LONGEST_SIDE, colmap_layout
+    from sundae_ns.data.layouts import LONGEST_SIDE, posed_layout
     from sundae_ns.data.lenses import size_of_first_image
     from sundae_ns.data.photos import find_photos
+    from sundae_ns.poses.video import is_video, video_size
 
     try:
-        layout = colmap_layout(photos)
+        layout = posed_layout(photos)
         if layout is not None:
             width, height = layout.size
             return width // layout.downscale, height // layout.downscale
         if (photos / "transforms.json").is_file():
             found = size_of_first_image(read_json(photos / "transforms.json"), photos)
+        elif is_video(photos):
+            found = video_size(photos)
         else:
-            found = check_image(find_photos(photos)[0][0])
+            found = check_image(find_photos(photos)[0].path)
     except SundaeError:
         return None
     if found is None:

@@ -20,6 +20,7 @@ from sundae_ns.cli.distill import distill_file
 from sundae_ns.cli.evaluate import evaluate
 from sundae_ns.cli.files import export, prune_file
 from sundae_ns.cli.packing import pack, unpack
+from sundae_ns.cli.poses import poses
 from sundae_ns.cli.process import loading
 from sundae_ns.cli.render import render_file
 from sundae_ns.cli.report import report
@@ -52,7 +53,8 @@ def doctor(compile: bool = False) -> int:  # noqa: A002
 
 
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
-    "run": (run, "photos to a packed scene, its report and its web page; resumes"),
+    "run": (run, "photos or a video to a packed scene, its report and its web page; resumes"),
+    "poses": (poses, "camera poses of photos or of a video: a capture to train on; resumes"),
     "train": (train, "train by ns-train, with short options"),
     "prune": (prune_file, "make any splat scene smaller, without its photos"),
     "distill": (distill_file, "prune, then train on the full scene's own images, without photos"),

@@ -1,169 +1,198 @@
-"""Camera poses of a folder of photos, by nerfstudio's program, which writes names into lines of a shell.
-
-So it runs in a working folder beside the capture, where photos and capture have plain names, and the finished capture
-is renamed. A capture that is there is whole.
-"""
+"""``sundae poses``: from photos or a video to a capture with camera poses, without a program of the system."""
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-from dataclasses import dataclass
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from sundae_ns.cli.process import quoted
-from sundae_ns.errors import DataError, SundaeError, writing
+import tyro
 
-Matching = Literal["exhaustive", "sequential", "vocab_tree"]
+from sundae_ns.cli.process import loading, quoted
+from sundae_ns.errors import ConfigError, DataError, StorageError, SundaeError, one_line
 
-TRANSFORMS = "transforms.json"
-LEAST_SHARE = 0.5
-"""Share of the photos that COLMAP must place; where it places fewer, they overlap too little for a good scene."""
+if TYPE_CHECKING:
+    from sundae_ns.data.photos import Photo
+    from sundae_ns.poses import Found, Placed
+
+Matching = Literal["auto", "exhaustive", "sequential", "similar"]
+FRAMES = 150
+"""Default number of frames of a video."""
+_MOST_NAMES = 3
 
 
-@dataclass(frozen=True)
-class Poses:
-    """A capture that is made of photos in two commands, each run in :attr:`folder`."""
+def poses(
+    photos: Annotated[Path, tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    matching: Matching = "auto",
+    frames: int = FRAMES,
+    masks: Path | None = None,
+) -> int:
+    """Find the camera poses of photos, and write a capture: images at several sizes, transforms.json, points, masks.
 
-    photos: Path
-    capture: Path
-    matching: Matching
-    masks: Path | None = None
-    """Folder of masks, one for each photo."""
+    The same command again continues an interrupted one. All processors are used, or as many as OMP_NUM_THREADS says.
 
-    @property
-    def folder(self) -> Path:
-        """Folder in which the capture is made."""
-        return self.capture.with_name(f"{self.capture.name}.partial")
-
-    @property
-    def found(self) -> bool:
-        """Whether photos have their poses."""
-        return self.done or is_capture(self.folder / "capture")
-
-    @property
-    def done(self) -> bool:
-        """Whether the capture is whole, in its place."""
-        return is_capture(self.capture)
-
-    def check(self) -> None:
-        """Name the photos that are left out; ``DataError`` if the others cannot be used."""
-        from sundae_ns.data.masks import masks_of
-        from sundae_ns.data.photos import find_photos, left_out
-
-        photos = find_photos(self.photos)[0]
-        if self.masks is not None:
-            masks_of(photos, self.masks)
-        for remark in left_out(self.photos, photos, masked=self.masks is not None):
-            print(f"# warning: {remark}", flush=True)
-
-    def find(self) -> list[str]:
-        """Fill the working folder with the photos; the command that finds their poses.
-
-        Raises:
-            SundaeError: a program is not installed, or the photos cannot be used.
-        """
-        for program, purpose in (("colmap", "finds the camera poses"), ("ffmpeg", "scales the photos")):
-            if shutil.which(program) is None:
-                raise SundaeError(
-                    f"{program} is not installed, which {purpose}; install it with `apt-get install {program}`, "
-                    "or give a capture with poses"
-                )
+    Args:
+        photos: folder of photos, or a video.
+        out: folder of the capture; it must not exist yet.
+        matching: photos that are compared: all pairs, neighbours in time and similar ones (for a video), or similar
+            ones; by default what suits their number.
+        frames: number of frames of a video; the sharpest of each stretch.
+        masks: folder with a mask for each photo, under its name; by default one named masks beside the photos.
+    """
+    check_poses(photos, frames, masks)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise StorageError(f"{out} exists; choose another folder, or remove it")
+    if photos.is_dir() and out.resolve().is_relative_to(photos.resolve()):
+        raise StorageError(f"{out} lies in {photos}, which the command reads; choose another folder")
+    with loading():
         from sundae_ns.data.photos import find_photos
+        from sundae_ns.poses import Request
+        from sundae_ns.poses.library import pycolmap
 
-        paths, suffix = find_photos(self.photos)
-        photos = self.folder / "photos"
-        with writing(f"cannot make {self.folder}"):
-            if self.folder.exists():
-                shutil.rmtree(self.folder)
-            photos.mkdir(parents=True)
-            for number, path in enumerate(paths, start=1):
-                _link(path, photos / f"{number:05d}{suffix}")
-        return self._command("--matching-method", self.matching, *([] if _colmap_uses_gpu() else ["--no-gpu"]))
-
-    def _command(self, *options: str) -> list[str]:
-        return ["ns-process-data", "images", "--data", "photos", "--output-dir", "capture", *options]
-
-    def _models(self) -> dict[str, int]:
-        """Numbers of photos of COLMAP's models, by their folders; several if it cannot join them into one."""
-        from sundae_ns.data.colmap import num_images
-
-        capture = self.folder / "capture"
-        found = sorted(path.parent for path in (capture / "colmap" / "sparse").glob("*/images.bin"))
-        return {path.relative_to(capture).as_posix(): num_images(path) for path in found}
-
-    def is_largest(self) -> bool:
-        """Whether the poses are those of the largest model; ns-process-data takes the first one."""
-        if self.done:
-            return True
-        models = self._models()
-        first = models.get("colmap/sparse/0")
-        return first is None or first == max(models.values()) or num_placed(self.folder / "capture") != first
-
-    def take_largest(self) -> list[str]:
-        """Command that replaces the poses by those of the largest model."""
-        models = self._models()
-        largest = max(models, key=models.__getitem__)
-        return self._command("--skip-image-processing", "--skip-colmap", "--colmap-model-path", largest)
-
-    def finish(self) -> None:
-        """Put the capture into its place.
-
-        Raises:
-            DataError: COLMAP placed too few photos.
-        """
-        from sundae_ns.data.masks import add_masks, masks_of
-        from sundae_ns.data.photos import LEAST_PHOTOS, find_photos
-        from sundae_ns.storage.atomic import flush, put_aside
-
-        if not self.done:
-            made = self.folder / "capture"
-            with writing(f"cannot make {self.capture}"):
-                if self.masks is not None:
-                    added = add_masks(made, masks_of(find_photos(self.photos)[0], self.masks))
-                    print(f"# masks: {added}", flush=True)
-                flush(made / TRANSFORMS)  # written last; the system has written the other files meanwhile
-                put_aside(self.capture)
-                made.replace(self.capture)
-        shutil.rmtree(self.folder, ignore_errors=True)
-        placed, images = num_placed(self.capture), len(list((self.capture / "images").glob("*")))
-        if placed < max(LEAST_PHOTOS, LEAST_SHARE * images):
-            raise DataError(
-                f"COLMAP placed {placed} of {images} photos; add sharp ones that overlap more, and start in another "
-                f"folder, or train on these with `sundae run {quoted(self.capture)} -o OTHER`"
-            )
+        pycolmap()
+    if masks is None and photos.is_dir():
+        with suppress(DataError):  # which check_poses has printed
+            masks = usable_masks(photos, find_photos(photos))
+    request = Request(photos, out, matching, frames, masks)
+    found = _interruptible(lambda: _find(request), request.work)
+    _print(out, found)
+    return 0
 
 
-def is_capture(folder: Path) -> bool:
-    """Whether a folder has a whole ``transforms.json``, which ns-process-data writes last."""
+def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool = True) -> None:
+    """Check photos or a video, by headers, before anything starts; ``remarks`` prints what is left out.
+
+    Raises:
+        ConfigError: pycolmap is not installed, a number is out of range, or masks are given for a video.
+        DataError: the photos or masks cannot be used.
+    """
+    from sundae_ns.data.masks import masks_of
+    from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside
+    from sundae_ns.poses.library import check_installed
+    from sundae_ns.poses.video import SUFFIXES, is_video, video_size
+
+    check_installed()
+    if not photos.exists():
+        raise DataError(f"{photos} does not exist; give a folder of photos, or a video")
+    if frames < LEAST_PHOTOS:
+        raise ConfigError(f"frames is {frames}; give at least {LEAST_PHOTOS}")
+    if masks is not None and not masks.is_dir():
+        raise DataError(f"{masks} is no folder of masks; give one with an image for each photo")
+    if is_video(photos):
+        if masks is not None:
+            raise ConfigError("a video has no masks; leave out --masks")
+        video_size(photos)
+        return
+    if photos.is_file():
+        raise DataError(f"{photos} is neither a folder of photos nor a video ({', '.join(SUFFIXES)})")
+    found = find_photos(photos)
+    if masks is not None:
+        masks_of(found, masks)
+    if not remarks:
+        return
+    said = [left_out(photos)]
+    if masks is None:
+        try:
+            usable_masks(photos, found)
+        except DataError as error:
+            said.append(f"{masks_beside(photos)} is left out: {error}")
+    for remark in filter(None, said):
+        print(f"# warning: {remark}", flush=True)
+
+
+def usable_masks(photos: Path, found: Sequence[Photo]) -> Path | None:
+    """The folder of masks beside photos; None without one, ``DataError`` if it does not fit them."""
+    from sundae_ns.data.masks import masks_of
+    from sundae_ns.data.photos import masks_beside
+
+    masks = masks_beside(photos)
+    if masks is not None:
+        masks_of(found, masks)
+    return masks
+
+
+def too_few(capture: Path, placed: Placed) -> DataError:
+    """The error for a capture of which too few photos have a pose."""
+    return DataError(
+        f"COLMAP placed {len(placed.placed)} of {placed.total} photos; {placed.again}, and start in another folder, or "
+        f"train on these with `sundae run {quoted(capture)} -o OTHER`"
+    )
+
+
+def _find(request: object) -> Found:
+    from sundae_ns.poses import find_poses
+
+    return find_poses(request, _report)  # type: ignore[arg-type]
+
+
+@contextmanager
+def _report(stage: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar on a terminal while a stage runs, and a line at its end."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console, begun, done = Console(), time.monotonic(), 0
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(stage, total=total)
+
+        def advance(count: int) -> None:
+            nonlocal done
+            done = min(done + count, total)
+            bar.update(task, completed=done)
+
+        yield advance
+    print(f"{stage}: {done:,} of {total:,}, {time.monotonic() - begun:.0f} s", flush=True)
+
+
+def _interruptible(work: Callable[[], Found], folder: Path) -> Found:
+    """Run in a thread: COLMAP's functions return to Python only after minutes, and an interrupt ends them at once."""
+    found: list[Found] = []
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            found.append(work())
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
     try:
-        num_placed(folder)
-    except DataError:
-        return False
-    return True
+        while thread.is_alive():
+            thread.join(0.2)
+    except KeyboardInterrupt:
+        cursor = "\x1b[?25h\x1b[2K\r" if sys.stderr.isatty() else ""  # a bar hides it
+        print(f"{cursor}sundae: interrupted; the same command continues here", file=sys.stderr, flush=True)
+        os._exit(130)
+    if not failed:
+        return found[0]
+    if isinstance(failed[0], (SundaeError, OSError)):
+        raise failed[0]
+    raise DataError(
+        f"COLMAP failed ({one_line(failed[0])}); remove {quoted(folder)} and start again, or report it"
+    ) from failed[0]
 
 
-def num_placed(capture: Path) -> int:
-    """Number of photos with a pose; ``DataError`` if ``transforms.json`` is missing or damaged."""
-    from sundae_ns.data.capture import read_json
-
-    path = capture / TRANSFORMS
-    frames = read_json(path).get("frames")
-    if not isinstance(frames, list):
-        raise DataError(f"{path} lists no frames; remove it to make it again")
-    return len(frames)
-
-
-def _link(path: Path, link: Path) -> None:
-    """Make a link to a photo, or a copy on a disk without links."""
-    try:
-        link.symlink_to(path.absolute())
-    except PermissionError:
-        shutil.copyfile(path, link)
-
-
-def _colmap_uses_gpu() -> bool:
-    """Whether COLMAP was built with CUDA, and an NVIDIA driver is here; otherwise its GPU code asks for a display."""
-    text = subprocess.run(["colmap", "-h"], capture_output=True, text=True, check=False, errors="replace").stdout
-    return "with CUDA" in text and shutil.which("nvidia-smi") is not None
+def _print(out: Path, found: Found) -> None:
+    photos = found.photos
+    cameras = "1 camera" if found.cameras == 1 else f"{found.cameras} cameras"
+    print(
+        f"{out}: {len(photos.placed):,} of {photos.total:,} photos have a pose, of {cameras}; mean reprojection error "
+        f"{found.error:.2f} px"
+    )
+    if len(found.models) > 1:
+        others = ", ".join(f"{count:,}" for count in found.models[1:])
+        print(f"# this is the largest of {len(found.models)} models that do not join; others have {others} photos")
+    if found.masks is not None:
+        print(f"# masks: {found.masks}")
+    if photos.left_out:
+        shown = ", ".join(photos.left_out[:_MOST_NAMES]) + (", ..." if len(photos.left_out) > _MOST_NAMES else "")
+        mark = "" if photos.enough else "warning: "
+        print(f"# {mark}without a pose: {shown}; to add them, {photos.again}", flush=True)

@@ -48,21 +48,16 @@ def quoted(path: Path) -> str:
 
 
 @contextmanager
-def _started(
-    words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = (), **options: Any
-) -> Iterator[subprocess.Popen[Any]]:
+def _started(words: Sequence[str], *, locks: Sequence[int] = (), **options: Any) -> Iterator[subprocess.Popen[Any]]:
     """Start a command without input in a process group of its own, which ends if this process dies.
 
     Args:
         words: the command; its program is looked for beside this interpreter first.
-        folder: to run it in; by default that of this process.
         locks: descriptors of locked files, which stay locked until the group has ended.
         options: of ``subprocess.Popen``.
     """
     guarded = [sys.executable, "-I", str(GUARD), console_script(words[0]), *words[1:]]
-    with subprocess.Popen(
-        guarded, stdin=subprocess.PIPE, start_new_session=True, cwd=folder, pass_fds=locks, **options
-    ) as process:
+    with subprocess.Popen(guarded, stdin=subprocess.PIPE, start_new_session=True, pass_fds=locks, **options) as process:
         yield process
 
 
@@ -102,9 +97,7 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
         raise SundaeError(f"{Path(arguments[0]).name} failed with {code}; its log is {log}, which ends with:\n{tail}")
 
 
-def run_in_group(
-    words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = (), saves: bool = True
-) -> int:
+def run_in_group(words: Sequence[str], *, locks: Sequence[int] = (), saves: bool = True) -> int:
     """Run a command with its output on the terminal; returns its exit code, or 128 + n if signal n arrived.
 
     A signal reaches the command once, with all processes that it started, whether it comes from a terminal or from
@@ -112,7 +105,6 @@ def run_in_group(
 
     Args:
         words: the command; it gets no input. Its program is looked for beside this interpreter first.
-        folder: to run it in; by default that of this process.
         locks: descriptors of locked files, which stay locked until the command has ended.
         saves: whether an interrupt makes the command save its work. Others end by SIGTERM in its place, because each of
             their processes would print a traceback.
@@ -131,7 +123,7 @@ def run_in_group(
 
     before = {number: signal.signal(number, pass_on) for number in passed_on}
     try:
-        with _started(words, folder=folder, locks=locks) as process:
+        with _started(words, locks=locks) as process:
             running.append(process)
             for number in received:  # those that came before there was a process
                 os.killpg(process.pid, passed_on[number])

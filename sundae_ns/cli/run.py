@@ -16,10 +16,10 @@ import tyro
 
 from sundae_ns.cli.forecast import measured_step, trained_size
 from sundae_ns.cli.outputs import check_folder
-from sundae_ns.cli.poses import Matching, Poses
-from sundae_ns.cli.process import quoted, run_in_group, word
+from sundae_ns.cli.poses import FRAMES, Matching, check_poses, too_few
+from sundae_ns.cli.process import run_in_group, word
 from sundae_ns.cli.results import is_evaluation, is_packed, is_page, is_report
-from sundae_ns.cli.train import command
+from sundae_ns.cli.train import check, command
 from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 
 SETTINGS = "run.json"
@@ -52,8 +52,6 @@ class Step:
     """File that is out of date once an earlier step has run again."""
     check: Callable[[], None] = lambda: None
     """Raises an error if later steps cannot use the result."""
-    folder: Path | None = None
-    """In which the command runs; by default that of this process."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class Project:
     """The files of ``sundae run`` and the choices of its user."""
 
     photos: Path
-    """Folder of photos, or a capture."""
+    """Folder of photos, a video, or a capture."""
     out: Path
     method: str
     keep: float | None
@@ -70,6 +68,7 @@ class Project:
     quality: Quality = "normal"
     max_mb: float | None = None
     masks: Path | None = None
+    frames: int = FRAMES
 
     @property
     def capture(self) -> Path:
@@ -91,12 +90,8 @@ class Project:
     @property
     def name(self) -> str:
         """Name of the scene in reports."""
-        return self.photos.resolve().name
-
-    @property
-    def poses(self) -> Poses | None:
-        """Makes the capture; None if it is given."""
-        return None if self.capture == self.photos else Poses(self.photos, self.capture, self.matching, self.masks)
+        path = self.photos.resolve()
+        return path.stem if path.is_file() else path.name
 
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
@@ -116,14 +111,38 @@ class Project:
             step("report", page, is_report, *report),
             step("web page", web, is_page, "sundae", "export", packed, "-o", web),
         ]
-        poses = self.poses
-        if poses is not None:
-            place = poses.folder
-            steps[:0] = [
-                Step("camera poses", poses.find, lambda: poses.found, folder=place),
-                Step("largest model", poses.take_largest, poses.is_largest, check=poses.finish, folder=place),
-            ]
+        if not self.posed:
+            steps.insert(0, Step("camera poses", self.find_poses, self.placed, check=self.check_poses))
         return steps
+
+    def find_poses(self) -> list[str]:
+        """Command that makes the capture."""
+        from sundae_ns.storage.atomic import put_aside
+
+        with writing(f"cannot replace {self.capture}"):
+            put_aside(self.capture)  # damaged
+        words = ["sundae", "poses", word(self.photos), "-o", word(self.capture)]
+        words += ["--matching", self.matching] if self.matching != "auto" else []
+        words += ["--frames", str(self.frames)] if self.frames != FRAMES else []
+        return [*words, "--masks", word(self.masks)] if self.masks is not None else words
+
+    def placed(self) -> bool:
+        """Whether the capture is whole."""
+        from sundae_ns.poses import placed_in
+
+        try:
+            placed_in(self.capture)
+        except DataError:
+            return False
+        return True
+
+    def check_poses(self) -> None:
+        """Raise ``DataError`` if too few photos have a pose."""
+        from sundae_ns.poses import placed_in
+
+        placed = placed_in(self.capture)
+        if not placed.enough:
+            raise too_few(self.capture, placed)
 
     def train(self) -> list[str]:
         """Command that trains, or resumes a training."""
@@ -162,8 +181,6 @@ class Project:
         """Raise ``ConfigError`` for options that contradict each other."""
         if self.max_mb is not None and not 0.01 <= self.max_mb <= 1e6:
             raise ConfigError(f"max-mb is {self.max_mb:g}; give at least 0.01")
-        if self.masks is not None and not self.masks.is_dir():
-            raise DataError(f"{self.masks} is no folder of masks; give one with an image for each photo")
         if self.masks is not None and self.posed:
             raise ConfigError(
                 f"{self.photos} has poses already; give each frame of transforms.json its mask_path, or a COLMAP model "
@@ -238,7 +255,10 @@ class Project:
             return lock
         try:
             before = {"quality": "normal", **json.loads(path.read_bytes())}
-        except (ValueError, TypeError) as error:
+            if "frames" not in before:  # of an earlier version, which compared all pairs by default
+                usual = {"exhaustive": "auto"}.get(before["matching"], before["matching"])
+                before |= {"frames": FRAMES, "matching": usual}
+        except (KeyError, ValueError, TypeError) as error:
             raise StorageError(f"{path} is damaged; choose another folder") from error
         for name, value in settings.items():
             if before.get(name) != value:
@@ -256,34 +276,36 @@ def run(
     method: str = "sundae",
     keep: float | None = None,
     steps: int | None = None,
-    matching: Matching = "exhaustive",
+    matching: Matching = "auto",
     quality: Quality = "normal",
     max_mb: float | None = None,
     masks: Path | None = None,
+    frames: int = FRAMES,
 ) -> int:
-    """Turn photos into a packed scene: find camera poses, train, evaluate, pack, and write a report and a web page.
+    """Turn photos or a video into a packed scene: find camera poses, train, evaluate, pack, write a report and a page.
 
     Each step prints the command that it runs. The same command again skips the steps that are done, and resumes an
     interrupted training.
 
     Args:
-        photos: folder of photos, or a capture, which has poses already.
+        photos: folder of photos, a video, or a capture, which has poses already.
         out: folder for the capture, the run, eval.json, scene.sundae, scene.html and the report; created if missing.
         method: as of sundae train; sundae-tiny suits small images and a CPU.
         keep: share of the primitives to keep, in (0, 1]; by default that of the method.
         steps: number of training steps; by default that of the method.
-        matching: photos that COLMAP compares: all pairs, neighbours by name (for frames of a video), or similar ones
-            (for thousands of photos; downloads a vocabulary).
+        matching: as of sundae poses; photos that are compared to find their poses.
         quality: draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03).
         max_mb: most megabytes of the packed scene; fewer primitives and coarser steps keep to it.
-        masks: folder with a mask for each photo, under its name; training leaves out what is black.
+        masks: folder with a mask for each photo, under its name; training leaves out what is black. By default one
+            named masks beside the photos.
+        frames: number of frames of a video; the sharpest of each stretch.
     """
     _check_input(photos)
-    command(photos, out, method, keep, steps)  # refuses numbers out of range before the first step
-    project = Project(photos, out, method, keep, steps, matching, quality, max_mb, masks)
+    check(photos, method, keep, steps)
+    project = Project(photos, out, method, keep, steps, matching, quality, max_mb, masks, frames)
     project.check()
-    if project.poses is not None and not project.poses.found:
-        project.poses.check()
+    if not project.posed and not project.placed():
+        check_poses(photos, frames, masks, remarks=False)  # sundae poses prints them
     lock = project.claim()
     project.forecast()
     plan = project.plan()
@@ -296,9 +318,8 @@ def run(
             for later in plan[number - 1 :]:
                 if later.result is not None:
                     later.result.unlink(missing_ok=True)
-            place = "" if step.folder is None else f"cd {quoted(step.folder)} && "
-            print(f"{heading}:\n{place}{shlex.join(words)}", flush=True)
-            code = run_in_group(words, folder=step.folder, locks=[lock], saves=step.name == TRAIN)
+            print(f"{heading}:\n{shlex.join(words)}", flush=True)
+            code = run_in_group(words, locks=[lock], saves=step.name == TRAIN)
             if code in STOPPED:
                 print("sundae: interrupted; the same command continues here", file=sys.stderr)
                 return code
@@ -315,17 +336,17 @@ def run(
 
 
 def _check_input(photos: Path) -> None:
-    """Raise ``DataError`` for a path that is neither a capture nor a folder that may hold photos."""
+    """Raise ``DataError`` for a path that is neither a capture nor a folder that may hold photos, or a video."""
     from sundae_ns.data.advice import no_transforms
-    from sundae_ns.data.layouts import colmap_layout, is_model, is_posed
+    from sundae_ns.data.layouts import ColmapLayout, is_model, is_posed, posed_layout
 
     if not photos.exists():
-        raise DataError(f"{photos} does not exist; give a folder of photos, or a capture")
+        raise DataError(f"{photos} does not exist; give a folder of photos, a video, or a capture")
     if is_posed(photos):
-        layout = colmap_layout(photos)
+        layout = posed_layout(photos)
         if layout is not None:
-            print(f"# capture in COLMAP layout: {layout}", flush=True)
+            kind = "COLMAP" if isinstance(layout, ColmapLayout) else "Blender"
+            print(f"# capture in {kind} layout: {layout}", flush=True)
         return
-    blender = (photos / "transforms_train.json").is_file()
-    if photos.is_file() or (photos / "sparse").is_dir() or blender or is_model(photos):
-        raise no_transforms(photos)  # says how to use a video, or a capture in another layout
+    if (photos / "sparse").is_dir() or is_model(photos):
+        raise no_transforms(photos)  # says how to use a capture in another layout

@@ -33,7 +33,8 @@ def train(
     """Print a command of ns-train and run it.
 
     Args:
-        capture: folder of the capture: a transforms.json, or a COLMAP model (sparse/0, dense/sparse) beside its images.
+        capture: folder of the capture: a transforms.json, a COLMAP model (sparse/0, dense/sparse) beside its images, or
+            Blender's transforms_train.json.
         further: behind --, any options of ns-train, as in sundae train CAPTURE -- --pipeline.model.sh-degree 2
         out: folder of runs.
         method: one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU.
@@ -48,41 +49,34 @@ def train(
         raise ConfigError(f"{further[0]} is no option; options of ns-train follow a --")
     if resume and steps is not None:
         raise ConfigError("a resumed run trains its remaining steps; leave out --steps or --resume")
-    command(capture, out, method, keep, steps)  # refuses what cannot be used before it looks for runs
+    check(capture, method, keep, steps)
     unfinished, more = unfinished_run(out, method, capture), list(further)
     if resume and unfinished is None:
         raise ConfigError(f"{out} has no unfinished run of {method} on {capture}; leave out --resume")
-    if unfinished is not None:
+    if unfinished is not None and resume:
+        folder = unfinished[0]
+        more[:0] = [f"--experiment-name={folder.parent.parent.name}", "--timestamp", folder.name]
+        more[:0] = ["--load-dir", word(folder / "nerfstudio_models")]
+    words = command(capture, out, method, keep, steps, more)  # refuses a damaged capture before it speaks of runs
+    if unfinished is not None and not resume:
         folder, done, length = unfinished
-        if resume:
-            more[:0] = [f"--experiment-name={folder.parent.parent.name}", "--timestamp", folder.name]
-            more[:0] = ["--load-dir", word(folder / "nerfstudio_models")]
-        else:
-            again = ["sundae", "train", word(capture), "--resume"]
-            again += ["-o", word(out)] if out != Path("outputs") else []
-            again += ["--method", method] if method != "sundae" else []
-            print(f"# {folder} ended after {done:,} of {length:,} steps; this is a new run. To resume the other:")
-            print(f"#     {shlex.join(again)}")
-    words = command(capture, out, method, keep, steps, more)
+        again = ["sundae", "train", word(capture), "--resume"]
+        again += ["-o", word(out)] if out != Path("outputs") else []
+        again += ["--method", method] if method != "sundae" else []
+        print(f"# {folder} ended after {done:,} of {length:,} steps; this is a new run. To resume the other:")
+        print(f"#     {shlex.join(again)}")
     print(shlex.join(words), flush=True)
     # The same process: an interrupt reaches the training, and its exit code is ours.
     os.execvp(console_script(words[0]), words)
 
 
-def command(
-    capture: Path, out: Path, method: str, keep: float | None, steps: int | None, more: Sequence[str] = ()
-) -> list[str]:
-    """The words of the command; options as in :func:`train`.
-
-    Args:
-        more: further words of ns-train; a parser of captures may stand among them.
+def check(capture: Path, method: str, keep: float | None, steps: int | None) -> None:
+    """Check the options of :func:`train`; of the capture, only that it exists.
 
     Raises:
         ConfigError: there is no such method, or a number is out of range.
-        DataError: the capture does not exist, or is in COLMAP's layout and damaged.
+        DataError: the capture does not exist.
     """
-    from sundae_ns.data.layouts import colmap_layout
-
     if not capture.exists():
         raise DataError(f"{capture} does not exist; give the folder of a capture")
     if method not in methods():
@@ -91,15 +85,29 @@ def command(
         raise ConfigError(f"keep is {keep}; give a share in (0, 1]")
     if steps is not None and steps < 1:
         raise ConfigError(f"steps is {steps}; give at least 1")
+
+
+def command(
+    capture: Path, out: Path, method: str, keep: float | None, steps: int | None, more: Sequence[str] = ()
+) -> list[str]:
+    """The words of the command; options as in :func:`train`, checked by :func:`check`.
+
+    Args:
+        more: further words of ns-train; a parser of captures may stand among them.
+
+    Raises:
+        DataError: the capture is in COLMAP's or Blender's layout and damaged.
+    """
+    from sundae_ns.data.layouts import posed_layout
+
+    layout = None if any(_is_parser(one) for one in more) else posed_layout(capture)
     words = ["ns-train", method, "--data", word(capture), "--output-dir", word(out)]
     if keep is not None:
         words += ["--pipeline.model.pruning.keep-ratio", f"{keep:g}"]
     if steps is not None:
         words += ["--max-num-iterations", str(steps)]
-    words += more
     # The parser and its options come last.
-    layout = None if any(_is_parser(one) for one in more) else colmap_layout(capture)
-    return words if layout is None else [*words, *layout.words]
+    return [*words, *more] if layout is None else [*words, *layout.options, *more, *layout.words]
 
 
 def _is_parser(word: str) -> bool:

@@ -6,15 +6,15 @@ import shlex
 from pathlib import Path
 
 from sundae_ns.data.beside import beside, entries
-from sundae_ns.data.layouts import colmap_options, is_model, model_folders, models_in
+from sundae_ns.data.layouts import is_blender, is_model, layout_of, model_folders, models_in
 from sundae_ns.errors import DataError
 
 
 def no_transforms(data: Path) -> DataError:
     """The error for a path without a ``transforms.json``, with advice that fits its contents."""
     if data.is_file():
-        return DataError(f"{data} is a file, not a capture; ns-process-data video makes a capture of a video")
-    if (data / "transforms_train.json").is_file():
+        return DataError(f"{data} is a file, not a capture; sundae poses makes a capture of a video")
+    if is_blender(data):
         return DataError(
             f"{data} has no transforms.json; it is in Blender's layout (transforms_train.json): add `blender-data` "
             "to ns-train"
@@ -26,8 +26,7 @@ def no_transforms(data: Path) -> DataError:
         best = max(found, key=found.__getitem__)
         several = f" (the largest of {len(found)} models, with {found[best]:,} images)" if len(found) > 1 else ""
         return DataError(
-            f"{data} has no transforms.json; it is in COLMAP layout: add `colmap {_options(data, best)}` to "
-            f"ns-train{several}"
+            f"{data} has no transforms.json; it is in COLMAP layout: add `{_options(data, best)}` to ns-train{several}"
         )
     inner = next((path for path in entries(data) if path.is_dir() and (path / "transforms.json").is_file()), None)
     if inner is not None:
@@ -36,7 +35,10 @@ def no_transforms(data: Path) -> DataError:
 
 
 def _options(data: Path, model: str) -> str:
-    return shlex.join(colmap_options(data, model))
+    try:
+        return shlex.join(layout_of(data, model).words)
+    except DataError:  # the images are elsewhere, or the model is damaged; ns-train then says so
+        return shlex.join(["colmap", "--colmap-path", model])
 
 
 def no_model(data: Path, model: Path) -> DataError:
@@ -47,7 +49,7 @@ def no_model(data: Path, model: Path) -> DataError:
             f"{data / model} is not a folder; give the folder of the model with colmap --colmap-path (usually sparse/0)"
         )
     best = max(found, key=found.__getitem__)
-    return DataError(f"{data / model} is not a folder; the model is in {best}: give `colmap {_options(data, best)}`")
+    return DataError(f"{data / model} is not a folder; the model is in {best}: give `{_options(data, best)}`")
 
 
 def larger_model(data: Path, model: Path) -> str | None:
@@ -64,5 +66,5 @@ def larger_model(data: Path, model: Path) -> str | None:
 
 def how_to_make_one(images: Path) -> str:
     """Advice with the command that makes a capture of a folder of images."""
-    folder = shlex.quote(str(images))
-    return f"make a capture of images with `ns-process-data images --data {folder} --output-dir CAPTURE`"
+    folder = shlex.quote(f"./{images}" if str(images).startswith("-") else str(images))
+    return f"make a capture of images with `sundae poses {folder} -o CAPTURE`"

@@ -10,33 +10,38 @@ from typing import Any
 from PIL import Image
 
 from sundae_ns.data.capture import check_image, read_json
-from sundae_ns.data.orientation import exif_orientation
+from sundae_ns.data.orientation import TURNED, exif_orientation
+from sundae_ns.data.photos import Photo
 from sundae_ns.errors import DataError, one_line
 
 
-def masks_of(photos: Sequence[Path], folder: Path) -> list[Path]:
+def masks_of(photos: Sequence[Photo], folder: Path) -> list[Path]:
     """The mask of each photo: an image in ``folder`` with the photo's name, or with ``.png`` behind it or in its place.
 
     Raises:
-        DataError: a photo has no mask, or one of another size, or is turned by EXIF.
+        DataError: a photo has no mask, or one of another size, or one that may be turned otherwise.
     """
     found = []
     for photo in photos:
-        names = (photo.name, f"{photo.name}.png", f"{photo.stem}.png", f"{photo.stem}.jpg")
+        path, wanted = photo.path, photo.size
+        names = (path.name, f"{path.name}.png", f"{path.stem}.png", f"{path.stem}.jpg")
         mask = next((folder / name for name in names if (folder / name).is_file()), None)
         if mask is None:
-            raise DataError(f"{photo} has no mask {photo.stem}.png in {folder}; add it, white where pixels count")
-        if exif_orientation(photo) != 1:
-            raise DataError(f"{photo} is turned by its EXIF entry, and its mask is not; save both upright")
-        size, wanted = check_image(mask, mask=True), check_image(photo)
-        if size != wanted:
+            raise DataError(f"{path} has no mask {path.stem}.png in {folder}; add it, white where pixels count")
+        size = check_image(mask, mask=True)
+        # A mask of the upright size is upright; where both sizes are the same, nothing says so.
+        if exif_orientation(path) != 1 and (
+            size != wanted or size == size[::-1] or exif_orientation(path) not in TURNED
+        ):
+            raise DataError(f"{path} is turned by its EXIF entry, and its mask is not; save both upright")
+        if wanted not in (size, (0, 0)):
             raise DataError(f"{mask} has {size[0]} x {size[1]} px and its photo {wanted[0]} x {wanted[1]}; scale it")
         found.append(mask)
     return found
 
 
 def add_masks(capture: Path, masks: Sequence[Path]) -> str:
-    """Copy masks into a capture of ns-process-data, at the sizes of its images, and name them in its frames.
+    """Copy masks into a capture, at the sizes of its images, and name them in its frames.
 
     Args:
         capture: whose images are named ``frame_00001`` and so on, in the order of the masks.

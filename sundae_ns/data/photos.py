@@ -4,63 +4,125 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 
-from sundae_ns.data.capture import check_image
+from sundae_ns.data.capture import check_image, undecodable
 from sundae_ns.errors import DataError, reading, regular
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".cr2")
-"""Photos that ns-process-data reads."""
+HEIF = (".heic", ".heif")
+"""Photos of phones, for which Pillow needs the package pillow-heif."""
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIF, ".cr2")
+"""Photos that are read."""
 LEAST_PHOTOS = 3
 """Number of photos with a pose that a scene needs, because nerfstudio holds out at least one for test."""
-_KINDS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif"}
-"""Suffix for a format of Pillow; phones write MPO, a JPEG of several images."""
-_RAW = ".cr2"
-_OTHERS = (".heic", ".heif", ".avif", ".webp", ".bmp", ".jxl", ".dng", ".nef", ".arw", ".cr3", ".raf", ".orf", ".rw2")
-"""Photos of other formats, which ns-process-data passes over."""
+AS_THEY_ARE = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
+"""Suffix for a format of Pillow that a capture may have; phones write MPO, a JPEG of several images."""
+_CONVERTED = ("TIFF", "WEBP", "BMP", "HEIF")
+"""Formats of Pillow whose photos are saved as JPEG, or as PNG if they have an alpha channel."""
+RAW = ".cr2"
+"""Raw photos of Canon, which Pillow does not read."""
+_OTHERS = (".avif", ".jxl", ".dng", ".nef", ".arw", ".cr3", ".raf", ".orf", ".rw2", ".gif")
+"""Photos of other formats, which are passed over."""
 _CONVERT = "convert them to JPEG (`magick mogrify -format jpg FILES`, or export them as JPEG)"
 MASKS = ("masks", "mask")
 """Names of folders whose images are masks, not photos."""
 
 
-def find_photos(folder: Path) -> tuple[list[Path], str]:
-    """The photos in a folder and its subfolders, sorted by path, and the suffix that fits their contents.
+class Photo(NamedTuple):
+    """A photo that can be used."""
+
+    path: Path
+    suffix: str
+    """Of the image in a capture: ``.jpg`` or ``.png``."""
+    size: tuple[int, int]
+    """Width and height in pixels, upright; of a raw photo as it is stored, (0, 0)."""
+    as_it_is: bool
+    """Whether the file can be copied: its format is that of the suffix, and its pixels are upright."""
+    lens: tuple[str, ...]
+    """Camera, lens and focal length by EXIF; photos that share these and their size share a camera."""
+
+
+def find_photos(folder: Path) -> list[Photo]:
+    """The photos in a folder and its subfolders, sorted by path. Only headers are read.
 
     Hidden files and folders are left out, and so are folders of masks and files of other suffixes, which
-    :func:`left_out` names. Only headers are read.
+    :func:`left_out` names.
 
     Raises:
         DataError: the folder cannot be read, has photos in several subfolders only, holds fewer than
-            :data:`LEAST_PHOTOS` photos, a file with the suffix of a photo that is none, or photos of several formats.
+            :data:`LEAST_PHOTOS` photos, or a file with the suffix of a photo that is none.
     """
     paths: list[Path] = []
     with reading(folder, "a folder of photos"):
-        for place, folders, files in os.walk(folder, onerror=_raise):
-            folders[:] = [name for name in folders if not name.startswith(".") and name.lower() not in MASKS]
-            for name in files:
-                path = Path(place, name)
-                if not name.startswith(".") and path.suffix.lower() in SUFFIXES:
-                    paths.append(path)
-    paths.sort()
+        paths = sorted(path for path in _files(folder) if path.suffix.lower() in SUFFIXES)
     _check_one_scene(folder, paths)
-    photos = {path: _suffix_of(path) for path in paths}
-    if not paths and (others := _other_formats(folder)):
-        raise DataError(f"{folder} holds only photos that cannot be read ({_counted(others)}); {_CONVERT}")
+    if not reads_heif():
+        paths = [path for path in paths if path.suffix.lower() not in HEIF]
+    photos = [photo_of(path) for path in paths]
+    if not paths and (others := _passed_over(folder)):
+        raise DataError(f"{folder} holds only photos that cannot be read ({_counted(others)}); {_mend(others)}")
     if not paths:
         raise DataError(f"{folder} holds no photos ({', '.join(SUFFIXES)}); give a folder of photos, or a capture")
     if len(paths) < LEAST_PHOTOS:
         few = "1 photo" if len(paths) == 1 else f"{len(paths)} photos"
         raise DataError(f"{folder} holds {few}, and camera poses need {LEAST_PHOTOS} or more that overlap; add some")
-    first = paths[0]
-    other = next((path for path in paths if photos[path] != photos[first]), None)
-    if other is not None:
-        raise DataError(
-            f"{first} is a {photos[first]} and {other} a {photos[other]} by its contents; save all photos in one format"
-        )
-    return paths, photos[first]
+    return photos
+
+
+@cache
+def reads_heif() -> bool:
+    """Whether pillow-heif is installed; then Pillow reads HEIC from now on."""
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        return False
+    register_heif_opener()
+    return True
+
+
+def left_out(folder: Path) -> str | None:
+    """A remark on photos of other formats in a folder; None without any."""
+    others = _passed_over(folder)
+    if not others:
+        return None
+    return f"{_counted(others)} {'is' if sum(others.values()) == 1 else 'are'} left out; {_mend(others)}"
+
+
+def masks_beside(folder: Path) -> Path | None:
+    """The first folder of masks in a folder of photos; None without one."""
+    for place, folders, _ in os.walk(folder):
+        for name in sorted(folders):
+            if name.lower() in MASKS:
+                return Path(place, name)
+    return None
+
+
+def upright(photo: Photo) -> Image.Image:
+    """The pixels of a photo as they are to be seen, with its EXIF data; ``DataError`` if they cannot be decoded."""
+    try:
+        if photo.path.suffix.lower() == RAW:
+            import rawpy  # comes with nerfstudio
+
+            with rawpy.imread(str(photo.path)) as raw:
+                return Image.fromarray(raw.postprocess())
+        with Image.open(photo.path) as image:
+            image.load()
+            return ImageOps.exif_transpose(image)
+    except Exception as error:  # decoders raise many kinds
+        raise undecodable(photo.path, error) from error
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Files of a folder and its subfolders that are neither hidden nor masks."""
+    for place, folders, files in os.walk(folder, onerror=_raise):
+        folders[:] = [name for name in folders if not name.startswith(".") and name.lower() not in MASKS]
+        yield from (Path(place, name) for name in files if not name.startswith("."))
 
 
 def _check_one_scene(folder: Path, photos: Sequence[Path]) -> None:
@@ -76,50 +138,15 @@ def _check_one_scene(folder: Path, photos: Sequence[Path]) -> None:
     )
 
 
-def left_out(folder: Path, photos: Sequence[Path], *, masked: bool = False) -> list[str]:
-    """Remarks on photos that no scene is made of, one each: of other formats, of an odd size, and masks.
-
-    Args:
-        folder: of the photos.
-        photos: from :func:`find_photos`.
-        masked: whether masks are given.
-    """
-    remarks = []
-    if others := _other_formats(folder):
-        verb = "is" if sum(others.values()) == 1 else "are"
-        remarks.append(f"{_counted(others)} {verb} left out, as only {', '.join(SUFFIXES)} are read; {_CONVERT}")
-    sizes: dict[tuple[int, int], list[Path]] = {}
-    for path in photos:
-        if path.suffix.lower() != _RAW:
-            sizes.setdefault(check_image(path), []).append(path)
-    if len(sizes) > 1:
-        usual = max(sizes, key=lambda size: len(sizes[size]))
-        odd = sorted(path for size, paths in sizes.items() if size != usual for path in paths)
-        shown = ", ".join(path.name for path in odd[:3]) + (", ..." if len(odd) > 3 else "")
-        remarks.append(
-            f"{len(odd)} of {len(photos)} photos ({shown}) are not {usual[0]} x {usual[1]} px as the others. COLMAP "
-            "leaves them out, as it estimates one camera for all; crop or scale them to this size"
-        )
-    for place, folders, _ in os.walk(folder):
-        for name in sorted(folders):
-            if name.lower() in MASKS and not masked:
-                remarks.append(
-                    f"{Path(place, name)} is left out, as masks are not used for camera poses; to leave out what they "
-                    "hide in training, give --masks, or each frame of transforms.json its mask_path"
-                )
-    return remarks
-
-
-def _other_formats(folder: Path) -> dict[str, int]:
+def _passed_over(folder: Path) -> dict[str, int]:
     """Numbers of photos of formats that are passed over, by suffix."""
-    counts: dict[str, int] = {}
-    for _, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        for name in files:
-            suffix = Path(name).suffix.lower()
-            if suffix in _OTHERS and not name.startswith("."):
-                counts[suffix] = counts.get(suffix, 0) + 1
-    return counts
+    unread = _OTHERS if reads_heif() else (*_OTHERS, *HEIF)
+    suffixes = (path.suffix.lower() for path in _files(folder))
+    return dict(Counter(suffix for suffix in suffixes if suffix in unread))
+
+
+def _mend(others: dict[str, int]) -> str:
+    return 'install pillow-heif with pip install "sundae_ns[photos]"' if set(others) <= set(HEIF) else _CONVERT
 
 
 def _counted(counts: dict[str, int]) -> str:
@@ -130,19 +157,33 @@ def _raise(error: OSError) -> None:
     raise error
 
 
-def _suffix_of(path: Path) -> str:
-    """Suffix for the contents of a photo; ``DataError`` if it is none."""
-    if path.suffix.lower() == _RAW:
+def photo_of(path: Path) -> Photo:
+    """A photo, after a check of its header; ``DataError`` if the file is none, or of a format that is not read."""
+    if path.suffix.lower() == RAW:
         with (
             reading(path, "a photo", mend="remove it", missing="repair or remove it"),
             regular(path).open("rb") as file,
         ):
             if file.read(10)[8:] != b"CR":
                 raise DataError(f"{path} is not a raw photo of Canon; repair or remove it")
-        return _RAW
+        return Photo(path, ".jpg", (0, 0), False, (RAW,))
     check_image(path)
     with Image.open(path) as image:
-        found = str(image.format)
-    if found not in _KINDS:
+        found, size, alpha, exif = str(image.format), image.size, image.mode == "RGBA", image.getexif()
+        stated = exif.get(ExifTags.Base.Orientation, 1)
+        lens = _lens(exif)
+    if found not in (*AS_THEY_ARE, *_CONVERTED):
         raise DataError(f"{path} is a {found} file by its contents; save it as JPEG or PNG, or remove it")
-    return _KINDS[found]
+    turned = stated in range(2, 9)
+    suffix = AS_THEY_ARE.get(found, ".png" if alpha else ".jpg")
+    return Photo(path, suffix, size[::-1] if stated in range(5, 9) else size, found in AS_THEY_ARE and not turned, lens)
+
+
+def _lens(exif: Image.Exif) -> tuple[str, ...]:
+    """Maker, model, lens and focal length of a photo, as far as they are stated."""
+    with suppress(Exception):  # a damaged entry is none
+        inner = exif.get_ifd(ExifTags.IFD.Exif)
+        named = [exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), inner.get(ExifTags.Base.LensModel)]
+        focal = inner.get(ExifTags.Base.FocalLength)
+        return tuple(str(value).strip() for value in [*named, focal and f"{float(focal):.1f}"] if value)
+    return ()

@@ -13,12 +13,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 import yaml
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
@@ -42,9 +43,12 @@ from sundae_ns.storage.runs.config_file import check_run
 from sundae_ns.storage.runs.folder import config_of, unpacked_folder
 
 _PARSERS: dict[str, type[DataParserConfig]] = {
+    "blender-data": BlenderDataParserConfig,
     "colmap": ColmapDataParserConfig,
     "nerfstudio-data": NerfstudioDataParserConfig,
 }
+_ALPHA_COLORS = ("white", "black", None)
+"""Colours that a packed scene may name for what is transparent in its images."""
 _FOLDER = re.compile(r"(?!.*\.\.)[\w.-]+(/[\w.-]+)*")
 """Paths that a packed scene may name: below the capture, and without special characters of a shell, because nerfstudio
 passes paths of images to ffmpeg through one."""
@@ -114,6 +118,8 @@ def _describe(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
             value = value.as_posix()
         if isinstance(value, str) and isinstance(default, Path) and not _FOLDER.fullmatch(value):
             return None  # outside of the capture
+        if name == "alpha_color" and value not in _ALPHA_COLORS:
+            return None
         options[name] = value
     stated = {"parser": kind, "options": options, "scale": manager.camera_res_scale_factor}
     return {**stated, "robust_frame": True} if manager.robust_frame else stated
@@ -121,7 +127,7 @@ def _describe(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
 
 def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
     """Options of a parser that a finished run needs, with their defaults."""
-    left_out = {"_target", "data", "masks_path", "depths_path", "mask_color", "load_3D_points"}
+    left_out = {"_target", "data", "masks_path", "depths_path", "mask_color", "load_3D_points", "ply_path"}
     return {field.name: getattr(kind(), field.name) for field in fields(kind) if field.name not in left_out}
 
 
@@ -261,7 +267,9 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
     scale = stated.get("scale")
     if not is_number(scale) or not 0 < scale <= 1:
         raise refusal("an impossible scale of its images")
-    parser = _PARSERS[kind](load_3D_points=False)  # type: ignore[call-arg]
+    parser: Any = _PARSERS[kind]()
+    if hasattr(parser, "load_3D_points"):
+        parser.load_3D_points = False
     known, hints = _options(_PARSERS[kind]), get_type_hints(_PARSERS[kind])
     for name, value in options.items():
         if name not in known or not _is_possible(value, known[name], hints[name]):
@@ -278,7 +286,9 @@ def _is_possible(value: Any, default: Any, hint: Any) -> bool:
         return isinstance(value, str) and _FOLDER.fullmatch(value) is not None
     if isinstance(default, float):
         return is_number(value)
-    return value in get_args(hint) if isinstance(default, str) else type(value) is type(default)
+    if isinstance(default, str):
+        return value in (get_args(hint) if get_origin(hint) is Literal else _ALPHA_COLORS)
+    return type(value) is type(default)
 
 
 def _transforms(packed: PackedScene) -> dict[str, Any]:

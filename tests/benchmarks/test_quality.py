@@ -364,5 +364,5 @@ def test_folders_that_cannot_be_used(archives: Path, tmp_path: Path) -> None:
     scene_folder(archives / "copy" / "bicycle")
     with pytest.raises(DataError, match="more than once"):
         find_scene(archives, "bicycle")
-    with pytest.raises(DataError, match="no capture: .*`ns-process-data images --data"):
+    with pytest.raises(DataError, match="no capture: .*`sundae poses "):
         parser_of(archives)

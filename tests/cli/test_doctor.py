@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import ctypes.util
 import shutil
+import sys
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -198,12 +200,24 @@ def test_the_oldest_driver_is_named(no_cuda: None, monkeypatch: pytest.MonkeyPat
 
 def test_programs_of_nerfstudios_commands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert finding("COLMAP").fix == "apt-get install colmap"
     assert finding("ffmpeg").fix == "apt-get install ffmpeg"
-    for name in ("colmap", "ffmpeg"):
-        (tmp_path / name).touch(mode=0o755)
-    assert finding("COLMAP").detail.startswith(f"{tmp_path / 'colmap'}, for ns-process-data")
-    assert finding("ffmpeg").detail == f"{tmp_path / 'ffmpeg'}, for ns-process-data and ns-render"
+    (tmp_path / "ffmpeg").touch(mode=0o755)
+    assert finding("ffmpeg").detail == f"{tmp_path / 'ffmpeg'}, for ns-render"
+
+
+@pytest.mark.parametrize(("name", "module"), [("pycolmap", "pycolmap"), ("pillow-heif", "pillow_heif")])
+def test_packages_for_photos(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, module: str) -> None:
+    monkeypatch.setitem(sys.modules, module, SimpleNamespace(__version__="4.2.1"))  # type: ignore[arg-type]
+    assert finding(name).detail.startswith("4.2.1, for ")
+    monkeypatch.setitem(sys.modules, module, None)
+    found = finding(name)
+    assert (found.ok, found.needed) == (False, False)
+    assert found.detail.startswith("not installed, for ")
+    assert found.fix == 'pip install "sundae_ns[photos]"'
+    (tmp_path / f"{module}.py").write_text("raise ImportError('libgomp.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, module)
+    assert "cannot be loaded (libgomp.so.1: cannot open" in finding(name).detail
 
 
 @pytest.mark.parametrize("on_disk", [True, False])
@@ -266,6 +280,8 @@ def test_everything_on_disk_needs_no_advice(
     monkeypatch.setattr(evaluation, "lpips_weights_available", lambda: True)
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")
     monkeypatch.setattr(shutil, "which", lambda name: str(tmp_path / name))
+    for module in ("pycolmap", "pillow_heif"):
+        monkeypatch.setitem(sys.modules, module, SimpleNamespace(__version__="9.9"))  # type: ignore[arg-type]
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setenv("CUDA_HOME", str(tmp_path))
     compiler(tmp_path / "bin", "release 13.0")

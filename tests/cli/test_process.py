@@ -173,11 +173,6 @@ def test_a_command_that_is_not_installed(capfd: pytest.CaptureFixture[str]) -> N
     assert capfd.readouterr().err == "sundae: no-such-command-of-sundae cannot be started (No such file or directory)\n"
 
 
-def test_a_command_runs_in_its_folder(tmp_path: Path) -> None:
-    code = "import os, sys; raise SystemExit(os.getcwd() != sys.argv[1])"
-    assert run_in_group([sys.executable, "-c", code, str(tmp_path.resolve())], folder=tmp_path) == 0
-
-
 def test_a_path_is_no_option() -> None:
     assert [word(Path(name)) for name in ("-a", "--help", "a", "/-a")] == ["./-a", "./--help", "a", "/-a"]
     assert [quoted(Path(name)) for name in ("-a", "a b", "$(b)")] == ["./-a", "'a b'", "'$(b)'"]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import shlex
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tyro
@@ -16,6 +18,7 @@ from PIL import Image
 from sundae_ns import method_configs
 from sundae_ns.cli import main
 from sundae_ns.cli.train import methods
+from sundae_ns.data import layouts
 from sundae_ns.storage.runs.folder import LOCK
 from sundae_ns.storage.runs.unfinished import unfinished_run
 
@@ -101,6 +104,40 @@ def test_further_options_and_the_parser_of_a_capture(tmp_path: Path, ran: list[l
     assert ran[1].count("colmap") == 1, "the user's parser takes the place of ours"
     config = tyro.cli(type(usual), default=usual, args=ran[1][2 : ran[1].index("colmap")])
     assert config.pipeline.model.sh_degree == 1
+
+
+def test_a_colmap_model_is_read_once(tmp_path: Path, ran: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (20, 16), "grey").save(tmp_path / "images" / "0.png")
+    write_model(tmp_path / "sparse" / "0", ["0.png"], (20, 16))
+    read: list[Path] = []
+    images_of = layouts.images_of
+
+    def count(model: Path) -> Any:
+        read.append(model)
+        return images_of(model)
+
+    monkeypatch.setattr(layouts, "images_of", count)
+    with pytest.raises(Replaced):
+        main(["train", str(tmp_path)])
+    assert read == [tmp_path / "sparse" / "0"]
+
+
+def test_a_capture_of_blender_is_read_over_white(tmp_path: Path, ran: list[list[str]]) -> None:
+    for split in ("train", "val", "test"):
+        frames = [{"file_path": "./0"}]
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps({"frames": frames}))
+    Image.new("RGBA", (20, 16)).save(tmp_path / "0.png")
+    usual = method_configs.sundae.config
+    for more, color in (([], "white"), (["--", "--pipeline.model.background-color", "black"], "black")):
+        with pytest.raises(Replaced):
+            main(["train", str(tmp_path), *more])
+        assert ran[-1][-1] == "blender-data"
+        assert tyro.cli(type(usual), default=usual, args=ran[-1][2:-1]).pipeline.model.background_color == color
+    with pytest.raises(Replaced):
+        main(["train", str(tmp_path), "--", "blender-data", "--alpha-color", "black"])
+    assert ran[-1][-3:] == ["blender-data", "--alpha-color", "black"]
+    assert "--pipeline.model.background-color" not in ran[-1]
 
 
 def test_a_stray_word_is_no_option(tmp_path: Path, ran: list[list[str]], capsys: pytest.CaptureFixture[str]) -> None:

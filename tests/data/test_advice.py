@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 from colmap_models import write_model
+from PIL import Image
 
 from sundae_ns.data.advice import larger_model, models_in, no_model, no_transforms
 from sundae_ns.data.beside import beside, unused_masks
+from sundae_ns.data.layouts import posed_layout
 
 
 def model(folder: Path, images: int = 3) -> None:
@@ -33,8 +35,10 @@ def _text(data: Path) -> None:
 
 def _dense(data: Path) -> None:
     model(data / "dense" / "sparse")
-    (data / "dense" / "images").mkdir()
     (data / "images").mkdir()
+    (data / "dense" / "images").mkdir()
+    for index in range(3):
+        Image.new("RGB", (20, 16)).save(data / "dense" / "images" / f"{index}.png")
 
 
 def _blender(data: Path) -> None:
@@ -54,11 +58,14 @@ LAYOUTS: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "a model in sparse": (lambda data: model(data / "sparse"), "add `colmap --colmap-path sparse` to ns-train"),
     "a text": (_text, "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
-    "a dense folder": (_dense, "add `colmap --colmap-path dense/sparse --images-path dense/images` to ns-train"),
+    "a dense folder": (
+        _dense,
+        "add `colmap --colmap-path dense/sparse --images-path dense/images --downscale-factor 1` to ns-train",
+    ),
     "Blender": (_blender, "it is in Blender's layout (transforms_train.json): add `blender-data` to ns-train"),
     "a folder further in": (_inner, "room has; give that folder"),
     "another name": (lambda data: (data / "Transforms.json").touch(), "(there is Transforms.json)"),
-    "nothing": (lambda _: None, "make a capture of images with `ns-process-data images --data"),
+    "nothing": (lambda _: None, "make a capture of images with `sundae poses "),
 }
 
 
@@ -69,7 +76,7 @@ def test_advice_fits_what_a_folder_holds(tmp_path: Path, kind: str) -> None:
     said = str(no_transforms(tmp_path))
     assert advice in said
     assert "\n" not in said
-    assert ("ns-process-data" in said) == (kind in ("nothing", "another name"))
+    assert ("sundae poses" in said) == (kind in ("nothing", "another name"))
 
 
 def test_the_advised_words_are_the_model_and_its_images(tmp_path: Path) -> None:
@@ -78,6 +85,9 @@ def test_the_advised_words_are_the_model_and_its_images(tmp_path: Path) -> None:
     words = shlex.split(str(no_transforms(data)).split("`")[1])
     assert (data / words[words.index("--colmap-path") + 1] / "cameras.bin").is_file()
     assert (data / words[words.index("--images-path") + 1]).is_dir()
+    layout = posed_layout(data)
+    assert layout is not None
+    assert words == layout.words, "the advice is what sundae train adds"
 
 
 def test_a_damaged_model_counts_no_images(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from sundae_ns.data.masks import masks_of
+from sundae_ns.data.photos import photo_of
 from sundae_ns.errors import DataError
 
 
@@ -22,7 +23,22 @@ def saved(path: Path, mode: str, size: tuple[int, int] = (16, 12), orientation: 
 @pytest.mark.parametrize("name", ["a.jpg", "a.jpg.png", "a.png"])
 def test_the_mask_of_a_photo(tmp_path: Path, name: str) -> None:
     photo, mask = saved(tmp_path / "photos" / "a.jpg", "RGB"), saved(tmp_path / "masks" / name, "L")
-    assert masks_of([photo], mask.parent) == [mask]
+    assert masks_of([photo_of(photo)], mask.parent) == [mask]
+
+
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_the_mask_of_a_turned_photo_has_its_upright_size(tmp_path: Path, orientation: int) -> None:
+    photo = saved(tmp_path / "photos" / "a.jpg", "RGB", orientation=orientation)
+    mask = saved(tmp_path / "masks" / "a.png", "L", (12, 16))
+    assert masks_of([photo_of(photo)], mask.parent) == [mask]
+
+
+@pytest.mark.parametrize(("orientation", "size"), [(3, (16, 12)), (6, (12, 12))])
+def test_a_mask_that_may_be_turned_is_refused(tmp_path: Path, orientation: int, size: tuple[int, int]) -> None:
+    photo = saved(tmp_path / "photos" / "a.jpg", "RGB", size, orientation)
+    mask = saved(tmp_path / "masks" / "a.png", "L", size)
+    with pytest.raises(DataError, match="is turned by its EXIF entry"):
+        masks_of([photo_of(photo)], mask.parent)
 
 
 def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
@@ -36,4 +52,4 @@ def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
     for make, cause in cases:
         make()
         with pytest.raises(DataError, match=cause):
-            masks_of([photo], masks)
+            masks_of([photo_of(photo)], masks)

@@ -11,15 +11,21 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from sundae_ns.cli.poses import Poses
-from sundae_ns.data.photos import find_photos, left_out
+from sundae_ns.cli.poses import check_poses
+from sundae_ns.data import photos as module
+from sundae_ns.data.photos import find_photos, left_out, masks_beside
 from sundae_ns.errors import DataError
+from sundae_ns.poses import library
 
 
 def photo(path: Path, kind: str = "png") -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", (16, 12), "grey").save(path, format=kind)
     return path
+
+
+def paths_of(folder: Path) -> list[Path]:
+    return [photo.path for photo in find_photos(folder)]
 
 
 @pytest.fixture
@@ -38,20 +44,30 @@ def test_photos_of_all_folders_in_the_order_of_their_paths(photos: Path) -> None
     (photos / "notes.txt").touch()
     (photos / "link.png").symlink_to(photos / "0.png")
     names = ["0.png", "1.png", "2.png", "a.png/-c.png", "b/0.PNG", "link.png"]
-    assert find_photos(photos) == ([photos / name for name in names], ".png")
+    assert paths_of(photos) == [photos / name for name in names]
 
 
-@pytest.mark.parametrize(("kind", "suffix"), [("jpeg", ".jpg"), ("mpo", ".jpg"), ("png", ".png"), ("tiff", ".tif")])
-def test_the_suffix_is_that_of_the_contents(tmp_path: Path, kind: str, suffix: str) -> None:
-    for index, name in enumerate(("JPG", "jpeg", "png", "tif", "TIFF")):
+KINDS = {"jpeg": (".jpg", True), "mpo": (".jpg", True), "png": (".png", True)}
+KINDS |= {"tiff": (".jpg", False), "webp": (".jpg", False), "bmp": (".jpg", False)}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_suffix_is_that_of_the_contents(tmp_path: Path, kind: str) -> None:
+    for index, name in enumerate(("JPG", "jpeg", "png", "tif", "TIFF", "webp", "bmp")):
         photo(tmp_path / f"{index}.{name}", kind)
-    assert find_photos(tmp_path)[1] == suffix
+    assert {(photo.suffix, photo.as_it_is) for photo in find_photos(tmp_path)} == {KINDS[kind]}
+
+
+def test_formats_may_be_mixed(photos: Path) -> None:
+    photo(photos / "a.jpg", "jpeg")
+    photo(photos / "b.png", "jpeg")
+    assert [one.suffix for one in find_photos(photos)] == [".png", ".png", ".png", ".jpg", ".jpg"]
 
 
 def test_raw_photos(tmp_path: Path) -> None:
     for index in range(3):
         (tmp_path / f"{index}.CR2").write_bytes(b"II*\0\x10\0\0\0CR\2\0" + bytes(100))
-    assert find_photos(tmp_path)[1] == ".cr2"
+    assert [(one.suffix, one.as_it_is) for one in find_photos(tmp_path)] == [(".jpg", False)] * 3
     (tmp_path / "3.cr2").write_bytes(b"II*\0" + bytes(100))
     with pytest.raises(DataError, match=r"3\.cr2 is not a raw photo"):
         find_photos(tmp_path)
@@ -65,9 +81,8 @@ ODD: dict[str, tuple[Callable[[Path], object], str]] = {
     "a link to itself": (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
     "text": (lambda path: path.write_text("not a photo"), "it is not an image"),
     "nothing": (lambda path: path.touch(), "it is not an image"),
-    "another format": (lambda path: photo(path, "bmp"), "is a BMP file by its contents"),
+    "another format": (lambda path: photo(path, "ppm"), "is a PPM file by its contents"),
     "16 bits": (lambda path: Image.new("I;16", (16, 12)).save(path), "pixels of type I;16"),
-    "two formats": (lambda path: photo(path, "jpeg"), r"x\.png a \.jpg by its contents"),
 }
 
 
@@ -106,40 +121,46 @@ def test_a_folder_that_is_none(tmp_path: Path) -> None:
 
 
 def test_photos_of_other_formats_are_named(photos: Path) -> None:
-    assert left_out(photos, find_photos(photos)[0]) == []
-    for name in ("a.HEIC", "sub/b.heic", "c.webp", ".hidden.heic"):
+    assert left_out(photos) is None
+    for name in ("a.AVIF", "sub/b.avif", "c.dng", ".hidden.avif"):
         (photos / name).parent.mkdir(exist_ok=True)
         (photos / name).touch()
-    (remark,) = left_out(photos, find_photos(photos)[0])
-    assert remark.startswith("2 .heic files and 1 .webp file are left out")
-    assert "convert them to JPEG" in remark
+    remark = left_out(photos)
+    assert remark is not None
+    assert remark.startswith("2 .avif files and 1 .dng file are left out; convert them to JPEG")
     for path in photos.glob("*.png"):
         path.unlink()
     with pytest.raises(
-        DataError, match=r"only photos that cannot be read \(2 \.heic files and 1 \.webp file\); convert"
+        DataError, match=r"only photos that cannot be read \(2 \.avif files and 1 \.dng file\); convert"
     ):
         find_photos(photos)
 
 
-def test_a_run_says_which_photos_it_leaves_out(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (photos / "a.heic").touch()
-    Poses(photos, photos.parent / "capture", "exhaustive").check()
-    assert capsys.readouterr().out.startswith("# warning: 1 .heic file is left out")
+def test_heic_without_its_package(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "reads_heif", lambda: False)
+    (photos / "a.HEIC").touch()
+    (photos / "b.heic").touch()
+    assert len(find_photos(photos)) == 3
+    assert left_out(photos) == '2 .heic files are left out; install pillow-heif with pip install "sundae_ns[photos]"'
+    for path in photos.glob("*.png"):
+        path.unlink()
+    with pytest.raises(DataError, match=r"only photos that cannot be read \(2 \.heic files\); install pillow-heif"):
+        find_photos(photos)
 
 
-def test_photos_of_an_odd_size_are_named(photos: Path) -> None:
-    Image.new("RGB", (12, 16)).save(photos / "upright.png")
-    (remark,) = left_out(photos, find_photos(photos)[0])
-    assert remark.startswith("1 of 4 photos (upright.png) are not 16 x 12 px as the others. COLMAP leaves them out")
+def test_poses_say_which_photos_they_leave_out(
+    photos: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (photos / "a.dng").touch()
+    monkeypatch.setattr(library, "check_installed", lambda: None)
+    check_poses(photos, 150, None)
+    assert capsys.readouterr().out.startswith("# warning: 1 .dng file is left out")
 
 
 def test_masks_are_no_photos(photos: Path) -> None:
     photo(photos / "masks" / "0.png")
-    found, _ = find_photos(photos)
-    assert [path.name for path in found] == ["0.png", "1.png", "2.png"]
-    (remark,) = left_out(photos, found)
-    assert f"{photos / 'masks'} is left out" in remark
-    assert "mask_path" in remark
+    assert [path.name for path in paths_of(photos)] == ["0.png", "1.png", "2.png"]
+    assert masks_beside(photos) == photos / "masks"
 
 
 def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path: Path) -> None:
@@ -153,4 +174,4 @@ def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path: Pat
 
 def test_photos_in_one_folder_further_in(tmp_path: Path) -> None:
     paths = [photo(tmp_path / "DCIM" / "100" / f"{index}.png") for index in range(3)]
-    assert find_photos(tmp_path)[0] == paths
+    assert paths_of(tmp_path) == paths

@@ -15,6 +15,8 @@ import traceback
 from pathlib import Path
 from types import ModuleType
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))  # as pytest does
+
 import torch
 import torch.distributed as dist
 

@@ -1,6 +1,6 @@
 """The arithmetic of several ranks in one process: the rows of each rank, and its part of a checkpoint.
 
-``test_collectives.py`` runs the collectives.
+``test_rendering.py`` and ``test_shards.py`` run the collectives.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import signal
 import tracemalloc
 from collections.abc import Callable
@@ -17,6 +18,9 @@ from random import Random
 from typing import Any
 
 import pytest
+from colmap_models import write_model
+from ray_tracing import write_still_life
+from small_captures import HEIGHT, SIZE, VIEWS, WIDTH
 
 from sundae_ns.errors import SundaeError
 
@@ -115,3 +119,18 @@ def corrupted() -> Callable[[bytes, int], bytes]:
         return bytes(data)
 
     return corrupt
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture with a transforms.json; tests change a copy."""
+    out = tmp_path_factory.mktemp("capture") / "scene"
+    return write_still_life(out, train_views=VIEWS, test_views=1, width=WIDTH, height=HEIGHT, points=40, samples=1)
+
+
+@pytest.fixture
+def capture(scene: Path, tmp_path: Path) -> Path:
+    """A copy of the capture for one test, with a transforms.json and a COLMAP model."""
+    copy = Path(shutil.copytree(scene, tmp_path / "scene"))
+    write_model(copy / "sparse" / "0", sorted(path.name for path in (copy / "images").iterdir()), SIZE)
+    return copy

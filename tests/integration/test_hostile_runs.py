@@ -28,6 +28,7 @@ CONFIGS: dict[str, Callable[[str], str]] = {
 }
 WORDS: dict[str, list[str]] = {
     "run": ["CAPTURE", "-o", "PROJECT", "--method", "sundae-tiny"],
+    "poses": ["RUN", "-o", "capture"],
     "train": ["CAPTURE", "-o", "runs"],
     "prune": ["RUN", "-o", "out.ply", "--views", "2"],
     "distill": ["RUN", "-o", "out.sundae", "--steps", "2"],

@@ -1,8 +1,9 @@
-"""``sundae run`` with the real commands but COLMAP's: an interrupted training, and its rest."""
+"""``sundae run`` with the real commands: an interrupted training and its rest; poses by a COLMAP that can wait."""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from colmap_models import write_model
+from fake_colmap import FakeColmap
 from PIL import Image
 
 from sundae_ns.cli import main
@@ -33,14 +34,12 @@ def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Run ``sundae run`` with its commands in this process, which has imported nerfstudio; poses are the scene's."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny.scene / "images", "photos")
-    monkeypatch.setattr("sundae_ns.cli.poses.shutil.which", lambda _: "/bin/true")
-    monkeypatch.setattr("sundae_ns.cli.poses._colmap_uses_gpu", lambda: False)
     monkeypatch.setattr("sundae_ns.cli.run.measured_step", lambda *_: None)
+    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
 
-    def here(words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = (), saves: bool = True) -> int:
-        if words[0] == "ns-process-data":
-            assert folder is not None
-            shutil.copytree(tiny.scene, folder / words[words.index("--output-dir") + 1])
+    def here(words: Sequence[str], *, locks: Sequence[int] = (), saves: bool = True) -> int:
+        if words[:2] == ["sundae", "poses"]:
+            shutil.copytree(tiny.scene, words[words.index("-o") + 1])
             return 0
         # A viewer in this process would outlive the test.
         words = ["tensorboard" if word == "viewer+tensorboard" else word for word in words]
@@ -97,35 +96,43 @@ def test_photos_to_a_report_with_an_interruption(
     assert "<canvas" in Path("out/scene.html").read_text(encoding="utf-8")
 
     assert run(*words) == 0
-    assert capfd.readouterr().out.count(": done\n") == 7
+    assert capfd.readouterr().out.count(": done\n") == 6
 
 
-COLMAP = """#!/bin/sh
-case "$1" in
-    -h) echo "COLMAP 3.9 (without CUDA)" ;;
-    feature_extractor) if [ -e "$HERE/slow" ]; then echo $$ > "$HERE/pid"; exec sleep 600; fi ;;
-    mapper) while [ "$1" != --output_path ]; do shift; done; mkdir -p "$2" && cp -r "$HERE/model" "$2/0" ;;
-esac
+COLMAP = """
+import os, sys, time
+from pathlib import Path
+sys.path[:0] = {support!r}
+from fake_colmap import FakeColmap
+
+
+def wait(self, *given, **named):
+    if Path("slow").exists():
+        Path("pid").write_text(f"{{os.getpid()}}\\n")
+        time.sleep(600)
+    return mapped(self, *given, **named)
+
+
+mapped, FakeColmap.incremental_mapping = FakeColmap.incremental_mapping, wait
+sys.modules["pycolmap"] = FakeColmap()
 """
 NASTY = """-a b'c"d$(touch PWNED)`touch PWNED`;touch PWNED&"""
 
 
 @pytest.fixture
-def poses(open3d: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """nerfstudio's own program with another COLMAP, in a folder of its own; no command runs after it. Those asked."""
+def poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Our own program with another COLMAP; no command runs after it. Those asked."""
     monkeypatch.chdir(tmp_path)
-    write_model(tmp_path / "model", [f"frame_{number:05d}.png" for number in range(1, 5)], (24, 16))
-    for program, script in (("colmap", COLMAP), ("ffmpeg", "#!/bin/sh\n")):
-        (tmp_path / "bin").mkdir(exist_ok=True)
-        (tmp_path / "bin" / program).write_text(script)
-        (tmp_path / "bin" / program).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:/usr/bin:/bin")
-    monkeypatch.setenv("HERE", str(tmp_path))
+    (tmp_path / "site").mkdir()
+    support = [str(Path(__file__).parents[1] / "support")]
+    (tmp_path / "site" / "pycolmap.py").write_text(COLMAP.format(support=support))
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
     asked: list[list[str]] = []
 
     def only_poses(words: list[str], **options: Any) -> int:
         asked.append(words)
-        return run_in_group(words, **options) if words[0] == "ns-process-data" else 3
+        return run_in_group(words, **options) if words[:2] == ["sundae", "poses"] else 3
 
     monkeypatch.setattr("sundae_ns.cli.run.run_in_group", only_poses)
     monkeypatch.setattr("sundae_ns.cli.run.measured_step", lambda *_: None)
@@ -142,11 +149,12 @@ def test_no_name_reaches_a_shell(poses: list[list[str]], tmp_path: Path) -> None
     folder, out = Path(NASTY), Path(f"out{NASTY}")
     folder.mkdir()
     for name in (f"{NASTY}.png", "-b.PNG", "--help.png", "plain.png"):
-        Image.new("RGB", (24, 16), "grey").save(folder / name, format="png")
+        Image.new("RGB", (16, 12), "grey").save(folder / name, format="png")
     run_poses(f"./{folder}", str(out))
-    assert [words[0] for words in poses] == ["ns-process-data", "ns-train"]
+    assert [words[0] for words in poses] == ["sundae", "ns-train"]
     frames = json.loads((out / "capture" / "transforms.json").read_text())["frames"]
     assert [frame["file_path"] for frame in frames] == [f"images/frame_{number:05d}.png" for number in range(1, 5)]
+    assert frames[1]["original"] == f"{NASTY}.png"
     assert sorted(path.name for path in out.iterdir()) == ["capture", "run.json", "training.lock"]
     assert not list(tmp_path.rglob("PWNED"))
 
@@ -154,7 +162,7 @@ def test_no_name_reaches_a_shell(poses: list[list[str]], tmp_path: Path) -> None
 def test_a_killed_command_takes_colmap_with_it_and_the_next_one_works(poses: list[list[str]], tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     for name in ("a.png", "b.png", "c.png", "d.png"):
-        Image.new("RGB", (24, 16), "grey").save(tmp_path / "photos" / name)
+        Image.new("RGB", (16, 12), "grey").save(tmp_path / "photos" / name)
     (tmp_path / "slow").touch()
     words = [Path(sys.executable).parent / "sundae", "run", "photos", "-o", "out"]
     pid = tmp_path / "pid"
@@ -171,7 +179,7 @@ def test_a_killed_command_takes_colmap_with_it_and_the_next_one_works(poses: lis
     (tmp_path / "slow").unlink()
     wait(lambda: not is_locked(tmp_path / "out"))
     run_poses("photos", "out")
-    assert [words[0] for words in poses] == ["ns-process-data", "ns-train"]
+    assert [words[0] for words in poses] == ["sundae", "ns-train"]
 
 
 def is_locked(folder: Path) -> bool:

@@ -58,7 +58,8 @@ def test_a_larger_model_beside_the_given_one(capture: Path, load: Load, capsys: 
     assert f"sparse/0 has 4 images and sparse/1 has {len(names)}" in said(capsys)
     load(capture, colmap="sparse/1")
     assert "to train on those" not in said(capsys)
-    with pytest.raises(DataError, match="the model is in sparse/1: give `colmap --colmap-path sparse/1`"):
+    advice = "the model is in sparse/1: give `colmap --colmap-path sparse/1 --downscale-factor 1`"
+    with pytest.raises(DataError, match=advice):
         load(capture, colmap="colmap/sparse/0")
 
 

@@ -251,10 +251,13 @@ def test_headers_that_lie_are_refused(tmp_path: Path, lie: str) -> None:
     [
         ColmapDataParserConfig(colmap_path=Path("sparse/0"), downscale_factor=2, eval_mode="interval", eval_interval=5),
         NerfstudioDataParserConfig(auto_scale_poses=False, scale_factor=0.5, center_method="focus"),
+        BlenderDataParserConfig(scale_factor=0.5),
+        BlenderDataParserConfig(alpha_color=None),
     ],
 )
 def test_the_options_of_a_capture_survive(parser: Any) -> None:
-    parser.load_3D_points = False
+    if hasattr(parser, "load_3D_points"):
+        parser.load_3D_points = False
     manager = SundaeDatamanagerConfig(dataparser=parser, camera_res_scale_factor=0.5)
     found, scale = packed_run._capture(packed_run._describe(manager))
     assert scale == 0.5
@@ -263,9 +266,12 @@ def test_the_options_of_a_capture_survive(parser: Any) -> None:
 
 
 def test_captures_that_are_not_described() -> None:
-    for parser in (BlenderDataParserConfig(), ColmapDataParserConfig(images_path=Path("/elsewhere/images"))):
+    for parser in (
+        BlenderDataParserConfig(alpha_color="pink"),
+        ColmapDataParserConfig(images_path=Path("/elsewhere/images")),
+    ):
         assert packed_run._describe(SundaeDatamanagerConfig(dataparser=parser)) is None
-    for stated in (None, {}, {"parser": "blender-data", "options": {}}, {"parser": "colmap", "options": None}):
+    for stated in (None, {}, {"parser": "dnerf-data", "options": {}}, {"parser": "colmap", "options": None}):
         with pytest.raises(PackError, match="without --data"):
             packed_run._capture(stated)
     for scale in (0, 2, "1", None, float("nan")):
@@ -298,6 +304,14 @@ def test_captures_that_are_not_described() -> None:
 def test_impossible_options_of_a_capture(name: str, value: Any) -> None:
     with pytest.raises(PackError, match="an impossible option"):
         packed_run._capture({"parser": "colmap", "options": {name: value}, "scale": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("alpha_color", "pink"), ("alpha_color", ["white"]), ("ply_path", "a.ply")]
+)
+def test_impossible_options_of_a_capture_of_blender(name: str, value: Any) -> None:
+    with pytest.raises(PackError, match="an impossible option"):
+        packed_run._capture({"parser": "blender-data", "options": {name: value}, "scale": 1.0})
 
 
 # ------------------------------------------------------------------------------------------------------- runs to pack

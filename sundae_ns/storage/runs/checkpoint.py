@@ -18,7 +18,6 @@ from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, DataError, StorageError, one_line, regular
 from sundae_ns.gaussians.field import Encoding, Field
-from sundae_ns.gaussians.mending import mend
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes
 from sundae_ns.storage.archive import damage_of, load_tensors
 from sundae_ns.storage.atomic import replacing
@@ -311,7 +310,7 @@ def read_field(path: Path) -> FinishedField:
     else:
         loaded = read(path)
     field = field_of(loaded, path)
-    usable = mended_of(field, path).as_harmonics()
+    usable = usable_of(field, path).as_harmonics()
     return FinishedField(dict(usable), True, field.num_primitives - usable.num_primitives)
 
 
@@ -326,8 +325,23 @@ def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
     field = {name: value.float() for name, value in stored.items() if isinstance(value, Tensor)}
     if len(field) < len(stored):
         raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
-    _check_field(field, path)
+    for odd in odd_shapes(field):
+        raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")
     return Field(field, _encoding(field, state.get(EXTRA_STATE)))
+
+
+def usable_of(field: Field, path: Path) -> Field:
+    """The primitives of a field from :func:`field_of` that have a meaning, with finite values; logs what was changed.
+
+    Raises:
+        CheckpointError: no primitive has a meaning.
+    """
+    usable = mended_of(field, path)
+    if not usable.num_primitives:
+        raise CheckpointError(
+            f"{path} holds {field.num_primitives:,} primitives, and none is finite; give another file"
+        )
+    return usable
 
 
 def model_state(loaded: Mapping[str, Any]) -> dict[str, Any]:
@@ -348,11 +362,3 @@ def _encoding(field: Mapping[str, Tensor], extra: Any) -> Encoding:
         if extra.get("encoding") == encoding:
             return encoding  # type: ignore[no-any-return]
     raise CheckpointError("the checkpoint does not say how it stores colours; give another")
-
-
-def _check_field(field: Mapping[str, Tensor], path: Path) -> None:
-    """Check the shape of each parameter, and that a primitive has a meaning."""
-    for odd in odd_shapes(field):
-        raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")
-    if not mend(field).field.num_primitives:
-        raise CheckpointError(f"{path} holds {len(field['means']):,} primitives, and none is finite; give another file")

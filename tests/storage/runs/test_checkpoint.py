@@ -13,7 +13,8 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, sh_to_rgb
+from sundae_ns.gaussians import mending
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, sh_to_rgb
 from sundae_ns.storage import MODEL_FRAME, write_ply
 from sundae_ns.storage.runs import checkpoint
 
@@ -188,6 +189,26 @@ def test_a_field_of_another_format_is_refused(tmp_path: Path, extra: Any, cause:
     with pytest.raises(CheckpointError, match=cause) as caught:
         checkpoint.read_field(tmp_path)
     assert one_line(caught.value)
+
+
+def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mended: list[int] = []
+
+    def count(params: Any) -> Any:
+        mended.append(len(params["means"]))
+        return finite_mask(params)
+
+    monkeypatch.setattr(mending, "finite_mask", count)
+    stored = stock_checkpoint(tmp_path / "step-000000001.ckpt", n=4)
+    assert torch.equal(checkpoint.read_field(tmp_path)[0]["means"], stored["means"])
+    assert mended == [4]
+    loaded = checkpoint.read(tmp_path / "step-000000001.ckpt")
+    loaded["pipeline"]["_model.gauss_params.means"].fill_(torch.nan)
+    torch.save(loaded, tmp_path / "step-000000002.ckpt")
+    with pytest.raises(CheckpointError, match=r"holds 4 primitives, and none is finite"):
+        checkpoint.read_field(tmp_path)
 
 
 @pytest.mark.parametrize("inside", [".", "nerfstudio_models"])

@@ -1,0 +1,24 @@
+"""The commands of ``sundae run``, in a folder with photos."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from fake_colmap import FakeColmap
+from run_commands import PHOTOS, Commands, photo
+
+
+@pytest.fixture
+def commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Commands:
+    """The commands, in a folder with photos."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").mkdir()
+    for index in range(PHOTOS):
+        photo(Path("photos", f"{index}.JPG"))
+    made = Commands()
+    monkeypatch.setattr("sundae_ns.cli.run.run_in_group", made)
+    monkeypatch.setattr("sundae_ns.cli.run.measured_step", made.measured)
+    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
+    return made

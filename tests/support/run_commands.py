@@ -1,0 +1,131 @@
+"""``sundae run`` with commands that write what the real ones write last."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from sundae_ns.cli import main
+from sundae_ns.cli.forecast import Forecast
+from sundae_ns.gaussians import from_points
+from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
+
+PHOTOS = 8
+STEPS = ["sundae poses", "ns-train", "sundae eval", "sundae pack", "sundae report", "sundae export"]
+NAMES = ["camera poses", "train", "evaluate", "pack", "report", "web page"]
+
+
+class Commands:
+    """Stands for the commands: each writes what the real one writes last, and can be told to end otherwise."""
+
+    def __init__(self) -> None:
+        self.ran: list[list[str]] = []
+        self.codes: dict[str, int] = {}
+        self.placed = PHOTOS
+        self.saved_at = {0: 99, 130: 39}
+        """Step of the checkpoint, by the exit code of the training."""
+        self.silent = False
+        self.forecast: Forecast | None = None
+        self.asked: list[tuple[str, int, int]] = []
+
+    def measured(self, *asked: Any) -> Forecast | None:
+        """Stands for the process that times steps."""
+        self.asked.append(asked)
+        return self.forecast
+
+    def __call__(self, words: list[str], *, locks: Sequence[int] = (), saves: bool = True) -> int:
+        self.ran.append(list(words))
+        name = self.names[-1]
+        code = self.codes.get(name, 0)
+        if not self.silent:
+            self.write(name, words, code)
+        return code
+
+    @property
+    def names(self) -> list[str]:
+        return [" ".join(words[:2]) if words[0] == "sundae" else words[0] for words in self.ran]
+
+    def option(self, name: str, place: int = -1) -> str:
+        words = self.ran[place]
+        joined = [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
+        return joined[0] if joined else words[words.index(name) + 1]
+
+    def write(self, name: str, words: list[str], code: int) -> None:
+        if name == "ns-train":
+            names = ("--output-dir", "--experiment-name", "--timestamp")
+            root, experiment, stamp = (self.option(each) for each in names)
+            folder = Path(root, experiment, words[1], stamp)
+            (folder / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
+            (folder / "config.yml").write_text(
+                "!!python/object:sundae_ns.trainer.SundaeTrainerConfig\nschedule_length: 100\n"
+            )
+            if code in self.saved_at:
+                checkpoint = folder / "nerfstudio_models" / f"step-{self.saved_at[code]:09d}.ckpt"
+                with zipfile.ZipFile(checkpoint, "w") as archive:
+                    archive.writestr("data.pkl", bytes(500))
+        elif code:
+            return
+        elif name == "sundae poses":
+            capture = Path(self.option("-o"))
+            (capture / "images").mkdir(parents=True)
+            names = [f"{index}.JPG" for index in range(PHOTOS)]
+            for one in names[: self.placed]:
+                photo(capture / "images" / one)
+            frames = [{"file_path": f"images/{one}", "original": one} for one in names[: self.placed]]
+            meta = {"frames": frames, "left_out": names[self.placed :]}
+            (capture / "transforms.json").write_text(json.dumps(meta))
+        elif name == "sundae eval":
+            Path(self.option("-o")).write_text('{"results": {"psnr": 20.0}}')
+        elif name == "sundae pack":
+            Path(self.option("-o")).write_bytes(packed())
+        elif name == "sundae export":
+            Path(self.option("-o")).write_text("<html><body>a scene</body></html>\n")
+        else:
+            folder = Path(self.option("-o"))
+            folder.mkdir(exist_ok=True)
+            Image.effect_noise((30, 20), 50).save(folder / "views.png")
+            (folder / "report.md").write_text("# Report\n\n![PSNR of each test view](views.png)\n")
+
+
+def packed() -> bytes:
+    points = torch.linspace(0, 1, 30).reshape(10, 3)
+    model = {"sh_degree": 0, "rasterize_mode": "classic", "background_color": "black"}
+    scene = PackedScene(from_points(points, points, sh_degree=0, num_features=0), meta={"model": model})
+    return pack_bytes(*fit_scene(scene))[0]
+
+
+def photo(path: Path, kind: str = "jpeg") -> None:
+    Image.new("RGB", (16, 12), "grey").save(path, format=kind)
+
+
+def run(*words: str) -> int:
+    with pytest.raises(SystemExit) as caught:
+        main(["run", *words])
+    assert isinstance(caught.value.code, int)
+    return caught.value.code
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    assert run(*words) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("sundae: ")
+    return line
+
+
+def write_video(path: Path, frames: int, size: tuple[int, int] = (64, 48)) -> None:
+    """Write a video of frames that a square crosses; every third frame is sharp, the others are blurred."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25, size)
+    for index in range(frames):
+        frame = np.full((size[1], size[0], 3), 60, np.uint8)
+        frame[10:30, index % 40 : index % 40 + 20] = (40, 200, 250)
+        writer.write(frame if index % 3 == 1 else cv2.GaussianBlur(frame, (9, 9), 4))
+    writer.release()
