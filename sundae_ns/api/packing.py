@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.sensitivity import sensitivity_of
+from sundae_ns.api.start import start_of, stated_start
 from sundae_ns.api.views import is_frame, view_in_front
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import PackError
@@ -44,6 +45,7 @@ def scene_of(packed: PackedScene) -> Scene:
     if not is_frame(meta.get("frame")):
         meta.pop("frame", None)
     source = meta.get("source")
+    up, start = start_of(packed.meta)
     return Scene(
         Field(dict(packed.field), "logits" if degree == 0 else "harmonics"),
         _head_of(packed, stated.get("head")),
@@ -51,6 +53,8 @@ def scene_of(packed: PackedScene) -> Scene:
         antialiased=stated["rasterize_mode"] == "antialiased",
         trained_focal=None if focal is None else (float(focal[0]), float(focal[1])),
         views=views_of_arrays(packed.cameras),
+        up=up,
+        start=start,
         in_model_frame=not isinstance(source, dict) or source.get("model_frame") is not False,
         meta=meta,
     )
@@ -81,7 +85,7 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
         "trained_focal": list(scene.trained_focal) if head and scene.trained_focal else None,
     }
     source = {**scene.meta.get("source", {}), **({} if scene.in_model_frame else {"model_frame": False})}
-    meta = {**scene.meta, "source": source, "model": model}
+    meta = {**scene.meta, "source": source, "model": model, **stated_start(scene)}
     views = views_of_arrays(cameras)
     return PackedScene(
         field, head, None if cameras is None else dict(cameras), meta, sensitivity_of(scene, views) if views else None

@@ -22,6 +22,8 @@ def export(
     scene: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     upright: bool = False,
+    start_view: str | None = None,
+    up: tuple[float, float, float] | None = None,
     data: Path | None = None,
     overwrite: Overwrite = False,
 ) -> int:
@@ -36,6 +38,9 @@ def export(
             A name without a suffix is a folder of page and scene, for a web server.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
             Do not use the rotated file for a warm start.
+        start_view: what a page opens with: index of a stored camera, or a camera file as sundae render reads it; by
+            default that of a packed scene, else the first camera.
+        up: direction about which a page turns, for example 0 0 1; by default that of the scene, else of its cameras.
         data: folder of the capture, if it moved; for a page of a run.
         overwrite: replace an existing file, once the new one is complete.
     """
@@ -56,12 +61,20 @@ def export(
         if upright:
             raise ConfigError("a page turns the scene upright by itself; leave out --upright")
         from sundae_ns.api.page import write_page
+        from sundae_ns.api.start import stated_start, with_start
+        from sundae_ns.storage.packing import container
 
-        size = write_page(out, *open_packed_file(scene, data), title=out.resolve().stem)
+        opened, packed = open_packed_file(scene, data)
+        if start_view is not None or up is not None:
+            opened = with_start(opened, start_view, up)
+            packed = container.restated(packed, stated_start(opened))
+        size = write_page(out, opened, packed, title=out.resolve().stem)
         print(f"{out}: {size:,} bytes; {'open it in a browser' if out.suffix else 'serve it'}")
         return 0
     if kind_of(scene) == "ply" and out.suffix.lower() == ".ply" and has_own_columns(scene):
         raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
+    if start_view is not None or up is not None:
+        raise ConfigError(f"{out.suffix} files hold neither a start view nor an up axis; leave them out")
     from sundae_ns.api.opening import load
     from sundae_ns.api.saving import save_for_viewers
 

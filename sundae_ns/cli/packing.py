@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from io import StringIO
 from json import dumps
@@ -52,6 +52,8 @@ def pack(
     target_drop: float | None = None,
     finetune: int = 0,
     max_cameras: int = 100,
+    start_view: str | None = None,
+    up: tuple[float, float, float] | None = None,
     data: Path | None = None,
     json: bool = False,
     overwrite: Overwrite = False,
@@ -68,6 +70,9 @@ def pack(
         finetune: training steps with quantisation in the loop before packing, for example 1000; the run is not changed.
             The defaults then quantise more coarsely, for a smaller file.
         max_cameras: maximum number of training cameras to store for viewers; with 0, the capture is not needed.
+        start_view: what a page of the scene opens with: index of a stored camera, or a camera file as sundae render
+            reads it; by default the first camera.
+        up: direction that is upwards, for example 0 0 1; by default that of a run's capture.
         data: folder of the capture, if it moved.
         json: print one JSON object in place of the table.
         overwrite: replace an existing file, once the new one is complete.
@@ -76,6 +81,8 @@ def pack(
     from rich.console import Console
     from rich.progress import Progress
 
+    from sundae_ns.api.packing import scene_of
+    from sundae_ns.api.start import stated_start, with_start
     from sundae_ns.errors import ConfigError
     from sundae_ns.storage.packing import FINETUNED, PackConfig, fit_scene, write_fitted
     from sundae_ns.storage.runs.config_file import check_run
@@ -114,6 +121,9 @@ def pack(
                 from sundae_ns.api.packing import contents_of
 
                 source = contents_of(load(run))
+            if start_view is not None or up is not None:
+                stated = stated_start(with_start(scene_of(source), start_view, up))
+                source = replace(source, meta={**source.meta, **stated})
             progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
             judge = _judge_of(run, data)
             if finetune:

@@ -17,6 +17,7 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from PIL import Image
 
+from sundae_ns.api.opening import load
 from sundae_ns.cli import main
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes.opening import open_scene
@@ -54,6 +55,15 @@ def test_the_report_counts_every_byte(packed: Packed) -> None:
     assert rows.pop("all") == size
     assert sum(rows.values()) == size
     assert {"means", "quats", "scales", "features", "head", "cameras", "header"} <= set(rows)
+
+
+def test_the_up_axis_is_that_of_the_capture(packed: Packed) -> None:
+    """nerfstudio turns a capture until the mean of its cameras' upward directions is z."""
+    found = load(packed.file)
+    assert found.up == (0, 0, 1)
+    ups = torch.stack([view.pose[:, 1] for view in found.views]).mean(dim=0)
+    assert torch.nn.functional.cosine_similarity(ups, torch.tensor(found.up), dim=0) > 0.99
+    assert load(packed.blind).up == load(packed.config).up == found.up
 
 
 @pytest.mark.filterwarnings("error::UserWarning")
