@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.start import START_FILE, Direction, start_of
+from sundae_ns.api.start import Direction
 from sundae_ns.api.views import is_frame
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.compensation.head import SIZES
@@ -29,6 +29,8 @@ from sundae_ns.storage.runs.folder import find_config
 _HEAD = "networks.head."
 FRAME_FILE = "dataparser_transforms.json"
 """Transform from the capture's coordinates to the model's, which nerfstudio writes into the folder of a run."""
+START_FILE = "start.json"
+"""Start view and up axis of an unpacked run, as in the header of a packed file."""
 
 
 def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
@@ -145,6 +147,8 @@ def _start_of(config: Path) -> tuple[Direction | None, View | None]:
     """Up axis and start view of a run. nerfstudio turns captures so that z is upwards, unless the options forbid it."""
     up, start = None, None
     if (config.parent / START_FILE).is_file():
+        from sundae_ns.api.packing import start_of  # needs a compiler, as above
+
         with suppress(DataError):
             up, start = start_of(read_json(config.parent / START_FILE))
     if up is None and parser_options(config).get("orientation_method") in ("up", "vertical"):

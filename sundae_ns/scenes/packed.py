@@ -26,10 +26,10 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from sundae_ns.api.opening import FRAME_FILE, load
-from sundae_ns.api.packing import contents_of, refusal, scene_of, stored_cameras
+from sundae_ns.api.opening import FRAME_FILE, START_FILE, load
+from sundae_ns.api.packing import contents_of, refusal, scene_of, stated_start, stored_cameras
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.start import START_FILE, stated_start, unit
+from sundae_ns.api.start import unit
 from sundae_ns.api.views import is_frame, is_number
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig, no_images_error

@@ -14,10 +14,11 @@ import pytest
 import torch
 
 import sundae_ns as sn
-from sundae_ns.api.packing import scene_of
+from sundae_ns.api.opening import START_FILE
+from sundae_ns.api.packing import scene_of, start_of, stated_start
 from sundae_ns.api.page import render_first
 from sundae_ns.api.rendering import image_of
-from sundae_ns.api.start import START_FILE, start_of, stated_start, with_start
+from sundae_ns.api.start import with_start
 from sundae_ns.api.views import view_in_front
 from sundae_ns.cli import main
 from sundae_ns.errors import ConfigError, DataError

@@ -66,6 +66,34 @@ def test_the_up_axis_is_that_of_the_capture(packed: Packed) -> None:
     assert load(packed.blind).up == load(packed.config).up == found.up
 
 
+def test_a_run_is_cut_before_it_is_packed_or_exported(
+    tiny: Any, packed: Packed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = load(packed.file)
+    places = load(tiny.folder).field["means"][:, 0]
+    middle = float(places.median())
+    box = [-1e3, -1e3, -1e3, middle, 1e3, 1e3]
+    for words in (["--crop", *box], ["--remove-floaters"]):
+        cut = tmp_path / "a.sundae"
+        with pytest.raises(SystemExit, match="0"):
+            main(["pack", str(tiny.folder), "-o", str(cut), "--overwrite", *map(str, words)])
+        found, said = load(cut), capsys.readouterr()
+        assert (found.head is None) == (whole.head is None)
+        assert found.meta["capture"] == whole.meta["capture"]
+        assert found.up == whole.up
+        if words[0] == "--crop":
+            assert float(found.field["means"][:, 0].max()) < middle + 0.01
+            assert found.num_primitives == int((places <= middle).sum())
+            assert "PSNR" not in said.out, "the photos show what is cut"
+        else:
+            before, after = map(float, re.findall(r"PSNR ([\d.]+) -> ([\d.]+) dB", said.out)[0])
+            assert after > before - 0.15
+            assert found.num_primitives <= whole.num_primitives
+        with pytest.raises(SystemExit, match="0"):
+            main(["export", str(tiny.folder), "-o", str(tmp_path / "a.ply"), "--overwrite", *map(str, words)])
+        assert load(tmp_path / "a.ply").num_primitives == found.num_primitives
+
+
 @pytest.mark.filterwarnings("error::UserWarning")
 def test_ns_eval_finds_the_same_quality(tiny: Any, packed: Packed, call_here: Any, tmp_path: Path) -> None:
     said = call_here("ns-eval", "--load-config", packed.config, "--output-path", tmp_path / "out.json")

@@ -24,9 +24,9 @@ from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packag
 from numpy.typing import NDArray
 from packed_scenes import KINDS, write_bomb, write_kind
 
+from sundae_ns.api.packing import stated_start
 from sundae_ns.api.page import page_of, write_page
 from sundae_ns.api.saving import packed_file
-from sundae_ns.api.start import stated_start
 from sundae_ns.cli.view import serve
 from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage.packing import container, read_scene, write_scene
