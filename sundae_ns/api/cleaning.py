@@ -25,7 +25,7 @@ NEIGHBORS = 16
 """Nearest primitives that may support one."""
 REACH = 3.0
 """Two primitives touch if they are nearer than this many times the sum of their largest standard deviations."""
-LARGEST_SHARE, LARGEST = 1e-3, 100
+LARGEST_SHARE, LARGEST = 1e-3, 30
 """Most primitives of a group that floats: a share of all, and a number."""
 _SIDE = 512
 """Longest side of the images that tell what views see, pixels."""

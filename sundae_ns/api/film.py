@@ -35,8 +35,8 @@ _OPPOSITE = -0.5
 """Cosine below which two directions are so far apart that the spline between them would flip."""
 _SAMPLES = 64
 """Points of the spline between two views, by which its length is measured."""
-_DEPTH_SIDE = 48
-"""Sides of the images that tell how far away things are, pixels."""
+_ASKED, _DEPTH_SIDE = 16, 48
+"""Most images that tell how far away things are, and their longest side, pixels."""
 
 Array = NDArray[np.float64]
 
@@ -113,7 +113,7 @@ def _up_of(scene: Scene) -> Array:
 def _distance(scene: Scene, views: Sequence[View]) -> float:
     """The median distance of what views see; the unit in which the path measures motion against turning."""
     found = []
-    for view in views:
+    for view in views[:: -(-len(views) // _ASKED)]:
         depth = render(scene, view.zoomed(_DEPTH_SIDE / max(view.width, view.height)), head=False).depth
         found.append(float(depth[depth > 0].median()) if bool((depth > 0).any()) else math.nan)
     median = float(np.nanmedian(found)) if not np.isnan(found).all() else 1.0

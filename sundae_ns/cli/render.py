@@ -76,7 +76,8 @@ def render_file(
     elif video:
         fps = fps or FRAMES_PER_SECOND
         length = SECONDS if seconds is None else seconds
-        cameras = CameraFile(film_views(opened, seconds=length, frames_per_second=fps), fps)
+        with Console(stderr=True).status("Finding a path"):
+            cameras = CameraFile(film_views(opened, seconds=length, frames_per_second=fps), fps)
     elif view is None and opened.start is not None:
         cameras = CameraFile([opened.start], None)
     else:

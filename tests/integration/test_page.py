@@ -239,6 +239,10 @@ def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(tmp_path: 
             page.drag(80, 60, 110, 70)
             browser.wait_for(lambda page=page, n=frames: page.evaluate("sundae.frames") > n, "a frame", SECONDS)
             shots[name].append(page.screenshot().astype(int))
+            if stop == "2 of 2":
+                page.evaluate("document.getElementById('after').click()")
+                said = "document.getElementById('stop').textContent"
+                browser.wait_for(lambda page=page, s=said: page.evaluate(s) == "1 of 2", "the next stop", SECONDS)
 
     def differ(one: str, other: str, i: int) -> float:
         return float(np.abs(shots[one][i] - shots[other][i]).mean())

@@ -144,7 +144,7 @@ async function show(
   page.fly.addEventListener("change", () => {
     navigation.fly = page.fly.checked;
   });
-  let visited = 0;
+  let visited = navigation.stop ?? 0;
   const visit = (index: number): void => {
     visited = (index + stops.length) % stops.length;
     navigation.visit(visited);
