@@ -116,8 +116,10 @@ def _distance(scene: Scene, views: Sequence[View]) -> float:
     for view in views[:: -(-len(views) // _ASKED)]:
         depth = render(scene, view.zoomed(_DEPTH_SIDE / max(view.width, view.height)), head=False).depth
         found.append(float(depth[depth > 0].median()) if bool((depth > 0).any()) else math.nan)
-    median = float(np.nanmedian(found)) if not np.isnan(found).all() else 1.0
-    return max(median, 1e-9)
+    if np.isnan(found).all():  # they see nothing, or only what is nearer than the near plane
+        centers = np.stack([_place(view) for view in views])
+        found = np.linalg.norm(centers - centers.mean(axis=0), axis=1).tolist()
+    return max(float(np.nanmedian(found)), 1e-9)
 
 
 def _tour(points: Array, most: int) -> list[int]:

@@ -96,6 +96,15 @@ def test_views_that_look_in_opposite_directions_are_turned_between() -> None:
     check_upright(views, torch.tensor([0.0, 0.0, 1.0]))
 
 
+def test_views_that_see_nothing_make_a_path_too() -> None:
+    eyes = on_a_ring(9, radius=400.0)
+    outward = [(2 * x, 2 * y, z) for x, y, z in eyes]
+    views = film(dataclasses.replace(ball(), views=looking(eyes, outward)))
+    found = steps(views, 400.0)
+    assert float(found.max() / found.min()) < 1.5
+    assert min(float(view.center.norm()) for view in views) > 300
+
+
 def test_a_view_straight_down_is_passed_over() -> None:
     eyes = on_a_ring(5)
     views = looking([(0.0, 0.0, 6.0), *eyes], 6 * [(0.0, 0.0, 0.0)])
