@@ -97,6 +97,9 @@ def _scene(path: Path, degree: int, kind: tuple[Any, int, int] | None) -> bytes:
         "source": {"method": "sundae", "step": 9},
         "frame": {"transform": torch.eye(4).tolist(), "scale": 1.0},
     }
+    if degree % 2:
+        meta["up"] = [0.6, 0.0, -0.8]
+        meta["start"] = {"pose": poses[1].tolist(), "intrinsics": lens[1].tolist(), "size": [24, 18]}
     write_scene(path, PackedScene(field, head, cameras, meta))
     return path.read_bytes()
 
@@ -135,7 +138,7 @@ def python_verdict(path: Path) -> Verdict:
     }
     for pose, lens, size in zip(cameras["poses"], cameras["intrinsics"], cameras["sizes"], strict=True):
         digest.update(torch.cat([pose.reshape(-1).double(), lens, size.double()]).numpy().tobytes())
-    rest = packed.field["features_rest"].shape[1]
+    rest, start = packed.field["features_rest"].shape[1], packed.meta.get("start")
     content = {
         "digest": digest.hexdigest(),
         "degree": round((rest + 1) ** 0.5) - 1,
@@ -143,8 +146,17 @@ def python_verdict(path: Path) -> Verdict:
         "antialiased": scene.antialiased,
         "background": [round(float(value), 4) for value in scene.background],
         "trainedFocal": list(scene.trained_focal) if scene.trained_focal else None,
+        "up": packed.meta.get("up"),
+        "start": None if start is None else _camera(start),
     }
+    assert (scene.up is None, scene.start is None) == (content["up"] is None, start is None)
     return Verdict(None, content)
+
+
+def _camera(stated: dict[str, Json]) -> dict[str, Json]:
+    """A start view as the page has it."""
+    lens = zip(("fx", "fy", "cx", "cy", "width", "height"), [*stated["intrinsics"], *stated["size"]], strict=True)
+    return {"pose": [value for row in stated["pose"] for value in row], **dict(lens)}
 
 
 @contextmanager

@@ -22,6 +22,8 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sundae_ns.api.cleaning import crop as crop
+    from sundae_ns.api.cleaning import remove_floaters as remove_floaters
     from sundae_ns.api.measuring import Quality as Quality
     from sundae_ns.api.measuring import measure as measure
     from sundae_ns.api.opening import load as load
@@ -46,10 +48,12 @@ _HOMES = {
     "Scene": "sundae_ns.api.scene",
     "SundaeError": "sundae_ns.errors",
     "View": "sundae_ns.rendering.views",
+    "crop": "sundae_ns.api.cleaning",
     "distill": "sundae_ns.scenes.distill",
     "load": "sundae_ns.api.opening",
     "measure": "sundae_ns.api.measuring",
     "prune": "sundae_ns.api.pruning",
+    "remove_floaters": "sundae_ns.api.cleaning",
     "render": "sundae_ns.api.rendering",
     "save": "sundae_ns.api.saving",
     "views_of": "sundae_ns.api.views",

@@ -166,6 +166,20 @@ def change_model(pack: Pack, rng: random.Random) -> None:
     )
 
 
+def change_start(pack: Pack, rng: random.Random) -> None:
+    """State another up axis or start view: wrong by a little, by much, or of another kind."""
+    near: list[Json] = [0, 1, -1, 0.3, 0.95, 0.7, 1.05, 2, 1e-300, 1e30, -1e9, 1e9, 1.1e9, None, "1", True, RAW]
+    up = [rng.choice(near) if rng.random() < 0.5 else float(i == 2) for i in range(3)]
+    start = json.loads(json.dumps(pack.meta.get("start", {"pose": [], "intrinsics": [1, 1, 0, 0], "size": [9, 9]})))
+    for part in start.values():
+        row = rng.choice(part) if part and isinstance(part[0], list) else part
+        if row and rng.random() < 0.4:
+            row[rng.randrange(len(row))] = rng.choice([*near, *NUMBERS])
+    if start["pose"] and rng.random() < 0.3:
+        start["pose"][0], start["pose"][1] = start["pose"][1], start["pose"][0]
+    pack.meta |= rng.choice([{"up": up}, {"start": start}, {"up": rng.choice(OTHERS)}, {"start": rng.choice(OTHERS)}])
+
+
 def change_tensors(pack: Pack, rng: random.Random) -> None:
     """State other tensors of the head: twice, reordered, reshaped, renamed."""
     about = pack.meta["attributes"].get("head")
@@ -356,7 +370,7 @@ def change_sections(pack: Pack, rng: random.Random) -> None:
 
 
 CHANGES: list[Callable[[Pack, random.Random], None]] = [
-    *(change_value, change_value, change_keys, change_model, change_tensors, change_tensors),
+    *(change_value, change_value, change_keys, change_model, change_tensors, change_tensors, change_start),
     *(change_stream, change_stream, change_frame, change_array, change_values, change_values, change_sections),
 ]
 

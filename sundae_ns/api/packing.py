@@ -11,9 +11,10 @@ from torch import Tensor
 
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.sensitivity import sensitivity_of
-from sundae_ns.api.views import is_frame, view_in_front
+from sundae_ns.api.start import Direction, unit
+from sundae_ns.api.views import is_frame, is_number, view_in_front
 from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.errors import PackError
+from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.gaussians import FEATURES, mend
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering.views import View
@@ -21,6 +22,7 @@ from sundae_ns.storage.packing import PackedScene
 from sundae_ns.storage.packing.schema import FORMAT, fault
 
 _MODEL: dict[str, Any] = FORMAT["model"]
+_PROPERTIES: dict[str, Any] = FORMAT["header"]["properties"]
 _HEAD_OPTIONS: list[str] = _MODEL["properties"]["head"]["required"]
 """Options of a head that a packed scene states."""
 _CARRIED = ("source", "frame", "capture")
@@ -44,6 +46,7 @@ def scene_of(packed: PackedScene) -> Scene:
     if not is_frame(meta.get("frame")):
         meta.pop("frame", None)
     source = meta.get("source")
+    up, start = start_of(packed.meta)
     return Scene(
         Field(dict(packed.field), "logits" if degree == 0 else "harmonics"),
         _head_of(packed, stated.get("head")),
@@ -51,6 +54,8 @@ def scene_of(packed: PackedScene) -> Scene:
         antialiased=stated["rasterize_mode"] == "antialiased",
         trained_focal=None if focal is None else (float(focal[0]), float(focal[1])),
         views=views_of_arrays(packed.cameras),
+        up=up,
+        start=start,
         in_model_frame=not isinstance(source, dict) or source.get("model_frame") is not False,
         meta=meta,
     )
@@ -81,11 +86,54 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
         "trained_focal": list(scene.trained_focal) if head and scene.trained_focal else None,
     }
     source = {**scene.meta.get("source", {}), **({} if scene.in_model_frame else {"model_frame": False})}
-    meta = {**scene.meta, "source": source, "model": model}
+    meta = {**scene.meta, "source": source, "model": model, **stated_start(scene)}
     views = views_of_arrays(cameras)
     return PackedScene(
         field, head, None if cameras is None else dict(cameras), meta, sensitivity_of(scene, views) if views else None
     )
+
+
+def stated_start(scene: Scene) -> dict[str, Any]:
+    """Entries ``up`` and ``start`` of a packed file's header; without those that the scene does not know.
+
+    Raises:
+        ConfigError: readers would refuse them.
+    """
+    stated: dict[str, Any] = {}
+    if scene.up is not None:
+        stated["up"] = [float(value) for value in scene.up]
+    if scene.start is not None:
+        view = scene.start
+        stated["start"] = {
+            "pose": view.pose.double().tolist(),
+            "intrinsics": view.K.double()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(),
+            "size": [view.width, view.height],
+        }
+    for name, value in stated.items():
+        if not all(map(is_number, _numbers(value))) or fault(value, _PROPERTIES[name]) is not None:
+            named = "start view" if name == "start" else "up axis"
+            raise ConfigError(f"the {named} of the scene has values that readers refuse; give another one")
+    return stated
+
+
+def _numbers(value: Any) -> list[Any]:
+    if isinstance(value, (dict, list)):
+        return [
+            number for inner in (value.values() if isinstance(value, dict) else value) for number in _numbers(inner)
+        ]
+    return [value]
+
+
+def start_of(stated: Mapping[str, Any]) -> tuple[Direction | None, View | None]:
+    """Up axis and start view of JSON values; None for one that is missing, or that the schema refuses."""
+    good = {name: stated[name] for name in ("up", "start") if name in stated}
+    good = {name: value for name, value in good.items() if fault(value, _PROPERTIES[name]) is None}
+    view = None
+    if "start" in good:
+        start = good["start"]
+        pose = torch.tensor(start["pose"], dtype=torch.float64)
+        view = View.from_pose(pose, start["intrinsics"], *start["size"])
+    return unit(good["up"]) if "up" in good else None, view
 
 
 def stored_cameras(packed: PackedScene) -> dict[str, Tensor]:

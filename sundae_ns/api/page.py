@@ -91,10 +91,10 @@ def _poster(scene: Scene) -> str:
 
 
 def render_first(scene: Scene) -> Image.Image:
-    """The image of the scene's first view, head included, at most 640 pixels wide and high.
+    """The image of the scene's start view, else of its first one, head included, at most 640 pixels wide and high.
 
     Raises:
         MemoryExhaustedError: the view has more primitives than any real scene, or needs more memory than there is.
     """
-    view = scene.views[0] if scene.views else view_in_front(scene)
+    view = scene.start or (scene.views[0] if scene.views else view_in_front(scene))
     return image_of(render(scene, view.zoomed(min(_POSTER_SIDE / max(view.width, view.height), 1.0))).rgb)

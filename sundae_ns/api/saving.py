@@ -50,9 +50,9 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
         if suffix in FORMATS:
             save_for_viewers(scene, path, upright=upright)
         elif suffix == ".html":
-            write_page(path, scene, _packed(scene), title=path.resolve().stem)
+            write_page(path, scene, packed_bytes(scene), title=path.resolve().stem)
         else:
-            packed = _packed(scene)
+            packed = packed_bytes(scene)
             with replacing(path) as partial:
                 partial.write_bytes(packed)
 
@@ -62,10 +62,11 @@ def packed_file(path: Path) -> tuple[Scene, bytes]:
     scene = load(path)
     if kind_of(path) == "packed":
         return scene, path.read_bytes()
-    return scene, _packed(scene)
+    return scene, packed_bytes(scene)
 
 
-def _packed(scene: Scene) -> bytes:
+def packed_bytes(scene: Scene) -> bytes:
+    """The packed file of a scene, with default settings."""
     from sundae_ns.api.packing import contents_of  # its encoder needs a compiler, which other files do not
     from sundae_ns.storage.packing import fit_scene, pack_bytes
 

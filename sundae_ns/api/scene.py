@@ -40,6 +40,10 @@ class Scene:
     """Shortest and longest focal length of the images that the head was trained on, pixels."""
     views: tuple[View, ...] = ()
     """Cameras stored with the scene, such as some of its training views; on the CPU."""
+    up: tuple[float, float, float] | None = None
+    """The direction that is upwards, of unit length; None if it is not known. The web page turns about it."""
+    start: View | None = None
+    """The camera that the web page opens with, on the CPU; None for the first of the stored ones."""
     in_model_frame: bool = False
     """Whether coordinates are those of nerfstudio's model, not of the capture or of another program."""
     meta: Mapping[str, Any] = dataclasses.field(default_factory=dict)

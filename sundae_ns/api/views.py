@@ -35,11 +35,14 @@ class CameraFile(NamedTuple):
 
 
 def view_in_front(scene: Scene) -> View:
-    """A camera of 640 x 480 pixels for a scene without cameras: it looks along y, with z upwards."""
+    """A camera of 640 x 480 pixels for a scene without cameras: with z upwards it looks along y."""
     means = scene.field["means"].detach().cpu()
     center = means.median(dim=0).values
     away = 3 * float((means - center).norm(dim=1).median().clamp_min(1e-6))
-    return View.look_at(center - torch.tensor([0.0, away, 0.0]), center, fov=_FRONT_FOV)
+    up = torch.tensor(scene.up or (0.0, 0.0, 1.0))
+    side = torch.tensor([1.0, 0.0, 0.0] if abs(float(up[0])) < 0.9 else [0.0, 1.0, 0.0])
+    back = torch.nn.functional.normalize(torch.linalg.cross(side, up), dim=0)
+    return View.look_at(center + away * back, center, up, fov=_FRONT_FOV)
 
 
 def views_of(path: Path | str, scene: Scene | None = None) -> list[View]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from sundae_ns.cli.cleaning import Cleaning
 from sundae_ns.cli.outputs import Overwrite, check_file, check_folder
 
 if TYPE_CHECKING:
@@ -22,8 +23,11 @@ def export(
     scene: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     upright: bool = False,
+    start_view: str | None = None,
+    up: tuple[float, float, float] | None = None,
     data: Path | None = None,
     overwrite: Overwrite = False,
+    cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
 ) -> int:
     """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz, .sog or .glb.
 
@@ -36,6 +40,9 @@ def export(
             much smaller). A name without a suffix is a folder of page and scene, for a web server.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
             Do not use the rotated file for a warm start.
+        start_view: what a page opens with: index of a stored camera, or a camera file as sundae render reads it; by
+            default that of a packed scene, else the first camera.
+        up: direction about which a page turns, for example 0 0 1; by default that of the scene, else of its cameras.
         data: folder of the capture, if it moved; for a page of a run.
         overwrite: replace an existing file, once the new one is complete.
     """
@@ -55,17 +62,41 @@ def export(
     if page:
         if upright:
             raise ConfigError("a page turns the scene upright by itself; leave out --upright")
+        from sundae_ns.api.packing import stated_start
         from sundae_ns.api.page import write_page
+        from sundae_ns.api.saving import packed_bytes
+        from sundae_ns.api.start import with_start
+        from sundae_ns.storage.packing import container
 
-        size = write_page(out, *open_packed_file(scene, data), title=out.resolve().stem)
+        opened, packed = open_packed_file(scene, data)
+        if cleaning.chosen:
+            opened = cleaning.cleaned(opened)
+            packed = packed_bytes(opened)
+        if start_view is not None or up is not None:
+            opened = with_start(opened, start_view, up)
+            packed = container.restated(packed, stated_start(opened))
+        size = write_page(out, opened, packed, title=out.resolve().stem)
         print(f"{out}: {size:,} bytes; {'open it in a browser' if out.suffix else 'serve it'}")
         return 0
-    if kind_of(scene) == "ply" and out.suffix.lower() == ".ply" and has_own_columns(scene):
+    copies = kind_of(scene) == "ply" and out.suffix.lower() == ".ply" and has_own_columns(scene)
+    if copies and (upright or not cleaning.chosen):
         raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
-    from sundae_ns.api.opening import load
+    if start_view is not None or up is not None:
+        raise ConfigError(f"{out.suffix} files hold neither a start view nor an up axis; leave them out")
+    from sundae_ns.api.cleaning import within
+    from sundae_ns.api.opening import load, load_with_mask
     from sundae_ns.api.saving import save_for_viewers
+    from sundae_ns.storage.ply import keep_vertices
 
-    found = load(scene)
+    if copies:
+        found, usable = load_with_mask(scene)
+        rows = within(usable, cleaning.mask(found, ()))
+        keep_vertices(scene, out, rows)
+        print(f"{out}: {int(rows.sum()):,} of {len(rows):,} primitives")
+        return 0
+    # A run's cameras are in its capture.
+    found = open_packed_file(scene, data)[0] if cleaning.remove_floaters else load(scene)
+    found = cleaning.cleaned(found)
     if upright and not found.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
     with Console(stderr=True).status(f"Writing {found.num_primitives:,} primitives"):  # minutes for a .sog of a million
@@ -106,16 +137,22 @@ def check_one(amounts: Mapping[str, float | None]) -> None:
 
 def cameras_for(scene: Scene, cameras: Path | None, views: int | None, seed: int) -> Sequence[View]:
     """Cameras that preserve a scene: of a file or a run, else those stored with the scene, else virtual ones."""
+    from sundae_ns.api.virtual import virtual_views
+
+    return cameras_of(scene, cameras, views) or virtual_views(scene, views, seed=seed)
+
+
+def cameras_of(scene: Scene, cameras: Path | None, most: int | None) -> Sequence[View]:
+    """Cameras of a file or a run, at most so many of a run, else those stored with the scene; there may be none."""
     from sundae_ns.api import opening
     from sundae_ns.api.views import views_of
-    from sundae_ns.api.virtual import VIEWS, virtual_views
     from sundae_ns.storage.kinds import kind_of
     from sundae_ns.storage.runs.folder import find_config
 
     if cameras is None:
-        return scene.views or virtual_views(scene, views, seed=seed)
+        return scene.views
     if kind_of(cameras) == "packed":
-        return opening.load(cameras).views or virtual_views(scene, views, seed=seed)
+        return opening.load(cameras).views
     is_run = (cameras.is_dir() or cameras.name == "config.yml") and find_config(cameras) is not None
     if not is_run:
         return views_of(cameras, scene)
@@ -123,10 +160,11 @@ def cameras_for(scene: Scene, cameras: Path | None, views: int | None, seed: int
 
     check_run(cameras)  # before nerfstudio is imported, which takes seconds
     from sundae_ns.api.packing import views_of_arrays
+    from sundae_ns.api.virtual import VIEWS
     from sundae_ns.scenes.packed import contents_of_run
 
     with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
-        return views_of_arrays(contents_of_run(cameras, max_cameras=views or VIEWS["cpu"]).cameras)
+        return views_of_arrays(contents_of_run(cameras, max_cameras=most or VIEWS["cpu"]).cameras)
 
 
 def prune_file(
@@ -146,6 +184,7 @@ def prune_file(
     cameras: Path | None = None,
     seed: int = 0,
     overwrite: Overwrite = False,
+    cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
 ) -> int:
     """Prune a scene of any program, without its photos.
 
@@ -157,7 +196,7 @@ def prune_file(
         source: a .ply, .spz, .sog, .glb, .splat or gsplat's .pt, a packed scene, or a run.
         out: file to write, in the format of its suffix: .ply, .spz, .sog, .glb or .sundae. A .ply of a .ply keeps all
             properties and comments.
-        keep: share of the primitives to keep, in (0, 1]; by default 0.1.
+        keep: share of the primitives to keep, of those that a box and the floaters leave, in (0, 1]; by default 0.1.
         count: number of primitives to keep, in place of a share.
         target_drop: keep as few as lose at most this PSNR, in dB, of a full field that shows its photos at 30 dB; by
             the images of held-out cameras.
@@ -177,8 +216,9 @@ def prune_file(
         overwrite: replace an existing file, once the new one is complete.
     """
     from sundae_ns.api import opening, pruning, saving
+    from sundae_ns.api.cleaning import kept, within
     from sundae_ns.api.cost import prune_cost, require_memory, state
-    from sundae_ns.api.virtual import SIDES, VIEWS
+    from sundae_ns.api.virtual import SIDES, VIEWS, virtual_views
     from sundae_ns.errors import ConfigError
     from sundae_ns.gpu.memory import naming_full_memory
     from sundae_ns.pruning import PruneRule
@@ -208,10 +248,15 @@ def prune_file(
             stated = True
             state(cost, n, looks)
     scene, usable = opening.load_with_mask(source)
-    with naming_full_memory(lambda: scene.num_primitives):
-        scene, seen = scene.to(device), None
+    total = scene.num_primitives if usable is None else len(usable)
+    with naming_full_memory(lambda: total):
+        scene, seen, clean = scene.to(device), None, None
+        given = cameras_of(scene, cameras, views)
+        if cleaning.chosen:
+            clean = cleaning.mask(scene, given)
+            scene = kept(scene, clean)
         if rule.uses_contribution or target_drop is not None:
-            seen = cameras_for(scene, cameras, views, seed)
+            seen = given or virtual_views(scene, views, seed=seed)
         if target_drop is not None:
             from sundae_ns.api.target import count_for_drop
 
@@ -226,11 +271,10 @@ def prune_file(
     small = pruned.scene.to("cpu")
     if usable is not None and out.suffix.lower() == ".ply" and kind_of(source) == "ply" and has_own_columns(source):
         rows = usable.clone()
-        rows[usable] = pruned.mask.cpu()
+        rows[usable] = within(clean, pruned.mask).cpu()
         keep_vertices(source, out, rows, small.field if merge else None)
     else:
         saving.save(small, out)
-    total = scene.num_primitives if usable is None else len(usable)
     print(f"{out}: {small.num_primitives:,} of {total:,} primitives")
     if pruned.seen is not None and seen:
         print(f"{len(seen)} cameras see {pruned.seen:.1%} of the primitives")

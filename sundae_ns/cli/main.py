@@ -62,7 +62,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "unpack": (unpack, "unpack a scene into a run, for the commands of nerfstudio"),
     "export": (export, "write a scene as a web page, .ply, .spz, .sog or .glb"),
     "view": (view, "show a scene with its head in the browser"),
-    "render": (render_file, "render a scene to an image, or a camera path to a video"),
+    "render": (render_file, "render a scene to an image, or to a film along a smooth path"),
     "report": (report, "measure and compare finished runs: quality, speed, size"),
     "curve": (curve, "how many primitives a run needs: the curve by which it has chosen"),
     "eval": (evaluate, "evaluate a run as ns-eval does, without running its config.yml"),

@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from io import StringIO
 from json import dumps
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from sundae_ns.cli.cleaning import Cleaning
 from sundae_ns.cli.outputs import Overwrite, check_file
 from sundae_ns.cli.process import quoted
 
@@ -52,11 +53,14 @@ def pack(
     target_drop: float | None = None,
     finetune: int = 0,
     max_cameras: int = 100,
+    start_view: str | None = None,
+    up: tuple[float, float, float] | None = None,
     data: Path | None = None,
     json: bool = False,
     overwrite: Overwrite = False,
     block: int = 1024,
     precision: Annotated[Precision, tyro.conf.arg(name="")] = Precision(),  # noqa: B008
+    cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
 ) -> int:
     """Pack a scene into one file that can be rendered; print the size of each part, and the quality before and after.
 
@@ -69,6 +73,9 @@ def pack(
         finetune: training steps with quantisation in the loop before packing, for example 1000; the run is not changed.
             The defaults then quantise more coarsely, for a smaller file.
         max_cameras: maximum number of training cameras to store for viewers; with 0, the capture is not needed.
+        start_view: what a page of the scene opens with: index of a stored camera, or a camera file as sundae render
+            reads it; by default the first camera.
+        up: direction that is upwards, for example 0 0 1; by default that of a run's capture.
         data: folder of the capture, if it moved.
         json: print one JSON object in place of the table.
         overwrite: replace an existing file, once the new one is complete.
@@ -77,6 +84,8 @@ def pack(
     from rich.console import Console
     from rich.progress import Progress
 
+    from sundae_ns.api.packing import contents_of, scene_of, stated_start
+    from sundae_ns.api.start import with_start
     from sundae_ns.errors import ConfigError
     from sundae_ns.storage.packing import FINETUNED, PackConfig, fit_scene, write_fitted
     from sundae_ns.storage.runs.config_file import check_run
@@ -92,6 +101,11 @@ def pack(
         raise ConfigError(f"target-bytes is {target_bytes}; give 1 or more")
     if target_drop is not None and not 0 < target_drop < 100:
         raise ConfigError(f"target-drop is {target_drop}; give a positive number of dB")
+    if cleaning.chosen and (finetune or target_drop is not None):
+        raise ConfigError(
+            f"--finetune and --target-drop look at photos of the whole scene; leave out {cleaning.chosen[0]}, or cut "
+            "the scene by `sundae export` or `sundae prune` afterwards"
+        )
     chosen = {name: value for name, value in {**asdict(precision), "block": block}.items() if value is not None}
     plain = PackConfig(**chosen)  # type: ignore[arg-type]
     config = PackConfig(**{**FINETUNED, **chosen}) if finetune else plain  # type: ignore[arg-type]
@@ -112,9 +126,13 @@ def pack(
                 source = contents_of_run(run, max_cameras=max_cameras, data=data)
             else:
                 from sundae_ns.api.opening import load
-                from sundae_ns.api.packing import contents_of
 
                 source = contents_of(load(run))
+            if cleaning.chosen:
+                source = contents_of(cleaning.cleaned(scene_of(source), progress=False))
+            if start_view is not None or up is not None:
+                stated = stated_start(with_start(scene_of(source), start_view, up))
+                source = replace(source, meta={**source.meta, **stated})
             progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
             judge = _judge_of(run, data)
             if finetune:
@@ -142,7 +160,7 @@ def pack(
                 scene, codecs = found.scene, found.codecs
             report = write_fitted(out, scene, codecs)
             progress.update(task, advance=1, description="Measuring")
-            if has_photos:
+            if has_photos and cleaning.crop is None:  # photos show what a box leaves out
                 packs = [(scene, codecs), *([fit_scene(source, plain)] if finetune else [])]
                 quality, figures = _measured(judge, packs, finetune, notes)
     for note in notes:

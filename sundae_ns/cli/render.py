@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 FRAMES_PER_SECOND = 24
+SECONDS = 12.0
 
 
 def render_file(
@@ -25,23 +26,34 @@ def render_file(
     view: int | None = None,
     head: bool = True,
     width: int | None = None,
+    seconds: float | None = None,
+    fps: float | None = None,
+    up: tuple[float, float, float] | None = None,
     overwrite: Overwrite = False,
 ) -> int:
-    """Render a scene to an image, or along a camera path to a video.
+    """Render a scene to an image, or along a path to a video.
+
+    Without --camera, a video is a film along a closed, smooth path through some of the cameras stored with the scene;
+    around it if there are none.
 
     Args:
         scene: a packed scene, a run, or a .ply, .spz, .sog, .glb, .splat or gsplat's .pt.
         out: image (.png, .jpg or .webp) or video (.mp4) to write.
         camera: a transforms.json or a camera path of the viewer; by default the cameras stored with the scene.
-        view: index of the camera for an image; needed if there are several.
+        view: index of the camera for an image; by default the start view of the scene, if it has one.
         head: let the head correct the images.
-        width: width of the images in pixels; by default that of the camera.
+        width: width of the images in pixels; by default that of the camera, in a film at most 1,280 a side.
+        seconds: length of a film without --camera; by default 12.
+        fps: frames a second of a video; by default those of the camera path, else 24.
+        up: direction that is upwards, for example 0 -1 0; by default that of the scene, else of its cameras, else z.
         overwrite: replace an existing file, once the new one is complete.
     """
     from rich.console import Console
     from rich.progress import track
 
     from sundae_ns.api import opening, rendering
+    from sundae_ns.api.film import film_views
+    from sundae_ns.api.start import with_start
     from sundae_ns.api.views import CameraFile, read_cameras, view_in_front
     from sundae_ns.errors import ConfigError
     from sundae_ns.evaluation.video import write_video
@@ -52,20 +64,32 @@ def render_file(
         raise ConfigError(f"{out} is neither an image nor a video; name it {', '.join(IMAGES)} or .mp4")
     if width is not None and width < 2:
         raise ConfigError(f"width is {width}; give 2 pixels or more")
+    video = suffix == ".mp4"
+    if seconds is not None and (camera is not None or not video):
+        raise ConfigError("--seconds is the length of a film without --camera; leave it out")
+    if fps is not None and not (video and 0 < fps <= 240):
+        raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
     check_file(out, reads=[scene, camera], overwrite=overwrite)
-    opened = opening.load(scene)
+    opened = with_start(opening.load(scene), None, up)
     if camera is not None:
         cameras = read_cameras(camera, opened)
+    elif video:
+        fps = fps or FRAMES_PER_SECOND
+        length = SECONDS if seconds is None else seconds
+        with Console(stderr=True).status("Finding a path"):
+            cameras = CameraFile(film_views(opened, seconds=length, frames_per_second=fps), fps)
+    elif view is None and opened.start is not None:
+        cameras = CameraFile([opened.start], None)
     else:
         cameras = CameraFile(list(opened.views) or [view_in_front(opened)], None)
-    views = [_resized(each, width, even=suffix == ".mp4") for each in cameras.views]
+    views = [_resized(each, width, even=video) for each in cameras.views]
 
     def rendered(view: View) -> Image.Image:
         return rendering.image_of(rendering.render(opened, view, head=head).rgb)
 
-    if suffix == ".mp4":
+    if video:
         shown = track(views, "Rendering", transient=True, console=Console(stderr=True))
-        speed = cameras.frames_per_second or FRAMES_PER_SECOND
+        speed = fps or cameras.frames_per_second or FRAMES_PER_SECOND
         with replacing(out) as partial:
             count = write_video(partial, (rendered(each) for each in shown), frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")

@@ -11,6 +11,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -26,13 +27,14 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from sundae_ns.api.opening import FRAME_FILE, load
-from sundae_ns.api.packing import contents_of, refusal, scene_of, stored_cameras
+from sundae_ns.api.opening import FRAME_FILE, START_FILE, load
+from sundae_ns.api.packing import contents_of, refusal, scene_of, stated_start, stored_cameras
 from sundae_ns.api.scene import Scene
+from sundae_ns.api.start import unit
 from sundae_ns.api.views import is_frame, is_number
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig, no_images_error
-from sundae_ns.errors import PackError
+from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.parsing import check_capture
 from sundae_ns.scenes import stock
@@ -81,9 +83,12 @@ def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = No
     manager.data = data or manager.data or config.data
     source = {"method": config.method_name, **scene.meta["source"]}
     meta = {**scene.meta, "source": source, "capture": _describe(manager)}
-    return contents_of(
-        dataclasses.replace(scene, meta=meta), _cameras(manager, max_cameras) if max_cameras > 0 else None
-    )
+    cameras = _cameras(manager, max_cameras) if max_cameras > 0 else None
+    up = scene.up
+    if up is None and cameras is not None:
+        with suppress(ConfigError):  # cameras that look all around have none
+            up = unit(cameras["poses"][:, :, 1].double().mean(dim=0).tolist())
+    return contents_of(dataclasses.replace(scene, meta=meta, up=up), cameras)
 
 
 def packed_run(run: Path, *, data: Path | None = None) -> tuple[Scene, bytes]:
@@ -159,7 +164,8 @@ def write_run(
     config: TrainerConfig = copy.deepcopy(all_methods["sundae"])  # type: ignore[assignment]
     folder = unpacked_folder(output_dir, name, overwrite=overwrite)
     config.output_dir, (config.experiment_name, _, config.timestamp) = output_dir.resolve(), folder.parts[-3:]
-    model = model_of(scene_of(packed))
+    scene = scene_of(packed)
+    model = model_of(scene)
     config.pipeline.model = model.config
     cameras = folder / "cameras"
     manager = _without_images(cameras) if data is None else datamanager_of(packed, data)
@@ -173,6 +179,10 @@ def write_run(
             write_text(folder / FRAME_FILE, json.dumps(frame, indent=4))
         else:
             (folder / FRAME_FILE).unlink(missing_ok=True)
+        if stated := stated_start(scene):
+            write_text(folder / START_FILE, json.dumps(stated, indent=4))
+        else:
+            (folder / START_FILE).unlink(missing_ok=True)
     state = {f"_model.{name}": value for name, value in model.state_dict().items()}
     path = config.get_checkpoint_dir() / f"step-{model.step:09d}.ckpt"
     checkpoint.write({"step": model.step, "pipeline": state}, path)

@@ -241,6 +241,7 @@ def put(path: str, value: Any) -> Callable[[Json], None]:
     return apply
 
 
+POSE = [[1, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 0]]
 LIES: dict[str, Callable[[Json], None]] = {
     "a billion primitives": put("primitives", 10**9),
     "no primitives": put("primitives", 0),
@@ -267,6 +268,19 @@ LIES: dict[str, Callable[[Json], None]] = {
     "a tensor named twice": put("attributes.head.tensors.1.0", "net.decoder.0.0.bias"),
     "a name in two lines": put(":means/low.name", "means\nlow"),
     "no list of sections": put("sections", {}),
+    "an up axis of no length": put("up", [0, 0, 0]),
+    "an up axis that is not finite": put("up", [0, 0, float("nan")]),
+    "an up axis of huge length": put("up", [0, 0, 1e30]),
+    "an up axis of words": put("up", ["0", "0", "1"]),
+    "an up axis of two numbers": put("up", [0, 1]),
+    "a start view that is no object": put("start", [1]),
+    "a start view without a lens": put("start", {"pose": POSE, "size": [4, 3]}),
+    "a start view that sees a point": put("start", {"pose": [[0] * 4] * 3, "intrinsics": [9, 9, 0, 0], "size": [4, 3]}),
+    "a mirrored start view": put("start", {"pose": POSE[::-1], "intrinsics": [9, 9, 0, 0], "size": [4, 3]}),
+    "a start view far away": put(
+        "start", {"pose": [[1, 0, 0, 1e30], *POSE[1:]], "intrinsics": [9, 9, 0, 0], "size": [4, 3]}
+    ),
+    "a start view of no pixels": put("start", {"pose": POSE, "intrinsics": [9, 9, 0, 0], "size": [0, 3]}),
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -113,8 +114,32 @@ def test_a_video_has_a_frame_for_each_camera_and_even_sides(
     assert capsys.readouterr().out == f"{out}: 5 frames of 40 x 30 px, 0.5 s\n"
     frames = frames_of(out)
     assert [(frame.width, frame.height) for frame in frames] == [(40, 30)] * 5
-    assert run(folder / "packed.sundae", "-o", out, "--overwrite", "--width", 63) == 0
-    assert [(frame.width, frame.height) for frame in frames_of(out)] == [(62, 48)] * 2
+    assert run(folder / "cloud.ply", "--camera", tmp_path / "path.json", "-o", out, "--fps", 5, "--overwrite") == 0
+    assert capsys.readouterr().out == f"{out}: 5 frames of 40 x 30 px, 1.0 s\n"
+
+
+@pytest.mark.parametrize("name", ["packed.sundae", "cloud.ply"])
+def test_a_film_without_a_camera_path(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    out = tmp_path / "a.mp4"
+    assert run(folder / name, "-o", out, "--width", 63, "--seconds", 0.5, "--fps", 10, "--up", 0, 0, 1) == 0
+    shown = {"packed.sundae": (62, 48), "cloud.ply": (62, 34)}[name]
+    assert capsys.readouterr().out == f"{out}: 5 frames of {shown[0]} x {shown[1]} px, 0.5 s\n"
+    frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in frames_of(out)]
+    assert [frame.shape[1::-1] for frame in frames] == [shown] * 5
+    assert min(frame.std() for frame in frames) > 5
+    assert min(np.abs(one - other).mean() for one, other in itertools.pairwise(frames)) > 1
+
+
+def test_an_image_is_that_of_the_start_view(folder: Path, tmp_path: Path) -> None:
+    scene = sundae_ns.load(folder / "packed.sundae")
+    start = scene.views[1].zoomed(2)
+    sundae_ns.save(dataclasses.replace(scene, start=start), tmp_path / "a.sundae")
+    assert run(tmp_path / "a.sundae", "-o", tmp_path / "a.png") == 0
+    assert pixels(tmp_path / "a.png").shape == (62, 82, 3)
+    assert run(tmp_path / "a.sundae", "-o", tmp_path / "b.png", "--view", 0) == 0
+    assert pixels(tmp_path / "b.png").shape == (31, 41, 3)
 
 
 def test_refusals_are_one_line_and_write_nothing(
@@ -130,6 +155,12 @@ def test_refusals_are_one_line_and_write_nothing(
         ((packed, "-o", out, "--view", -1), "there is no camera -1"),
         ((packed, "-o", tmp_path / "a.gif", "--view", 0), "is neither an image nor a video"),
         ((packed, "-o", out, "--view", 0, "--width", 1), "width is 1; give 2 pixels or more"),
+        ((packed, "-o", out, "--view", 0, "--fps", 9), "--fps is of a video"),
+        ((packed, "-o", out, "--view", 0, "--seconds", 9), "--seconds is the length of a film"),
+        ((packed, "-o", out, "--up", 0, 0, 0), "the up axis has no direction"),
+        ((packed, "-o", tmp_path / "a.mp4", "--camera", few, "--seconds", 9), "--seconds is the length of a film"),
+        ((packed, "-o", tmp_path / "a.mp4", "--seconds", 0), "is impossible; give 1 to 36,000 frames"),
+        ((packed, "-o", tmp_path / "a.mp4", "--fps", "nan"), "--fps is of a video"),
         ((packed, "-o", out, "--camera", damaged), "damaged.json is not JSON"),
         ((packed, "-o", out, "--camera", few), "few.json has an empty camera_path"),
         ((packed, "-o", out, "--camera", tmp_path / "none.json"), "none.json"),

@@ -17,6 +17,7 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from PIL import Image
 
+from sundae_ns.api.opening import load
 from sundae_ns.cli import main
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes.opening import open_scene
@@ -54,6 +55,43 @@ def test_the_report_counts_every_byte(packed: Packed) -> None:
     assert rows.pop("all") == size
     assert sum(rows.values()) == size
     assert {"means", "quats", "scales", "features", "head", "cameras", "header"} <= set(rows)
+
+
+def test_the_up_axis_is_that_of_the_capture(packed: Packed) -> None:
+    """nerfstudio turns a capture until the mean of its cameras' upward directions is z."""
+    found = load(packed.file)
+    assert found.up == (0, 0, 1)
+    ups = torch.stack([view.pose[:, 1] for view in found.views]).mean(dim=0)
+    assert torch.nn.functional.cosine_similarity(ups, torch.tensor(found.up), dim=0) > 0.99
+    assert load(packed.blind).up == load(packed.config).up == found.up
+
+
+def test_a_run_is_cut_before_it_is_packed_or_exported(
+    tiny: Any, packed: Packed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = load(packed.file)
+    places = load(tiny.folder).field["means"][:, 0]
+    middle = float(places.median())
+    box = [-1e3, -1e3, -1e3, middle, 1e3, 1e3]
+    for words in (["--crop", *box], ["--remove-floaters"]):
+        cut = tmp_path / "a.sundae"
+        with pytest.raises(SystemExit, match="0"):
+            main(["pack", str(tiny.folder), "-o", str(cut), "--overwrite", *map(str, words)])
+        found, said = load(cut), capsys.readouterr()
+        assert (found.head is None) == (whole.head is None)
+        assert found.meta["capture"] == whole.meta["capture"]
+        assert found.up == whole.up
+        if words[0] == "--crop":
+            assert float(found.field["means"][:, 0].max()) < middle + 0.01
+            assert found.num_primitives == int((places <= middle).sum())
+            assert "PSNR" not in said.out, "the photos show what is cut"
+        else:
+            before, after = map(float, re.findall(r"PSNR ([\d.]+) -> ([\d.]+) dB", said.out)[0])
+            assert after > before - 0.15
+            assert found.num_primitives <= whole.num_primitives
+        with pytest.raises(SystemExit, match="0"):
+            main(["export", str(tiny.folder), "-o", str(tmp_path / "a.ply"), "--overwrite", *map(str, words)])
+        assert load(tmp_path / "a.ply").num_primitives == found.num_primitives
 
 
 @pytest.mark.filterwarnings("error::UserWarning")

@@ -6,6 +6,7 @@ The page's images are bytes, whose rounding alone gives 58.9 dB. ``make browser 
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 import os
 import threading
@@ -17,16 +18,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packages
 from numpy.typing import NDArray
 from packed_scenes import KINDS, write_bomb, write_kind
-from pages import SAID, SECONDS, SIZE, STOP, WEBGL, Quiet, hold, opened, rested, touch
+from pages import SAID, SECONDS, SIZE, STOP, TICKING, WEBGL, Quiet, hold, opened, rested, touch
 
+from sundae_ns.api.packing import stated_start
 from sundae_ns.api.page import page_of, write_page
 from sundae_ns.api.saving import packed_file
 from sundae_ns.cli.view import serve
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.storage.packing import read_scene, write_scene
+from sundae_ns.storage.packing import container, read_scene, write_scene
 
 pytestmark = needs_chromium
 image, psnr, truths = bench_page.image, bench_page.psnr, bench_page.truths
@@ -157,6 +160,41 @@ def test_the_controls(tmp_path: Path) -> None:
     finally:
         server.shutdown()
         server.server_close()
+
+
+@pytest.mark.browser
+def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(tmp_path: Path) -> None:
+    plain, content = packed_file(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
+    second = plain.views[1]
+    free = second._replace(viewmat=second.viewmat + 0.05 * torch.eye(4)[[3, 3, 3, 3]])
+    shots = {}
+    for name, up, start, stop in (
+        ("x", (1.0, 0.0, 0.0), second, "2 of 2"),
+        ("z", (0.0, 0.0, 1.0), second, "2 of 2"),
+        ("free", (0.0, 0.0, 1.0), free, "free"),
+    ):
+        scene = dataclasses.replace(plain, up=up, start=start)
+        write_page(tmp_path / "a.html", scene, container.restated(content, stated_start(scene)), title="a")
+        with opened((tmp_path / "a.html").as_uri(), flags=["--disable-features=WebGPU"]) as page:
+            hidden = "for (const id of ['panel', 'message']) document.getElementById(id).style.visibility = 'hidden'"
+            page.evaluate(f"{{ {hidden}; {TICKING} }}")  # the message of WebGL2 would take the drag
+            assert page.evaluate("document.getElementById('stop').textContent") == stop
+            shots[name] = [page.screenshot().astype(int)]
+            frames = page.evaluate("sundae.frames")
+            page.drag(80, 60, 110, 70)
+            browser.wait_for(lambda page=page, n=frames: page.evaluate("sundae.frames") > n, "a frame", SECONDS)
+            shots[name].append(page.screenshot().astype(int))
+            if stop == "2 of 2":
+                page.evaluate("document.getElementById('after').click()")
+                said = "document.getElementById('stop').textContent"
+                browser.wait_for(lambda page=page, s=said: page.evaluate(s) == "1 of 2", "the next stop", SECONDS)
+
+    def differ(one: str, other: str, i: int) -> float:
+        return float(np.abs(shots[one][i] - shots[other][i]).mean())
+
+    assert differ("x", "z", 0) < 0.1
+    assert differ("x", "z", 1) > 1
+    assert differ("free", "z", 0) > 1
 
 
 @pytest.mark.browser

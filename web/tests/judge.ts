@@ -22,8 +22,8 @@ for await (const path of createInterface({ input: process.stdin })) {
   let found: object;
   try {
     const scene = await readScene(new Uint8Array(readFileSync(path)));
-    const { degree, logits, antialiased, background, trainedFocal } = scene;
-    found = { digest: digestOf(scene), degree, logits, antialiased, background, trainedFocal };
+    const { degree, logits, antialiased, background, trainedFocal, up, start } = scene;
+    found = { digest: digestOf(scene), degree, logits, antialiased, background, trainedFocal, up, start };
   } catch (error) {
     found = error instanceof PackError ? { error: error.message } : { traceback: `${error}` };
   }

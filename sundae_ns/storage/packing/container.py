@@ -159,14 +159,30 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
         named[PADDING] = np.zeros(lacking, np.uint8)
         parts[PADDING] = [named[PADDING].tobytes()]
     sections = [_entry(name, array, parts[name]) for name, array in named.items()]
-    header = json.dumps({**meta, "sections": sections}, allow_nan=False, separators=(",", ":")).encode()
+    content = b"".join(
+        [_front({**meta, "sections": sections}), *(part for planes in parts.values() for part in planes)]
+    )
+    return content, {name: sum(map(len, planes)) for name, planes in parts.items()}
+
+
+def _front(meta: Mapping[str, Any]) -> bytes:
+    """All bytes of a file before its sections."""
+    header = json.dumps(meta, allow_nan=False, separators=(",", ":")).encode()
     if len(header) > MAX_HEADER:
         raise PackError(
             f"the header takes {len(header):,} bytes, but readers accept {MAX_HEADER:,}; give fewer cameras"
         )
-    preamble = _PREAMBLE.pack(PACKED, VERSION, len(header), hashlib.sha256(header).digest())
-    content = b"".join([preamble, header, *(part for planes in parts.values() for part in planes)])
-    return content, {name: sum(map(len, planes)) for name, planes in parts.items()}
+    return _PREAMBLE.pack(PACKED, VERSION, len(header), hashlib.sha256(header).digest()) + header
+
+
+def restated(content: bytes, entries: Mapping[str, Any]) -> bytes:
+    """A checked file with other entries of its header, which must not be ``sections``; its sections stay as they are.
+
+    The file may not become so much shorter that its sections unpack to too much; an entry more is always right.
+    """
+    length = _PREAMBLE.unpack_from(content)[2]
+    end = _PREAMBLE.size + length
+    return _front({**parsed(content[_PREAMBLE.size : end]), **entries}) + content[end:]
 
 
 def _entry(name: str, array: Array, parts: list[bytes]) -> dict[str, Any]:

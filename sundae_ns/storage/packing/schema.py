@@ -1,8 +1,9 @@
 """The one description of headers and sections, ``format.json``, and the checks by it.
 
 The web page is built with the same file, and ``web/src/scene/schema.ts`` is the twin of this module: both readers
-refuse the same files. A schema is JSON Schema (2020-12) with the keywords that :func:`fault` reads. ``uniqueBy`` is our
-own: items of a list differ in this entry.
+refuse the same files. A schema is JSON Schema (2020-12) with the keywords that :func:`fault` reads. Two are our own:
+items of a list differ in the entry ``uniqueBy``; ``orthonormal`` lists are a direction ``[3]`` or the rows of a pose
+``[3, 4]``, of about unit length and at right angles, and three rows are no mirror image.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from numpy.typing import NDArray
 FORMAT: dict[str, Any] = json.loads(resources.files(__package__).joinpath("format.json").read_text(encoding="utf-8"))
 """``limits`` of files, schemas of ``container``, ``header`` and ``model``, and ``sections`` by codec and part."""
 LIMITS: dict[str, int] = FORMAT["limits"]
+_CROOKED = 0.1
+"""Most that products of ``orthonormal`` rows are off; captures may be as far off."""
 _TYPES: dict[str, type] = {"object": dict, "array": list, "string": str, "null": type(None)}
 
 
@@ -61,7 +64,26 @@ def _fault_of_list(value: list[Any], schema: Mapping[str, Any], place: str) -> s
         if found is not None:
             return found
     key = schema.get("uniqueBy")
-    return place if key is not None and len({item[key] for item in value}) < count else None
+    if key is not None and len({item[key] for item in value}) < count:
+        return place
+    return place if schema.get("orthonormal") and not _is_orthonormal(value) else None
+
+
+def _is_orthonormal(value: list[Any]) -> bool:
+    """Whether a checked list is a direction, or the rows of a rotation, before their fourth number."""
+    rows = [row[:3] for row in value] if isinstance(value[0], list) else [value]
+
+    def dot(a: list[float], b: list[float]) -> float:
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+    for i, row in enumerate(rows):
+        for j in range(i + 1):
+            if not abs(dot(row, rows[j]) - (i == j)) <= _CROOKED:
+                return False
+    if len(rows) < 3:
+        return True
+    (a, b, c), (d, e, f) = rows[0], rows[1]
+    return dot([b * f - c * e, c * d - a * f, a * e - b * d], rows[2]) > 0
 
 
 def _fault_of_object(value: dict[str, Any], schema: Mapping[str, Any], place: str) -> str | None:

@@ -129,12 +129,22 @@ def model_options(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: it cannot be read, or is no configuration of a run.
     """
-    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
-    for part in ("pipeline", "model"):
-        found = found.get(part) if isinstance(found, dict) else None
-    if not isinstance(found, dict):
+    found = _part(path, "pipeline", "model")
+    if found is None:
         raise CheckpointError(f"{path} is not a run's config.yml; give the folder of a run")
     return found
+
+
+def parser_options(path: Path) -> dict[str, Any]:
+    """As :func:`model_options`, those of the data parser; empty for a run without one."""
+    return _part(path, "pipeline", "datamanager", "dataparser") or {}
+
+
+def _part(path: Path, *keys: str) -> dict[str, Any] | None:
+    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
+    for key in keys:
+        found = found.get(key) if isinstance(found, dict) else None
+    return found if isinstance(found, dict) else None
 
 
 def check_run(run: Path) -> None:

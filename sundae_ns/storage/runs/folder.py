@@ -142,7 +142,8 @@ def files_of(run: Path) -> list[Path]:
     if run.is_file() and run.name != "config.yml":
         return [run]
     folder = config_of(run).parent
-    return [folder / name for name in ("config.yml", "nerfstudio_models", "dataparser_transforms.json", PRUNES)]
+    names = ("config.yml", "nerfstudio_models", "dataparser_transforms.json", "start.json", PRUNES)
+    return [folder / name for name in names]
 
 
 def find_config(path: Path) -> Path | None:

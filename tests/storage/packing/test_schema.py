@@ -31,7 +31,15 @@ ATTRIBUTES = {
     "features_rest": {"codec": "transform", "step": 0.02, "width": 24},
     "head": {"codec": "channels", "weights": 4, "tensors": [["a", [2, 2]], ["b", [2]]]},
 }
-HEADER = {"primitives": 40, "attributes": ATTRIBUTES, "source": {"method": "sundae"}}
+POSE = [[1.0, 0, 0, 3], [0, 0.6, -0.8, 1e9], [0, 0.8, 0.6, 0]]
+START = {"pose": POSE, "intrinsics": [9, 9.5, -3, 0], "size": [640, 480.0]}
+HEADER = {
+    "primitives": 40,
+    "attributes": ATTRIBUTES,
+    "source": {"method": "sundae"},
+    "up": [0, 0.6, -0.82],
+    "start": START,
+}
 SECTION = {"name": "means/low", "dtype": "<f4", "shape": [1, 3], "parts": [3, 3, 3, 3], "sha256": 64 * "0"}
 CONTAINER = {"sections": [SECTION, {**SECTION, "name": "means/high"}]}
 VALID = {"container": CONTAINER, "header": HEADER, "model": MODEL}
@@ -57,6 +65,29 @@ WRONG: list[tuple[str, str, Any]] = [
     ("header", "attributes.head.tensors.0.0", "a\n"),
     ("header", "attributes.head.tensors.1.1", [2, 0]),
     ("header", "attributes.head.tensors.1", ["b", [2], 3]),
+    ("header", "up", None),
+    ("header", "up", [0, 0, 0]),
+    ("header", "up", [0, 1]),
+    ("header", "up", [0, 0, 1, 0]),
+    ("header", "up", [[0, 0, 1]]),
+    ("header", "up", [0, 0, True]),
+    ("header", "up", [0, 1e-200, 0]),
+    ("header", "up.1", 1e30),
+    ("header", "up.1", "0.6"),
+    ("header", "start", None),
+    ("header", "start", []),
+    ("header", "start.pose", POSE[:2]),
+    ("header", "start.pose", 3 * [4 * [0]]),
+    ("header", "start.pose", [POSE[1], POSE[0], POSE[2]]),
+    ("header", "start.pose", [POSE[0], POSE[0], POSE[2]]),
+    ("header", "start.pose.0", [1, 0, 0]),
+    ("header", "start.pose", [[1.06, 0, 0, 0], *POSE[1:]]),
+    ("header", "start.pose.0.3", 1e30),
+    ("header", "start.pose.0.3", None),
+    ("header", "start.intrinsics.1", 0),
+    ("header", "start.intrinsics.2", -1e10),
+    ("header", "start.size.0", 0),
+    ("header", "start.size.1", 480.5),
     ("container", "sections.1.dtype", "|O"),
     ("container", "sections.1.sha256", 64 * "g"),
     ("container", "sections.1.shape", []),

@@ -44,22 +44,31 @@ function middleOf({ field }: Scene): Vector3 {
   return new Vector3(along(0), along(1), along(2));
 }
 
-/** A camera in front of a scene without cameras: it looks along y, with z upwards. */
+/** A camera in front of a scene without cameras: with z upwards it looks along y. The twin of view_in_front. */
 function outside(scene: Scene, middle: Vector3): Camera {
   const distances: number[] = [];
   const place = new Vector3();
   for (let i = 0; i < scene.field.count; i++)
     distances.push(place.fromArray(scene.field.means, 3 * i).distanceTo(middle));
   const away = 3 * Math.max(median(distances), 1e-6);
-  const pose = [1, 0, 0, middle.x, 0, 0, -1, middle.y - away, 0, 1, 0, middle.z];
-  return { pose, fx: 500, fy: 500, cx: 320, cy: 240, width: 640, height: 480 };
+  const up = new Vector3(...(scene.up ?? [0, 0, 1])).normalize();
+  const side = new Vector3(...(Math.abs(up.x) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
+  const back = side.cross(up).normalize();
+  const pose = new Matrix4()
+    .makeBasis(up.clone().cross(back), up, back)
+    .setPosition(back.multiplyScalar(away).add(middle));
+  return { pose: pose.transpose().elements.slice(0, 12), fx: 500, fy: 500, cx: 320, cy: 240, width: 640, height: 480 };
 }
+
+/** Whether two poses are one, up to rounding. */
+const isNear = (one: Camera, other: Camera): boolean =>
+  one.pose.every((value, i) => Math.abs(value - other.pose[i]!) <= 1e-5 * Math.max(Math.abs(value), 1));
 
 export class Navigation {
   readonly stops: Camera[];
   /** Index of the stop that is shown; null once the camera has moved. */
   stop: number | null = null;
-  /** Index of the last stop, whose lens is used. */
+  /** Index of the last stop. */
   visited = 0;
   private readonly camera = new PerspectiveCamera(DEFAULT_FOV, 1, 1e-3, 1e6);
   private readonly controls: OrbitControls;
@@ -67,6 +76,7 @@ export class Navigation {
   private readonly pressed = new Set<string>();
   private flying = false;
   private lastMove = 0;
+  private lens: Camera;
 
   /** Called when the camera has moved. */
   onChange = (): void => {};
@@ -77,18 +87,17 @@ export class Navigation {
   constructor(scene: Scene, element: HTMLElement) {
     this.middle = middleOf(scene);
     this.stops = scene.cameras.length ? scene.cameras : [outside(scene, this.middle)];
-    this.camera.up.copy(this.up());
+    this.lens = this.stops[0]!;
+    this.camera.up.copy(scene.up ? new Vector3(...scene.up).normalize() : this.up());
     this.controls = new OrbitControls(this.camera, element);
     this.controls.addEventListener("change", () => this.onChange());
     this.controls.addEventListener("start", () => this.leave());
     window.addEventListener("keydown", (event) => this.press(event));
     window.addEventListener("keyup", (event) => this.pressed.delete(event.code));
     window.addEventListener("blur", () => this.pressed.clear());
-    this.visit(0);
-  }
-
-  private get lens(): Camera {
-    return this.stops[this.visited]!;
+    const start = scene.start ?? this.stops[0]!;
+    const index = this.stops.findIndex((stop) => isNear(stop, start));
+    this.open(start, index);
   }
 
   /** The mean of the upward directions of the stops. */
@@ -100,10 +109,16 @@ export class Navigation {
 
   /** Goes to a camera of the capture. */
   visit(index: number): void {
-    const stop = this.stops[index]!;
-    const matrix = new Matrix4().fromArray([...stop.pose, 0, 0, 0, 1]).transpose(); // rows to columns
+    this.open(this.stops[index]!, index);
+  }
+
+  /** Goes to a camera and the stop that it is; -1 for none. */
+  private open(camera: Camera, index: number): void {
+    const matrix = new Matrix4().fromArray([...camera.pose, 0, 0, 0, 1]).transpose(); // rows to columns
     matrix.decompose(this.camera.position, this.camera.quaternion, new Vector3());
-    this.visited = this.stop = index;
+    this.lens = camera;
+    this.stop = index < 0 ? null : index;
+    if (index >= 0) this.visited = index;
     this.aim();
     this.onChange();
   }
@@ -124,6 +139,7 @@ export class Navigation {
       return;
     }
     this.visited = found.lens;
+    this.lens = this.stops[found.lens]!;
     this.stop = null;
     this.camera.position.fromArray(found.position);
     this.controls.target.fromArray(found.ahead).add(this.camera.position);

@@ -38,6 +38,10 @@ export type Scene = {
   head: Head | null;
   trainedFocal: [number, number] | null;
   cameras: Camera[];
+  /** The direction that is upwards, about of unit length; null where the file states none. */
+  up: number[] | null;
+  /** The camera that the page opens with; null for the first one. */
+  start: Camera | null;
 };
 
 /** Random backgrounds are shown in viser's colour. */
@@ -55,7 +59,7 @@ export async function readScene(file: Uint8Array<ArrayBuffer>, onProgress: OnPro
   const header = await readHeader(file);
   const wrong = violation(header.meta, "header") ?? violation(header.meta.model, "model", "model");
   if (wrong !== null) throw damaged(`its header has no valid ${wrong}`);
-  const { primitives, attributes, model: stated } = header.meta as unknown as Stated;
+  const { primitives, attributes, model: stated, up = null, start = null } = header.meta as unknown as Stated;
   const width = (name: string): number => attributes[name]?.width ?? 0;
   const shape = { count: primitives, rest: width("features_rest"), features: width("features") };
   checkRatio(4 * shape.count * (14 + shape.rest + shape.features), file.length);
@@ -77,6 +81,8 @@ export async function readScene(file: Uint8Array<ArrayBuffer>, onProgress: OnPro
     head,
     trainedFocal: stated.trained_focal ?? null,
     cameras: readCameras(reader),
+    up,
+    start: start && cameraOf(start.pose.flat(), start.intrinsics, start.size),
   };
 }
 
@@ -93,7 +99,13 @@ type Stated = {
     head?: StatedHead | null;
     trained_focal?: [number, number] | null;
   };
+  up?: number[];
+  start?: { pose: number[][]; intrinsics: number[]; size: number[] };
 };
+
+function cameraOf(pose: number[], [fx, fy, cx, cy]: number[], [width, height]: number[]): Camera {
+  return { pose, fx: fx!, fy: fy!, cx: cx!, cy: cy!, width: width!, height: height! };
+}
 
 function readField(reader: Reader, { count, rest, features }: Shape, onProgress: OnProgress): Field {
   const none = new Float32Array(0);
@@ -140,9 +152,7 @@ function readCameras(reader: Reader): Camera[] {
     reader.array("cameras", part, { cameras: count }),
   ) as [Numbers, Numbers, Numbers];
   return Array.from({ length: count }, (_, i) => {
-    const [fx, fy, cx, cy] = intrinsics.subarray(4 * i, 4 * i + 4);
-    const [width, height] = sizes.subarray(2 * i, 2 * i + 2);
-    const pose = [...poses.subarray(12 * i, 12 * i + 12)];
-    return { pose, fx: fx!, fy: fy!, cx: cx!, cy: cy!, width: width!, height: height! };
+    const row = (array: Numbers, length: number): number[] => [...array.subarray(length * i, length * (i + 1))];
+    return cameraOf(row(poses, 12), row(intrinsics, 4), row(sizes, 2));
   });
 }

@@ -5,7 +5,7 @@ import format from "../../../sundae_ns/storage/packing/format.json";
 export type Json = null | boolean | number | string | Json[] | { [key: string]: Json };
 export type JsonObject = { [key: string]: Json };
 
-/** JSON Schema with the keywords that `fault` reads; items of a list with `uniqueBy` differ in this entry. */
+/** JSON Schema with the keywords that `fault` reads; schema.py says what `uniqueBy` and `orthonormal` mean. */
 type Schema = {
   type?: string | string[];
   enum?: Json[];
@@ -17,6 +17,7 @@ type Schema = {
   prefixItems?: Schema[];
   items?: Schema;
   uniqueBy?: string | number;
+  orthonormal?: boolean;
   required?: string[];
   additionalProperties?: boolean;
   properties?: Record<string, Schema>;
@@ -69,7 +70,23 @@ function faultOfList(value: Json[], schema: Schema, place: string): string | nul
     if (found !== null) return found;
   }
   const key = schema.uniqueBy;
-  return key !== undefined && new Set(value.map((item) => (item as JsonObject)[key])).size < count ? place : null;
+  if (key !== undefined && new Set(value.map((item) => (item as JsonObject)[key])).size < count) return place;
+  return schema.orthonormal && !isOrthonormal(value as number[] | number[][]) ? place : null;
+}
+
+const CROOKED = 0.1;
+type Row = [number, number, number];
+const dot = (a: Row, b: Row): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
+/** Whether a checked list is a direction, or the rows of a rotation, before their fourth number. */
+function isOrthonormal(value: number[] | number[][]): boolean {
+  const rows = (Array.isArray(value[0]) ? value : [value]) as Row[];
+  const straight = rows.every((row, i) =>
+    rows.slice(0, i + 1).every((other, j) => Math.abs(dot(row, other) - (i === j ? 1 : 0)) <= CROOKED),
+  );
+  if (!straight || rows.length < 3) return straight;
+  const [[a, b, c], [d, e, f], last] = rows as [Row, Row, Row];
+  return dot([b * f - c * e, c * d - a * f, a * e - b * d], last) > 0;
 }
 
 function faultOfObject(value: JsonObject, schema: Schema, place: string): string | null {
