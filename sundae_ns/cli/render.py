@@ -57,6 +57,7 @@ def render_file(
     from sundae_ns.api.views import CameraFile, read_cameras, view_in_front
     from sundae_ns.errors import ConfigError
     from sundae_ns.evaluation.video import write_video
+    from sundae_ns.rasterization.select import fastest_device
     from sundae_ns.storage.atomic import replacing, write_image
 
     suffix = out.suffix.lower()
@@ -83,6 +84,7 @@ def render_file(
     else:
         cameras = CameraFile(list(opened.views) or [view_in_front(opened)], None)
     views = [_resized(each, width, even=video) for each in cameras.views]
+    opened = opened.to(fastest_device())
 
     def rendered(view: View) -> Image.Image:
         return rendering.image_of(rendering.render(opened, view, head=head).rgb)

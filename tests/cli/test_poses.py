@@ -146,7 +146,8 @@ def test_an_error_of_colmap_is_one_line(colmap: FakeColmap, capsys: pytest.Captu
 
 
 SLOW = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 from fake_colmap import FakeColmap
 made = FakeColmap()
 def wait(*_, **__):
