@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import fcntl
 import os
 import re
 import subprocess
@@ -19,6 +18,7 @@ from sundae_ns.errors import StorageError, SundaeError
 from sundae_ns.storage import atomic, locks
 from sundae_ns.storage.runs import folder
 
+fcntl = pytest.importorskip("fcntl", reason="tests what Linux can tell of Windows")
 ROOT = Path(__file__).parents[1]
 SOURCES = [*(ROOT / "sundae_ns").rglob("*.py"), *(ROOT / "method_configs").rglob("*.py")]
 
