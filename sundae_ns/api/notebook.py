@@ -1,4 +1,8 @@
-"""A scene in a notebook: its web page in a frame, which needs no server."""
+"""A scene in a notebook: its web page in a frame, which needs no server.
+
+Seen to render in JupyterLab 4.6, in trusted notebooks: it removes frames from others. VS Code and Colab were not tried;
+VS Code's setting ``notebook.experimental.enableCsp`` would refuse the worker in which the page decodes.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +32,7 @@ class Embedded:
     """Height of the frame in pixels; it is as wide as the notebook."""
 
     def _repr_html_(self) -> str:
-        """The frame, as Jupyter, VS Code and Colab ask for it."""
+        """The frame, by the name under which notebooks ask for HTML."""
         # srcdoc, not an address: notebooks serve no files beside them, and browsers limit the length of data addresses.
         return (
             f'<iframe srcdoc="{html.escape(self.page)}" title="{html.escape(self.title)}" width="100%" '
