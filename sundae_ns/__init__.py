@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sundae_ns.api.cleaning import remove_floaters as remove_floaters
     from sundae_ns.api.measuring import Quality as Quality
     from sundae_ns.api.measuring import measure as measure
+    from sundae_ns.api.notebook import show as show
     from sundae_ns.api.opening import load as load
     from sundae_ns.api.pruning import prune as prune
     from sundae_ns.api.rendering import Rendering as Rendering
@@ -56,6 +57,7 @@ _HOMES = {
     "remove_floaters": "sundae_ns.api.cleaning",
     "render": "sundae_ns.api.rendering",
     "save": "sundae_ns.api.saving",
+    "show": "sundae_ns.api.notebook",
     "views_of": "sundae_ns.api.views",
     "virtual_views": "sundae_ns.api.virtual",
 }

@@ -37,7 +37,8 @@ def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_example_is_tested() -> None:
-    assert {path.name for path in EXAMPLES.glob("*.py")} == {"plot_curve.py", "prune_ply.py", "render_packed.py"}
+    programs = {"plot_curve.py", "prune_ply.py", "render_packed.py"}
+    assert {path.name for path in EXAMPLES.iterdir() if path.is_file()} == {"notebook.ipynb", *programs}
 
 
 def test_prune_ply(cloud: Path, tmp_path: Path) -> None:
@@ -60,3 +61,18 @@ def test_plot_curve(cloud: Path, tmp_path: Path) -> None:
     assert len(quality) == 10
     assert quality[4] > quality[0]
     assert Image.open(tmp_path / "a.png").size == (750, 525)
+
+
+def test_the_notebook(tmp_path: Path) -> None:
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    text = (EXAMPLES / "notebook.ipynb").read_text(encoding="utf-8")
+    notebook = nbformat.reads(text, as_version=4)
+    nbformat.validate(notebook)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert not [cell for cell in cells if cell.outputs], "the repository keeps no outputs"
+    nbclient.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    shown = [output.data for cell in cells for output in cell.outputs if output.output_type == "execute_result"]
+    assert [data["text/plain"] for data in shown[:2]] == ["2000", "500"]
+    assert float(re.findall(r"PSNR ([\d.]+) dB", shown[2]["text/plain"])[0]) > 20
+    assert "image/png" in shown[3]
+    assert shown[4]["text/html"].startswith('<iframe srcdoc="')

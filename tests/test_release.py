@@ -93,6 +93,12 @@ def test_ci_runs_what_the_repository_runs() -> None:
         assert used[:2] == ["actions/checkout", "actions/setup-python"]
         assert steps(name, job)[1]["with"] == python
         assert [step["run"] for step in steps(name, job) if step.get("run") == "bash .ci/run"]
+    elsewhere = parsed(ROOT / ".github" / "workflows" / "ci.yml")["jobs"]["elsewhere"]
+    assert {name.partition("-")[0] for name in elsewhere["strategy"]["matrix"]["os"]} == {"windows", "macos"}
+    assert steps("ci.yml", "elsewhere")[2]["with"] == python
+    run = steps("ci.yml", "elsewhere")[-1]["run"]
+    tests = re.findall(r"tests/\S+", run)
+    assert [path for path in tests if not (ROOT / path).exists()] == []
     # yaml reads the key "on" as True.
     assert parsed(WORKFLOWS[1])[True] == {"push": {"tags": ["v*"]}}
     assert parsed(WORKFLOWS[1])["jobs"]["publish"]["needs"] == "build"

@@ -13,7 +13,7 @@ WRITERS = {"write_text", "write_bytes", "save", "savefig", "tofile", "imwrite", 
 FILES = {"partial", "content", "file", "buffer", "poster", "bundle"}
 """Names of files that will be renamed, of files opened from them, and of files in memory."""
 ELSEWHERE = {
-    "cli/demo.py": ["open(out / 'measure.log', 'w')"],  # a log is read while it is written
+    "cli/demo.py": ["open(out / 'measure.log', 'w', encoding='utf-8')"],  # a log is read while it is written
     "cli/process.py": ["open(log, 'w', encoding='utf-8')"],
     "cli/distill.py": ["saving.save(result, out)"],
     "cli/files.py": ["saving.save(small, out)"],  # the public function, which renames
@@ -21,7 +21,7 @@ ELSEWHERE = {
     "evaluation/video.py": ["av.open(str(path), 'w', format='mp4', options={'movflags': 'faststart'})"],  # in cli/
     # In folders that are renamed, and a list that COLMAP reads at once.
     "poses/capture.py": ["(out / CLOUD).open('wb')"],
-    "poses/reconstruction.py": ["(work / _LISTED).open('w', encoding='utf-8')"],
+    "poses/reconstruction.py": ["(work / _LISTED).open('w', encoding='utf-8', newline='\\n')"],
     "poses/video.py": ["name.open('wb')"],
     "storage/runs/folder.py": ["(run / LOCK).open('a+', encoding='utf-8')"],  # a lock stays
     "training/pruning.py": ["run.save()"],  # checkpoints

@@ -116,20 +116,20 @@ def free_memory() -> int | None:
     """
     found = []
     with suppress(OSError, ValueError, KeyError):
-        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text(encoding="utf-8").splitlines())
         found.append(sum(int(lines[name].split()[0]) * 1024 for name in ("MemAvailable", "SwapFree")))
     with suppress(OSError, ValueError, KeyError):
         group = Path("/sys/fs/cgroup")
-        limit = int((group / "memory.max").read_text())  # the word max without a limit
-        stated = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        used = int((group / "memory.current").read_text()) - int(stated["inactive_file"])  # files that it would drop
-        found.append(limit - used)
+        limit = int((group / "memory.max").read_text(encoding="utf-8"))  # the word max without a limit
+        stated = dict(line.split() for line in (group / "memory.stat").read_text(encoding="utf-8").splitlines())
+        used = int((group / "memory.current").read_text(encoding="utf-8"))
+        found.append(limit - used + int(stated["inactive_file"]))  # files that it would drop
     with suppress(ImportError, OSError, ValueError):
         import resource  # missing on Windows
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit != resource.RLIM_INFINITY:
-            pages = int(Path("/proc/self/statm").read_text().split()[0])
+            pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0])
             found.append(limit - pages * resource.getpagesize())
     return max(min(found), 0) if found else None
 

@@ -61,7 +61,7 @@ def views_of(path: Path | str, scene: Scene | None = None) -> list[View]:
     >>> frame = {"transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]}
     >>> camera = {"fl_x": 50, "fl_y": 50, "cx": 32, "cy": 24, "w": 64, "h": 48, "frames": [frame]}
     >>> path = pathlib.Path(tempfile.mkdtemp(), "camera.json")
-    >>> _ = path.write_text(json.dumps(camera))
+    >>> _ = path.write_text(json.dumps(camera), encoding="utf-8")
     >>> sn.views_of(path)[0].center
     tensor([0., 0., 3.])
     """

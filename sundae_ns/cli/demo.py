@@ -69,7 +69,7 @@ def demo(
         progress.add_task("Evaluating", total=None)
 
         # nerfstudio prints messages while it imports and loads.
-        with open(out / "measure.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
+        with open(out / "measure.log", "w", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
             from sundae_ns.api.page import write_page
             from sundae_ns.scenes.measure import comparison_of, evaluation, frame_times, sizes
             from sundae_ns.scenes.opening import open_scene

@@ -97,10 +97,11 @@ def nvcc() -> Finding:
 def _release_of(compiler: Path) -> str:
     """CUDA version that a compiler reports, such as ``13.0``; empty if it reports none."""
     try:
-        output = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True, timeout=60).stdout
+        words = [str(compiler), "--version"]
+        done = subprocess.run(words, capture_output=True, encoding="utf-8", errors="replace", check=True, timeout=60)
     except (OSError, subprocess.SubprocessError):
         return ""
-    return next(iter(re.findall(r"release (\d+\.\d+)", output)), "")
+    return next(iter(re.findall(r"release (\d+\.\d+)", done.stdout)), "")
 
 
 def kernels_built() -> bool:

@@ -36,7 +36,7 @@ def measured_step(method: str, width: int, height: int) -> Forecast | None:
     """Time the steps of a method at a size of images in pixels; None if that is impossible or takes minutes."""
     words = [sys.executable, "-m", __name__, method, str(width), str(height)]
     try:
-        done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=_PATIENCE)
+        done = subprocess.run(words, capture_output=True, encoding="utf-8", check=True, timeout=_PATIENCE)
         return Forecast(**json.loads(done.stdout.splitlines()[-1]))
     except (OSError, subprocess.SubprocessError, ValueError, TypeError, IndexError):
         return None

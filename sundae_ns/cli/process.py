@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,8 +27,7 @@ _TAIL = 12
 
 def console_script(name: str) -> str:
     """Path of a command beside this interpreter, or its bare name if there is none."""
-    path = Path(sys.executable).parent / name
-    return str(path) if path.exists() else name
+    return shutil.which(name, path=str(Path(sys.executable).parent)) or name  # on Windows, name.exe
 
 
 def loading() -> AbstractContextManager[object]:
@@ -44,7 +44,7 @@ def word(path: Path) -> str:
 
 def quoted(path: Path) -> str:
     """A path as a word of a command that a user copies into a shell."""
-    return shlex.quote(word(path))
+    return shlex.quote(word(path)) if os.name == "posix" else subprocess.list2cmdline([word(path)])
 
 
 @contextmanager
@@ -57,8 +57,20 @@ def _started(words: Sequence[str], *, locks: Sequence[int] = (), **options: Any)
         options: of ``subprocess.Popen``.
     """
     guarded = [sys.executable, "-I", str(GUARD), console_script(words[0]), *words[1:]]
-    with subprocess.Popen(guarded, stdin=subprocess.PIPE, start_new_session=True, pass_fds=locks, **options) as process:
+    if guard.GROUPS:
+        options |= {"start_new_session": True, "pass_fds": locks}
+    with subprocess.Popen(guarded, stdin=subprocess.PIPE, **options) as process:
         yield process
+
+
+def _send(process: subprocess.Popen[Any], number: int) -> None:
+    """Send a signal to the group of a command.
+
+    Without groups nothing is sent: a terminal's Ctrl-C reaches each process of a Windows console by itself.
+    """
+    if guard.GROUPS:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, number)
 
 
 def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], None] | None = None) -> None:
@@ -73,8 +85,9 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
         SundaeError: the command failed; the message ends with the last lines of its output.
     """
     last: deque[str] = deque(maxlen=_TAIL)
-    environment = {**os.environ, "COLUMNS": "160"}
-    output: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "errors": "replace"}
+    environment = {**os.environ, "COLUMNS": "160", "PYTHONUTF8": "1"}  # Windows has another encoding by default
+    output: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    output |= {"encoding": "utf-8", "errors": "replace"}
     with (
         open(log, "w", encoding="utf-8") as file,
         _started(arguments, env=environment, **output) as process,
@@ -88,8 +101,10 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
                     on_line(line)
             code = process.wait()
         except BaseException:  # an interrupt must not leave the process running
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGTERM)
+            if guard.GROUPS:
+                _send(process, signal.SIGTERM)
+            elif process.stdin is not None:
+                process.stdin.close()  # the guard takes this process for dead, and ends the command
             process.wait()
             raise
     if code != 0:
@@ -111,22 +126,22 @@ def run_in_group(words: Sequence[str], *, locks: Sequence[int] = (), saves: bool
     """
     # A training that loses its terminal saves itself too.
     interrupt = signal.SIGINT if saves else signal.SIGTERM
-    passed_on = {signal.SIGINT: interrupt, signal.SIGTERM: signal.SIGTERM, signal.SIGHUP: signal.SIGTERM}
+    caught = [signal.Signals[name] for name in guard.SIGNALS if name in signal.Signals.__members__]
+    passed_on = {number: interrupt if number == signal.SIGINT else signal.SIGTERM for number in caught}
     received: list[signal.Signals] = []
     running: list[subprocess.Popen[Any]] = []
 
     def pass_on(number: int, frame: object) -> None:
         received.append(signal.Signals(number))
         for process in running:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, passed_on[received[-1]])
+            _send(process, passed_on[received[-1]])
 
     before = {number: signal.signal(number, pass_on) for number in passed_on}
     try:
         with _started(words, locks=locks) as process:
             running.append(process)
             for number in received:  # those that came before there was a process
-                os.killpg(process.pid, passed_on[number])
+                _send(process, passed_on[number])
             code = process.wait()
     finally:
         for number, handler in before.items():

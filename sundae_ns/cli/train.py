@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.process import console_script, word
+from sundae_ns.cli.guard import GROUPS
+from sundae_ns.cli.process import console_script, run_in_group, word
 from sundae_ns.errors import ConfigError, DataError
 
 
@@ -66,6 +68,8 @@ def train(
         print(f"# {folder} ended after {done:,} of {length:,} steps; this is a new run. To resume the other:")
         print(f"#     {shlex.join(again)}")
     print(shlex.join(words), flush=True)
+    if not GROUPS:  # Windows, where a process that is replaced ends, and the shell does not wait for the other
+        sys.exit(run_in_group(words))
     # The same process: an interrupt reaches the training, and its exit code is ours.
     os.execvp(console_script(words[0]), words)
 

@@ -42,7 +42,7 @@ def _claim(out: Path, files: Sequence[str]) -> None:
         raise DataError(f"{out} is a file; name a folder for the capture")
     if marker.exists():
         try:
-            stale = [str(name) for name in json.loads(marker.read_text())["files"]]
+            stale = [str(name) for name in json.loads(marker.read_text(encoding="utf-8"))["files"]]
         except (ValueError, KeyError, TypeError) as error:
             raise DataError(
                 f"{marker} is damaged; remove it and the capture in {out}, or name another folder"

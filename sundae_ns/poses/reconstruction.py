@@ -105,7 +105,7 @@ def match(work: Path, names: Sequence[str], pairs: Pairs, advance: Advance) -> N
     size = _PAIRS_AT_ONCE * threads()
     for start in range(0, len(pairs), size):
         part = pairs[start : start + size]
-        with (work / _LISTED).open("w", encoding="utf-8") as file:
+        with (work / _LISTED).open("w", encoding="utf-8", newline="\n") as file:
             file.writelines(f"{names[i]} {names[j]}\n" for i, j in part)
         module.match_image_pairs(work / DATABASE, options, listed)
         advance(len(part))

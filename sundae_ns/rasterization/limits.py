@@ -66,12 +66,14 @@ def available_memory() -> int | None:
     """Bytes that this process can still take: of the machine, and of its control group; None if unknown."""
     found = []
     try:
-        lines = dict(line.split(":", 1) for line in _MEMORY.read_text().splitlines())
+        lines = dict(line.split(":", 1) for line in _MEMORY.read_text(encoding="utf-8").splitlines())
         found.append(1024 * int(lines["MemAvailable"].split()[0]))
     except (OSError, KeyError, ValueError):
         pass
     try:
-        most, used, parts = ((_CONTROL_GROUP / f"memory.{name}").read_text() for name in ("max", "current", "stat"))
+        most, used, parts = (
+            (_CONTROL_GROUP / f"memory.{name}").read_text(encoding="utf-8") for name in ("max", "current", "stat")
+        )
         # The cache of files is given back when memory is needed.
         sizes = dict(line.split() for line in parts.splitlines())
         cached = int(sizes["active_file"]) + int(sizes["inactive_file"])

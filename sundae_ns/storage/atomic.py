@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sundae_ns.errors import writing
+from sundae_ns.storage.locks import lock
 
 if TYPE_CHECKING:
     from PIL import Image
 
 PARTIAL = ".partial"
 """Suffix of files that are not complete yet."""
+_WINDOWS = os.name == "nt"
 
 
 @contextmanager
@@ -53,19 +55,20 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
 def _reserved(path: Path, partial: Path) -> Iterator[None]:
     """Hold a lock on the partial file, and remove those of killed processes: the system drops a lock with its process.
 
-    Where the file system has no locks, none is removed.
+    Where the file system has no locks, none is removed; nor on Windows, which renames no file that is open.
     """
-    import fcntl
-
+    if _WINDOWS:
+        yield
+        return
     for other in path.parent.glob(f"{escape(path.name)}.*{PARTIAL}"):
         if not other.name[len(path.name) + 1 : -len(PARTIAL)].isdigit():  # of a file with a longer name
             continue
         with suppress(OSError), other.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            other.unlink()
+            if lock(file):
+                other.unlink()
     with partial.open("wb") as file:
         with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(file)
         yield
 
 
@@ -104,8 +107,10 @@ def put_aside(path: Path) -> None:
 
 
 def flush(path: Path) -> None:
-    """Wait until a file, or the entries of a folder, are on the disk."""
-    handle = os.open(path, os.O_RDONLY)
+    """Wait until a file, or the entries of a folder, are on the disk; Windows does not open folders."""
+    if _WINDOWS and path.is_dir():
+        return
+    handle = os.open(path, os.O_RDWR if _WINDOWS else os.O_RDONLY)  # Windows flushes only what it may write
     try:
         os.fsync(handle)
     finally:

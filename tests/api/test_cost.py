@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from sundae_ns.pruning import PruneRule, prune_field, redistribution
 from sundae_ns.storage import write_ply
 from sundae_ns.storage.ply import stated_size
 
+resource = pytest.importorskip("resource", reason="Windows has none")
 N = 2000
 
 

@@ -20,7 +20,8 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.storage import write_ply
 
 ROOT = Path(__file__).parents[2]
-FUNCTIONS = ("crop", "load", "measure", "prune", "remove_floaters", "render", "save", "views_of", "virtual_views")
+FUNCTIONS = ("crop", "load", "measure", "prune", "remove_floaters", "render", "save", "show", "views_of")
+FUNCTIONS += ("virtual_views",)
 WITHOUT_NERFSTUDIO = """
 import sys
 sys.modules["nerfstudio"] = None

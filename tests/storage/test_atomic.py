@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import io
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -21,6 +20,8 @@ from sundae_ns.errors import DataError, PackError, StorageError, reading, regula
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import replacing, write_ply, write_text
 from sundae_ns.storage.atomic import put_aside, write_files, write_image
+
+resource = pytest.importorskip("resource", reason="Windows has none")
 
 
 @contextmanager

@@ -28,7 +28,7 @@ _RANGES_PER_THREAD = 8  # enough for an even load, few enough to cost nothing
 _NOTICE_AFTER = 1.0  # seconds of compilation before a notice is printed
 
 _FILES = (*sorted(Path(__file__).parent.glob("*.py")), Path(__file__).parents[1] / "harmonics.py")
-_SOURCES = "".join(path.read_text() for path in _FILES)
+_SOURCES = "".join(path.read_text(encoding="utf-8") for path in _FILES)
 """Sources of all loops: a loop calls functions of other modules, but numba's cache checks one file only."""
 
 _ready: set[tuple[Any, ...]] = set()  # loops already called, with the dtypes of their arguments

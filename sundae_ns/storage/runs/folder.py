@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
@@ -14,6 +13,7 @@ from typing import Any, TextIO
 
 from sundae_ns.errors import PackError, StorageError, regular, writing
 from sundae_ns.storage.atomic import write_text
+from sundae_ns.storage.locks import lock
 
 LOCK = "training.lock"
 """Names the process that trains in a folder. The file stays; the system drops its lock when the process ends."""
@@ -58,20 +58,15 @@ def reserve(run: Path, busy: str = "trains in {}; wait for it, or give another -
     run = run.resolve()
     if run in _held:
         return _held[run].fileno()
-    import fcntl
-
     with writing(f"cannot write to the run's folder {run}"):
         run.mkdir(parents=True, exist_ok=True)
         file = (run / LOCK).open("a+", encoding="utf-8")
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(file)
         except BlockingIOError as error:
             file.seek(0)
             holder = file.read().strip() or "another process"
             raise StorageError(f"{holder} {busy.format(run)}") from error
-        except OSError as error:
-            if error.errno not in (errno.ENOLCK, errno.ENOTSUP):  # network file systems without locks
-                raise
         file.truncate(0)
         print(f"process {os.getpid()} on {socket.gethostname()}", file=file, flush=True)
     _held[run] = file

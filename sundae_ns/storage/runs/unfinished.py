@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sundae_ns.errors import CheckpointError
+from sundae_ns.storage.locks import lock
 from sundae_ns.storage.runs.checkpoint import newest_step
 from sundae_ns.storage.runs.config_file import capture_and_source, schedule_length
 from sundae_ns.storage.runs.folder import LOCK
@@ -62,15 +63,11 @@ def unfinished_run(out: Path, method: str, capture: Path) -> UnfinishedRun | Non
 
 def _in_training(run: Path) -> bool:
     """Whether a process has reserved the folder of a run."""
-    import fcntl
-
     try:
-        with (run / LOCK).open() as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return False
+        with (run / LOCK).open(encoding="utf-8") as file:
+            lock(file, shared=True)
     except BlockingIOError:
         return True
-    except OSError:  # network file systems without locks
+    except OSError:  # no such file, or none that can be locked
         return False
     return False
