@@ -85,10 +85,8 @@ def virtual_views(scene: Scene, n: int | None = None, *, seed: int = 0, size: in
     8
     """
     device = scene.device.type
-    n, size = (
-        VIEWS.get(device, VIEWS["cpu"]) if n is None else n,
-        SIDES.get(device, SIDES["cpu"]) if size is None else size,
-    )
+    n = VIEWS.get(device, VIEWS["cpu"]) if n is None else n
+    size = SIDES.get(device, SIDES["cpu"]) if size is None else size
     if n < 1 or size < 1:
         raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
     field = _usable(scene)
