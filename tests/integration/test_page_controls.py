@@ -88,13 +88,14 @@ def test_fingers_turn_and_zoom(drawn: str, site: str) -> None:
         rested(page)
         assert linked() == [1]
         touch(page, (80, 60), (110, 60))
+        browser.wait_for(lambda: len(linked()) > 1, "the turn", SECONDS)  # frames in software take seconds
         turned = linked()
         for i, points in enumerate(PINCH):
             event = {"type": "touchMove" if i else "touchStart", "touchPoints": [{"x": x, "y": y} for x, y in points]}
             page.call("Input.dispatchTouchEvent", event)
         page.call("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-        zoomed = linked()
-        assert np.linalg.norm(zoomed[3:6]) < 0.8 * np.linalg.norm(turned[3:6])
+        nearer = 0.8 * np.linalg.norm(turned[3:6])
+        browser.wait_for(lambda: np.linalg.norm(linked()[3:6]) < nearer, "the zoom", SECONDS)
 
 
 def test_the_panel_of_a_phone(site: str) -> None:
