@@ -12,7 +12,7 @@
 
 Every run is nerfstudio's own training command, or one of sundae, on a ray-traced scene, in a process of its own. A
 server process without threads imports nerfstudio once and forks the runs. Exits with 1 if anything was lost. On a CPU a
-resumed run must be the same bit for bit. On CUDA sums have no fixed order, so that runs of one seed differ and even
+resumed run must be the same bit for bit. On CUDA sums have no fixed order, so that runs of one seed differ and may even
 decide differently: there its test views must be as good as those of two undisturbed runs, less ``SPREAD`` dB.
 """
 
