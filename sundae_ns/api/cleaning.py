@@ -80,7 +80,7 @@ def kept(scene: Scene, mask: Tensor) -> Scene:
 
 
 def within(mask: Tensor | None, inner: Tensor) -> Tensor:
-    """A mask ``[N]`` of which an inner one ``[M]`` keeps some of its M true entries; None for all."""
+    """The entries of a mask ``[N]`` that an inner mask keeps: ``[M]``, for its M true ones. None is true everywhere."""
     if mask is None:
         return inner
     found = mask.clone()

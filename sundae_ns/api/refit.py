@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from sundae_ns.api.virtual import by_device
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rasterization import rasterize_views
 from sundae_ns.rendering import LocalField, View
@@ -55,8 +56,8 @@ def refit(
     Returns:
         A field of as many primitives. It is ``small`` if the refit matches no better.
     """
-    device = small["means"].device.type
-    most, count = (limits.get(device, limits["cpu"]) for limits in (MOST_PIXELS, STEPS))
+    device = small["means"].device
+    most, count = by_device(MOST_PIXELS, device), by_device(STEPS, device)
     views = [view.zoomed(min(1.0, math.sqrt(most / (view.width * view.height)))) for view in views]
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(seed)).tolist()
     images: dict[int, Tensor] = {}
@@ -86,7 +87,7 @@ def refit(
         steps = track(steps, "Refit of primitives", transient=True, console=console)  # type: ignore[assignment]
     for step in steps:
         chosen = [shown[i % len(shown)] for i in range(step * VIEWS, (step + 1) * VIEWS)]
-        for some in [chosen] if device == "cuda" else [[i] for i in chosen]:  # a GPU takes small images together
+        for some in [chosen] if device.type == "cuda" else [[i] for i in chosen]:  # a GPU takes small images together
             with torch.enable_grad():
                 error(fitted(), some).backward()
         for group in optimizer.param_groups:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ from sundae_ns.rendering.views import poses_looking_at
 NEAREST, FARTHEST = 0.3, 2.0
 """Distances of the eyes from the middle of the scene, as multiples of the median distance of its primitives."""
 FOV = 40.0
+T = TypeVar("T")
 VIEWS = {"cpu": 128, "cuda": 256}
 """Default number of cameras by the device: a GPU has the time to look closer."""
 SIDES = {"cpu": 256, "cuda": 512}
@@ -53,6 +54,11 @@ _PROBE_PRIMITIVES = 20_000
 """Most primitives of these images."""
 _PROBES = 64
 """Images that are rendered at once."""
+
+
+def by_device(values: Mapping[str, T], device: torch.device) -> T:
+    """The value for a device, by its type; other devices than those named take that of a CPU."""
+    return values.get(device.type, values["cpu"])
 
 
 def virtual_views(scene: Scene, n: int | None = None, *, seed: int = 0, size: int | None = None) -> list[View]:
@@ -84,9 +90,8 @@ def virtual_views(scene: Scene, n: int | None = None, *, seed: int = 0, size: in
     >>> len(sn.virtual_views(scene, 8))
     8
     """
-    device = scene.device.type
-    n = VIEWS.get(device, VIEWS["cpu"]) if n is None else n
-    size = SIDES.get(device, SIDES["cpu"]) if size is None else size
+    n = by_device(VIEWS, scene.device) if n is None else n
+    size = by_device(SIDES, scene.device) if size is None else size
     if n < 1 or size < 1:
         raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
     field = _usable(scene)

@@ -49,8 +49,6 @@ def export(
     from rich.console import Console
 
     from sundae_ns.errors import ConfigError
-    from sundae_ns.storage.kinds import kind_of
-    from sundae_ns.storage.ply import has_own_columns
     from sundae_ns.storage.runs.folder import files_of
     from sundae_ns.storage.viewers import check_format
 
@@ -78,7 +76,7 @@ def export(
         size = write_page(out, opened, packed, title=out.resolve().stem)
         print(f"{out}: {size:,} bytes; {'open it in a browser' if out.suffix else 'serve it'}")
         return 0
-    copies = kind_of(scene) == "ply" and out.suffix.lower() == ".ply" and has_own_columns(scene)
+    copies = copies_rows(scene, out)
     if copies and (upright or not cleaning.chosen):
         raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
     if start_view is not None or up is not None:
@@ -126,6 +124,14 @@ def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
         return packed_run(path, data=data)
 
 
+def copies_rows(source: Path, out: Path) -> bool:
+    """Whether a .ply is written with the rows of another one, its properties and comments."""
+    from sundae_ns.storage.kinds import kind_of
+    from sundae_ns.storage.ply import has_own_columns
+
+    return kind_of(source) == "ply" and out.suffix.lower() == ".ply" and has_own_columns(source)
+
+
 def check_one(amounts: Mapping[str, float | None]) -> None:
     """Raise ``ConfigError`` if more than one of the options that say how many to keep is given."""
     from sundae_ns.errors import ConfigError
@@ -143,7 +149,13 @@ def cameras_for(scene: Scene, cameras: Path | None, views: int | None, seed: int
 
 
 def cameras_of(scene: Scene, cameras: Path | None, most: int | None) -> Sequence[View]:
-    """Cameras of a file or a run, at most so many of a run, else those stored with the scene; there may be none."""
+    """Cameras of a file or a run, else those stored with the scene; none if there are none.
+
+    Args:
+        scene: whose cameras are the default.
+        cameras: the file or the run.
+        most: largest number of cameras that are taken from a run.
+    """
     from sundae_ns.api import opening
     from sundae_ns.api.views import views_of
     from sundae_ns.storage.kinds import kind_of
@@ -224,7 +236,7 @@ def prune_file(
     from sundae_ns.pruning import PruneRule
     from sundae_ns.rasterization.select import fastest_device
     from sundae_ns.storage.kinds import kind_of
-    from sundae_ns.storage.ply import has_own_columns, keep_vertices, stated_size
+    from sundae_ns.storage.ply import keep_vertices, stated_size
 
     amounts = {"--keep": keep, "--count": count, "--target-drop": target_drop}
     check_one(amounts)
@@ -251,11 +263,12 @@ def prune_file(
     total = scene.num_primitives if usable is None else len(usable)
     with naming_full_memory(lambda: total):
         scene, seen, clean = scene.to(device), None, None
-        given = cameras_of(scene, cameras, views)
+        looks_around = rule.uses_contribution or target_drop is not None
+        given = cameras_of(scene, cameras, views) if looks_around or cleaning.remove_floaters else ()
         if cleaning.chosen:
             clean = cleaning.mask(scene, given)
             scene = kept(scene, clean)
-        if rule.uses_contribution or target_drop is not None:
+        if looks_around:
             seen = given or virtual_views(scene, views, seed=seed)
         if target_drop is not None:
             from sundae_ns.api.target import count_for_drop
@@ -269,9 +282,8 @@ def prune_file(
             scene, keep=keep, count=count, views=seen, rule=rule, progress=True, stated=stated
         )
     small = pruned.scene.to("cpu")
-    if usable is not None and out.suffix.lower() == ".ply" and kind_of(source) == "ply" and has_own_columns(source):
-        rows = usable.clone()
-        rows[usable] = within(clean, pruned.mask).cpu()
+    if copies_rows(source, out):
+        rows = within(usable, within(clean, pruned.mask).cpu())
         keep_vertices(source, out, rows, small.field if merge else None)
     else:
         saving.save(small, out)

@@ -6,8 +6,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,7 +17,6 @@ from sundae_ns.cli.process import loading, quoted
 from sundae_ns.errors import ConfigError, DataError, StorageError, SundaeError, one_line
 
 if TYPE_CHECKING:
-    from sundae_ns.data.photos import Photo
     from sundae_ns.poses import Found, Placed
 
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
@@ -45,28 +44,27 @@ def poses(
         frames: number of frames of a video; the sharpest of each stretch.
         masks: folder with a mask for each photo, under its name; by default one named masks beside the photos.
     """
-    check_poses(photos, frames, masks)
+    masks = check_poses(photos, frames, masks)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StorageError(f"{out} exists; choose another folder, or remove it")
     if photos.is_dir() and out.resolve().is_relative_to(photos.resolve()):
         raise StorageError(f"{out} lies in {photos}, which the command reads; choose another folder")
     with loading():
-        from sundae_ns.data.photos import find_photos
         from sundae_ns.poses import Request
         from sundae_ns.poses.library import pycolmap
 
         pycolmap()
-    if masks is None and photos.is_dir():
-        with suppress(DataError):  # which check_poses has printed
-            masks = usable_masks(photos, find_photos(photos))
     request = Request(photos, out, matching, frames, masks)
     found = _interruptible(lambda: _find(request), request.work)
     _print(out, found)
     return 0
 
 
-def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool = True) -> None:
+def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool = True) -> Path | None:
     """Check photos or a video, by headers, before anything starts; ``remarks`` prints what is left out.
+
+    Returns:
+        The folder of masks: the given one, with ``remarks`` else one beside the photos that fits them; None without.
 
     Raises:
         ConfigError: pycolmap is not installed, a number is out of range, or masks are given for a video.
@@ -88,37 +86,28 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
         if masks is not None:
             raise ConfigError("a video has no masks; leave out --masks")
         video_size(photos)
-        return
+        return None
     if photos.is_file():
         raise DataError(f"{photos} is neither a folder of photos nor a video ({', '.join(SUFFIXES)})")
     found = find_photos(photos)
     if masks is not None:
         masks_of(found, masks)
     if not remarks:
-        return
+        return masks
     said = [left_out(photos)]
-    if masks is None:
+    if masks is None and (beside := masks_beside(photos)) is not None:
         try:
-            usable_masks(photos, found)
+            masks_of(found, beside)
+            masks = beside
         except DataError as error:
-            said.append(f"{masks_beside(photos)} is left out: {error}")
+            said.append(f"{beside} is left out: {error}")
     for remark in filter(None, said):
         print(f"# warning: {remark}", flush=True)
-
-
-def usable_masks(photos: Path, found: Sequence[Photo]) -> Path | None:
-    """The folder of masks beside photos; None without one, ``DataError`` if it does not fit them."""
-    from sundae_ns.data.masks import masks_of
-    from sundae_ns.data.photos import masks_beside
-
-    masks = masks_beside(photos)
-    if masks is not None:
-        masks_of(found, masks)
     return masks
 
 
 def too_few(capture: Path, placed: Placed) -> DataError:
-    """The error for a capture of which too few photos have a pose."""
+    """The error for a capture in which too few photos have a pose."""
     return DataError(
         f"COLMAP placed {len(placed.placed)} of {placed.total} photos; {placed.again}, and start in another folder, or "
         f"train on these with `sundae run {quoted(capture)} -o OTHER`"

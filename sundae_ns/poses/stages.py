@@ -81,8 +81,9 @@ def find_poses(request: Request, report: Reporter) -> Found:
     work = request.work
     with writing(f"cannot make {work}"):
         reserve(work, _BUSY)
-        _take_up(request)
-        photos = _photos(request, report)
+        given = [] if is_video(request.photos) else find_photos(request.photos)
+        _take_up(request, given)
+        photos = given or _frames(request, report)
         names = names_of(photos)
         images = work / "images"
         with report("images", len(photos)) as advance:
@@ -118,9 +119,7 @@ def _models(request: Request, names: Sequence[str], report: Reporter) -> list[Mo
         return reconstruction.reconstruct(work, images, len(names), advance)
 
 
-def _photos(request: Request, report: Reporter) -> list[Photo]:
-    if not is_video(request.photos):
-        return find_photos(request.photos)
+def _frames(request: Request, report: Reporter) -> list[Photo]:
     frames = request.work / "frames"
     if not frames.exists():
         with report("frames", request.frames) as advance:
@@ -128,9 +127,9 @@ def _photos(request: Request, report: Reporter) -> list[Photo]:
     return find_photos(frames)
 
 
-def _take_up(request: Request) -> None:
+def _take_up(request: Request, photos: Sequence[Photo]) -> None:
     """Keep what the folder holds if it was made of the same photos with the same options; remove it otherwise."""
-    asked = json.dumps(_described(request), indent=1) + "\n"
+    asked = json.dumps(_described(request, photos), indent=1) + "\n"
     path = request.work / _REQUEST
     if path.is_file() and path.read_text(encoding="utf-8", errors="replace") == asked:
         return
@@ -142,9 +141,9 @@ def _take_up(request: Request) -> None:
     write_text(path, asked)
 
 
-def _described(request: Request) -> dict[str, object]:
-    """The options, and each photo with its size and time."""
+def _described(request: Request, photos: Sequence[Photo]) -> dict[str, object]:
+    """The options, and each photo, or the video, with its size and time."""
     video = is_video(request.photos)
-    files = [request.photos] if video else [photo.path for photo in find_photos(request.photos)]
+    files = [request.photos] if video else [photo.path for photo in photos]
     times = [(str(path.absolute()), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
     return {"matching": request.matching, "frames": request.frames if video else 0, "files": times}

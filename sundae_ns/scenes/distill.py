@@ -22,7 +22,7 @@ from sundae_ns.api.pruning import prune_with_mask
 from sundae_ns.api.rendering import render
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.target import split
-from sundae_ns.api.virtual import VIEWS, of_unit_size, resized, size_of, virtual_views
+from sundae_ns.api.virtual import VIEWS, by_device, of_unit_size, resized, size_of, virtual_views
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError, reading
 from sundae_ns.gaussians import FEATURES, initial_features, mend
@@ -104,7 +104,7 @@ class Distillation:
         if keep is None and count is None:
             keep = 0.1
         teacher = dataclasses.replace(teacher, field=mend(teacher.field).field)
-        side = size or SIDES.get(teacher.device.type, SIDES["cpu"])
+        side = size or by_device(SIDES, teacher.device)
         if views:
             shown, held_out = split(views)
             given = shown or views
@@ -116,7 +116,7 @@ class Distillation:
         self.cameras = [view.to(teacher.device) for view in seen[: len(given)]]
         self.held_out = [view.to(teacher.device) for view in seen[len(given) :]][:HELD_OUT]
         self._steps, self._seed = steps, seed
-        seen = self.cameras[: VIEWS.get(teacher.device.type, VIEWS["cpu"])]
+        seen = self.cameras[: by_device(VIEWS, teacher.device)]
         cut = prune_with_mask(self._teacher, keep, count, seen, None, progress=progress, trains=True)
         self._config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
         self._head_config = None

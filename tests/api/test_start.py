@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command_line import run
 
 import sundae_ns as sn
 from sundae_ns.api.opening import START_FILE
@@ -20,7 +21,6 @@ from sundae_ns.api.page import render_first
 from sundae_ns.api.rendering import image_of
 from sundae_ns.api.start import with_start
 from sundae_ns.api.views import view_in_front
-from sundae_ns.cli import main
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.scenes.distill import distill
 from sundae_ns.scenes.packed import contents_of_run, write_run
@@ -48,13 +48,6 @@ def same(one: sn.Scene, other: sn.Scene) -> bool:
         for a, b in ((one.start.viewmat, other.start.viewmat), (one.start.K, other.start.K))
     )
     return alike and one.start[2:] == pytest.approx(other.start[2:]) and one.up == pytest.approx(other.up)
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as caught:
-        main([str(argument) for argument in arguments])
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
 
 
 def test_files_and_scenes_made_of_a_scene_keep_both(tmp_path: Path) -> None:

@@ -9,19 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_line import run
 from plyfile import PlyData, PlyElement
 
 import sundae_ns as sn
-from sundae_ns.cli import main
 
 INSIDE = ("--crop", 0, 0, 0, 0.5, 1, 1)
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as caught:
-        main([str(argument) for argument in arguments])
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
 
 
 def scene(n: int = 400) -> sn.Scene:

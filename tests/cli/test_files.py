@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from colmap_models import write_model
+from command_line import run
 from foreign_files import FOREIGN, small_field
 from packed_scenes import KINDS, write_kind
 from plyfile import PlyData, PlyElement
@@ -23,21 +24,12 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.api import pruning
-from sundae_ns.cli import main
 from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.parameters import SH_C0, SPLAT_NAMES
 from sundae_ns.storage import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply
 from sundae_ns.storage.packing import PackedScene, read_scene, write_scene
 from sundae_ns.storage.primitives import read_primitives
 from sundae_ns.storage.viewers import write_for_viewers
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as caught:
-        main([str(argument) for argument in arguments])
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
-
 
 MODEL = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "black"}
 

@@ -8,16 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from command_line import run
 
 from sundae_ns.cli import main
 from sundae_ns.cli.main import COMMANDS
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as caught:
-        main([str(argument) for argument in arguments])
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
 
 
 @pytest.mark.parametrize("wrong", ["foreign folder", "file", "option"])

@@ -9,18 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from command_line import run
 
-from sundae_ns.cli import main
 from sundae_ns.cli.packing import Precision, pack
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage.packing import FINETUNED, PackConfig, PackedScene, write_scene
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as caught:
-        main([str(argument) for argument in arguments])
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
 
 
 def test_options_are_those_of_the_configuration() -> None:

@@ -10,12 +10,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import command_line
 import pytest
 from fake_colmap import FakeColmap
 from PIL import Image
 from run_commands import photo, write_video
 
-from sundae_ns.cli import main
 from sundae_ns.poses import reconstruction
 from sundae_ns.storage.runs import folder as run_folder
 
@@ -36,17 +36,11 @@ def colmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeColmap:
 
 
 def poses(*words: str) -> int:
-    with pytest.raises(SystemExit) as caught:
-        main(["poses", *words])
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
+    return command_line.run("poses", *words)
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    assert poses(*words) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("sundae: ")
-    return line
+    return command_line.refusal(capsys, "poses", *words)
 
 
 def test_each_stage_and_the_result_are_one_line(colmap: FakeColmap, capsys: pytest.CaptureFixture[str]) -> None:

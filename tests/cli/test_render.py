@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import av
+import command_line
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 import sundae_ns
-from sundae_ns.cli import main
 
 VIEWS = [
     sundae_ns.View.look_at((0.5 + dx, -2.0, 0.5), (0.5, 0.5, 0.5), fov=60.0, width=41, height=31) for dx in (0.0, 0.8)
@@ -23,17 +23,11 @@ VIEWS = [
 
 
 def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as caught:
-        main(["render", *map(str, arguments)])
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
+    return command_line.run("render", *arguments)
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    assert run(*arguments) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("sundae: ")
-    return line
+    return command_line.refusal(capsys, "render", *arguments)
 
 
 def capture_file(path: Path, count: int) -> Path:

@@ -16,6 +16,8 @@ from shared_fields import (
     COLORS,
     NAMES,
     RANKS,
+    Passed,
+    RunRanks,
     Views,
     a_field,
     a_view,
@@ -37,9 +39,6 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.rasterization.sharded import camera_row, cameras_of_rows, may_be_seen
 from sundae_ns.rendering import StepResolution, TrainingView, View
 from sundae_ns.training.densification import CappedStrategy
-
-RunRanks = Callable[[str, Path], None]
-Passed = Callable[[Path, str], None]
 
 
 def check_drawing(shards: Shards) -> None:

@@ -16,6 +16,8 @@ import torch
 import torch.distributed as dist
 from shared_fields import (
     COLORS,
+    Passed,
+    RunRanks,
     a_field,
     a_view,
     adams,
@@ -41,9 +43,6 @@ from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedules import PruningSchedule
-
-RunRanks = Callable[[str, Path], None]
-Passed = Callable[[Path, str], None]
 
 
 def check_levelling(shards: Shards) -> None:

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import command_line
 import cv2
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from sundae_ns.cli import main
 from sundae_ns.cli.forecast import Forecast
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
@@ -108,17 +108,11 @@ def photo(path: Path, kind: str = "jpeg") -> None:
 
 
 def run(*words: str) -> int:
-    with pytest.raises(SystemExit) as caught:
-        main(["run", *words])
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
+    return command_line.run("run", *words)
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    assert run(*words) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("sundae: ")
-    return line
+    return command_line.refusal(capsys, "run", *words)
 
 
 def write_video(path: Path, frames: int, size: tuple[int, int] = (64, 48)) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,6 +19,9 @@ from sundae_ns.rasterization.sharded import Cameras, camera_row, cameras_of_rows
 from sundae_ns.rendering import ColorSettings, Primitives, StepResolution, View
 from sundae_ns.rendering.source import colors_from
 
+RunRanks = Callable[[str, Path], None]
+Passed = Callable[[Path, str], None]
+"""Fixtures of conftest.py: run the checks of a file on two ranks, and fail with the error of one."""
 RANKS = 2
 REFERENCE = select_backend("reference", "cpu")
 COLORS = ColorSettings(REFERENCE)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sundae_ns.evaluation.count_curve import CurvePoint
-from sundae_ns.training.trials.head import least_gain
+from sundae_ns.training.trials.head import is_enough
 
 PSNR_WEIGHTS = (0.75, 0.1)
 """Weight of the PSNR at the end of a trial, and dB that each halving of the count gains after it."""
@@ -142,8 +142,7 @@ def head_pays(curve: Sequence[CurvePoint], gain: HeadGain, tolerance: Tolerance)
     more, doublings = gain.bytes_of(count), 0.0
     if near.bytes and more is not None:
         doublings = math.log2(1 + more / (near.bytes * count / near.count))
-    gained = gain.psnr * gain.falls_by(count, HEAD_PSNR[1])
-    return math.inf > gained >= least_gain(doublings) and gain.ssim >= 0  # false if a figure is not finite
+    return is_enough(gain.psnr * gain.falls_by(count, HEAD_PSNR[1]), gain.ssim, doublings)
 
 
 def _paired(differences: NDArray[np.float64], pixels: NDArray[np.float64]) -> tuple[float, float]:

@@ -155,6 +155,11 @@ class HeadTrialProgress:
         return best
 
 
+def is_enough(psnr: float, ssim: float, doublings: float) -> bool:
+    """Whether gains in PSNR (dB) and SSIM pay for doublings of the bytes; those that are not finite do not."""
+    return math.inf > psnr >= least_gain(doublings) and ssim >= 0
+
+
 def pays(smaller: Sequence[HeldOutQuality], larger: Sequence[HeldOutQuality], doublings: float = 0.0) -> bool:
     """Whether a larger scene gains enough PSNR over a smaller one, and loses no SSIM.
 
@@ -163,8 +168,7 @@ def pays(smaller: Sequence[HeldOutQuality], larger: Sequence[HeldOutQuality], do
         doublings: of the stored bytes that the larger one takes.
     """
     decibels, similarity = (b - a for a, b in zip(*map(mean_quality, (smaller, larger)), strict=True))
-    # Comparisons with figures that are not finite fail.
-    return math.inf > decibels >= least_gain(doublings) and similarity >= 0
+    return is_enough(decibels, similarity, doublings)
 
 
 class HeadTrials(Extension):
