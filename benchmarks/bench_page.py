@@ -286,6 +286,8 @@ def main() -> None:
     parser.add_argument("--as-trained", action="store_true", help="with --dawn: the head at the scale of its training")
     parser.add_argument("--folder", type=Path, help="with --dawn: write what it runs to this folder, and do not run it")
     options = parser.parse_args()
+    if options.folder and (not options.dawn or options.folder.exists()):
+        parser.error("--folder names a new folder, and needs --dawn")
     if options.dawn and options.folder:
         options.folder.mkdir(parents=True)
         write_timing(options.folder, options.scene, options.dawn, options.frames, as_trained=options.as_trained)
