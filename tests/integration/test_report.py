@@ -62,7 +62,7 @@ def test_files(report: Path, stock: Path) -> None:
     names = {path.name for path in report.iterdir()}
     images = {"views.png", "curves.png", "errors-1.png", "errors-2.png"}
     images |= {f"quality-{cost}.png" for cost in ("size", "time", "primitives")}
-    assert names == {"report.json", "report.csv", "report.md"} | images
+    assert names == {"report.json", "report.csv", "report.md", "report.html"} | images
     text = (report / "report.md").read_text()
     assert all(f"({name})" in text for name in images)
     assert f"Curves of stock/splatfacto: {stock} holds no tensorboard event files" in text
