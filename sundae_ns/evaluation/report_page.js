@@ -22,16 +22,26 @@ for (const card of document.querySelectorAll(".view")) {
     slider.value = Math.round((100 * (event.clientX - box.left)) / box.width);
     show();
   };
-  // On the whole image: some browsers move a slider only by its thumb.
+  // On the whole image: some browsers move a slider only by its thumb. A finger that scrolls the page moves nothing.
+  let start = null;
   stage.addEventListener("pointerdown", (event) => {
-    if (event.button !== 0) return;
-    event.preventDefault();
+    if (event.button !== 0 || !event.isPrimary) return;
+    start = event.pointerType === "touch" ? event : null;
+    if (!start) {
+      event.preventDefault();
+      follow(event);
+    }
     stage.setPointerCapture(event.pointerId);
     slider.focus({ preventScroll: true });
-    follow(event);
   });
   stage.addEventListener("pointermove", (event) => {
-    if (stage.hasPointerCapture(event.pointerId)) follow(event);
+    if (!stage.hasPointerCapture(event.pointerId)) return;
+    if (start && Math.abs(event.clientX - start.clientX) <= Math.abs(event.clientY - start.clientY)) return;
+    start = null;
+    follow(event);
+  });
+  stage.addEventListener("click", (event) => {
+    if (event.isTrusted && event.detail) follow(event);
   });
   slider.addEventListener("input", show);
   card.querySelector(".layers").addEventListener("change", layer);

@@ -138,7 +138,8 @@ def shown_view(row: ComparisonRow, index: int, full: ViewQuality, base: ViewQual
 
 
 def _plain(image: Tensor) -> Tensor:
-    return image.detach().to(device="cpu", dtype=torch.float32).clamp(0, 1)
+    # A damaged field may render NaN, which no image holds.
+    return image.detach().to(device="cpu", dtype=torch.float32).nan_to_num(nan=0.0).clamp(0, 1)
 
 
 def _image(image: Tensor, size: tuple[int, int]) -> Image.Image:
