@@ -148,7 +148,7 @@ def _run(run: ShownRun, numbers: Mapping[str, int], beside: Sequence[ShownRun]) 
         "views": views,
         "total": len(own.full.views),
         "has_head": own.has_head,
-        "reduced": any(view.shown != view.size for view in run.views),
+        "exact": all(view.exact for view in run.views),
         "curve": None if run.curve is None else Markup(_drawing(run.curve, f"c{place}-")),
         "decision": run.curve,
     }

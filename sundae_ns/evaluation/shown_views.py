@@ -21,13 +21,16 @@ from sundae_ns.evaluation.measured import ViewQuality
 
 MOST_VIEWS = 24
 """Most views that a page shows of a run."""
-MOST_ON_A_PAGE = 48
+MOST_ON_A_PAGE = 32
 """Most views that a page shows of all runs, unless the worst and the best of each are more."""
 LONGEST_SIDE = 1200
 """Of the images in a page, pixels; larger ones are reduced."""
 LARGEST_ERROR = 51
 """Mean absolute difference of the channels, in levels of 255, that gets the last colour of the error map."""
+EXACT_SIDE = 512
+"""Longest side of images that lose nothing, pixels: a browser enlarges them, so that losses at colours' edges show."""
 _QUALITY = 90
+"""Of larger ones, as WebP: the losses of a view to its photo are far larger."""
 _COLORS = 32
 """Colours of an error map: few, because they decide its bytes."""
 _COLORMAP = "magma"
@@ -56,6 +59,11 @@ class ShownView:
     """Rendering without the head; None if there is no head."""
     error: str
     """Error of the complete rendering."""
+
+    @property
+    def exact(self) -> bool:
+        """Whether the images are those that were measured, neither reduced nor with losses of their format."""
+        return max(self.size) <= EXACT_SIDE
 
 
 def choose_views(qualities: Sequence[float], most: int) -> list[int]:
@@ -133,7 +141,7 @@ def shown_view(row: ComparisonRow, index: int, full: ViewQuality, base: ViewQual
         photo=_address(_image(photo, size)),
         rendering=_address(_image(rendering, size)),
         bare=None if base is None else _address(_image(torch.as_tensor(row.base), size)),
-        error=_address(error_map(rendering, photo, size), lossless=True),
+        error=_address(error_map(rendering, photo, size)),
     )
 
 
@@ -147,12 +155,14 @@ def _image(image: Tensor, size: tuple[int, int]) -> Image.Image:
     return whole if whole.size == size else whole.resize(size, Image.Resampling.LANCZOS)
 
 
-def _address(image: Image.Image, *, lossless: bool = False) -> str:
-    """An image as a ``data:`` address: PNG if nothing may be lost, else WebP."""
+def _address(image: Image.Image) -> str:
+    """An image as a ``data:`` address: PNG if it has a palette, else WebP."""
     file = BytesIO()
-    if lossless:
+    if image.mode == "P":
         image.save(file, "png", optimize=True)
+    elif max(image.size) <= EXACT_SIDE:
+        image.save(file, "webp", lossless=True)
     else:
         image.save(file, "webp", quality=_QUALITY)
-    kind = "png" if lossless else "webp"
+    kind = "png" if image.mode == "P" else "webp"
     return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}"

@@ -25,6 +25,7 @@ from sundae_ns.evaluation.count_curve import CountCurve, CurvePoint
 from sundae_ns.evaluation.document import row_of
 from sundae_ns.evaluation.report_page import ShownRun, report_page
 from sundae_ns.evaluation.shown_views import (
+    EXACT_SIDE,
     LARGEST_ERROR,
     LONGEST_SIDE,
     MOST_ON_A_PAGE,
@@ -112,7 +113,8 @@ def shown(run: Measured, *, name: str = "", **options: Any) -> ShownRun:
 def page_of(*runs: ShownRun, notes: tuple[str, ...] = ()) -> str:
     png = BytesIO()
     Image.new("RGB", (4, 4)).save(png, "png")
-    scenes = {scene: [run for run in runs if run.measured.scene == scene] for scene in {r.measured.scene for r in runs}}
+    names = dict.fromkeys(run.measured.scene for run in runs)
+    scenes = {scene: [run for run in runs if run.measured.scene == scene] for scene in names}
     return report_page(scenes, {next(iter(scenes)): [("A plot", png.getvalue())]}, notes, "sundae report x")
 
 
@@ -146,7 +148,7 @@ def test_a_view_without_a_figure_counts_as_worst() -> None:
 
 
 def test_a_page_of_many_runs_shows_fewer_views_of_each() -> None:
-    assert views_for_each(1) == views_for_each(2) == MOST_VIEWS
+    assert views_for_each(1) == MOST_VIEWS
     assert all(runs * views_for_each(runs) <= MOST_ON_A_PAGE for runs in range(1, MOST_ON_A_PAGE // 2 + 1))
     assert views_for_each(1000) == 2
 
@@ -205,12 +207,23 @@ def test_images_of_a_view_have_one_size(
     assert shown_view(row, 3, run.full.views[0], None).bare is None
 
 
-def test_images_show_their_tensors(measured: Callable[..., Measured]) -> None:
-    flat = [torch.full((16, 16, 3), value) for value in (0.2, 0.5, 0.8)]
+@pytest.mark.parametrize(("size", "exact"), [((24, EXACT_SIDE), True), ((24, EXACT_SIDE + 2), False)])
+def test_small_images_lose_nothing(measured: Callable[..., Measured], size: tuple[int, int], exact: bool) -> None:
+    row, quality = images(0, *size), measured().full.views[0]
+    view = shown_view(row, 0, quality, quality)
+    assert view.exact is exact
+    for address, image in ((view.photo, row.truth), (view.bare, row.base), (view.rendering, row.compensated)):
+        levels = (255 * torch.as_tensor(image)).round().numpy()
+        assert np.array_equal(np.asarray(decoded(address)), levels) is exact
+    errors = error_map(torch.as_tensor(row.compensated), torch.as_tensor(row.truth))
+    assert np.array_equal(decoded(view.error).convert("RGB"), errors.convert("RGB"))
+
+
+def test_larger_images_look_like_their_tensors(measured: Callable[..., Measured]) -> None:
+    flat = [torch.full((16, 800, 3), value) for value in (0.2, 0.5, 0.8)]
     view = shown_view(ComparisonRow(*flat), 0, measured().full.views[0], measured().base.views[0])
     for address, image in ((view.photo, flat[0]), (view.bare, flat[1]), (view.rendering, flat[2])):
         assert np.abs(np.asarray(decoded(address)) / 255 - image.numpy()).max() < 0.01
-    assert np.array_equal(decoded(view.error).convert("RGB"), error_map(flat[2], flat[0]).convert("RGB"))
 
 
 def test_a_rendering_that_is_not_finite_is_shown(measured: Callable[..., Measured]) -> None:
@@ -273,11 +286,11 @@ def test_it_says_how_many_views_it_shows(measured: Callable[..., Measured]) -> N
     run = shown(measured())
     page = Page(page_of(replace(run, views=run.views[1:])))
     assert "2 of 3 test views: the worst, the best" in page.words
-    assert "Images are reduced" not in page.words
-    small = replace(run.views[0], size=(64, 48))
-    page = Page(page_of(replace(run, views=[small])))
-    assert f"Images are reduced to {LONGEST_SIDE} pixels" in page.words
-    assert "64 x 48 px, shown at 50%" in page.words
+    assert "Images are compressed" not in page.words
+    large = replace(run.views[0], size=(2400, 1800), shown=(1200, 900))
+    page = Page(page_of(replace(run, views=[large])))
+    assert f"Images are compressed here, and reduced to {LONGEST_SIDE} pixels" in page.words
+    assert "2400 x 1800 px, shown at 50%" in page.words
 
 
 def test_hostile_names_stay_text(measured: Callable[..., Measured]) -> None:
