@@ -177,7 +177,11 @@ def report(
     files[out / "report.json"] = (json.dumps(rows, indent=1) + "\n").encode()
     files[out / "report.csv"] = csv_text(rows).encode()
     runs_shown = {scene: [shown[run.label] for run in own] for scene, own in scenes.items()}
-    drawn = {scene: [(title, figures[name]) for title, name in plots[scene]] for scene in scenes}
+    # The page draws the curve of each run itself.
+    drawn = {
+        scene: [(title, figures[name]) for title, name in plots[scene] if not name.startswith("counts")]
+        for scene in scenes
+    }
     page = report_page(runs_shown, drawn, notes, command).encode()
     files[out / "report.html"] = page
     files[out / "report.md"] = document(scenes, images, notes, command).encode()

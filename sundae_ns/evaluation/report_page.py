@@ -116,7 +116,7 @@ def _run(run: ShownRun, numbers: Mapping[str, int], beside: Sequence[ShownRun]) 
         "primitives": f"{own.primitives:,}",
         "size": f"{own.bytes_total / MEGABYTE:.2f} MB ({own.bytes_total:,} bytes)",
         "test views": f"{len(own.full.views)}, {own.resolution} px",
-        "head": f"on, {own.precision}" if own.has_head else "off",
+        "head": f"on, {own.precision}" if own.has_head else "none",
     }
     # The same view of another run of this scene may stand in the photo's place.
     peers = [
