@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from sundae_ns.evaluation.count_curve import CountCurve
     from sundae_ns.evaluation.curves import Curves
     from sundae_ns.evaluation.plots import Cost
+    from sundae_ns.evaluation.report_page import ShownRun
+    from sundae_ns.evaluation.shown_views import ShownView
     from sundae_ns.scenes.opening import Opened
 
 PNG_WIDTH = 400
@@ -78,6 +80,8 @@ def report(
         from sundae_ns.evaluation.document import document
         from sundae_ns.evaluation.jod import INSTALL_JOD, jod_available
         from sundae_ns.evaluation.metrics import INSTALL_FLIP
+        from sundae_ns.evaluation.report_page import ShownRun, report_page
+        from sundae_ns.evaluation.shown_views import views_for_each
         from sundae_ns.scenes.measure import measure_scene
         from sundae_ns.scenes.opening import open_scene
         from sundae_ns.storage.atomic import write_files
@@ -98,6 +102,7 @@ def report(
     curves: dict[str, Curves] = {}
     counts: dict[str, CountCurve] = {}
     comparisons: dict[str, list[tuple[str, str]]] = {}
+    shown: dict[str, ShownRun] = {}
     failures: list[SundaeError] = []
     columns = (*Progress.get_default_columns()[:-1], MofNCompleteColumn(), TimeRemainingColumn())
     console = Console()
@@ -146,10 +151,13 @@ def report(
                         f"Curves of {label}: {opened.source} holds no tensorboard event files; "
                         "train with --vis viewer+tensorboard to record them."
                     )
+                progress.update(task, description=f"Encoding views of {escape(label)}")
+                views = _views(opened, measured, views_for_each(len(runs)))
+                shown[label] = ShownRun(measured, views, decided, capture=str(opened.capture.resolve()))
                 done.append(measured)
                 if video is not None:
-                    views = len(opened.datamanager.train_dataset) + len(opened.cameras)
-                    progress.update(task, description="Rendering the video", completed=0, total=views)
+                    total = len(opened.datamanager.train_dataset) + len(opened.cameras)
+                    progress.update(task, description="Rendering the video", completed=0, total=total)
                     files[video] = _video(opened, advance)
             progress.remove_task(task)
             progress.advance(scenes_done)
@@ -168,6 +176,14 @@ def report(
     files |= {out / name: content for name, content in figures.items()}
     files[out / "report.json"] = (json.dumps(rows, indent=1) + "\n").encode()
     files[out / "report.csv"] = csv_text(rows).encode()
+    runs_shown = {scene: [shown[run.label] for run in own] for scene, own in scenes.items()}
+    # The page draws the curve of each run itself.
+    drawn = {
+        scene: [(title, figures[name]) for title, name in plots[scene] if not name.startswith("counts")]
+        for scene in scenes
+    }
+    page = report_page(runs_shown, drawn, notes, command).encode()
+    files[out / "report.html"] = page
     files[out / "report.md"] = document(scenes, images, notes, command).encode()
     write_files(files)
     for note in notes:
@@ -175,6 +191,9 @@ def report(
     if video is not None:
         console.print(f"wrote {video}", highlight=False)
     console.print(f"wrote {out / 'report.md'}, with report.csv, report.json and images beside it", highlight=False)
+    views_shown = sum(len(run.views) for run in shown.values())
+    about = f"{len(page) / 1e6:.1f} MB, {views_shown} of {sum(len(run.full.views) for run in done)} views"
+    console.print(f"wrote {out / 'report.html'}, to look at in a browser: {about}", highlight=False)
     return 1 if failures else 0
 
 
@@ -205,6 +224,20 @@ def _errors(opened: Opened, measured: Measured, kind: str) -> bytes:
     file = BytesIO()
     comparison_sheet(rows).save(file, kind)
     return file.getvalue()
+
+
+def _views(opened: Opened, measured: Measured, most: int) -> list[ShownView]:
+    """Views of a run as the page shows them, at most so many; one view at a time is held at its full size."""
+    from sundae_ns.evaluation.shown_views import choose_views, shown_view
+    from sundae_ns.scenes.measure import comparison_of
+
+    full, base = measured.full.views, measured.base.views if measured.has_head else None
+    names = [path.name for path in opened.datamanager.eval_dataset.image_filenames]
+    shown = []
+    for index in choose_views([view.psnr for view in full], most):
+        row = comparison_of(opened.model, opened.cameras[index], opened.truths[index], names[index])
+        shown.append(shown_view(row, index, full[index], None if base is None else base[index]))
+    return shown
 
 
 def _video(opened: Opened, progress: Callable[[], object]) -> bytes:

@@ -36,12 +36,13 @@ def is_packed(path: Path) -> bool:
 
 
 def is_report(path: Path) -> bool:
-    """Whether a report (``report.md``) has its last line, and beside it all of its images."""
+    """Whether a report (``report.md``) has its last line, and beside it all of its images and ``report.html``."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, ValueError):
         return False
-    return text.endswith("\n") and all(_decodes(path.parent / name) for name in _IMAGE.findall(text))
+    whole = text.endswith("\n") and is_page(path.with_suffix(".html"))
+    return whole and all(_decodes(path.parent / name) for name in _IMAGE.findall(text))
 
 
 def _decodes(path: Path) -> bool:

@@ -329,7 +329,7 @@ def run(
             if not step.done():
                 raise SundaeError(f"{words[0]} ended without its result; the output above says why")
         step.check()
-    print(f"# packed scene: {out / 'scene.sundae'}; report: {out / 'report' / 'report.md'}")
+    print(f"# packed scene: {out / 'scene.sundae'}; report: {out / 'report' / 'report.html'}")
     print(f"# to look at the scene: open {out / 'scene.html'} in a browser, or")
     print(shlex.join(["sundae", "view", word(out / "scene.sundae")]))
     return 0

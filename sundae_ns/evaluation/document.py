@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from io import StringIO
+from textwrap import wrap
 from typing import Any
 
 from rich.console import Console
@@ -18,6 +19,17 @@ METRICS = (("psnr", 2), ("ssim", 4), ("flip", 4), ("lpips", 4), ("jod", 3))
 """Metrics in the order of a table's columns, with their number of decimals."""
 Stage = tuple[str, int, Mapping[str, float] | None]
 """Name of a stage of a run, number of primitives, and means over the test views by name; None for a skipped stage."""
+EXPLANATIONS = (
+    "Each row is one configuration of rendering a field. Its time and its metrics come from the same calls.",
+    "Metrics are means over the test views. PSNR is over all pixels and channels, SSIM is pytorch_msssim's "
+    f"(11 x 11 window, no padding), FLIP is {FLIP_VARIANT}, and LPIPS names its net.",
+    f"JOD is {JOD_VARIANT}: 10 for equal images, and three of four viewers see 1 less.",
+    "Higher PSNR, SSIM and JOD are better; lower FLIP, LPIPS, ms and MB are better.",
+    "ms per frame is the median over the test views, synchronised with the device.",
+    "MB are 1e6 bytes in fp32 of all that the configuration needs: no network or features if the head is off. "
+    "For a packed scene it is the whole file.",
+)
+"""Sentences on the figures of a report's table."""
 COLUMNS = (
     *("scene", "method", "variant", "keep_ratio", "seed", "steps", "primitives"),
     *("psnr", "ssim", "psnr_base", "ssim_base", "lpips", "lpips_net"),
@@ -40,7 +52,15 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, words: int = 2
     return ["| " + " | ".join(cells).replace("\n", " ") + " |" for cells in (heads, rule, *rows)]
 
 
-def _row(run: Measured, configuration: Configuration) -> list[str]:
+def heads_of(runs: Sequence[Measured]) -> list[str]:
+    """Heads of the table of the runs of a report; LPIPS names the nets that the runs have."""
+    nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})
+    heads = ["run", "rendered with", "primitives", "MB", "ms per frame", "PSNR, dB", "SSIM", "FLIP"]
+    return [*heads, f"LPIPS ({', '.join(nets)})" if nets else "LPIPS", "JOD"]
+
+
+def row_of(run: Measured, configuration: Configuration) -> list[str]:
+    """Cells of a configuration below :func:`heads_of`."""
     return [
         run.label,
         configuration.name if run.has_head else "no head",
@@ -71,24 +91,15 @@ def document(
     lines += [
         f"Rendered on {', '.join(devices)}.",
         "",
-        "- Each row is one configuration of rendering a field. Its time and its metrics come from the same calls.",
-        "- Metrics are means over the test views. PSNR is over all pixels and channels, SSIM is pytorch_msssim's",
-        f"  (11 x 11 window, no padding), FLIP is {FLIP_VARIANT}, and LPIPS names its net.",
-        f"- JOD is {JOD_VARIANT}: 10 for equal images, and three of four viewers see 1 less.",
-        "- Higher PSNR, SSIM and JOD are better; lower FLIP, LPIPS, ms and MB are better.",
-        "- ms per frame is the median over the test views, synchronised with the device.",
-        "- MB are 1e6 bytes in fp32 of all that the configuration needs: no network or features if the head is off.",
-        "  For a packed scene it is the whole file.",
+        *("\n".join(wrap(f"- {line}", 120, subsequent_indent="  ")) for line in EXPLANATIONS),
         "",
     ]
-    nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})
-    heads = ["run", "rendered with", "primitives", "MB", "ms per frame", "PSNR, dB", "SSIM", "FLIP"]
-    heads += [f"LPIPS ({', '.join(nets)})" if nets else "LPIPS", "JOD"]
+    heads = heads_of(runs)
     for scene, own in scenes.items():
         views = sorted({len(run.full.views) for run in own})
         sizes = sorted({run.resolution for run in own})
         lines += [f"## {scene}", "", f"{' or '.join(map(str, views))} test views, {' or '.join(sizes)} px.", ""]
-        lines += table(heads, [_row(run, configuration) for run in own for configuration in run.configurations])
+        lines += table(heads, [row_of(run, configuration) for run in own for configuration in run.configurations])
         for title, name in images.get(scene, ()):
             lines += ["", f"![{title}]({name})", "", f"*{title}.*"]
         lines.append("")

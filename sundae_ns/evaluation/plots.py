@@ -78,7 +78,9 @@ def plot_quality(file: Path | BinaryIO, runs: Sequence[Measured], cost: Cost, co
     return True
 
 
-def plot_counts(file: Path | BinaryIO, curve: CountCurve, *, title: str) -> None:
+def plot_counts(
+    file: Path | BinaryIO, curve: CountCurve, *, title: str = "", form: Literal["png", "svg"] = "png"
+) -> None:
     """Expected PSNR and SSIM against the number of primitives, with errors, and the number that was chosen."""
     figure, panels = _figure(1, 2, width=5.4, height=3.8)
     points = [point for point in curve.points if point.psnr_loss is not None and point.ssim_loss is not None]
@@ -95,7 +97,7 @@ def plot_counts(file: Path | BinaryIO, curve: CountCurve, *, title: str) -> None
         _key("expected; bars: standard error of the loss over the views", color=PALETTE[0], marker="o"),
         _key(f"chosen: {curve.chosen:,} of {curve.full:,}", color=PALETTE[1], linestyle="--"),
     ]
-    _save(figure, file, keys, title)
+    _save(figure, file, keys, title, form)
 
 
 def plot_views(file: Path | BinaryIO, runs: Sequence[Measured], colors: Mapping[str, str]) -> None:
@@ -178,11 +180,12 @@ def _key(label: str, **look: Any) -> Line2D:
     return Line2D([], [], label=label, **look)
 
 
-def _save(figure: Figure, file: Path | BinaryIO, keys: Sequence[Line2D], title: str) -> None:
+def _save(figure: Figure, file: Path | BinaryIO, keys: Sequence[Line2D], title: str, form: str = "png") -> None:
     # The legend is below the panels, where it hides no data.
     figure.legend(handles=keys, loc="outside lower center", ncols=min(len(keys), 3), fontsize=8, frameon=False)
-    figure.suptitle(title, fontsize=11)
-    figure.savefig(file, format="png")
+    if title:
+        figure.suptitle(title, fontsize=11)
+    figure.savefig(file, format=form)
 
 
 def _number(value: float, _: object = None) -> str:

@@ -40,6 +40,7 @@ RUN = "out/runs/photos/sundae/run"
         ("out/eval.json", 2),
         ("out/scene.sundae", 3),
         ("out/report/report.md", 4),
+        ("out/report/report.html", 4),
         ("out/report/views.png", 4),
         ("out/scene.html", 5),
     ],

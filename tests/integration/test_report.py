@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import copy
 import csv
 import json
+import re
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +65,7 @@ def test_files(report: Path, stock: Path) -> None:
     names = {path.name for path in report.iterdir()}
     images = {"views.png", "curves.png", "errors-1.png", "errors-2.png"}
     images |= {f"quality-{cost}.png" for cost in ("size", "time", "primitives")}
-    assert names == {"report.json", "report.csv", "report.md"} | images
+    assert names == {"report.json", "report.csv", "report.md", "report.html"} | images
     text = (report / "report.md").read_text()
     assert all(f"({name})" in text for name in images)
     assert f"Curves of stock/splatfacto: {stock} holds no tensorboard event files" in text
@@ -81,6 +84,39 @@ def test_rows_are_of_the_runs(report: Path, tiny: Any) -> None:
     assert min(ours.ms_frame, ours.ms_splat, ours.ms_head, theirs.ms_frame) > 0
     assert ours.bytes_head > 0 == theirs.bytes_head
     assert ours.command.startswith("sundae report ")
+
+
+def test_the_page_shows_the_views_with_their_figures(report: Path, tiny: Any) -> None:
+    text = (report / "report.html").read_text(encoding="utf-8")
+    ours, theirs = json.loads((report / "report.json").read_text())
+    cards = re.findall("<article.*?</article>", text, re.DOTALL)
+    views = [(run, index) for run in (ours, theirs) for index in range(3)]
+    assert len(cards) == len(views)
+    photographs = sorted((tiny.scene / "images").iterdir())
+    for card, (run, index) in zip(cards, views, strict=True):
+        for way in run["configurations"]:
+            found = way["views"][index]
+            assert f"PSNR {found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}" in card
+        photo = photographs[(2, 7, 12)[index]]
+        assert f">{photo.name}</h4>" in card
+        data = [base64.b64decode(each) for each in re.findall(r'src="data:image/\w+;base64,([^"]+)"', card)]
+        assert len(data) == 2 + len(run["configurations"])
+        shown, rendering, *_ = (np.asarray(Image.open(BytesIO(each)), dtype=float) for each in data)
+        truth = np.asarray(Image.open(photo), dtype=float)
+        assert np.array_equal(shown, truth)
+        psnr = 20 * np.log10(255 / np.sqrt(((rendering - truth) ** 2).mean()))
+        assert psnr == pytest.approx(run["configurations"][0]["views"][index]["psnr"], abs=0.01)
+    assert len({*re.findall('<option value="(v[0-9-]+)">', text)}) == len(views)  # each stands beside the other run's
+
+
+def test_the_page_of_many_views_is_limited(
+    tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sundae_ns.evaluation.shown_views.MOST_VIEWS", 2)
+    assert sundae("report", tiny.folder, "-o", tmp_path / "out", "--repeats", 0) == 0
+    said, page = " ".join(capsys.readouterr().out.split()), tmp_path / "out" / "report.html"
+    assert "MB, 2 of 3 views" in said
+    assert "2 of 3 test views" in page.read_text(encoding="utf-8")
 
 
 def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any) -> None:

@@ -93,6 +93,7 @@ class Commands:
             folder = Path(self.option("-o"))
             folder.mkdir(exist_ok=True)
             Image.effect_noise((30, 20), 50).save(folder / "views.png")
+            (folder / "report.html").write_text("<html><body>a report</body></html>\n")
             (folder / "report.md").write_text("# Report\n\n![PSNR of each test view](views.png)\n")
 
 
