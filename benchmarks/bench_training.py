@@ -5,18 +5,20 @@
 
 Every arm trains in a process of its own, on images of full size on the GPU, with every 8th image for the test and the
 head as the method decides. Nothing is evaluated or saved while the clock runs; the clock waits for the GPU.
-``gpu_busy_share`` is the share of 100 steps in which a kernel runs, before and after the prune (``--profile``: in a
-further training, because the profiler takes time). ``curve`` lists seconds, PSNR and SSIM of the test views on the way,
-measured with the clock stopped.
+``gpu_busy_share`` is the share of 100 steps in which a kernel runs, before and after the prune, and ``kernels`` has the
+microseconds of a step in each of them (``--profile``: in a further training, because the profiler takes time).
+``curve`` lists seconds, PSNR and SSIM of the test views on the way, measured with the clock stopped.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -131,9 +133,10 @@ def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
 
 
 def busy(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
-    """Shares of time in which a kernel runs: a quarter into the training, and at its end."""
+    """Shares of time in which a kernel runs, and the time of each: a quarter into the training, and at its end."""
     trainer, steps = trainer_of(options, arm, out), steps_of(options, arm)
     shares: list[float] = []
+    kernels: list[dict[str, float]] = []
     profile: Any = None
     began = 0.0
 
@@ -149,11 +152,24 @@ def busy(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
             span = time.perf_counter() - began
             profile.__exit__(None, None, None)
             shares.append(round(covered(profile) / span, 3))
+            kernels.append(by_kernel(profile))
             profile = None
 
     after_step(trainer, look)
     trainer.train()
-    return {"gpu_busy_share": shares}
+    return {"gpu_busy_share": shares, "kernels": kernels}
+
+
+def by_kernel(profile: Any) -> dict[str, float]:
+    """Microseconds of a step in each kernel, the longest first; those below 1% of all are summed as ``other``."""
+    spent: Counter[str] = Counter()
+    for event in profile.events():
+        if event.device_type == torch.autograd.DeviceType.CUDA:
+            name = re.sub(r"<.*|\(.*|^void ", "", event.name.replace("(anonymous namespace)::", ""))
+            spent[name] += (event.time_range.end - event.time_range.start) / PROFILED
+    least = 0.01 * spent.total()
+    found = {name: round(value, 1) for name, value in spent.most_common() if value >= least}
+    return {**found, "other": round(sum(value for value in spent.values() if value < least), 1)}
 
 
 def covered(profile: Any) -> float:

@@ -1,7 +1,7 @@
 """Run jobs from /tmp/jobs/NNN-name.sh on GPUs with 4 slots each, lowest name first; those whose `# after X` has not ended wait. Ends at /tmp/jobs/END once all are done."""
 import os, subprocess, time
 from pathlib import Path
-J = Path("/tmp/jobs"); J.mkdir(exist_ok=True); Path("/tmp/logs").mkdir(exist_ok=True); slots = [(g, s) for s in range(int(os.environ.get("SLOTS", 4))) for g in range(2)]
+J = Path("/tmp/jobs"); J.mkdir(exist_ok=True); Path("/tmp/logs").mkdir(exist_ok=True); slots = [(g, s) for s in range(int(os.environ.get("SLOTS", 4))) for g in range(int(os.environ.get("GPUS", 2)))]
 running, done, log = {}, set(), open("/tmp/logs/queue.log", "a", buffering=1)
 T = time.time()
 while True:
@@ -17,7 +17,7 @@ while True:
         only = [int(l.split()[2]) for l in text.splitlines() if l.startswith("# gpu ")]
         free = [s for s in slots if s not in running and (not only or s[0] in only)]
         if not free: continue
-        load = {g: sum(1 for s in running if s[0] == g) for g in (0, 1)}
+        load = {g: sum(1 for s in running if s[0] == g) for g in range(int(os.environ.get("GPUS", 2)))}
         slot = min(free, key=lambda s: load[s[0]])
         env = dict(os.environ, CUDA_VISIBLE_DEVICES=str(slot[0]))
         out = open(f"/tmp/logs/{path.stem}.log", "w")
