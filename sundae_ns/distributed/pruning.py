@@ -51,6 +51,14 @@ class RankPruner(FieldPruner):
             self.shards.level(self.params, self.optimizers, self.states, mended.mask)
         return dropped
 
+    def drop(self, mask: Tensor, *, at_most: float) -> int:
+        """As :meth:`FieldPruner.drop`. Collective."""
+        count = sum(found for (found,) in self.shards.numbers(int(mask.sum())))
+        if not 0 < count <= at_most * self.total:
+            return 0
+        self.shards.level(self.params, self.optimizers, self.states, ~mask)
+        return count
+
     @torch.no_grad()
     def cut(self, rule: PruneRule, count: int, contribution: Tensor | None = None) -> Decision:
         """Decide on rank 0, remove and merge on all. Collective; an error of rank 0 is raised on every rank.

@@ -25,6 +25,7 @@ from sundae_ns.rendering.source import FieldSource
 from sundae_ns.training.densification import CappedStrategy, Densification
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.floaters import FloaterRemoval
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.warning import warn
 
@@ -118,7 +119,7 @@ class Team:
             if isinstance(strategy, CappedStrategy):
                 strategy.see_each_image_after_resets(-(-num_images // self.count))
             return ShardedDensification(strategy, self.shards)
-        if isinstance(extension, ScheduledPruning):
+        if isinstance(extension, (ScheduledPruning, FloaterRemoval)):
             extension.pruner = partial(RankPruner, shards=self.shards)
         return extension
 

@@ -55,6 +55,22 @@ class FieldPruner:
             rewrite(self.params, self.optimizers, mended.field)
         return mended.dropped
 
+    def drop(self, mask: Tensor, *, at_most: float) -> int:
+        """Remove the primitives under a mask, unless they are too many.
+
+        Args:
+            mask: of the primitives of this process, bool ``[N]``.
+            at_most: largest share of the whole field that is removed, below 1.
+
+        Returns:
+            Number of removed primitives of the whole field.
+        """
+        count = int(mask.sum())
+        if not 0 < count <= at_most * self.total:
+            return 0
+        keep(self.params, self.optimizers, self.states, ~mask)
+        return count
+
     @torch.no_grad()
     def cut(self, rule: PruneRule, count: int, contribution: Tensor | None = None) -> Decision:
         """Decide, remove and merge; see :func:`sundae_ns.pruning.decide` for arguments and errors.

@@ -13,6 +13,7 @@ from sundae_ns.training.averaging import Averaging
 from sundae_ns.training.densification import Densification, make_strategy
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.floaters import FloaterRemoval
 from sundae_ns.training.initial_field import Frame, Points, Start, initial_field
 from sundae_ns.training.options import ModelOptions
 from sundae_ns.training.pruning import ScheduledPruning
@@ -59,9 +60,9 @@ def build(
         frame: transform from the capture's coordinates to the model's, if known.
 
     Returns:
-        State of field and head; extensions in their order (densification, trials of counts, scheduled pruning, trials
-        of the head and stopping, averaging; all but the pruning and densification optional); what to announce when
-        training starts.
+        State of field and head; extensions in their order (densification, removal of floaters, trials of counts,
+        scheduled pruning, trials of the head and stopping, averaging; trials and averaging optional); what to announce
+        when training starts.
 
     Raises:
         ConfigError: an option cannot work.
@@ -85,7 +86,8 @@ def build(
     state.pruning = schedule.initialize_state()
     begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
     engine = TrialEngine(begins_at)
-    extensions: list[Extension] = [densification]
+    removal = FloaterRemoval(None if points is None else points[0])
+    extensions: list[Extension] = [densification, removal]
     counts = CountTrials(pruning, densification, engine, alone=options.head.mode != "auto") if pruning.decides else None
     extensions += [] if counts is None else [counts]
     extensions.append(ScheduledPruning(schedule, evaluate=options.evaluate_prune))

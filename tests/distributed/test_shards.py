@@ -198,6 +198,20 @@ def check_mending(shards: Shards) -> None:
     assert all(bool(value.isfinite().all()) for value in params.values())
 
 
+def check_drop(shards: Shards) -> None:
+    """Rows of one rank go, unless they are too many of the whole field."""
+    params = own_half(shards)
+    shards.recount(params)
+    mask = torch.zeros(len(params["means"]), dtype=torch.bool)
+    mask[:9] = shards.rank == 1
+    pruner = RankPruner(params, {}, shards=shards)
+    assert pruner.drop(mask, at_most=0.05) == 0
+    assert shards.total == 90
+    assert pruner.drop(mask, at_most=0.1) == 9
+    assert shards.total == 81
+    assert abs(shards.counts[0] - shards.counts[1]) <= 1
+
+
 def check_refusal(shards: Shards) -> None:
     """All ranks raise the error that rank 0 finds."""
     params = own_half(shards)
@@ -246,11 +260,12 @@ def checks(_: Path) -> dict[str, Callable[[Shards], None]]:
         check_drift,
         check_pruning,
     )
+    rest = (check_mending, check_drop, check_refusal, check_averages, check_taking_a_shard)
     by_response = partial(check_pruning, redistribution="none", score="response-contribution", selection="top")
     return {
         **{check.__name__: check for check in plain},
         "check_pruningresponse-contribution": by_response,
-        **{check.__name__: check for check in (check_mending, check_refusal, check_averages, check_taking_a_shard)},
+        **{check.__name__: check for check in rest},
     }
 
 

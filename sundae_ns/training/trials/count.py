@@ -119,7 +119,7 @@ class CountTrialProgress:
     def head_gain(self) -> HeadGain:
         """What both trials of the head have shown."""
         plain, head = (mean_quality(from_values(trial)) for trial in self.head)
-        gain = HeadGain(kept_count(USUAL_SHARE, self.full), head[0] - plain[0], head[1] - plain[1])
+        gain = HeadGain.of(kept_count(USUAL_SHARE, self.full), plain, head)
         if len(self.head_bytes) == 2 and None not in self.head_bytes:
             (fewer, _), (more, fixed) = self.head_bytes  # type: ignore[misc]
             gain = gain._replace(features=more - fewer, head=fixed)

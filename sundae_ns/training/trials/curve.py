@@ -55,10 +55,20 @@ class HeadGain(NamedTuple):
     """What the head has gained, dB."""
     ssim: float
     """The same for SSIM."""
+    ssim_db: float | None = None
+    """By how much 1 - SSIM has fallen, dB; None where images are too small for SSIM."""
     features: int | None = None
     """Estimated bytes of the features of these primitives in a packed scene; None if unknown."""
     head: int = 0
     """Bytes of the packed head."""
+
+    @classmethod
+    def of(cls, primitives: int, plain: tuple[float, float], head: tuple[float, float]) -> HeadGain:
+        """What trials with ``primitives`` have shown that ended with these PSNRs (dB) and SSIMs."""
+        (psnr, ssim), (better, closer) = plain, head
+        seen = ssim != closer and max(ssim, closer) < 1
+        rise = 10 * math.log10((1 - ssim) / (1 - closer)) if seen else None
+        return cls(primitives, better - psnr, closer - ssim, rise)
 
     def falls_by(self, count: int, power: float) -> float:
         """Factor of the gain at another count. Fewer primitives than in the trials were not tried with a head."""
@@ -127,22 +137,30 @@ def with_head(curve: Sequence[CurvePoint], gain: HeadGain) -> list[CurvePoint]:
 
 
 def head_pays(curve: Sequence[CurvePoint], gain: HeadGain, tolerance: Tolerance) -> bool:
-    """Whether a head gains enough for its bytes in a packed scene, and loses no SSIM.
+    """Whether a head gains enough for its bytes in a packed scene, in PSNR and in SSIM.
 
-    What counts is the field that would be kept with the head: in a larger one it gains less, and takes a smaller part
-    of the bytes.
+    Both scenes are compared as they would be kept: with a head quality levels off at fewer primitives, so the scene may
+    take fewer bytes in all. Gains count at the count that is kept with the head, since in a larger field it gains less.
 
     Args:
         curve: of the field without a head.
         gain: what its trials have shown.
-        tolerance: by which the count is chosen.
+        tolerance: by which the counts are chosen.
     """
-    count = choose(with_head(curve, gain), tolerance)
+    with_one, without = choose(with_head(curve, gain), tolerance), choose(curve, tolerance)
+    added, doublings = gain.bytes_of(with_one), 0.0
+    ours, theirs = _bytes_at(curve, with_one), _bytes_at(curve, without)
+    if ours and theirs and added is not None:
+        doublings = math.log2((ours + added) / theirs)
+    falls = gain.falls_by(with_one, HEAD_PSNR[1])
+    gains = [one * falls for one in (gain.psnr, gain.ssim_db) if one is not None]
+    return all(is_enough(one, gain.ssim, doublings) for one in gains)
+
+
+def _bytes_at(curve: Sequence[CurvePoint], count: int) -> float | None:
+    """Estimated bytes of a packed field without a head, from the nearest count of a curve."""
     near = min(curve, key=lambda point: abs(math.log(point.count / count)))
-    more, doublings = gain.bytes_of(count), 0.0
-    if near.bytes and more is not None:
-        doublings = math.log2(1 + more / (near.bytes * count / near.count))
-    return is_enough(gain.psnr * gain.falls_by(count, HEAD_PSNR[1]), gain.ssim, doublings)
+    return near.bytes and near.bytes * count / near.count
 
 
 def _paired(differences: NDArray[np.float64], pixels: NDArray[np.float64]) -> tuple[float, float]:

@@ -129,24 +129,43 @@ def test_a_head_gains_less_the_more_primitives_there_are() -> None:
     assert choose(found, Tolerance()) < choose(curve, Tolerance())
 
 
-def test_a_head_must_be_worth_its_bytes_in_the_field_that_is_kept() -> None:
-    """0.4 dB for each doubling of the bytes, by what the head gains among as many primitives."""
-    curve = [point(1000, size=9000), point(400, size=4000), point(200, 0.5, 0.02, size=2000)]
-    kept = choose(with_head(curve, HeadGain(100, 0.3, 0.01)), Tolerance())
-    assert 200 < kept <= 400
+def test_a_head_must_be_worth_its_bytes_in_the_fields_that_would_be_kept() -> None:
+    """0.4 dB for each doubling of the bytes of the scene without one, by what it gains among as many primitives."""
+    curve = [point(1000, size=10_000), point(400, size=4000), point(200, 0.5, 0.02, size=2000)]
+    kept, plain = choose(with_head(curve, HeadGain(100, 0.3, 0.01)), Tolerance()), choose(curve, Tolerance())
+    assert 200 < kept < plain <= 400
     gained = 0.3 * (100 / kept) ** 0.4  # 0.17 to 0.23 dB
 
-    def pays(features: int | None, psnr: float = 0.3, ssim: float = 0.01) -> bool:
-        return head_pays(curve, HeadGain(100, psnr, ssim, features, head=0), Tolerance())
+    def pays(features: int | None, psnr: float = 0.3, ssim: float = 0.01, ssim_db: float | None = 0.4) -> bool:
+        return head_pays(curve, HeadGain(100, psnr, ssim, ssim_db, features, head=0), Tolerance())
 
-    enough = round(1000 * (2 ** (gained / 0.4) - 1))  # bytes of the features of 100 primitives; of these 1,000
+    # Bytes of the features of 100 primitives; of the field these take 1,000.
+    enough = round(1000 * (plain / kept * 2 ** (gained / 0.4) - 1))
     assert pays(enough - 20)
     assert not pays(enough + 20)
     assert pays(None)
     assert not pays(10, psnr=0.12)  # below the least gain of any head, 0.1 dB, in the field that is kept
-    assert not pays(10, ssim=-0.001)
+    assert not pays(10, ssim_db=0.12)  # SSIM has to rise as much
+    assert pays(10, ssim_db=None)  # images too small for it
+    assert not pays(10, ssim=-0.001, ssim_db=-0.01)
     assert not pays(10, psnr=math.nan)
+    assert not pays(10, ssim_db=math.nan)
     assert not pays(10, psnr=math.inf)
+
+
+def test_a_head_that_lets_the_scene_shrink_needs_to_gain_little() -> None:
+    """Where quality levels off at far fewer primitives with a head, the scene is smaller with one."""
+    curve = [point(1000, size=10_000), point(400, 0.2, 0.006, size=4000), point(200, 0.8, 0.03, size=2000)]
+    gain = HeadGain(100, 0.2, 0.02, 0.3, features=400, head=0)
+    assert choose(with_head(curve, gain), Tolerance()) < 0.7 * choose(curve, Tolerance())
+    assert head_pays(curve, gain, Tolerance())
+    assert not head_pays(curve, gain._replace(features=4000), Tolerance())
+
+
+def test_the_gain_of_a_head_in_ssim_is_in_decibels_of_its_distance_from_one() -> None:
+    gain = HeadGain.of(10, (30.0, 0.9), (30.5, 0.95))
+    assert (gain.psnr, gain.ssim, gain.ssim_db) == pytest.approx((0.5, 0.05, 10 * math.log10(2)))
+    assert HeadGain.of(10, (30.0, 0.0), (30.5, 0.0)).ssim_db is None
 
 
 def test_a_budget_in_bytes_is_a_count_between_the_tried_ones() -> None:

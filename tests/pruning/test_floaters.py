@@ -1,0 +1,60 @@
+"""What counts as a floater in front of a camera."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from sundae_ns.pruning.cutting import FieldPruner
+from sundae_ns.pruning.floaters import FREE, near_cameras
+
+
+def scene() -> tuple[Tensor, Tensor]:
+    """Eight cameras on a circle of radius 4, and 2,000 points in a ball of radius 1: at least 3 from each of them."""
+    angle = torch.arange(8) * torch.pi / 4
+    eyes = torch.stack([4 * angle.cos(), 4 * angle.sin(), 0 * angle], dim=1)
+    points = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    return eyes, points
+
+
+def test_a_primitive_is_a_floater_where_the_points_say_that_nothing_is() -> None:
+    eyes, points = scene()
+    nearest = torch.cdist(points, eyes).amin(dim=1).sort().values[19]  # a hundredth of them is nearer
+    towards = torch.tensor([-1.0, 0, 0])
+    means = eyes[0] + towards * nearest * torch.tensor([[0.1], [0.99 * FREE], [1.01 * FREE], [1.0], [4.0]])
+    assert near_cameras(means, eyes, points).tolist() == [True, True, False, False, False]
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e6])
+def test_the_unit_of_length_does_not_matter(scale: float) -> None:
+    eyes, points = scene()
+    means = 3 * torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) + 1
+    found = near_cameras(means, eyes, points)
+    assert 0 < found.sum() < 500
+    assert torch.equal(near_cameras(scale * means, scale * eyes, scale * points), found)
+
+
+def test_a_few_wrong_points_do_not_hide_floaters_and_nan_does_not_count() -> None:
+    eyes, points = scene()
+    means = eyes[:1] - torch.tensor([[1.0, 0, 0]])
+    points[:10] = eyes[0] + 1e-3  # matched wrongly, in front of a lens
+    points[10:500] = torch.nan
+    assert near_cameras(means, eyes, points).all()
+
+
+def test_without_points_or_cameras_nothing_floats() -> None:
+    eyes, points = scene()
+    for one, other in ((eyes[:0], points), (eyes, points[:0]), (eyes, points * torch.nan)):
+        assert not near_cameras(eyes, one, other).any()
+    assert near_cameras(points[:0], eyes, points).shape == (0,)
+
+
+@pytest.mark.parametrize(("rows", "removed"), [(0, 0), (5, 5), (6, 0)])
+def test_more_floaters_than_there_can_be_stay(rows: int, removed: int) -> None:
+    params, counts = {"means": Parameter(torch.arange(300.0).reshape(100, 3))}, {"count": torch.arange(100)}
+    mask = torch.arange(100) < rows
+    assert FieldPruner(params, {}, [counts]).drop(mask, at_most=0.05) == removed
+    assert len(params["means"]) == len(counts["count"]) == 100 - removed
+    assert params["means"][0, 0] == 3 * removed
