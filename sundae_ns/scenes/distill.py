@@ -58,7 +58,8 @@ RATES = {
 HEAD_RATE = 1e-3
 LAST_MEANS = 0.01
 """Rate of the centres after the last step, as a share of the first."""
-STEPS = 3000
+STEPS = {"cpu": 3000, "cuda": 8000}
+"""Steps by the device."""
 CAMERAS = 256
 """Virtual cameras that the steps begin from."""
 HELD_OUT = 16
@@ -93,12 +94,13 @@ class Distillation:
         keep: float | None = None,
         count: int | None = None,
         views: Sequence[View] | None = None,
-        steps: int = STEPS,
+        steps: int | None = None,
         seed: int = 0,
         head: bool = True,
         size: int | None = None,
         progress: bool = False,
     ) -> None:
+        steps = by_device(STEPS, teacher.device) if steps is None else steps
         if steps < 1:
             raise ConfigError(f"steps is {steps}; give 1 or more")
         if keep is None and count is None:
@@ -115,7 +117,8 @@ class Distillation:
         self._teacher, seen = of_unit_size(teacher, [*given, *held_out])
         self.cameras = [view.to(teacher.device) for view in seen[: len(given)]]
         self.held_out = [view.to(teacher.device) for view in seen[len(given) :]][:HELD_OUT]
-        self._steps, self._seed = steps, seed
+        self.steps, self._seed = steps, seed
+        """Number of steps to train."""
         seen = self.cameras[: by_device(VIEWS, teacher.device)]
         cut = prune_with_mask(self._teacher, keep, count, seen, None, progress=progress, trains=True)
         self._config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
@@ -176,8 +179,8 @@ class Distillation:
         Raises:
             MemoryExhaustedError: the GPU's memory is full.
         """
-        trial = max(round(TRIAL * self._steps), 1) if self._head_config is not None and self.gain is None else 0
-        done, total = 0, self._steps + 2 * trial
+        trial = max(round(TRIAL * self.steps), 1) if self._head_config is not None and self.gain is None else 0
+        done, total = 0, self.steps + 2 * trial
         with naming_full_memory(lambda: self.state.field.num_primitives):
             if trial:
                 engine, quality = TrialEngine(), []
@@ -192,13 +195,13 @@ class Distillation:
                     quality.append(self.quality())
                     engine.go_back("start", self.state)
                 self._decide(quality)
-            while self.step < self._steps:
-                self._train_step(self.step, self._steps)
+            while self.step < self.steps:
+                self._train_step(self.step, self.steps)
                 self.step += 1
-                if self._steps - self.step < AVERAGED * self._steps and self.step % AVERAGED_EVERY == 0:
+                if self.steps - self.step < AVERAGED * self.steps and self.step % AVERAGED_EVERY == 0:
                     self._mean.count_in(weights_of(self.state))
                 done += 1
-                if not after_step(total - self._steps + self.step, total) and self.step < self._steps:
+                if not after_step(total - self.steps + self.step, total) and self.step < self.steps:
                     return False
         self._mean.replace(weights_of(self.state))
         return True
@@ -323,7 +326,7 @@ class Distillation:
     def _options(self) -> Mapping[str, Any]:
         """What a resumed training must share."""
         shape = [self._teacher.num_primitives, self.state.field.num_primitives, len(self.cameras)]
-        return {"steps": self._steps, "seed": self._seed, "counts": shape}
+        return {"steps": self.steps, "seed": self._seed, "counts": shape}
 
 
 def distill(
@@ -332,7 +335,7 @@ def distill(
     keep: float | None = None,
     count: int | None = None,
     views: Sequence[View] | None = None,
-    steps: int = STEPS,
+    steps: int | None = None,
     seed: int = 0,
     head: bool = True,
     size: int | None = None,
@@ -344,7 +347,8 @@ def distill(
         keep: share of the finite primitives to keep, in (0, 1]; by default 0.1.
         count: number of primitives to keep, in place of a share.
         views: cameras that the steps begin from. Every eighth is held out. By default they are virtual ones.
-        steps: number of training steps; the trials of the head come before them.
+        steps: number of training steps, by default 8,000 on a GPU, 3,000 on a CPU; the trials of the head come before
+            them.
         seed: of all random draws.
         head: whether to add a compensation head if held-out views show that it pays.
         size: sides of the images of virtual cameras, pixels; by default 512 on a GPU, 128 on a CPU.
