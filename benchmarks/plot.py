@@ -33,7 +33,8 @@ KEPT_RULES = {
 
 
 def plot_curve() -> Any:
-    """PSNR and SSIM of packed scenes against their size: fixed shares as a line, and what the default has chosen."""
+    """PSNR and SSIM of packed scenes against their size: fixed shares as a line, what the default has chosen, and its
+    fine-tuned pack."""
     rows = [row for row in lines_of("curve.csv") if row["seed"] == "42"]
     stock = {row["capture"]: row for row in lines_of("formats.csv") if row["method"] == "splatfacto"}
     stock = {row["capture"]: row for row in stock.values() if row["format"] == ".sundae"}
@@ -59,6 +60,9 @@ def plot_curve() -> Any:
                     place = int(row["packed_bytes"]) / MB, float(row[f"packed_{metric}"])
                     shown = "tab:red" if row["head"] == "yes" else "white"
                     panel.plot(*place, "D", color="tab:red", markerfacecolor=shown, markersize=8, label="sundae")
+                    if row["tuned_bytes"]:
+                        place = int(row["tuned_bytes"]) / MB, float(row[f"tuned_{metric}"])
+                        panel.plot(*place, "P", color="tab:red", markersize=8, label="sundae, fine-tuned")
             if capture in stock:
                 place = int(stock[capture]["bytes"]) / MB, float(stock[capture][metric])
                 panel.plot(*place, "s", color="gray", label="splatfacto")

@@ -26,6 +26,7 @@ from harness.script import run_script
 from sundae_ns.errors import DataError
 from sundae_ns.evaluation.document import METRICS, number, table
 from sundae_ns.evaluation.measured import MEGABYTE
+from sundae_ns.storage.packing import FINETUNE_STEPS
 
 ARMS = (
     *("splatfacto", "sundae", "sundae-with-head", "sundae-no-head", "sundae-no-head-bytes"),
@@ -140,7 +141,7 @@ def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping
         # The output of a training that failed ends with the cause.
         lines += [*(f"- {name}: {reason.splitlines()[-1]}" for name, reason in left_out.items()), ""]
     trained = [r for r in results if r["job"]["kind"] in ("whole", "mcmc") and r["measured"]["train_s"] is not None]
-    packed = [result for result in results if result.get("packed")]
+    packed, tuned = ([result for result in results if result.get(name)] for name in ("packed", "tuned"))
     lines += [
         "## Training",
         "",
@@ -152,8 +153,11 @@ def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping
         "",
         "By the defaults of `sundae pack`; errors on all test views.",
         "",
-        *_packing(group(packed, arms)),
+        *_packing(group(packed, arms), "packed"),
     ]
+    if tuned:
+        lines += ["", f"With `--finetune {FINETUNE_STEPS}`, as `sundae run` packs on a GPU.", ""]
+        lines += _packing(group(tuned, arms), "tuned")
     return "\n".join([*lines, "", quality_page(results, arms, command)])
 
 
@@ -176,17 +180,17 @@ def _training(groups: Mapping[tuple[str, str, float | None], Sequence[Result]]) 
     return table([*heads, "primitives", "MiB at most", "GPU"], rows)
 
 
-def _packing(groups: Mapping[tuple[str, str, float | None], Sequence[Result]]) -> list[str]:
+def _packing(groups: Mapping[tuple[str, str, float | None], Sequence[Result]], name: str) -> list[str]:
     rows = []
     for (scene, arm, ratio), own in groups.items():
         means = [result["measured"]["configurations"][0]["mean"] for result in own]
         errors = [
             spread([figures[metric] for figures in place], digits)
             for metric, digits in METRICS[:2]
-            for place in (means, [result["packed"] for result in own])
+            for place in (means, [result[name] for result in own])
         ]
         count = spread([result["measured"]["primitives"] for result in own], 0)
-        size = spread([result["packed"]["bytes"] / MEGABYTE for result in own], 2)
+        size = spread([result[name]["bytes"] / MEGABYTE for result in own], 2)
         rows.append([scene, arm, percent(ratio), str(len(own)), count, size, *errors])
     heads = ["capture", "arm", "keep", "seeds", "primitives", "packed, MB", "PSNR of the run", "packed"]
     return table([*heads, "SSIM of the run", "packed"], rows)

@@ -25,6 +25,7 @@ from harness.results import spread
 from harness.today import EARLIER, SHARE, is_of_today
 from sundae_ns.evaluation import COLUMNS, csv_text
 from sundae_ns.evaluation.document import number, table
+from sundae_ns.storage.packing import FINETUNE_STEPS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -402,7 +403,7 @@ def take_over(results: Path) -> None:
     for name, lines, places in (
         ("frames.jsonl", [_frame_line(r) for r in own if r["measured"]["ms_head"] is not None], ("config",)),
         ("training_time.jsonl", [_training_line(r) for r in own if _is_timed(r)], ("scene", "arm")),
-        ("pack.jsonl", [_pack_line(r) for r in own if r["packed"]], ("run", "variant", "finetune_steps")),
+        ("pack.jsonl", [line for r in own for line in _pack_lines(r)], ("run", "variant", "finetune_steps")),
     ):
         kept = _merged(lines_of(name), lines, places)
         (RESULTS / name).write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
@@ -479,13 +480,18 @@ def _training_line(result: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _pack_line(result: dict[str, Any]) -> dict[str, Any]:
-    run, packed = result["measured"], result["packed"]
-    return {
-        **{"run": run["scene"], "variant": run["variant"], "finetune_steps": 0, "bytes": packed["bytes"]},
-        **_common(result),
-        **{"psnr_packed": packed["psnr"], "ssim_packed": packed["ssim"]},
-    }
+def _pack_lines(result: dict[str, Any]) -> list[dict[str, Any]]:
+    """Lines of the default pack and of the fine-tuned one, as far as they were made."""
+    run = result["measured"]
+    return [
+        {
+            **{"run": run["scene"], "variant": run["variant"], "finetune_steps": steps, "bytes": packed["bytes"]},
+            **_common(result),
+            **{"psnr_packed": packed["psnr"], "ssim_packed": packed["ssim"]},
+        }
+        for steps, packed in ((0, result["packed"]), (FINETUNE_STEPS, result.get("tuned")))
+        if packed
+    ]
 
 
 def main() -> None:

@@ -27,14 +27,23 @@ from harness.alone import watched_gpu
 from harness.plan import Job, Words, done_file, job_folder
 from harness.script import run_script
 from sundae_ns.api.opening import load
-from sundae_ns.errors import BackendError, CheckpointError, PackError
+from sundae_ns.errors import BackendError, CheckpointError, PackError, SundaeError
 from sundae_ns.evaluation import Lpips, Measured, lpips_weights_available
 from sundae_ns.model import SundaeModelConfig
+from sundae_ns.scenes.finetune import finetune
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import Opened, open_scene
 from sundae_ns.scenes.packed import contents_of_run, model_of
 from sundae_ns.storage.atomic import write_text
-from sundae_ns.storage.packing import PackConfig, fit_scene, write_fitted
+from sundae_ns.storage.packing import (
+    FINETUNE_STEPS,
+    FINETUNED,
+    Codecs,
+    PackConfig,
+    PackedScene,
+    fit_scene,
+    write_fitted,
+)
 from sundae_ns.storage.runs.fingerprint import fingerprint
 from sundae_ns.trainer import SundaeTrainerConfig
 from sundae_ns.training.run_length import set_schedule
@@ -88,7 +97,8 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
     Nothing is evaluated or saved while training is timed, whatever the method.
 
     Returns:
-        Plain values: ``job``; ``measured``; ``packed``, see :func:`pack`; ``alone``, whether no other job used the GPU.
+        Plain values: ``job``; ``measured``; ``packed`` and ``tuned``, see :func:`pack` and :func:`tune`; ``alone``,
+        whether no other job used the GPU.
         A job that was not alone has no times.
 
     Raises:
@@ -103,9 +113,13 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
         opened, measured = _measured(job, config, command)
         small = ours and job.kind != "warm-up"
         packed = pack(opened, job_folder(out, job.key) / "scene.sundae") if small else None
+        tuned = (
+            tune(opened, job_folder(out, job.key) / "tuned.sundae") if packed and torch.cuda.is_available() else None
+        )
         had_gpu = alone()
     measured = measured if had_gpu else without_times(measured)
-    return {"job": asdict(job), "measured": measured.as_json(), "packed": packed, "alone": had_gpu}
+    described = {"job": asdict(job), "measured": measured.as_json()}
+    return {**described, "packed": packed, "tuned": tuned, "alone": had_gpu}
 
 
 def without_times(measured: Measured) -> Measured:
@@ -127,10 +141,32 @@ def pack(opened: Opened, path: Path) -> dict[str, Any] | None:
         None for a field that cannot be packed.
     """
     try:
-        report = write_fitted(path, *fit_scene(contents_of_run(opened.source), PackConfig()))
+        return _written(opened, path, *fit_scene(contents_of_run(opened.source), PackConfig()))
     except PackError as error:
         print(f"not packed: {error}")
         return None
+
+
+def tune(opened: Opened, path: Path) -> dict[str, Any] | None:
+    """As :func:`pack`, after the fine-tune with which ``sundae run`` packs on a GPU.
+
+    Returns:
+        None for a run that cannot be fine-tuned, such as one that still densifies.
+    """
+    config = PackConfig(**FINETUNED)  # type: ignore[arg-type]
+    try:
+        scene, codecs = finetune(opened.source, contents_of_run(opened.source), config, FINETUNE_STEPS)
+        _forget()
+        return _written(opened, path, scene, codecs)
+    # The training of hours before it must not be lost.
+    except (SundaeError, torch.cuda.OutOfMemoryError) as error:
+        print(f"not fine-tuned: {error}")
+        return None
+
+
+def _written(opened: Opened, path: Path, scene: PackedScene, codecs: Codecs) -> dict[str, Any]:
+    """Write a pack of a run and measure the file on the test views."""
+    report = write_fitted(path, scene, codecs)
     model = model_of(load(path)).to(opened.model.device).eval()
     found = measure_scene(replace(opened, model=model, packed_bytes=report.bytes), label="", repeats=0, visible=False)
     errors = {name: found.full.mean(name) for name in ("psnr", "ssim")}

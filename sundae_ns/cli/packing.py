@@ -145,18 +145,19 @@ def pack(
                 scene, codecs = fit_scene(source, config)
             progress.update(task, description="Packing")
             if target_bytes is not None or target_drop is not None:
-                from sundae_ns.scenes.targets import Search
+                from sundae_ns.scenes.targets import Search, fewest_bytes, least_drop
 
-                # Not what is fitted already: its positions are rounded.
-                search, without = Search(scene if finetune else source, config, judge), Search(source, plain, judge)
+                # Not what is fitted already without a fine-tune: its positions are rounded.
+                searches = [Search(source, plain, judge)]
+                if finetune:
+                    searches.append(Search(scene, codecs, judge))
                 if target_bytes is not None:
-                    found = search.smaller_than(target_bytes)
+                    found = least_drop(searches, target_bytes)
                 else:
-                    tuned = search.better_unless(target_drop or 0.0, without) if finetune else None
-                    found = tuned or without.better_than(target_drop or 0.0)
-                    if finetune and tuned is None:
-                        notes.append("the fine-tune loses too much for the target; packed without it, try more steps")
-                        finetune = 0
+                    found = fewest_bytes(searches[::-1], target_drop or 0.0)
+                if finetune and found.scene is not scene:
+                    notes.append("the fine-tune loses too much for the target; packed without it, try more steps")
+                    finetune = 0
                 scene, codecs = found.scene, found.codecs
             report = write_fitted(out, scene, codecs)
             progress.update(task, advance=1, description="Measuring")

@@ -6,7 +6,7 @@ The ratios between the steps come from renderings: at the defaults, one bit less
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -106,19 +106,23 @@ class Search:
     """Packs of one scene at several factors.
 
     Args:
-        scene: exact, or fine-tuned with the rounding of ``config``.
-        config: the options at the factor 1.
+        scene: exact, or fine-tuned with the rounding of codecs.
+        fit: the options at the factor 1, or the codecs of the fine-tune. It trained with their grids and bases, which
+            no factor changes: others would only add an error.
         judge: opens the run's test views when they are first needed.
     """
 
-    def __init__(self, scene: PackedScene, config: PackConfig, judge: Callable[[], Judge]) -> None:
-        self.scene, self.config, self._open = scene, config, judge
-        # A fine-tune has rounded the positions: another grid would only add an error.
-        self._with_positions = "finetuned" not in (scene.meta.get("source") or {})
+    def __init__(self, scene: PackedScene, fit: PackConfig | Codecs, judge: Callable[[], Judge]) -> None:
+        self.scene, self._fit, self._open = scene, fit, judge
 
     @cached_property
     def _judge(self) -> Judge:
         return self._open()
+
+    @cached_property
+    def default(self) -> Try:
+        """The pack at the factor 1; of a fine-tuned scene, the one that was trained."""
+        return self._tried(0.0)
 
     def drop(self, tried: Try) -> float:
         """PSNR of a pack below the unpacked run on some test views, dB; infinite for images that are not finite.
@@ -136,7 +140,7 @@ class Search:
             PackError: even the coarsest is larger.
         """
         found, fits = self._bisected(lambda tried: tried.bytes <= limit, first=COARSEST, last=FINEST)
-        default = self._tried(0.0)
+        default = self.default
         try:
             lost = f" and loses {self.drop(found):.2f} dB"
             if fits and default.bytes <= limit and self.drop(default) < self.drop(found):
@@ -152,7 +156,7 @@ class Search:
     def better_than(self, limit: float) -> Try:
         """The coarsest pack that loses at most ``limit`` dB on the test views.
 
-        The search begins at the factor 1: its result is smaller than that pack, or loses less.
+        Where the pack at the factor 1 loses at most ``limit``, the result is no larger than that.
 
         Raises:
             PackError: even the finest loses more.
@@ -162,28 +166,15 @@ class Search:
         def fits(tried: Try) -> bool:
             return self.drop(tried) <= limit
 
-        default = self._tried(0.0)
-        if fits(default):
-            found, _ = self._bisected(fits, first=0.0, last=COARSEST, known=default)
-            return found
+        if fits(self.default):
+            found, _ = self._bisected(fits, first=0.0, last=COARSEST, known=self.default)
+            return min(self.default, found, key=lambda tried: tried.bytes)
         found, fitting = self._bisected(fits, first=FINEST, last=0.0)
         if fitting:
             return found
         raise PackError(
             f"the finest pack loses {self.drop(found):.3f} dB at {found.bytes:,} bytes; give a larger --target-drop"
         )
-
-    def better_unless(self, limit: float, plain: Search) -> Try | None:
-        """As :meth:`better_than` of a fine-tuned scene; None if it loses more, or if ``plain`` has a smaller pack.
-
-        ``plain`` is the search without the fine-tune.
-        """
-        try:
-            found = self.better_than(limit)
-        except PackError:
-            return None
-        default = plain._tried(0.0)
-        return None if default.bytes < found.bytes and plain.drop(default) <= limit else found
 
     def _bisected(
         self, fits: Callable[[Try], bool], *, first: float, last: float, known: Try | None = None
@@ -202,6 +193,48 @@ class Search:
         return best, True
 
     def _tried(self, power: float) -> Try:
-        config = scaled(self.config, power, with_positions=self._with_positions)
-        scene, codecs = fit_scene(self.scene, config)
+        if isinstance(self._fit, PackConfig):
+            scene, codecs = fit_scene(self.scene, scaled(self._fit, power))
+        else:
+            scene, codecs = self.scene, self._fit
+            if power:
+                config = scaled(codecs.config, power, with_positions=False)
+                codecs = codecs.with_steps(config, scene.field, scene.head)
         return Try(scene, codecs, len(pack_bytes(scene, codecs)[0]))
+
+
+def least_drop(searches: Sequence[Search], limit: int) -> Try:
+    """The pack of at most ``limit`` bytes that loses least, of searches of one run; without test views, the last's.
+
+    Raises:
+        PackError: none has one; that of the last.
+    """
+    found = _of_each(searches, lambda search: search.smaller_than(limit))
+    try:
+        return min(found, key=lambda pair: pair[0].drop(pair[1]))[1]
+    except SundaeError:  # sizes need no capture
+        return found[-1][1]
+
+
+def fewest_bytes(searches: Sequence[Search], limit: float) -> Try:
+    """The smallest pack that loses at most ``limit`` dB on the test views, of searches of one run.
+
+    Raises:
+        PackError: none has one; that of the last.
+        DataError: the capture is missing, or cannot be used.
+    """
+    found = _of_each(searches, lambda search: search.better_than(limit))
+    return min((tried for _, tried in found), key=lambda tried: tried.bytes)
+
+
+def _of_each(searches: Sequence[Search], look: Callable[[Search], Try]) -> list[tuple[Search, Try]]:
+    """What the searches find, without those that find nothing."""
+    found, last = [], None
+    for search in searches:
+        try:
+            found.append((search, look(search)))
+        except PackError as error:
+            last = error
+    if last is not None and not found:
+        raise last
+    return found

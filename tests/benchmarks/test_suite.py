@@ -243,6 +243,19 @@ def test_times_stand_beside_errors_and_are_of_trainings_from_scratch(captures: P
     assert set(packing) == {"sundae", "sundae-no-head", "mcmc"}
     assert packing["sundae"] == ["fox", "sundae", "10%", "1", "1,000", "0.05", "26.00", "24.90", "0.8000", "0.7500"]
     assert "`sundae`: `sundae` from scratch, 30,000 steps" in page
+    assert "--finetune" not in page
+
+
+def test_fine_tuned_packs_have_a_table_of_their_own(captures: Path) -> None:
+    suite(captures, Runner(), scenes=("fox",))
+    out = captures.parent / "out"
+    path = done_file(out, "fox-sundae-10pct-s42")
+    result = json.loads(path.read_text())
+    result["tuned"] = {**result["packed"], "bytes": 30_000, "psnr": 24.8}
+    path.write_text(json.dumps(result) + "\n")
+    suite(captures, Runner(), scenes=("fox",))
+    *_, row = lines_of((out / "table.md").read_text(), "Packing")
+    assert row[1:] == ["sundae", "10%", "1", "1,000", "0.03", "26.00", "24.80", "0.8000", "0.7500"]
 
 
 def test_a_job_that_shared_its_gpu_has_no_times(captures: Path) -> None:

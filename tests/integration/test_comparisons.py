@@ -19,12 +19,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from suite import SuiteOptions, run_suite
 
+from harness import job as jobs
 from harness.arms import choose_arms
 from harness.job import fingerprint_of, perform
 from harness.plan import Job, parser_of, plan_scene
 from harness.results import read_results
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import open_scene
+from sundae_ns.storage.packing import read_header
 
 ROOT = Path(__file__).parents[2]
 SCALE, WARMUP = 0.02, 12
@@ -83,7 +85,7 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path, monkeypatch: pytest.Mo
     assert {row.fingerprint for row in rows.values()} == {fingerprint_of(job) for job in jobs}
     assert len({row.fingerprint for row in rows.values()}) == len(jobs)
     results = {result["job"]["arm"]: result for result in read_results(out)}
-    assert results[WARM_UP]["packed"] is None
+    assert results[WARM_UP]["packed"] is results[WARM_UP]["tuned"] is None
     for arm in arms:
         packed, key = results[arm]["packed"], results[arm]["job"]["key"]
         scene = open_scene(out / "jobs" / key / "scene.sundae", data=tiny.scene)
@@ -93,6 +95,24 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path, monkeypatch: pytest.Mo
             (found.full.mean("psnr"), found.base.mean("psnr"))
         )
         assert packed["bytes"] < 0.7 * results[arm]["measured"]["bytes_total"]
+
+
+def test_a_run_is_packed_with_a_fine_tune(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a job does on a GPU."""
+    monkeypatch.setattr(jobs, "FINETUNE_STEPS", 3)
+    opened = open_scene(tiny.folder)
+    plain = jobs.pack(opened, tmp_path / "plain.sundae")
+    tuned = jobs.tune(opened, tmp_path / "tuned.sundae")
+    assert plain is not None
+    assert tuned is not None
+    assert tuned.keys() == plain.keys()
+    assert tuned["bytes"] == (tmp_path / "tuned.sundae").stat().st_size < plain["bytes"]
+    assert read_header(tmp_path / "tuned.sundae").meta["source"]["finetuned"] == 3
+    shutil.copytree(tiny.folder, tmp_path / "run")
+    for checkpoint in (tmp_path / "run" / "nerfstudio_models").iterdir():
+        if checkpoint.name != tiny.checkpoint(30).name:
+            checkpoint.unlink()
+    assert jobs.tune(open_scene(tmp_path / "run"), tmp_path / "b.sundae") is None  # it still densifies
 
 
 def test_the_suite_trains_a_method_as_its_command_does(tiny: Any, tmp_path: Path) -> None:

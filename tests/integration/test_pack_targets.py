@@ -6,9 +6,8 @@ import json
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -16,8 +15,18 @@ import torch
 from sundae_ns.cli import main
 from sundae_ns.errors import PackError
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.scenes.targets import COARSEST, Judge, Quality, Search, scaled
-from sundae_ns.storage.packing import FINETUNED, Codecs, PackConfig, PackedScene, read_header, read_scene
+from sundae_ns.scenes.targets import COARSEST, Judge, Quality, Search, fewest_bytes, least_drop, scaled
+from sundae_ns.storage.packing import (
+    FINETUNED,
+    Codecs,
+    PackConfig,
+    PackedScene,
+    fit_scene,
+    pack_bytes,
+    read_header,
+    read_scene,
+)
+from sundae_ns.storage.packing.transform import Transform
 
 
 def packed(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
@@ -72,7 +81,7 @@ def test_the_search_uses_what_is_allowed(tiny: Any) -> None:
 def test_a_target_is_never_larger_than_a_default_that_meets_it(tiny: Any) -> None:
     """Even where finer steps happen to lose more."""
     by_chance = search(tiny.folder, lambda config: 0.06 if config.harmonics_step == 0.02 else 0.3)
-    default = by_chance._tried(0.0)
+    default = by_chance.default
     found = by_chance.better_than(0.2)
     assert (found.bytes, by_chance.drop(found)) == (default.bytes, pytest.approx(0.06))
     with pytest.raises(PackError, match=r"the finest pack loses 0\.300 dB"):
@@ -101,21 +110,93 @@ def test_positions_are_rounded_once(tiny: Any, tmp_path: Path, capsys: pytest.Ca
     assert errors[1] < errors[0] / 4  # three bits more
 
 
-def test_a_fine_tune_that_loses_too_much_is_left_out(tiny: Any) -> None:
-    scene = contents_of_run(tiny.folder, max_cameras=0)
-    tuned_scene = replace(scene, meta={**scene.meta, "source": {"finetuned": 100}})
-    coarse = PackConfig(**FINETUNED)  # type: ignore[arg-type]
+class Faithful(Stated):
+    """Judges a fine-tuned scene: other bases than those of its training lose 1 dB more."""
 
-    def tuned(lost: float) -> Search:
-        return Search(tuned_scene, coarse, lambda: Stated(lambda _: lost))  # type: ignore[arg-type, return-value]
+    def __init__(self, trained: Codecs, drop: Callable[[PackConfig], float]) -> None:
+        super().__init__(drop)
+        self.trained = trained
 
+    def quality(self, scene: PackedScene, codecs: Codecs) -> Quality:
+        pairs = [(codecs.field[name], one) for name, one in self.trained.field.items() if isinstance(one, Transform)]
+        same = all(isinstance(a, Transform) and torch.equal(a.basis, b.basis) for a, b in pairs)
+        return Quality(super().quality(scene, codecs).psnr - (0 if same else 1), 0.9)
+
+
+class Tuned(NamedTuple):
+    scene: PackedScene
+    codecs: Codecs
+    bytes: int
+    """Of the pack without a target."""
+
+    def search(self, drop: Callable[[PackConfig], float]) -> Search:
+        return Search(self.scene, self.codecs, lambda: Faithful(self.codecs, drop))  # type: ignore[arg-type, return-value]
+
+
+@pytest.fixture(scope="module")
+def tuned(tiny: Any) -> Tuned:
+    """A scene whose rows have moved since its codecs were fitted, as training moves them."""
+    config = PackConfig(**FINETUNED)  # type: ignore[arg-type]
+    scene, codecs = fit_scene(contents_of_run(tiny.folder, max_cameras=0), config)
+    generator = torch.Generator().manual_seed(0)
+    for name in codecs.field:
+        scene.field[name] += 0.3 * torch.randn(scene.field[name].shape, generator=generator)
+    return Tuned(scene, codecs, len(pack_bytes(scene, codecs)[0]))
+
+
+def test_a_target_begins_with_the_pack_of_the_fine_tune(tuned: Tuned) -> None:
+    """Not with grids, bases and steps that are fitted anew, which the training did not know."""
+    search = tuned.search(lambda config: config.harmonics_step)
+    assert search.default == (tuned.scene, tuned.codecs, tuned.bytes)
+    lost = FINETUNED["harmonics_step"]
+    for limit, least in ((lost, 0.95 * lost), (2 * lost, 1.9 * lost), (0.5 * lost, 0.45 * lost)):
+        found = search.better_than(limit)
+        assert (found.bytes <= tuned.bytes) == (limit >= lost)
+        assert least <= search.drop(found) <= limit
+        # Positions are rounded once.
+        assert found.codecs.blocks is tuned.codecs.blocks
+    found = search.smaller_than(tuned.bytes)
+    assert found.bytes <= tuned.bytes
+    assert search.drop(found) <= lost
+
+
+def test_a_fine_tune_that_does_not_help_is_left_out(tiny: Any, tuned: Tuned) -> None:
     plain = search(tiny.folder, lambda config: config.harmonics_step)
-    assert tuned(0.5).better_unless(0.1, plain) is None
-    found = tuned(0.05).better_unless(0.1, plain)
-    assert found is not None
-    assert found.bytes < plain.better_than(0.1).bytes
-    # The positions of a fine-tuned scene keep their grid.
-    assert found.codecs.config.position_bits == coarse.position_bits
+    plain_default = plain.default.bytes
+    assert tuned.bytes < plain_default
+    good, bad = tuned.search(lambda _: 0.01), tuned.search(lambda _: 0.5)
+    found = fewest_bytes([good, plain], 0.02)
+    assert found.scene is tuned.scene
+    assert found.bytes <= tuned.bytes
+    assert fewest_bytes([bad, plain], 0.02).bytes <= plain_default
+    assert fewest_bytes([plain, bad], 0.02).scene is not tuned.scene
+    with pytest.raises(PackError, match=r"the finest pack loses 0\.500 dB"):
+        fewest_bytes([plain, bad], 0.0001)
+    for limit in (tuned.bytes, plain_default):
+        assert least_drop([plain, good], limit).scene is tuned.scene
+        assert least_drop([plain, bad], limit).bytes <= limit
+        assert least_drop([plain, bad], limit).scene is not tuned.scene
+
+
+def test_the_finest_steps_may_lose_more_than_those_of_the_training(tuned: Tuned) -> None:
+    """A larger target of bytes then takes the pack of the fine-tune, and one of quality finds it too."""
+    search = tuned.search(lambda config: 0.1 if config.harmonics_step < FINETUNED["harmonics_step"] else 0.02)
+    assert search.smaller_than(2 * tuned.bytes).bytes == tuned.bytes
+    assert search.better_than(0.05).bytes <= tuned.bytes
+
+
+def test_a_target_that_a_fine_tune_meets_costs_no_bytes(
+    tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [tiny.folder, "--finetune", 4]
+    alone = packed(capsys, *words, "-o", tmp_path / "a.sundae")
+    lost = max(alone["psnr"][0] - alone["psnr"][1], 0.0) + 0.001
+    found = packed(capsys, *words, "-o", tmp_path / "b.sundae", "--target-drop", lost)
+    assert found["bytes"] <= alone["bytes"]
+    assert found["psnr"][1] >= alone["psnr"][0] - lost
+    found = packed(capsys, *words, "-o", tmp_path / "c.sundae", "--target-bytes", alone["bytes"])
+    assert found["bytes"] <= alone["bytes"]
+    assert found["psnr"][1] >= alone["psnr"][1]
 
 
 def test_targets_that_cannot_be_met(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -157,11 +238,18 @@ def test_a_pack_without_its_capture_says_that_it_is_not_measured(
 
 
 def test_a_target_after_a_fine_tune(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """So few steps may not be worth it: it then says that it packed without them, and never loses more than that."""
     file = tmp_path / "a.sundae"
     limit = int(0.8 * packed(capsys, tiny.folder, "-o", tmp_path / "plain.sundae")["bytes"])
-    found = packed(capsys, tiny.folder, "-o", file, "--finetune", 3, "--target-bytes", limit)
+    plain = packed(capsys, tiny.folder, "-o", tmp_path / "b.sundae", "--target-bytes", limit)
+    with pytest.raises(SystemExit, match="0"):
+        main(["pack", str(tiny.folder), "-o", str(file), "--finetune", "3", "--target-bytes", str(limit), "--json"])
+    shown = capsys.readouterr()
+    found = json.loads(shown.out)
     assert 0.9 * limit < found["bytes"] <= limit
-    assert read_header(file).meta["source"]["finetuned"] == 3
+    assert found["psnr"][1] >= plain["psnr"][1]
+    tuned = read_header(file).meta["source"].get("finetuned")
+    assert tuned == (None if "packed without it" in shown.err else 3)
 
 
 def test_steps_grow_together() -> None:

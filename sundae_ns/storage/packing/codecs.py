@@ -14,13 +14,22 @@ from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES
 from sundae_ns.storage.morton import scene_order
 from sundae_ns.storage.packing import quantize, transform
-from sundae_ns.storage.packing.config import PackConfig
+from sundae_ns.storage.packing.config import STEPS, PackConfig
 from sundae_ns.storage.packing.container import Array, Coded, Floats
 from sundae_ns.storage.packing.quantize import Blocks, Rotations
 from sundae_ns.storage.packing.transform import Transform
 
 _LOGITS = (-6.0, 8.0)
 """Opacities outside of these logits look the same as at them: below 1/255 nothing is drawn."""
+_STEPS = {
+    "quats": "rotation_step",
+    "scales": "scale_step",
+    "opacities": "opacity_step",
+    "features_dc": "color_step",
+    "features_rest": "harmonics_step",
+    FEATURES: "feature_step",
+}
+"""Options of the steps of attributes."""
 _LARGEST_SHARE = 0.5
 """Step of an output channel of the head, at most, as a share of its largest weight."""
 
@@ -74,6 +83,14 @@ class HeadCodec:
         step = self.steps(name)
         return quantize.weights_at(quantize.weight_levels(values, step), step)
 
+    def scaled(self, factor: float, head: Mapping[str, Tensor]) -> HeadCodec:
+        """Steps of the same ratios for a head, larger by a factor, but no output channel beyond its largest share."""
+        rows = {}
+        for name, row in self.rows.items():
+            largest = quantize.weight_steps(head[name].detach().to("cpu", torch.float32), _LARGEST_SHARE)
+            rows[name] = torch.minimum(row * factor, torch.maximum(row, largest))
+        return HeadCodec(rows, self.columns)
+
     def steps(self, name: str) -> Tensor:
         """Steps of a tensor ``[O, I]``, float32."""
         return self.rows[name][:, None] * self.columns[name]
@@ -97,6 +114,28 @@ class Codecs:
     def to(self, device: torch.device) -> Codecs:
         """Return a copy on another device."""
         return _moved(self, device)  # type: ignore[no-any-return]
+
+    def with_steps(self, config: PackConfig, field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Codecs:
+        """The same grids and bases with the steps of other options; their bits and blocks of positions have no effect.
+
+        With the present options, these are the same steps.
+
+        Args:
+            config: valid options.
+            field: primitives in the order of these codecs, which the steps have to suit.
+            head: its head; {} for none.
+        """
+        ratios = {name: getattr(config, name) / getattr(self.config, name) for name in STEPS}
+        codecs: dict[str, Rotations | Transform] = {}
+        for name, codec in self.field.items():
+            step = codec.step * ratios[_STEPS[name]]
+            if isinstance(codec, Rotations):
+                codecs[name] = Rotations(step)
+            else:
+                codecs[name] = codec.with_step(step, as_matrix(field[name]))
+        kept = {"position_bits": self.config.position_bits, "block": self.config.block}
+        of_head = None if self.head is None else self.head.scaled(ratios["head_step"], head)
+        return Codecs(replace(config, **kept), self.blocks, codecs, of_head)  # type: ignore[arg-type]
 
     @torch.no_grad()
     def rounded(self, field: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -140,17 +179,13 @@ def fit_codecs(
     values["means"] = quantize.dequantize_positions(blocks, config.position_bits, config.block)
     values["quats"], values["scales"] = quantize.aligned(values["quats"], values["scales"])
     values["opacities"] = values["opacities"].clip(*_LOGITS)
-    steps = {
-        "scales": config.scale_step,
-        "opacities": config.opacity_step,
-        "features_dc": config.color_step,
-        "features_rest": config.harmonics_step,
-        FEATURES: config.feature_step,
-    }
     forms = {} if sensitivity is None else sensitivity.rows
-    codecs: dict[str, Rotations | Transform] = {"quats": Rotations(config.rotation_step)}
-    for name, step in steps.items():
-        if name in values and values[name].size:
+    codecs: dict[str, Rotations | Transform] = {}
+    for name, option in _STEPS.items():
+        step = getattr(config, option)
+        if name == "quats":
+            codecs[name] = Rotations(step)
+        elif name in values and values[name].size:
             codecs[name] = transform.fit(values[name], step, centred=name != "features_rest", form=forms.get(name))
     ordered = {name: torch.from_numpy(values[name]).reshape(field[name].shape) for name in names}
     of_head = {} if sensitivity is None else sensitivity.head

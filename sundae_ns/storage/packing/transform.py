@@ -53,6 +53,12 @@ class Transform:
         """Coefficients in steps, float64 ``[N, D]``; gradients flow through them."""
         return (rows.double() - self.mean.double()) @ self.inverse / self.step
 
+    def with_step(self, step: float, rows: Floats) -> Transform:
+        """The same basis with another step, or a larger one where the largest coefficient of rows would not fit."""
+        other = replace(self, step=step)
+        highest = float(other.coefficients(torch.from_numpy(rows)).abs().max())
+        return replace(self, step=step * max(2 * highest / LARGEST, 1.0))
+
     def _levels(self, rows: Tensor) -> Tensor:
         return self.coefficients(rows).round().clamp(-LARGEST, LARGEST)
 
@@ -81,8 +87,7 @@ def fit(rows: Floats, step: float, *, centred: bool = True, form: Tensor | None 
     # Invert the stored basis, so that its rounding adds no error.
     inverse = torch.from_numpy(np.linalg.inv(basis / _UNIT))
     fitted = Transform(torch.from_numpy(mean), torch.from_numpy(basis), inverse, step * largest)
-    highest = float(fitted.coefficients(torch.from_numpy(rows)).abs().max())
-    return replace(fitted, step=fitted.step * max(2 * highest / LARGEST, 1.0))
+    return fitted.with_step(fitted.step, rows)
 
 
 def _roots(size: int, form: Tensor | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -130,6 +130,48 @@ def test_codecs_of_another_scene_are_refused(tmp_path: Path, other: PackedScene)
     assert not list(tmp_path.iterdir())
 
 
+def test_other_steps_keep_grids_and_bases(tmp_path: Path) -> None:
+    """Of a scene that has moved since, whose own bases would be others."""
+    present = PackConfig(block=100, position_bits=11, head_step=0.1)
+    fitted, codecs = fit_scene(scene(), present)
+    moved = replace(fitted, field={name: drifted_tensor(value) for name, value in fitted.field.items()})
+    wanted = replace(present, scale_step=0.2, rotation_step=0.002, head_step=0.8, position_bits=16, block=1024)
+    other = codecs.with_steps(wanted, moved.field, moved.head)
+    assert other.blocks is codecs.blocks
+    assert other.config == replace(wanted, position_bits=11, block=100)
+    for name, codec in codecs.field.items():
+        factor = {"scales": 0.2 / 0.05, "quats": 0.002 / 0.008}.get(name, 1.0)
+        found = other.field[name]
+        assert found.step == pytest.approx(factor * codec.step), name
+        if isinstance(codec, transform.Transform):
+            assert isinstance(found, transform.Transform)
+            assert torch.equal(found.basis, codec.basis)
+            assert torch.equal(found.mean, codec.mean)
+    assert codecs.head is not None
+    assert other.head is not None
+    # Half of the largest weight, not eight tenths.
+    torch.testing.assert_close(other.head.rows["a.weight"], 5 * codecs.head.rows["a.weight"])
+    same = codecs.with_steps(present, moved.field, moved.head)
+    for number, these in enumerate((codecs, same, other)):
+        write_fitted(tmp_path / f"{number}.sundae", moved, these)
+    assert (tmp_path / "0.sundae").read_bytes() == (tmp_path / "1.sundae").read_bytes()
+    found, shown = read_scene(tmp_path / "2.sundae").field, other.rounded(moved.field)
+    assert all(torch.equal(found[name], shown[name]) for name in other.field)
+
+
+def test_steps_that_are_too_fine_for_a_row_become_larger() -> None:
+    rows = hard_values("normal", 50, 3, 0)
+    codec = transform.fit(rows, 0.01)
+    rows[7] = 1e5
+    finer = codec.with_step(0.0001, rows)
+    assert finer.step > 0.005
+    assert np.abs(finer.rounded(torch.from_numpy(rows)).numpy() - rows).max() < 0.1
+
+
+def drifted_tensor(values: Tensor) -> Tensor:
+    return torch.from_numpy(drifted(values.flatten(1).numpy(), 0)).reshape(values.shape)
+
+
 def test_larger_steps_of_the_head_are_fewer_bytes(tmp_path: Path) -> None:
     big = {"a.weight": torch.randn(64, 64, 3, 3, generator=torch.Generator().manual_seed(0))}
     whole = PackedScene(scene().field, big)
