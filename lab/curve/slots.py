@@ -9,13 +9,14 @@ while True:
         proc, name, began = running[slot]
         if proc.poll() is not None:
             log.write(f"{time.time()-T:.0f} done {name} rc {proc.returncode} {time.time()-began:.0f} s gpu {slot[0]}\n"); done.add(name); del running[slot]
+    taken = any(n.startswith('00-alone') for _, n, _ in running.values()) or not done and not running
     busy = {n for _, n, _ in running.values()}
     for path in sorted(J.glob("*.sh")):
         if path.name in done or path.name in busy: continue
         text = path.read_text(); need = [l.split()[2] for l in text.splitlines() if l.startswith("# after ")]
         if any(not any(d.endswith(n + ".sh") for d in done) for n in need): continue
         only = [int(l.split()[2]) for l in text.splitlines() if l.startswith("# gpu ")]
-        free = [s for s in slots if s not in running and (not only or s[0] in only)]
+        free = [s for s in slots if s not in running and (s[0] in only if only else not (taken and s[0] == 3))]
         if not free: continue
         load = {g: sum(1 for s in running if s[0] == g) for g in range(int(os.environ.get("GPUS", 2)))}
         slot = min(free, key=lambda s: load[s[0]])
