@@ -15,7 +15,7 @@ import torch
 from sundae_ns.cli import main
 from sundae_ns.errors import PackError
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.scenes.targets import COARSEST, Judge, Quality, Search, fewest_bytes, is_worth, least_drop, scaled
+from sundae_ns.scenes.targets import COARSEST, Judge, Quality, Search, Try, fewest_bytes, is_worth, least_drop, scaled
 from sundae_ns.storage.packing import (
     FINETUNED,
     Codecs,
@@ -183,6 +183,14 @@ def test_the_finest_steps_may_lose_more_than_those_of_the_training(tuned: Tuned)
     search = tuned.search(lambda config: 0.1 if config.harmonics_step < FINETUNED["harmonics_step"] else 0.02)
     assert search.smaller_than(2 * tuned.bytes).bytes == tuned.bytes
     assert search.better_than(0.05).bytes <= tuned.bytes
+
+
+def test_coarser_steps_that_take_more_bytes_are_not_taken(tuned: Tuned) -> None:
+    class Growing(Search):
+        def _tried(self, power: float) -> Try:
+            return Try(self.scene, tuned.codecs, round(100 + 10 * power))
+
+    assert Growing(tuned.scene, tuned.codecs, lambda: Stated(lambda _: 0.0)).better_than(0.1).bytes == 100  # type: ignore[arg-type, return-value]
 
 
 def test_a_target_that_a_fine_tune_meets_costs_no_bytes(
