@@ -52,6 +52,8 @@ class Step:
     """File that is out of date once an earlier step has run again."""
     check: Callable[[], None] = lambda: None
     """Raises an error if later steps cannot use the result."""
+    instead: Callable[[], list[str]] | None = None
+    """Makes the command to try where the first one fails."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,6 @@ class Project:
         """The steps in their order; a capture needs no poses."""
         evaluated, packed, page = self.out / "eval.json", self.out / "scene.sundae", self.out / "report" / "report.md"
         web, data = self.out / "scene.html", ("--data", self.capture)
-        size = () if self.max_bytes is None else ("--target-bytes", self.max_bytes)
 
         def step(name: str, result: Path, whole: Callable[[Path], bool], *words: object) -> Step:
             line = [word(part) if isinstance(part, Path) else str(part) for part in words]
@@ -107,7 +108,10 @@ class Project:
         steps = [
             Step(TRAIN, self.train, self.trained),
             step("evaluate", evaluated, is_evaluation, "sundae", "eval", self.run, *data, "-o", evaluated),
-            step("pack", packed, is_packed, "sundae", "pack", self.run, "-o", packed, *data, *size),
+            Step(
+                *("pack", lambda: self.pack(packed), lambda: is_packed(packed), packed),
+                instead=lambda: self.pack(packed, plain=True),
+            ),
             step("report", page, is_report, *report),
             step("web page", web, is_page, "sundae", "export", packed, "-o", web),
         ]
@@ -160,6 +164,15 @@ class Project:
         # Without a number of steps, a resumed run trains those that are left.
         steps = None if resumes else self.num_steps
         return command(self.capture, self.out / "runs", self.method, self.keep, steps, more)
+
+    def pack(self, packed: Path, *, plain: bool = False) -> list[str]:
+        """Command that packs, with a fine-tune where that takes seconds and nobody asked for a draft."""
+        from sundae_ns.storage.packing import FINETUNE_STEPS
+
+        words = ["sundae", "pack", word(self.run), "-o", word(packed), "--data", word(self.capture)]
+        words += [] if self.max_bytes is None else ["--target-bytes", str(self.max_bytes)]
+        tuned = not plain and self.quality != "draft" and has_gpu()
+        return [*words, "--finetune", str(FINETUNE_STEPS)] if tuned else words
 
     @property
     def num_steps(self) -> int | None:
@@ -320,6 +333,10 @@ def run(
                     later.result.unlink(missing_ok=True)
             print(f"{heading}:\n{shlex.join(words)}", flush=True)
             code = run_in_group(words, locks=[lock], saves=step.name == TRAIN)
+            if code and code not in STOPPED and step.instead is not None and step.instead() != words:
+                words = step.instead()
+                print(f"{heading}, after the fine-tune ended with {code}:\n{shlex.join(words)}", flush=True)
+                code = run_in_group(words, locks=[lock], saves=False)
             if code in STOPPED:
                 print("sundae: interrupted; the same command continues here", file=sys.stderr)
                 return code
@@ -333,6 +350,13 @@ def run(
     print(f"# to look at the scene: open {out / 'scene.html'} in a browser, or")
     print(shlex.join(["sundae", "view", word(out / "scene.sundae")]))
     return 0
+
+
+def has_gpu() -> bool:
+    """Whether a GPU trains; imports torch, so ask only when the training is over."""
+    import torch
+
+    return torch.cuda.is_available()
 
 
 def _check_input(photos: Path) -> None:

@@ -21,6 +21,7 @@ from sundae_ns.scenes.packed import place
 from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene, pack_bytes
 from sundae_ns.storage.packing.config import STEPS
 from sundae_ns.storage.runs.folder import config_of
+from sundae_ns.training.trials.head import GAIN_PER_DOUBLING
 
 FINEST, COARSEST = -3.0, 4.0
 """Ends of the search: powers of two of the factor."""
@@ -84,6 +85,11 @@ class Judge:
             image = self._model.get_outputs_for_camera(camera)["rgb"].clamp(0, 1)
             found.append((float(psnr(image, truth)), float(ssim(image, truth))))
         return Quality(*(sum(values) / len(found) for values in zip(*found, strict=True)))
+
+
+def is_worth(psnr: float, size: int, other_psnr: float, other_size: int) -> bool:
+    """Whether a pack of ``size`` bytes is worth more than another, by the PSNR that trials ask for a doubling."""
+    return psnr >= other_psnr + GAIN_PER_DOUBLING * math.log2(size / other_size)
 
 
 class Try(NamedTuple):

@@ -20,5 +20,6 @@ def commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Commands:
     made = Commands()
     monkeypatch.setattr("sundae_ns.cli.run.run_in_group", made)
     monkeypatch.setattr("sundae_ns.cli.run.measured_step", made.measured)
+    monkeypatch.setattr("sundae_ns.cli.run.has_gpu", lambda: made.gpu)
     monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
     return made

@@ -110,6 +110,36 @@ def test_a_size_and_a_quality(commands: Commands) -> None:
     assert "--target-bytes" not in commands.ran[3]
 
 
+def test_a_gpu_packs_with_a_fine_tune(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    commands.gpu = True
+    assert run("photos", "-o", "out", "--max-mb", "2") == 0
+    assert commands.option("--finetune", 3) == "1500"
+    assert commands.option("--target-bytes", 3) == "2000000"
+    assert shlex.join(commands.ran[3]) in capsys.readouterr().out
+    commands.ran.clear()
+    assert run("photos", "-o", "draft", "--quality", "draft") == 0
+    commands.gpu = False
+    assert run("photos", "-o", "cpu") == 0
+    assert not any("--finetune" in words for words in commands.ran)
+
+
+def test_a_fine_tune_that_fails_is_left_out(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    """For example because the GPU's memory is full; a scene that is larger is better than none."""
+    commands.gpu = commands.out_of_memory = True
+    assert run("photos", "-o", "out") == 0
+    assert commands.names == [*STEPS[:4], *STEPS[3:]]
+    assert commands.ran[4] == commands.ran[3][:-2]
+    assert f"after the fine-tune ended with 2:\n{shlex.join(commands.ran[4])}\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("code", [3, 130])
+def test_a_pack_that_fails_or_stops_with_a_fine_tune_ends(commands: Commands, code: int) -> None:
+    commands.gpu = True
+    commands.codes["sundae pack"] = code
+    assert run("photos", "-o", "out") == code
+    assert commands.names[3:] == ["sundae pack"] * (1 if code == 130 else 2)
+
+
 def test_a_training_of_hours_on_a_cpu_is_foretold_before_it_starts(
     commands: Commands, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -34,6 +34,9 @@ class Commands:
         self.saved_at = {0: 99, 130: 39}
         """Step of the checkpoint, by the exit code of the training."""
         self.silent = False
+        self.gpu = False
+        self.out_of_memory = False
+        """Whether a fine-tune ends with an error."""
         self.forecast: Forecast | None = None
         self.asked: list[tuple[str, int, int]] = []
 
@@ -45,7 +48,7 @@ class Commands:
     def __call__(self, words: list[str], *, locks: Sequence[int] = (), saves: bool = True) -> int:
         self.ran.append(list(words))
         name = self.names[-1]
-        code = self.codes.get(name, 0)
+        code = 2 if self.out_of_memory and "--finetune" in words else self.codes.get(name, 0)
         if not self.silent:
             self.write(name, words, code)
         return code
