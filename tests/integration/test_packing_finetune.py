@@ -35,9 +35,9 @@ from sundae_ns.storage.runs import checkpoint
 
 COARSE = PackConfig(
     position_bits=12,
-    scale_step=0.2,
-    rotation_step=0.04,
-    color_step=0.6,
+    scale_step=0.3,
+    rotation_step=0.08,
+    color_step=0.9,
     opacity_step=0.5,
     harmonics_step=1.0,
     feature_step=0.3,
