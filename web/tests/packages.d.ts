@@ -26,3 +26,45 @@ declare module "@sparkjsdev/spark" {
     readonly initialized: Promise<unknown>;
   }
 }
+
+declare module "playcanvas" {
+  export const SHADERLANGUAGE_GLSL: string;
+  export const ShaderChunks: {
+    get(device: object, language: string): { get(name: string): string; set(name: string, text: string): void };
+  };
+  export const FILLMODE_NONE: string;
+  export const RESOLUTION_FIXED: string;
+  export class Color {
+    constructor(r: number, g: number, b: number);
+  }
+  export class Mat4 {
+    set(columns: number[]): this;
+  }
+  export class Quat {
+    setFromMat4(matrix: Mat4): this;
+  }
+  export class Asset {
+    constructor(name: string, type: string, file: { url: string });
+    readonly resource: { instantiateRenderEntity(): Entity };
+    on(event: string, call: (found: string) => void): void;
+  }
+  export class Entity {
+    readonly camera: { calculateProjection: (matrix: Mat4) => void };
+    addComponent(name: string, options: object): void;
+    addChild(entity: Entity): void;
+    setPosition(x: number, y: number, z: number): void;
+    setRotation(turn: Quat): void;
+  }
+  export class Application {
+    constructor(canvas: HTMLCanvasElement, options: object);
+    readonly graphicsDevice: object;
+    readonly root: Entity;
+    readonly scene: { gsplat: object };
+    readonly assets: { add(asset: Asset): void; load(asset: Asset): void };
+    setCanvasFillMode(mode: string, width: number, height: number): void;
+    setCanvasResolution(mode: string, width: number, height: number): void;
+    start(): void;
+    once(event: string, call: () => void): void;
+    destroy(): void;
+  }
+}
