@@ -5,9 +5,9 @@
     python benchmarks/bench_viewers.py scene.sundae --kind glb --central --viewer three
 
 The viewers are Spark, GaussianSplats3D, three.js, PlayCanvas and Babylon.js, each with the files that it reads, in a
-Chromium that renders in software; ``make browser`` installs them. Six cameras, a black background, base colours. Each setting of a viewer adds to the one before.
-``--central`` keeps the primitives whose centres lie in all six images: beside the image the viewers project and drop
-primitives differently. Lines belong in results/viewers.jsonl.
+Chromium that renders in software; ``make browser`` installs them. Six cameras, a black background, base colours. Each
+setting of a viewer adds to the one before. ``--central`` keeps the primitives whose centres lie in all six images:
+beside the image the viewers project and drop primitives differently. Lines belong in results/viewers.jsonl.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def settings(kind: str, antialiased: bool) -> dict[str, dict[str, Options]]:
             "blur": {"renderer": {"blur": 1.2}, "scene": {"antiAlias": antialiased}},
             "full precision": {"scene": {"dataFormat": "large"}},
         },
-        "babylon": {"default": {}},
+        "babylon": {"default": {}, "blur": {"scene": {"KernelSize": 1.2, "Compensation": antialiased}}},
     }
     ladders = {viewer: ladder for viewer, ladder in ladders.items() if kind in READS[viewer]}
     for ladder in ladders.values():
@@ -112,8 +112,8 @@ class _Quiet(SimpleHTTPRequestHandler):
 class Viewers:
     """A page with the viewers, and the export and the cameras of a scene."""
 
-    def __init__(self, page: Browser, scene: PackedScene, file: str) -> None:
-        self._page, self._file = page, file
+    def __init__(self, page: Browser, address: str, scene: PackedScene, file: str) -> None:
+        self._page, self._address, self._file = page, address, file
         cameras = stored_cameras(scene)
         names = ("fx", "fy", "cx", "cy", "width", "height")
         self._sizes = cameras["sizes"].tolist()
@@ -124,6 +124,8 @@ class Viewers:
 
     def images(self, viewer: str, options: Options) -> list[NDArray[np.float64]]:
         """Images ``[H, W, 3]`` of all cameras in [0, 1]."""
+        self._page.open(self._address)
+        wait_for(lambda: self._page.evaluate("typeof show") == "function", "the viewers", SECONDS)
         words = ", ".join(json.dumps(word) for word in (viewer, self._file, self._cameras, options))
         keep = "(found => { window.found = found; }, error => { window.found = String(error); })"
         # Several minutes in software: the page keeps the images until they are asked for.
@@ -154,9 +156,7 @@ def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             try:
                 with Browser(chromium, width, height) as page:
-                    page.open(f"http://127.0.0.1:{server.server_port}/")
-                    wait_for(lambda: page.evaluate("typeof show") == "function", "the viewers", SECONDS)
-                    yield Viewers(page, scene, f"a.{kind}")
+                    yield Viewers(page, f"http://127.0.0.1:{server.server_port}/", scene, f"a.{kind}")
             finally:
                 server.shutdown()
 

@@ -64,7 +64,75 @@ declare module "playcanvas" {
     setCanvasFillMode(mode: string, width: number, height: number): void;
     setCanvasResolution(mode: string, width: number, height: number): void;
     start(): void;
-    once(event: string, call: () => void): void;
+    requestAnimationFrame: () => void;
+    tick(time: number): void;
     destroy(): void;
   }
+}
+
+declare module "@babylonjs/loaders/glTF/2.0";
+declare module "@babylonjs/loaders/SPLAT";
+
+declare module "@babylonjs/core/Maths/math.color" {
+  export class Color4 {
+    constructor(r: number, g: number, b: number, a: number);
+  }
+}
+
+declare module "@babylonjs/core/Maths/math.vector" {
+  export class Vector3 {
+    static Zero(): Vector3;
+    setAll(value: number): void;
+  }
+  export class Matrix {
+    static Identity(): Matrix;
+    static FromArray(values: number[]): Matrix;
+    invert(): Matrix;
+    decomposeToTransformNode(node: object): void;
+  }
+}
+
+declare module "@babylonjs/core/Engines/engine" {
+  export class Engine {
+    constructor(canvas: HTMLCanvasElement, antialias: boolean, options: object);
+    dispose(): void;
+  }
+}
+
+declare module "@babylonjs/core/scene" {
+  export class Scene {
+    constructor(engine: object);
+    useRightHandedSystem: boolean;
+    clearColor: object;
+    render(): void;
+  }
+}
+
+declare module "@babylonjs/core/Cameras/freeCamera" {
+  import type { Matrix, Vector3 } from "@babylonjs/core/Maths/math.vector";
+
+  export class FreeCamera {
+    constructor(name: string, place: Vector3, scene: object);
+    freezeProjectionMatrix(projection: Matrix): void;
+  }
+}
+
+declare module "@babylonjs/core/Meshes/transformNode" {
+  export class TransformNode {
+    constructor(name: string, scene: object);
+  }
+}
+
+declare module "@babylonjs/core/Materials/GaussianSplatting/gaussianSplattingMaterial" {
+  export const GaussianSplattingMaterial: object;
+}
+
+declare module "@babylonjs/core/Loading/sceneLoader" {
+  import type { Vector3 } from "@babylonjs/core/Maths/math.vector";
+
+  export function ImportMeshAsync(
+    address: string,
+    scene: object,
+    options: object,
+  ): Promise<{ meshes: { parent: object | null; scaling: Vector3 }[] }>;
 }

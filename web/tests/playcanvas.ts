@@ -20,10 +20,8 @@ export const showByPlayCanvas: Show = async (file, cameras, options) => {
   const app = new Application(canvas, { graphicsDeviceOptions: kept });
   app.setCanvasFillMode(FILLMODE_NONE, width, height);
   app.setCanvasResolution(RESOLUTION_FIXED, width, height);
-  Object.assign(app.scene.gsplat, options.scene);
-  const chunks = ShaderChunks.get(app.graphicsDevice, SHADERLANGUAGE_GLSL);
-  const [name, { blur = 0.3 }] = ["gsplatCornerVS", options.renderer as { blur?: number }];
-  chunks.set(name, chunks.get(name).replaceAll("+ 0.3", `+ ${blur}`));
+  // Frames are drawn below: Chromium asks for none while a page without a window is at work.
+  app.requestAnimationFrame = () => undefined;
   app.start();
   const isGltf = file.endsWith(".glb");
   const asset = new Asset(file, isGltf ? "container" : "gsplat", { url: file });
@@ -33,6 +31,10 @@ export const showByPlayCanvas: Show = async (file, cameras, options) => {
     app.assets.add(asset);
     app.assets.load(asset);
   });
+  Object.assign(app.scene.gsplat, options.scene);
+  const chunks = ShaderChunks.get(app.graphicsDevice, SHADERLANGUAGE_GLSL);
+  const [name, { blur = 0.3 }] = ["gsplatCornerVS", options.renderer as { blur?: number }];
+  chunks.set(name, chunks.get(name).replaceAll("+ 0.3", `+ ${blur}`));
   const turn = (rows: readonly number[]) => new Quat().setFromMat4(new Mat4().set(columns(rows)));
   const scene = isGltf ? asset.resource.instantiateRenderEntity() : new Entity();
   if (isGltf) scene.setRotation(turn(FROM_GLTF));
@@ -53,7 +55,7 @@ export const showByPlayCanvas: Show = async (file, cameras, options) => {
     const { pose } = place;
     camera.setPosition(pose[3]!, pose[7]!, pose[11]!);
     camera.setRotation(turn([...pose, 0, 0, 0, 1]));
-    await afterFrames(() => new Promise<void>((done) => app.once("frameend", () => done())));
+    await afterFrames(() => app.tick(performance.now()));
     images.push(pixelsOn(canvas));
   }
   app.destroy();

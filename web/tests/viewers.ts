@@ -8,6 +8,7 @@ import { GLTFGaussianSplatLoaderExtension } from "three/addons/loaders/GLTFGauss
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { WebGPURenderer } from "three/webgpu";
 import type { Camera } from "../src/scene/scene";
+import { showByBabylon } from "./babylon";
 import { showByPlayCanvas } from "./playcanvas";
 import { afterFrames, columns, FROM_GLTF, type Options, pixelsOn, projectionOf, type Show, text } from "./shots";
 
@@ -118,6 +119,7 @@ const SHOWS: Record<string, Show> = {
   gaussianSplats3D: showByOpener(gaussianSplats3D),
   three: showByThree,
   playcanvas: showByPlayCanvas,
+  babylon: showByBabylon,
 };
 
 /** Images of a file by one viewer. */
