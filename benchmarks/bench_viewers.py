@@ -2,12 +2,12 @@
 
     python benchmarks/bench_viewers.py scene.sundae                     # a .ply of all primitives
     python benchmarks/bench_viewers.py scene.sundae --kind spz --central
-    python benchmarks/bench_viewers.py scene.sundae --kind glb --central    # by three.js's own loader
+    python benchmarks/bench_viewers.py scene.sundae --kind glb --central --viewer three
 
-The viewers are Spark, GaussianSplats3D and, for a .glb, three.js, in a Chromium that renders in software; ``make
-browser`` installs them. Six cameras, a black background, base colours. Each setting of a viewer adds to the one before.
-``--central`` keeps the primitives whose centres lie in all six images: beside the image the viewers project and drop
-primitives differently. Lines belong in results/viewers.jsonl.
+The viewers are Spark, GaussianSplats3D, three.js, PlayCanvas and Babylon.js, each with the files that it reads, in a
+Chromium that renders in software; ``make browser`` installs them. Six cameras, a black background, base colours. Each
+setting of a viewer adds to the one before. ``--central`` keeps the primitives whose centres lie in all six images:
+beside the image the viewers project and drop primitives differently. Lines belong in results/viewers.jsonl.
 """
 
 from __future__ import annotations
@@ -43,12 +43,18 @@ PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 REACH = math.sqrt(2 * math.log(255))
 """Sigmas to where the alpha of an opaque primitive falls below 1/255."""
 Options = dict[str, dict[str, Any]]
+READS = {
+    "spark": ("ply", "spz"),
+    "gaussianSplats3D": ("ply",),  # it has versions 1 and 2 of .spz; Spark and we have 3
+    "three": ("glb",),
+    "playcanvas": ("ply", "sog", "glb"),
+    "babylon": ("ply", "spz", "sog", "glb"),
+}
+"""Kinds of our files by viewer."""
 
 
 def settings(kind: str, antialiased: bool) -> dict[str, dict[str, Options]]:
     """Settings of each viewer of a file by name, beginning with its own defaults; each contains those before."""
-    if kind == "glb":
-        return {"three": {"default": {}}}
     blur = {"preBlurAmount": 0.0, "blurAmount": 0.3} if antialiased else {"preBlurAmount": 0.3, "blurAmount": 0.0}
     ladders: dict[str, dict[str, Options]] = {
         "spark": {
@@ -63,10 +69,15 @@ def settings(kind: str, antialiased: bool) -> dict[str, dict[str, Options]]:
             "harmonics": {"renderer": {"sphericalHarmonicsDegree": 2, "antialiased": antialiased}},
             "exact order": {"renderer": {"integerBasedSort": False}},
         },
+        "three": {"default": {}},
+        "playcanvas": {
+            "default": {},
+            "blur": {"renderer": {"blur": 1.2}, "scene": {"antiAlias": antialiased}},
+            "full precision": {"scene": {"dataFormat": "large"}},
+        },
+        "babylon": {"default": {}, "blur": {"scene": {"KernelSize": 1.2, "Compensation": antialiased}}},
     }
-    if kind == "spz":
-        # It reads versions 1 and 2; Spark and we have 3.
-        del ladders["gaussianSplats3D"]
+    ladders = {viewer: ladder for viewer, ladder in ladders.items() if kind in READS[viewer]}
     for ladder in ladders.values():
         total: Options = {"renderer": {}, "scene": {}}
         for name, step in ladder.items():
@@ -101,8 +112,8 @@ class _Quiet(SimpleHTTPRequestHandler):
 class Viewers:
     """A page with the viewers, and the export and the cameras of a scene."""
 
-    def __init__(self, page: Browser, scene: PackedScene, file: str) -> None:
-        self._page, self._file = page, file
+    def __init__(self, page: Browser, address: str, scene: PackedScene, file: str) -> None:
+        self._page, self._address, self._file = page, address, file
         cameras = stored_cameras(scene)
         names = ("fx", "fy", "cx", "cy", "width", "height")
         self._sizes = cameras["sizes"].tolist()
@@ -113,6 +124,8 @@ class Viewers:
 
     def images(self, viewer: str, options: Options) -> list[NDArray[np.float64]]:
         """Images ``[H, W, 3]`` of all cameras in [0, 1]."""
+        self._page.open(self._address)
+        wait_for(lambda: self._page.evaluate("typeof show") == "function", "the viewers", SECONDS)
         words = ", ".join(json.dumps(word) for word in (viewer, self._file, self._cameras, options))
         keep = "(found => { window.found = found; }, error => { window.found = String(error); })"
         # Several minutes in software: the page keeps the images until they are asked for.
@@ -129,7 +142,7 @@ class Viewers:
 
 @contextmanager
 def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
-    """The viewers with an export of a scene; ``kind`` is ``ply``, ``spz`` or ``glb``."""
+    """The viewers with an export of a scene; ``kind`` is ``ply``, ``spz``, ``sog`` or ``glb``."""
     chromium = find_chromium()
     if chromium is None or not has_packages():
         sys.exit("no Chromium or no viewers here: apt-get install chromium, then make browser")
@@ -143,15 +156,15 @@ def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             try:
                 with Browser(chromium, width, height) as page:
-                    page.open(f"http://127.0.0.1:{server.server_port}/")
-                    wait_for(lambda: page.evaluate("typeof show") == "function", "the viewers", SECONDS)
-                    yield Viewers(page, scene, f"a.{kind}")
+                    yield Viewers(page, f"http://127.0.0.1:{server.server_port}/", scene, f"a.{kind}")
             finally:
                 server.shutdown()
 
 
-def rows(scene: Path, *, kind: str = "ply", side: int = SIDE, center: bool = False) -> Iterator[dict[str, Any]]:
-    """A line for each setting of each viewer, with the PSNR of six images against Python's."""
+def rows(
+    scene: Path, *, kind: str = "ply", side: int = SIDE, center: bool = False, only: str | None = None
+) -> Iterator[dict[str, Any]]:
+    """A line for each setting of each viewer, or of one, with the PSNR of six images against Python's."""
     shown = base_colors(scaled(read_scene(scene), side))
     if center:
         shown = central(shown)
@@ -160,6 +173,8 @@ def rows(scene: Path, *, kind: str = "ply", side: int = SIDE, center: bool = Fal
     about = {"scene": scene.name, "file": kind, "primitives": len(shown.field["means"]), "central": center}
     with opened(shown, kind) as viewers:
         for viewer, ladder in settings(kind, shown.meta["model"]["rasterize_mode"] == "antialiased").items():
+            if only not in (None, viewer):
+                continue
             for name, options in ladder.items():
                 found = viewers.images(viewer, options)
                 each = [psnr(image, truth) for image, truth in zip(found, images, strict=True)]
@@ -170,11 +185,12 @@ def rows(scene: Path, *, kind: str = "ply", side: int = SIDE, center: bool = Fal
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="written by sundae pack")
-    parser.add_argument("--kind", choices=("ply", "spz", "glb"), default="ply", help="of the export")
+    parser.add_argument("--kind", choices=("ply", "spz", "sog", "glb"), default="ply", help="of the export")
     parser.add_argument("--side", type=int, default=SIDE, help="longest side of the images, pixels")
+    parser.add_argument("--viewer", choices=READS, help="one viewer instead of all")
     parser.add_argument("--central", action="store_true", help="only primitives whose centres lie in all images")
     options = parser.parse_args()
-    for row in rows(options.scene, kind=options.kind, side=options.side, center=options.central):
+    for row in rows(options.scene, kind=options.kind, side=options.side, center=options.central, only=options.viewer):
         print(json.dumps(row), flush=True)
 
 

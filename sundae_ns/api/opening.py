@@ -40,9 +40,9 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     or infinite without a meaning, are left out. A warning says how many.
 
     Args:
-        path: a ``.ply``, also a compressed one, a ``.spz``, ``.sog``, ``.glb`` or ``.splat`` of any program, a
-            checkpoint of gsplat (``.pt``), a packed ``.sundae``, or a run of ``ns-train`` with sundae or splatfacto:
-            its folder, its ``config.yml`` or one of its checkpoints.
+        path: a ``.ply``, also a compressed one, a ``.spz``, ``.sog``, ``.glb``, ``.splat`` or ``.ksplat`` of any
+            program, a checkpoint of gsplat (``.pt``), a packed ``.sundae``, or a run of ``ns-train`` with sundae or
+            splatfacto: its folder, its ``config.yml`` or one of its checkpoints.
         device: of the scene.
 
     Raises:
@@ -78,7 +78,7 @@ def _of_run(path: Path) -> Scene:
     config = find_config(path)
     if config is None:
         reason = "is no run" if path.exists() else "does not exist"
-        wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .glb, .splat or .pt file"
+        wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .glb, .splat, .ksplat or .pt file"
         raise CheckpointError(f"{path} {unread(path) or f'{reason}; {wanted}'}")
     if path.suffix == ".ckpt":
         return scene_of_checkpoint(path, checkpoint.read(path), config)

@@ -35,7 +35,7 @@ def distill_file(
     that no step sees show that it pays. Ctrl-C saves; the same command goes on.
 
     Args:
-        source: a .ply, .spz, .sog, .glb, .splat or gsplat's .pt, a packed scene, or a run.
+        source: a .ply, .spz, .sog, .glb, .splat, .ksplat or gsplat's .pt, a packed scene, or a run.
         out: file to write, in the format of its suffix: .sundae, or without a head .ply, .spz or .sog.
         keep: share of the primitives to keep, in (0, 1]; by default 0.1.
         count: number of primitives to keep, in place of a share.

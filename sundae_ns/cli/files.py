@@ -35,7 +35,8 @@ def export(
     marked as such.
 
     Args:
-        scene: a run (its folder or config.yml), a packed scene, or a .ply, .spz, .sog, .glb, .splat or gsplat's .pt.
+        scene: a run (its folder or config.yml), a packed scene, or a .ply, .spz, .sog, .glb, .splat, .ksplat or
+            gsplat's .pt.
         out: file to write; its suffix selects the format: .html, .ply or .glb (exact), .spz or .sog (quantised,
             much smaller). A name without a suffix is a folder of page and scene, for a web server.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
@@ -205,7 +206,7 @@ def prune_file(
     more than a minute states its cost first.
 
     Args:
-        source: a .ply, .spz, .sog, .glb, .splat or gsplat's .pt, a packed scene, or a run.
+        source: a .ply, .spz, .sog, .glb, .splat, .ksplat or gsplat's .pt, a packed scene, or a run.
         out: file to write, in the format of its suffix: .ply, .spz, .sog, .glb or .sundae. A .ply of a .ply keeps all
             properties and comments.
         keep: share of the primitives to keep, of those that a box and the floaters leave, in (0, 1]; by default 0.1.

@@ -65,8 +65,8 @@ def pack(
     """Pack a scene into one file that can be rendered; print the size of each part, and the quality before and after.
 
     Args:
-        run: a run of sundae or splatfacto (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat or
-            gsplat's .pt.
+        run: a run of sundae or splatfacto (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat,
+            .ksplat or gsplat's .pt.
         out: file to write, for example scene.sundae.
         target_bytes: find the finest steps whose file has at most this many bytes.
         target_drop: find the coarsest steps that lose at most this PSNR on some test views, dB.

@@ -37,7 +37,7 @@ def render_file(
     around it if there are none.
 
     Args:
-        scene: a packed scene, a run, or a .ply, .spz, .sog, .glb, .splat or gsplat's .pt.
+        scene: a packed scene, a run, or a .ply, .spz, .sog, .glb, .splat, .ksplat or gsplat's .pt.
         out: image (.png, .jpg or .webp) or video (.mp4) to write.
         camera: a transforms.json or a camera path of the viewer; by default the cameras stored with the scene.
         view: index of the camera for an image; by default the start view of the scene, if it has one.

@@ -85,7 +85,8 @@ def view(
     number: ssh -L 8000:127.0.0.1:8000 with --port 8000.
 
     Args:
-        scene: a packed scene, a run (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat or gsplat's .pt.
+        scene: a packed scene, a run (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat, .ksplat or
+            gsplat's .pt.
         port: port on 127.0.0.1; 0 takes a free one.
         open_browser: open the default browser; otherwise only print the address.
         data: folder of the capture of a run, if it moved.

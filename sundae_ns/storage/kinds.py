@@ -7,13 +7,14 @@ from typing import Literal
 
 from sundae_ns.errors import CheckpointError, regular
 
-Kind = Literal["packed", "ply", "spz", "sog", "glb", "splat", "gsplat"]
+Kind = Literal["packed", "ply", "spz", "sog", "glb", "splat", "ksplat", "gsplat"]
 PRIMITIVES: dict[Kind, str] = {
     "ply": ".ply file",
     "spz": ".spz file",
     "sog": ".sog file",
     "glb": ".glb file",
     "splat": ".splat file",
+    "ksplat": ".ksplat file",
     "gsplat": "checkpoint of gsplat",
 }
 """Kinds of files that hold primitives alone, and their names."""
@@ -28,14 +29,15 @@ _FIRST_BYTES: dict[bytes, Kind] = {
     b"PK\x03\x04": "sog",
     b"glTF": "glb",
 }
+_HEADERLESS: dict[str, Kind] = {".splat": "splat", ".ksplat": "ksplat"}
+"""Kinds without first bytes of their own, by suffix."""
 _ZIPS: dict[str, Kind] = {".sog": "sog", ".pt": "gsplat"}
 _BY_SUFFIX: dict[str, Kind] = {
-    **{".ply": "ply", ".spz": "spz", ".sog": "sog", ".glb": "glb", ".splat": "splat", ".pt": "gsplat"},
+    **{".ply": "ply", ".spz": "spz", ".sog": "sog", ".glb": "glb", ".pt": "gsplat"},
+    **_HEADERLESS,
 }
-_CONVERT = "convert it to .ply with SuperSplat or splat-transform"
 _UNREAD = {
-    ".ksplat": f"is a scene of GaussianSplats3D; {_CONVERT}",
-    ".lcc": f"is a scene of XGRIDS; {_CONVERT}",
+    ".lcc": "is a scene of XGRIDS; convert it to .ply with SuperSplat or splat-transform",
     ".rad": "is a scene of Spark; convert the .ply that it was made of",
     ".gltf": "is a glTF scene in several files; export it as .glb",
     ".pth": "is a checkpoint of another trainer; give its .ply, such as point_cloud/iteration_*/point_cloud.ply",
@@ -52,8 +54,7 @@ def kind_of(path: Path) -> Kind | None:
     kind = next((kind for begin, kind in _FIRST_BYTES.items() if first.startswith(begin)), None)
     if kind == "sog":  # a checkpoint is a zip file too
         return _ZIPS.get(path.suffix.lower())
-    # A .splat has no header.
-    return "splat" if kind is None and path.suffix.lower() == ".splat" else kind
+    return _HEADERLESS.get(path.suffix.lower()) if kind is None else kind
 
 
 def kind_of_primitives(path: Path) -> Kind | None:
@@ -72,8 +73,8 @@ def kind_of_primitives(path: Path) -> Kind | None:
 def unread(path: Path) -> str | None:
     """What a scene is that this program does not read, and how to convert it; None for any other path.
 
-    >>> unread(Path("garden.ksplat"))
-    'is a scene of GaussianSplats3D; convert it to .ply with SuperSplat or splat-transform'
+    >>> unread(Path("garden.lcc"))
+    'is a scene of XGRIDS; convert it to .ply with SuperSplat or splat-transform'
     """
     if path.is_dir():
         # The folder of a training by the authors of 3DGS.

@@ -1,4 +1,4 @@
-"""The one reader of files of primitives: .ply, .spz, .sog, .glb, .splat, and checkpoints of gsplat."""
+"""The one reader of files of primitives: .ply, .spz, .sog, .glb, .splat, .ksplat, and checkpoints of gsplat."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.mending import Mended, mend
 from sundae_ns.storage.gltf import read_glb
 from sundae_ns.storage.kinds import kind_of_primitives
+from sundae_ns.storage.ksplat import read_ksplat
 from sundae_ns.storage.ply import is_nerfstudio_ply, ply_comments, read_ply
 from sundae_ns.storage.sog import read_sog
 from sundae_ns.storage.splat import read_gsplat, read_splat
@@ -48,6 +49,8 @@ def read_primitives(path: Path) -> StoredPrimitives:
         params, antialiased, in_model_frame = read_glb(path)
     elif kind == "splat":
         params = read_splat(path)
+    elif kind == "ksplat":
+        params = read_ksplat(path)
     elif kind == "gsplat":
         params = read_gsplat(path)
     else:

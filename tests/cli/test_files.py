@@ -17,7 +17,7 @@ import pytest
 import torch
 from colmap_models import write_model
 from command_line import run
-from foreign_files import FOREIGN, small_field
+from foreign_files import FOREIGN, KSPLAT, small_field
 from packed_scenes import KINDS, write_kind
 from plyfile import PlyData, PlyElement
 from torch import Tensor
@@ -188,8 +188,11 @@ def test_prune_does_not_change_kept_rows(
         (["pack", "in.sundae", "-o", "a.sundae"], "in.sundae is a packed scene; give the run that was packed"),
         (["pack", "in.ply", "-o", "a.sundae", "--finetune", "9"], "in.ply is a .ply file without photos; leave out"),
         (["pack", "in.ply", "-o", "a.sundae", "--target-drop", "1"], "leave out --target-drop, or give a run"),
-        (["report", "a.ksplat", "-o", "out"], "a.ksplat is a scene of GaussianSplats3D; convert it to .ply with"),
-        (["prune", "a.ksplat", "-o", "a.ply"], "a.ksplat is a scene of GaussianSplats3D; convert it to .ply with"),
+        (["report", "a.lcc", "-o", "out"], "a.lcc is a scene of XGRIDS; convert it to .ply with"),
+        (
+            ["prune", "a.ksplat", "-o", "a.ply"],
+            "a.ksplat is not a complete .ksplat (33 bytes are",
+        ),
         (["export", "a.glb", "-o", "a.ply"], "a.glb is not a complete .glb with Gaussians"),
         (["render", "a.pth", "-o", "a.png"], "a.pth is a checkpoint of another trainer; give its .ply"),
         (
@@ -220,7 +223,7 @@ def test_refusals_are_one_line(
     Path("in.bin").write_bytes(b"\x1f\x8b\xff")
     write_ply(Path("none.ply"), {name: torch.full_like(value[:5], torch.nan) for name, value in field().items()})
     write_ply(Path("empty.ply"), {name: value[:0] for name, value in field().items()})
-    for name in ("a.ksplat", "a.glb", "a.pth", "a.splat"):
+    for name in ("a.ksplat", "a.lcc", "a.glb", "a.pth", "a.splat"):
         Path(name).write_bytes(bytes(33))
     Path("trained/point_cloud/iteration_7").mkdir(parents=True)
     Path("trained/point_cloud/iteration_7/point_cloud.ply").touch()
@@ -237,11 +240,11 @@ def test_every_command_reads_files_of_other_programs(
 ) -> None:
     """In folders that do not exist yet."""
     monkeypatch.chdir(tmp_path)
-    truth = small_field()
+    truth = KSPLAT if name == "a.ksplat" else small_field()
     FOREIGN[name](Path(name), truth)
     colors = read_primitives(Path(name)).mended.field["features_dc"]
     assert run("prune", name, "-o", "pruned/a/b.ply", "--keep", "0.5", "--views", "4") == 0
-    assert len(read_ply(Path("pruned/a/b.ply"))["means"]) == 150
+    assert len(read_ply(Path("pruned/a/b.ply"))["means"]) == len(truth["means"]) // 2
     assert run("prune", name, "-o", "same/a.ply", "--keep", "1", "--views", "4") == 0
     torch.testing.assert_close(read_primitives(Path("same/a.ply")).mended.field["features_dc"], colors)
     assert run("export", name, "-o", "exported/a.spz") == 0

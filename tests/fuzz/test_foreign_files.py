@@ -1,4 +1,4 @@
-"""Bad files of other programs: .splat, compressed .ply, colours in a .ply, checkpoints of gsplat."""
+"""Bad files of other programs: .splat, .ksplat, compressed .ply, colours in a .ply, checkpoints of gsplat."""
 
 from __future__ import annotations
 

@@ -250,7 +250,7 @@ def test_kinds(tmp_path: Path) -> None:
     for name, write in FOREIGN.items():
         write(tmp_path / name, FIELD)
         kinds[name] = kind_of(tmp_path / name)
-    assert list(kinds.values()) == ["splat", "ply", "ply", "gsplat", "ply"]
+    assert list(kinds.values()) == ["splat", "ply", "ply", "gsplat", "ksplat", "ply"]
 
 
 def test_folders_of_3dgs_name_their_file(tmp_path: Path) -> None:

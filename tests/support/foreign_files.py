@@ -1,4 +1,4 @@
-"""Files of other programs, made in small: .splat, compressed .ply, colours in a .ply, checkpoints of gsplat."""
+"""Files of other programs, made in small: .splat, .ksplat, compressed .ply, colours, checkpoints of gsplat."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from sundae_ns.gaussians.parameters import SH_C0
 from sundae_ns.storage import write_ply
 
 _CHUNK = 256
+_STORED = Path(__file__).parents[1] / "storage" / "foreign"
 
 
 def small_field(n: int = 300, degree: int = 1) -> dict[str, Tensor]:
@@ -127,11 +128,24 @@ def write_gsplat(path: Path, field: Mapping[str, Tensor], **others: object) -> N
     torch.save({"step": 6999, "splats": splats, **others}, path)
 
 
+def ksplat(level: int, degree: int) -> Path:
+    """A file that GaussianSplats3D 0.4.7 wrote of ``KSPLAT``, by foreign/ksplat.mjs."""
+    return _STORED / f"level_{level}_degree_{degree}.ksplat"
+
+
+KSPLAT = small_field(30, 3)
+
+
+def copy_ksplat(path: Path, _: Mapping[str, Tensor] = KSPLAT) -> None:
+    path.write_bytes(ksplat(1, 2).read_bytes())
+
+
 FOREIGN: dict[str, Callable[[Path, Mapping[str, Tensor]], None]] = {
     "a.splat": write_splat,
     "a.compressed.ply": write_compressed_ply,
     "colors.ply": write_colored_ply,
     "ckpt_6999_rank0.pt": write_gsplat,
+    "a.ksplat": copy_ksplat,
     "plain.ply": write_ply,
 }
 """Files by their names, and their writers."""
