@@ -171,6 +171,7 @@ export class Splatter {
   private readonly depths: [GPUBuffer, GPUBuffer];
   private readonly ids: [GPUBuffer, GPUBuffer];
   private readonly blockSums: GPUBuffer;
+  private readonly starts: GPUBuffer;
   private readonly depthSizes: GPUBuffer;
   private readonly sorting: SortKernels;
   private readonly depthSorter: Sorter;
@@ -197,6 +198,7 @@ export class Splatter {
     this.depths = [storage(device, count * 4), storage(device, count * 4)];
     this.ids = [storage(device, count * 4), storage(device, count * 4)];
     this.blockSums = storage(device, blocksOf(count, THREADS) * 4);
+    this.starts = storage(device, count * 4);
     this.depthSizes = filled(device, new Uint32Array([blocksOf(count, SORT_BLOCK), 1, 1]), GPUBufferUsage.INDIRECT);
     const length = filled(device, new Uint32Array([count]));
     this.sorting = new SortKernels(device);
@@ -249,17 +251,16 @@ export class Splatter {
     device.queue.writeBuffer(target.view, 0, data);
     encoder.clearBuffer(target.ranges);
     const pass = encoder.beginComputePass(timestampWrites ? { timestampWrites } : {});
-    const { kernels, splats, colors, blockSums } = this;
+    const { kernels, splats, colors, blockSums, starts } = this;
     const [depths, ids] = [this.depths[0], this.ids[0]];
     const geometry = { 0: target.view, 1: this.primitives, 2: this.coefficients, 3: splats, 4: colors };
     new Step(device, kernels.project, { ...geometry, 5: depths, 6: ids }).run(pass, ...grid(blocksOf(count, THREADS)));
     this.depthSorter.encode(pass, this.depthSizes);
-    const ranked = { 0: target.view, 1: splats, 2: ids, 3: blockSums };
-    const blocks = grid(blocksOf(count, THREADS));
-    new Step(device, kernels.measure, ranked).run(pass, ...blocks);
+    const ranked = { 0: target.view, 1: splats, 2: ids, 3: blockSums, 8: starts };
+    new Step(device, kernels.measure, ranked).run(pass, ...grid(blocksOf(count, THREADS)));
     new Step(device, kernels.place, { 0: target.view, 3: blockSums, 4: pairs.count, 5: pairs.sizes }).run(pass, 1);
     const listed = { ...ranked, 4: pairs.count, 6: pairs.tiles[0], 7: pairs.ids[0] };
-    new Step(device, kernels.emit, listed).run(pass, ...blocks);
+    new Step(device, kernels.emit, listed).runAs(pass, pairs.sizes, 0);
     pairs.sorter.encode(pass, pairs.sizes);
     const ranges = new Step(device, kernels.findRanges, { 4: pairs.count, 6: pairs.tiles[0] }, { 0: target.ranges });
     ranges.runAs(pass, pairs.sizes, 12);

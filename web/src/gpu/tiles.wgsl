@@ -15,9 +15,13 @@ struct Pairs {
 @group(0) @binding(5) var<storage, read_write> blocks: array<u32>;
 @group(0) @binding(6) var<storage, read_write> pair_tiles: array<u32>;
 @group(0) @binding(7) var<storage, read_write> pair_ids: array<u32>;
+// The first place of each rank among those of its block.
+@group(0) @binding(8) var<storage, read_write> starts: array<u32>;
 @group(1) @binding(0) var<storage, read_write> ranges: array<vec2u>;
 
 const SORT_BLOCK = 2048u;
+// Pairs that a thread makes.
+const RUN = SORT_BLOCK / THREADS;
 
 fn corners(splat: Splat) -> vec4u {
   return vec4u(splat.low & 0xffffu, splat.low >> 16u, splat.high & 0xffffu, splat.high >> 16u);
@@ -31,15 +35,20 @@ fn num_tiles(rank: u32) -> u32 {
   return (box.z - box.x) * (box.w - box.y);
 }
 
-// The number of pairs of each block of 256 ranks.
+// The number of pairs of each block of 256 ranks, and the places of its ranks.
 @compute @workgroup_size(256)
 fn measure(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u,
            @builtin(local_invocation_index) thread: u32) {
   let block = group.x + group.y * groups.x;
-  let total = sums_before(thread, num_tiles(block * THREADS + thread)).y;
-  if (thread == 0u && block * THREADS < view.count) {
+  let rank = block * THREADS + thread;
+  let sums = sums_before(thread, num_tiles(rank));
+  if (rank >= view.count) {
+    return;
+  }
+  starts[rank] = sums.x;
+  if (thread == 0u) {
     // One less than a block can have, so that sums of 256 blocks do not overflow.
-    block_sums[block] = min(total, 0xffffffu);
+    block_sums[block] = min(sums.y, 0xffffffu);
   }
 }
 
@@ -74,27 +83,36 @@ fn place(@builtin(local_invocation_index) thread: u32) {
   }
 }
 
+fn start_of(rank: u32) -> u32 {
+  return block_sums[rank / THREADS] + starts[rank];
+}
+
+// Threads share the pairs, not the primitives: one may cover all tiles, and the frame would wait for its thread.
 @compute @workgroup_size(256)
-fn emit(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u,
-        @builtin(local_invocation_index) thread: u32) {
-  let block = group.x + group.y * groups.x;
-  let rank = block * THREADS + thread;
-  let count = num_tiles(rank);
-  let before = sums_before(thread, count).x;
-  if (count == 0u || pairs.count == 0u) {
-    return;
+fn emit(@builtin(global_invocation_id) thread: vec3u) {
+  var slot = thread.x * RUN;
+  let end = min(slot + RUN, pairs.count);
+  // The last rank that starts at the first pair or before it.
+  var rank = 0u;
+  var after = view.count;
+  while (after - rank > 1u) {
+    let middle = (rank + after) / 2u;
+    if (start_of(middle) <= slot) {
+      rank = middle;
+    } else {
+      after = middle;
+    }
   }
-  var slot = block_sums[block] + before;
-  let id = order[rank];
-  let box = corners(splats[id]);
-  for (var y = box.y; y < box.w; y++) {
-    for (var x = box.x; x < box.z; x++) {
-      if (slot >= view.capacity) {
-        return;
-      }
-      pair_tiles[slot] = y * view.tiles.x + x;
+  for (; slot < end; rank++) {
+    let id = order[rank];
+    let box = corners(splats[id]);
+    let width = box.z - box.x;
+    let start = start_of(rank);
+    let stop = min(start + num_tiles(rank), end);
+    for (; slot < stop; slot++) {
+      let place = slot - start;
+      pair_tiles[slot] = (box.y + place / width) * view.tiles.x + box.x + place % width;
       pair_ids[slot] = id;
-      slot++;
     }
   }
 }
