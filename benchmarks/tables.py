@@ -205,23 +205,24 @@ def training_time() -> list[str]:
 
 
 def packing() -> list[str]:
-    """Packed runs: bytes, and PSNR and SSIM before and after."""
-    heads = ["run", "fine-tuning", "primitives", "MB", "bits", "PSNR of the run", "packed", "SSIM of the run", "packed"]
-    rows = []
-    for line in lines_of("pack.jsonl"):
-        if line["run"] is not None and line.get("variant", "sundae") == "sundae":
-            steps = line["finetune_steps"]
-            bits = 8 * line["bytes"] / line["primitives"]
-            rows.append(
-                [
-                    named(line["run"], is_of_today({"variant": "sundae", **line})),
-                    *(f"{steps:,} steps" if steps else "", number(line["primitives"], 0)),
-                    *(number(line["bytes"] / MB, 2), number(bits, 0)),
-                    *(number(line[name], 2) for name in ("psnr", "psnr_packed")),
-                    *(number(line[name], 4) for name in ("ssim", "ssim_packed")),
-                ]
-            )
-    return table(heads, first_of_each(rows))
+    """What the default keeps of each capture, and its packs without and with a fine-tune."""
+    heads = ["capture", "seed", "primitives", "head", "PSNR, SSIM of the run", "MB", "bits", "PSNR, SSIM"]
+    rows = [
+        [
+            *(row["capture"], row["seed"], number(int(row["primitives"]), 0), "yes" if row["head"] == "yes" else ""),
+            *(f"{float(row['psnr']):.2f}, {row['ssim']}", *_packed(row, "packed"), *_packed(row, "tuned")),
+        ]
+        for row in lines_of("curve.csv")
+        if row["chosen"] == "yes"
+    ]
+    return table([*heads, "fine-tuned MB", *heads[-2:]], first_of_each(rows))
+
+
+def _packed(row: dict[str, Any], kind: str) -> tuple[str, str, str]:
+    """Megabytes, bits a primitive, and quality of a pack of a row of curve.csv."""
+    size = int(row[f"{kind}_bytes"])
+    quality = f"{float(row[f'{kind}_psnr']):.2f}, {row[f'{kind}_ssim']}"
+    return number(size / MB, 2), number(8 * size / int(row["primitives"]), 0), quality
 
 
 def format_rows() -> list[dict[str, Any]]:
@@ -260,13 +261,25 @@ def formats() -> list[str]:
 
 
 def packed_headline() -> list[str]:
-    """README's table of packed sizes: MB and dB of each packed format, our default beside stock splatfacto."""
-    cells: dict[tuple[str, str], dict[str, str]] = {}
-    for row in (row for row in format_rows() if row["kind"] in FORMATS):
-        cell = f"{number(row['bytes'] / MB, 1)} MB, {number(row['psnr'], 1)} dB"
-        cells.setdefault((row["capture"], row["method"]), {})[row["kind"]] = cell
-    rows = [[*place, *(own.get(kind, "") for kind in FORMATS)] for place, own in cells.items()]
-    return table(["capture", "method", *FORMATS.values()], first_of_each(rows))
+    """README's table of packed sizes: MB and dB of stock splatfacto in each format, beside our default."""
+
+    def cell(size: float, psnr: float) -> str:
+        return f"{number(size / MB, 1)} MB, {number(psnr, 1)} dB"
+
+    stock: dict[str, dict[str, str]] = {}
+    for row in format_rows():
+        if row["kind"] in FORMATS and row["method"] == METHODS["splatfacto"]:
+            stock.setdefault(row["capture"], {})[row["kind"]] = cell(row["bytes"], row["psnr"])
+    rows = [
+        [
+            *(row["capture"], *(stock.get(row["capture"], {}).get(kind, "") for kind in FORMATS)),
+            *(cell(int(row[f"{kind}_bytes"]), float(row[f"{kind}_psnr"])) for kind in ("packed", "tuned")),
+        ]
+        for row in lines_of("curve.csv")
+        if row["chosen"] == "yes" and row["seed"] == "42"
+    ]
+    kinds = [f"splatfacto, {name}" for name in FORMATS.values()]
+    return table(["capture", *kinds, "sundae", "fine-tuned"], rows)
 
 
 def multi_gpu() -> list[str]:

@@ -41,9 +41,9 @@ class FloaterRemoval(Extension):
         self._done = self._points is None or bool(saved.get("done", state.pruning["num_prunes"] > 0))
 
     def after_step(self, run: TrainingRun) -> None:
-        """Remove floaters once the field has stopped growing."""
+        """Remove floaters after the last step at which the field grows, so that a saved warm-up has none."""
         state = run.state
-        if self._done or state.densifying:
+        if self._done or state.schedule_step + 1 < state.densify_until:
             return
         self._done = True
         assert self._points is not None

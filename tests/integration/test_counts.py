@@ -14,6 +14,7 @@ from nerfstudio.engine.trainer import Trainer
 from trial_runs import PRUNE_AT, STEPS, same, tidy, tiny_run, tiny_scene
 
 from sundae_ns.evaluation.count_curve import read_count_curve
+from sundae_ns.pruning import kept_count
 from sundae_ns.training.heldout import HeldOutQuality
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.trials import count as count_trials
@@ -65,7 +66,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
             found, similar = 30 - losses[share], 0.9 - 0.03 * losses[share]
             if trials.progress.tries_head:
                 assert run.state.head_enabled == (len(trials.progress.head) == 1)
-                assert run.source.total == trials.progress.full / 10
+                assert run.source.total == kept_count(0.1, trials.progress.full)
                 found, similar = 30 + head * len(trials.progress.head), 0.9
             return [HeldOutQuality(100, found, similar, found) for _ in run.heldout_views()]
 

@@ -17,7 +17,7 @@ FLOATERS = [4, 50]
 
 
 def with_floaters(build: Build, **options: Any) -> SundaeModel:
-    model = build(pruning={"keep_ratio": 1.0}, stop_split_at=3, **options)
+    model = build(pruning={"keep_ratio": 1.0, "prune_at": 4}, stop_split_at=4, **options)
     with torch.no_grad():
         model.gauss_params["means"][FLOATERS] = torch.tensor([0.5, 0.1, 2.9])  # a tenth in front of the third camera
     return model
@@ -58,7 +58,7 @@ def test_a_resumed_run_removes_them_only_if_that_was_still_due(
     for step in range(saved_after + 1):
         training.step(step)
     saved = training.model.state_dict()
-    model = build(pruning={"keep_ratio": 1.0}, stop_split_at=3)
+    model = build(pruning={"keep_ratio": 1.0, "prune_at": 4}, stop_split_at=4)
     model.load_state_dict(saved)
     with torch.no_grad():  # moved there since, as in a field that trains on
         model.gauss_params["means"][0] = torch.tensor([0.5, 0.1, 2.9])
