@@ -76,7 +76,7 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path, monkeypatch: pytest.Mo
     for row in rows.values():
         assert None not in (row.ms_frame, row.psnr, row.train_s)
     peaks = {arm: row.peak_primitives for arm, row in rows.items()}
-    assert peaks["sundae"] == peaks["random-no-head"] == peaks[WARM_UP] >= rows[WARM_UP].primitives
+    assert peaks["sundae"] == peaks["random-no-head"] == rows[WARM_UP].primitives <= peaks[WARM_UP]
     assert peaks["mcmc"] == kept
     assert rows["sundae"].bytes_head > 0 == rows["random-no-head"].bytes_head
     # What was measured is what lies there: the run can be opened and looked at.
