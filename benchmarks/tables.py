@@ -49,6 +49,8 @@ METHODS = {
     "contribution-no-head": "highest contribution, as LightGaussian",
 }
 """Arms of runs.csv in the order of a table, by the names that readers see."""
+LEFT_OUT = ("splatfacto-7k", "sundae-with-head", "sundae-no-head-bytes")
+"""Methods of runs.csv that the table of quality leaves out; the text gives what they show."""
 FORMATS = {".spz": ".spz", ".sog": ".sog", ".sog theirs": ".sog by splat-transform", ".sundae": ".sundae"}
 """Packed formats in the order of a table, by the heads that readers see."""
 
@@ -115,8 +117,11 @@ def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
 def quality() -> list[str]:
     """All methods on the captures: quality and size; :func:`speed` has times, because suites share their GPUs."""
     heads = ["capture", "method", "keep", "primitives", "PSNR, dB", "SSIM", "PSNR, head off", "MB"]
-    rows = []
-    for row in default_runs():
+    rows, found = [], default_runs()
+    compared = {row["scene"] for row in found if row["variant"] == "sundae"}
+    for row in found:
+        if row["variant"] in LEFT_OUT or row["scene"] not in compared:
+            continue
         capture, method, *others = cells_of(row)
         keep = "" if row["keep_ratio"] is None else f"{row['keep_ratio']:.0%}"
         rows.append([capture, method, keep, *others])
@@ -206,16 +211,18 @@ def training_time() -> list[str]:
 
 def packing() -> list[str]:
     """What the default keeps of each capture, and its packs without and with a fine-tune."""
-    heads = ["capture", "seed", "primitives", "head", "PSNR, SSIM of the run", "MB", "bits", "PSNR, SSIM"]
+    heads = ["capture", "stock", "kept", "head", "sundae", "MB", "bits", "packed"]
+    stock = {row["scene"]: row for row in runs() if row["variant"] == "splatfacto"}
     rows = [
         [
-            *(row["capture"], row["seed"], number(int(row["primitives"]), 0), "yes" if row["head"] == "yes" else ""),
+            *(row["capture"], f"{stock[row['capture']]['psnr']:.2f}, {stock[row['capture']]['ssim']:.4f}"),
+            *(number(int(row["primitives"]), 0), "yes" if row["head"] == "yes" else ""),
             *(f"{float(row['psnr']):.2f}, {row['ssim']}", *_packed(row, "packed"), *_packed(row, "tuned")),
         ]
         for row in lines_of("curve.csv")
         if row["chosen"] == "yes"
     ]
-    return table([*heads, "fine-tuned MB", *heads[-2:]], first_of_each(rows))
+    return table([*heads, "MB", "bits", "fine-tuned"], first_of_each(rows))
 
 
 def _packed(row: dict[str, Any], kind: str) -> tuple[str, str, str]:
@@ -246,7 +253,7 @@ def format_rows() -> list[dict[str, Any]]:
 
 
 def formats() -> list[str]:
-    """Finished runs in each format: bytes of the whole file, and quality on the test views."""
+    """Stock runs in each format: bytes of the whole file, and quality on the test views."""
     heads = ["capture, method", "format", "program", "primitives", "MB", "PSNR, dB", "SSIM"]
     rows = [
         [
@@ -256,6 +263,7 @@ def formats() -> list[str]:
             *(number(row["psnr"], 2), number(row["ssim"], 4)),
         ]
         for row in format_rows()
+        if row["method"] == METHODS["splatfacto"]
     ]
     return table(heads, first_of_each(rows), words=3)
 
