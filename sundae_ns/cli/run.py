@@ -171,8 +171,12 @@ class Project:
 
         words = ["sundae", "pack", word(self.run), "-o", word(packed), "--data", word(self.capture)]
         words += [] if self.max_bytes is None else ["--target-bytes", str(self.max_bytes)]
-        tuned = not plain and self.quality != "draft" and has_gpu()
-        return [*words, "--finetune", str(FINETUNE_STEPS)] if tuned else words
+        return [*words, "--finetune", str(FINETUNE_STEPS)] if self.tunes and not plain else words
+
+    @property
+    def tunes(self) -> bool:
+        """Whether the pack is fine-tuned."""
+        return self.quality != "draft" and has_gpu()
 
     @property
     def num_steps(self) -> int | None:
@@ -187,8 +191,13 @@ class Project:
     @property
     def options(self) -> list[str]:
         """Options of ns-train for the quality and the size."""
-        size = [] if self.max_bytes is None else ["--pipeline.model.pruning.max-bytes", str(self.max_bytes)]
-        return [*QUALITIES[self.quality], *size]
+        if self.max_bytes is None:
+            return QUALITIES[self.quality]
+        from sundae_ns.storage.packing import FINETUNED_SIZE
+
+        # Trials count the bytes of packs without a fine-tune.
+        most = round(self.max_bytes / FINETUNED_SIZE) if self.tunes else self.max_bytes
+        return [*QUALITIES[self.quality], "--pipeline.model.pruning.max-bytes", str(most)]
 
     def check(self) -> None:
         """Raise ``ConfigError`` for options that contradict each other."""

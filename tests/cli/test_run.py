@@ -115,6 +115,8 @@ def test_a_gpu_packs_with_a_fine_tune(commands: Commands, capsys: pytest.Capture
     assert run("photos", "-o", "out", "--max-mb", "2") == 0
     assert commands.option("--finetune", 3) == "1500"
     assert commands.option("--target-bytes", 3) == "2000000"
+    # Trials count the bytes of a pack without one.
+    assert commands.option("--pipeline.model.pruning.max-bytes", 1) == "3333333"
     assert shlex.join(commands.ran[3]) in capsys.readouterr().out
     commands.ran.clear()
     assert run("photos", "-o", "draft", "--quality", "draft") == 0

@@ -1,7 +1,7 @@
 """Packed scenes: a field, its head and its cameras in one small, checksummed file without executable content."""
 
 from sundae_ns.storage.packing.codecs import Codecs, Sensitivity
-from sundae_ns.storage.packing.config import FINETUNE_STEPS, FINETUNED, PackConfig
+from sundae_ns.storage.packing.config import FINETUNE_STEPS, FINETUNED, FINETUNED_SIZE, PackConfig
 from sundae_ns.storage.packing.container import read_header
 from sundae_ns.storage.packing.scene import (
     PackedScene,
@@ -16,6 +16,7 @@ from sundae_ns.storage.packing.scene import (
 __all__ = [
     "FINETUNE_STEPS",
     "FINETUNED",
+    "FINETUNED_SIZE",
     "Codecs",
     "PackConfig",
     "PackReport",
