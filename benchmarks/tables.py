@@ -215,7 +215,8 @@ def packing() -> list[str]:
     stock = {row["scene"]: row for row in runs() if row["variant"] == "splatfacto"}
     rows = [
         [
-            *(row["capture"], f"{stock[row['capture']]['psnr']:.2f}, {stock[row['capture']]['ssim']:.4f}"),
+            named(row["capture"], is_of_today({"variant": "sundae-auto", **row})),
+            f"{stock[row['capture']]['psnr']:.2f}, {stock[row['capture']]['ssim']:.4f}",
             *(number(int(row["primitives"]), 0), "yes" if row["head"] == "yes" else ""),
             *(f"{float(row['psnr']):.2f}, {row['ssim']}", *_packed(row, "packed"), *_packed(row, "tuned")),
         ]
@@ -280,14 +281,15 @@ def packed_headline() -> list[str]:
             stock.setdefault(row["capture"], {})[row["kind"]] = cell(row["bytes"], row["psnr"])
     rows = [
         [
-            *(row["capture"], *(stock.get(row["capture"], {}).get(kind, "") for kind in FORMATS)),
+            named(row["capture"], is_of_today({"variant": "sundae-auto", **row})),
+            *(stock.get(row["capture"], {}).get(kind, "") for kind in FORMATS),
             *(cell(int(row[f"{kind}_bytes"]), float(row[f"{kind}_psnr"])) for kind in ("packed", "tuned")),
         ]
         for row in lines_of("curve.csv")
         if row["chosen"] == "yes" and row["seed"] == "42"
     ]
-    kinds = [f"splatfacto, {name}" for name in FORMATS.values()]
-    return table(["capture", *kinds, "sundae", "fine-tuned"], rows)
+    kinds = list(FORMATS.values())
+    return table(["capture", f"splatfacto, {kinds[0]}", *kinds[1:], "sundae", "fine-tuned"], rows)
 
 
 def multi_gpu() -> list[str]:

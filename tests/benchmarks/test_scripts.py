@@ -127,12 +127,14 @@ def test_rows_of_earlier_defaults_say_so(monkeypatch: pytest.MonkeyPatch) -> Non
     # A row of the tables is of all seeds, and of the share that is the default, or the arm's own.
     seeds: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in csv.DictReader((RESULTS / "runs.csv").open(newline="")):
-        if row["variant"] in tables["METHODS"] and row["keep_ratio"] in ("0.1", "0.13", "1.0"):
+        shown_method = row["variant"] in tables["METHODS"] and row["variant"] not in tables["LEFT_OUT"]
+        if shown_method and row["keep_ratio"] in ("0.1", "0.13", "1.0"):
             seeds.setdefault((row["scene"], row["variant"]), []).append(row)
-    runs = {place: all(today_of(row, "") for row in rows) for place, rows in seeds.items()}
+    compared = {scene for scene, variant in seeds if variant == "sundae"}
+    runs = {place: all(today_of(row, "") for row in rows) for place, rows in seeds.items() if place[0] in compared}
     lines = {
         name: [json.loads(line) for line in (RESULTS / f"{name}.jsonl").read_text().splitlines()]
-        for name in ("frames", "training_time", "pack")
+        for name in ("frames", "training_time")
     }
     # Of a training that was timed twice, the last line is shown.
     lines["training_time"] = list({(line["scene"], line["arm"]): line for line in lines["training_time"]}.values())
@@ -141,9 +143,9 @@ def test_rows_of_earlier_defaults_say_so(monkeypatch: pytest.MonkeyPatch) -> Non
         "speed": [today_of(line, "") for line in lines["frames"]],
         "training-time": [today_of(line, line["arm"]) for line in lines["training_time"]],
         "packing": [
-            today_of(line, "sundae")
-            for line in lines["pack"]
-            if line["run"] and line.get("variant", "sundae") == "sundae"
+            today_of(row, "sundae-auto")
+            for row in csv.DictReader((RESULTS / "curve.csv").open(newline=""))
+            if row["chosen"] == "yes"
         ],
     }
     marked = 0
@@ -216,8 +218,9 @@ def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     for name, count in (("speed", 2), ("training-time", 1)):
         made = [line for line in tables["TABLES"][name]() if "X |" in line]
         assert len(made) == count, name
-    packs = [line.split(" | ") for line in tables["TABLES"]["packing"]()]
-    assert [pack[1] for size in ("1.00", "0.60") for pack in packs if pack[3] == size] == ["", "1,500 steps"]
+    packs = [json.loads(line) for line in (results / "pack.jsonl").read_text().splitlines()]
+    made = {line["bytes"]: line["finetune_steps"] for line in packs if line["bytes"] in (1_000_000, 600_000)}
+    assert made == {1_000_000: 0, 600_000: 1500}
     for name, make in tables["TABLES"].items():
         assert make()[2:], name
 
@@ -237,22 +240,28 @@ def test_packed_formats_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, tmp_
     tables = loaded(monkeypatch, "tables.py")
     monkeypatch.setitem(tables["lines_of"].__globals__, "RESULTS", tmp_path)
     heads = "capture,method,format,program,bytes,psnr,ssim,primitives,seed,fingerprint,command\n"
-    (ours, *_), (stock, *_) = (sorted(fingerprints(name, 0.1)) for name in ("sundae", "splatfacto"))
+    (ours, *_), (stock, *_) = (sorted(fingerprints(name, 0.1)) for name in ("sundae-auto", "splatfacto"))
     (tmp_path / "formats.csv").write_text(
-        heads + f"fox,sundae,.sundae,sundae_ns,1000000,30.5,0.9,100,42,{ours},a\n"
-        f"fox,sundae,.sundae,sundae_ns,3000000,31.5,0.8,100,43,{ours},a\n"
-        f"fox,splatfacto,.sog,splat-transform 3.7.0,9000000,29.5,0.7,900,42,{stock},b\n"
-        f"fox,splatfacto,.sog,sundae_ns,8000000,29.4,0.7,900,42,older,c\n"
+        heads + f"fox,splatfacto,.sog,splat-transform 3.7.0,9000000,29.5,0.7,900,42,{stock},b\n"
+        f"fox,splatfacto,.sundae,sundae_ns,8000000,29.0,0.6,900,42,{stock},c\n"
+        f"fox,splatfacto,.sundae,sundae_ns,6000000,29.4,0.7,900,43,{stock},c\n"
+        f"fox,splatfacto,.spz,sundae_ns,8000000,29.4,0.7,900,42,older,c\n"
+    )
+    columns = "capture,seed,chosen,fingerprint,packed_bytes,packed_psnr,tuned_bytes,tuned_psnr\n"
+    (tmp_path / "curve.csv").write_text(
+        columns + f"fox,42,yes,{ours},2000000,31.0,1200000,30.9\n"
+        f"fox,43,yes,{ours},3000000,31.0,1500000,30.9\n"
+        f"fox,42,no,{ours},4000000,31.0,,\n"
+        "lion,42,yes,older,2000000,31.0,1000000,30.0\n"
     )
     assert [line.split(" | ") for line in tables["packed_headline"]()[2:]] == [
-        ["| fox", "splatfacto, 30,000 steps, earlier default", "", "8.0 MB, 29.4 dB", "", " |"],
-        ["| ", "splatfacto, 30,000 steps", "", "", "9.0 MB, 29.5 dB", " |"],
-        ["| ", "**sundae**, fixed share", "", "", "", "2.0 MB, 31.0 dB |"],
+        ["| fox", "", "", "9.0 MB, 29.5 dB", "7.0 MB, 29.2 dB", "2.0 MB, 31.0 dB", "1.2 MB, 30.9 dB |"],
+        ["| lion, earlier default", "", "", "", "", "2.0 MB, 31.0 dB", "1.0 MB, 30.0 dB |"],
     ]
-    assert (
-        tables["formats"]()[-1]
-        == "| fox, **sundae**, fixed share | `.sundae` | sundae_ns | 100 | 2.00 | 31.00 | 0.8500 |"
-    )
+    assert tables["formats"]()[-2:] == [
+        "| fox, splatfacto, 30,000 steps | `.sog` | splat-transform 3.7.0 | 900 | 9.00 | 29.50 | 0.7000 |",
+        "|  | `.sundae` | sundae_ns | 900 | 7.00 | 29.20 | 0.6500 |",
+    ]
 
 
 def test_plots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -101,7 +101,7 @@ def test_a_ply_of_the_capture_needs_to_know_the_way(build: Build, training_of: T
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", [name for name in FOREIGN if name != "colors.ply"])
+@pytest.mark.parametrize("name", [name for name in FOREIGN if name not in ("colors.ply", "a.ksplat")])
 def test_files_of_other_programs_start_a_model(
     build: Build, training_of: TrainingOf, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
