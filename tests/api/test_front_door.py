@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from fields import random_field
+from short_prunes import SHORT
 
 import sundae_ns as sn
 from sundae_ns.compensation import CompensationHead, HeadConfig
@@ -25,6 +26,7 @@ FUNCTIONS += ("virtual_views",)
 WITHOUT_NERFSTUDIO = """
 import sys
 sys.modules["nerfstudio"] = None
+%s
 import sundae_ns as sn
 scene = sn.load("headed.sundae")
 sn.render(scene, sn.View.look_at((2.0, 2.0, 2.0), (0.5, 0.5, 0.5), width=64, height=48))
@@ -58,7 +60,7 @@ def test_the_lines_of_the_pages_run_without_nerfstudio(garden: Path) -> None:
     for program in programs:
         for name in ("load", "prune", "render", "save"):
             assert f"sn.{name}(" in program
-    code = [sys.executable, "-c", WITHOUT_NERFSTUDIO]
+    code = [sys.executable, "-c", WITHOUT_NERFSTUDIO % SHORT]
     # Each in names of its own.
     told = "\n".join(
         f"exec({program!r}, {{}})\nimport os; os.rename('small.sundae', 'small-{number}.sundae')"

@@ -11,6 +11,7 @@ import pytest
 import torch
 from colmap_models import write_model
 from fields import random_field
+from short_prunes import short_prunes  # noqa: F401
 
 import sundae_ns as sn
 from sundae_ns.api import virtual
@@ -152,6 +153,7 @@ def test_virtual_views_of_a_scene_of_any_size(factor: float) -> None:
     )
 
 
+@pytest.mark.usefixtures("short_prunes")
 @pytest.mark.parametrize("factor", [1e-3, 1e6])
 def test_a_scene_of_any_size_is_pruned_alike(factor: float) -> None:
     """The near plane is 0.01 world units away, which is more than the whole of a small scene."""

@@ -8,6 +8,12 @@ from pathlib import Path
 import pytest
 from fake_colmap import FakeColmap
 from run_commands import PHOTOS, Commands, photo
+from short_prunes import short_prunes  # noqa: F401
+
+
+@pytest.fixture(autouse=True)
+def _short(short_prunes: None) -> None:  # noqa: F811
+    """No test here is about how good a prune is."""
 
 
 @pytest.fixture

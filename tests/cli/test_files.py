@@ -20,6 +20,7 @@ from command_line import run
 from foreign_files import FOREIGN, KSPLAT, small_field
 from packed_scenes import KINDS, write_kind
 from plyfile import PlyData, PlyElement
+from short_prunes import SHORT
 from torch import Tensor
 
 import sundae_ns as sn
@@ -306,6 +307,7 @@ WITHOUT = """
 import json, sys
 package, commands = json.loads(sys.argv[1])
 sys.modules[package] = None
+%s
 from sundae_ns.cli import main
 codes = []
 for words in commands:
@@ -319,7 +321,7 @@ print(json.dumps(codes))
 
 def without(package: str, commands: list[list[str]], folder: Path) -> tuple[list[int], list[str]]:
     """Run commands of ``sundae`` in one process where importing a package fails; exit codes, and lines of stderr."""
-    started = [sys.executable, "-c", WITHOUT, json.dumps([package, commands])]
+    started = [sys.executable, "-c", WITHOUT % SHORT, json.dumps([package, commands])]
     done = subprocess.run(started, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1]), done.stderr.splitlines()

@@ -19,6 +19,7 @@ import yaml
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import profiler, writer
 from ray_tracing import write_still_life
+from short_prunes import short_prunes  # noqa: F401
 
 Call = Callable[..., "subprocess.CompletedProcess[str]"]
 CallHere = Callable[..., str]

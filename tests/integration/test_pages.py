@@ -65,9 +65,11 @@ def commands_of(page: Path, *programs: str) -> Iterator[list[str]]:
             yield [word for word in words if word] + MORE.get(words[1], [])
 
 
+@pytest.mark.usefixtures("short_prunes")
 @pytest.mark.parametrize("page", [page for page in PAGES if list(commands_of(page))], ids=lambda page: page.name)
 def test_commands_run_as_they_stand(page: Path, tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sundae_ns.scenes.distill.CAMERAS", 8)
     shutil.copytree(tiny.folder, "RUN")
     shutil.copytree(tiny.scene, "CAPTURE")
 

@@ -36,7 +36,7 @@ def test_it_is_better_than_the_prune_alone(size: float, ball: sn.Scene, views: l
     field = ball.field.replaced({"means": ball.field["means"] * size, "scales": ball.field["scales"] + math.log(size)})
     teacher = sn.Scene(field)
     made = sn.distill(teacher, keep=0.2, steps=150, head=False, size=40)
-    pruned = sn.prune(teacher, keep=0.2)
+    pruned = sn.prune(teacher, keep=0.2, views=sn.virtual_views(teacher, 16, size=64))
     assert made.num_primitives == pruned.num_primitives == 300
     grown = {"means": made.field["means"] / size, "scales": made.field["scales"] - math.log(size)}
     judged = sn.Scene(made.field.replaced(grown))
