@@ -2,7 +2,7 @@
 
 A primitive that is near enough to one camera can explain what differs between its photo and the others, and covers much
 of the images of cameras beside it (such floaters are described by Philip and Deschaintre, "Floaters No More", 2023).
-The sparse points of structure from motion say how near the scene comes to the cameras.
+The sparse points of structure from motion say how near the scene comes to the cameras, and where it comes nearer.
 """
 
 from __future__ import annotations
@@ -14,16 +14,20 @@ NEAREST = 0.01
 """Share of the sparse points that may be nearer to a camera than the scene is taken to be: some of them are wrong."""
 FREE = 2 / 3
 """Share of that distance which is taken to be empty."""
+SUPPORT, REACH = 3, 0.5
+"""A primitive with so many sparse points about it, within this share of the empty distance, is no floater: a few photos
+may be of something near. Wrong points lie alone."""
 MOST = 0.05
 """Largest share of the primitives that can be floaters; with more of them the points do not say where the scene is."""
-_ROWS = 1 << 16
+_ROWS = 1 << 14
 
 
-def _distances_to_nearest(points: Tensor, eyes: Tensor) -> Tensor:
-    """Distance of each point ``[N, 3]`` to the nearest of some others ``[V, 3]``: ``[N]``, world units."""
-    if not len(points):  # a rank without primitives
-        return points.new_zeros(0)
-    return torch.cat([torch.cdist(rows, eyes).amin(dim=1) for rows in points.split(_ROWS)])
+def _distances(points: Tensor, others: Tensor, nth: int = 1) -> Tensor:
+    """Distance of each point ``[N, 3]`` to the nth nearest of some others ``[M, 3]``, infinite without: ``[N]``."""
+    if len(others) < nth or not len(points):
+        return points.new_full((len(points),), torch.inf)
+    found = [torch.cdist(rows, others).topk(nth, largest=False).values[:, -1] for rows in points.split(_ROWS)]
+    return torch.cat(found)
 
 
 @torch.no_grad()
@@ -42,6 +46,9 @@ def near_cameras(means: Tensor, eyes: Tensor, points: Tensor) -> Tensor:
     if not len(finite) or not len(eyes):
         return torch.zeros(len(means), dtype=torch.bool, device=means.device)
     eyes = eyes.to(means)
-    found = _distances_to_nearest(finite, eyes).sort().values
-    free = FREE * found[int(NEAREST * (len(found) - 1))]
-    return _distances_to_nearest(means, eyes) < free
+    distances = _distances(finite, eyes)
+    free = FREE * distances.sort().values[int(NEAREST * (len(finite) - 1))]
+    near = _distances(means, eyes) < free
+    about = finite[distances < (1 + REACH) * free]
+    near[near.clone()] = _distances(means[near], about, SUPPORT) > REACH * free
+    return near

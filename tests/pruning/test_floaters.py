@@ -39,9 +39,18 @@ def test_the_unit_of_length_does_not_matter(scale: float) -> None:
 def test_a_few_wrong_points_do_not_hide_floaters_and_nan_does_not_count() -> None:
     eyes, points = scene()
     means = eyes[:1] - torch.tensor([[1.0, 0, 0]])
-    points[:10] = eyes[0] + 1e-3  # matched wrongly, in front of a lens
+    points[:8] = eyes + 1e-3  # matched wrongly, in front of each lens
     points[10:500] = torch.nan
     assert near_cameras(means, eyes, points).all()
+
+
+def test_what_sparse_points_show_near_a_camera_is_no_floater() -> None:
+    """A few photos of a flower beside the path: so few of the points that they do not say how near the scene comes."""
+    eyes, points = scene()
+    means = eyes[0] - torch.tensor([[0.5, 0, 0], [0.5, 0.05, 0], [0.5, 0.0, 1.2]])
+    for shown, floats in ((2, [True, True, True]), (3, [False, False, True])):
+        points[:shown] = means[0] + 0.1 * torch.randn(shown, 3, generator=torch.Generator().manual_seed(0))
+        assert near_cameras(means, eyes, points).tolist() == floats
 
 
 def test_without_points_or_cameras_nothing_floats() -> None:
