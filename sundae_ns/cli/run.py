@@ -362,7 +362,7 @@ def run(
 
 
 def has_gpu() -> bool:
-    """Whether a GPU trains; imports torch, so ask only when the training is over."""
+    """Whether a GPU trains; imports torch, which takes a second, so ask only where it matters."""
     import torch
 
     return torch.cuda.is_available()
