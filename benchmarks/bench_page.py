@@ -234,12 +234,12 @@ def write_timing(
     for name in ("index.js", "package.json", "LICENSE.md"):
         shutil.copy(WEB / "tests" / package / name, folder / package / name)
     bundled("timing.ts", folder / "timing.mjs", "--platform=node", "--external:webgpu")
-    scenes = []
+    scenes, whole = [], read_scene(scene)
     for width, height in sizes:
         file, step = f"{width}x{height}.sundae", -(-height // ROWS)
-        small = cropped(read_scene(scene), width, height)
+        small = cropped(whole, width, height)
         if as_trained:
-            small = replace(small, meta=read_scene(scene).meta)
+            small = replace(small, meta=whole.meta)
         small = write_changed(folder / file, scene, small)
         images = truths(small, slice(COMPARED))
         for camera, image in enumerate(images):

@@ -227,7 +227,7 @@ def _errors(opened: Opened, measured: Measured, kind: str) -> bytes:
 
 
 def _views(opened: Opened, measured: Measured, most: int) -> list[ShownView]:
-    """Views of a run as the page shows them, at most so many; one view at a time is held at its full size."""
+    """The views of a run that the page shows, ``most`` or fewer; memory holds one at a time at its full size."""
     from sundae_ns.evaluation.shown_views import choose_views, shown_view
     from sundae_ns.scenes.measure import comparison_of
 

@@ -342,8 +342,9 @@ def run(
                     later.result.unlink(missing_ok=True)
             print(f"{heading}:\n{shlex.join(words)}", flush=True)
             code = run_in_group(words, locks=[lock], saves=step.name == TRAIN)
-            if code and code not in STOPPED and step.instead is not None and step.instead() != words:
-                words = step.instead()
+            other = step.instead() if code and code not in STOPPED and step.instead is not None else words
+            if other != words:
+                words = other
                 print(f"{heading}, after the fine-tune ended with {code}:\n{shlex.join(words)}", flush=True)
                 code = run_in_group(words, locks=[lock], saves=False)
             if code in STOPPED:

@@ -38,7 +38,7 @@ class RankPruner(FieldPruner):
             DataError: no primitive is finite.
         """
         mended, before = mend(self.params), self.total
-        dropped = before - sum(count for (count,) in self.shards.numbers(mended.field.num_primitives))
+        dropped = before - self._over_all(mended.field.num_primitives)
         if dropped == before:
             raise diverged(before)
         if mended.clamped:
@@ -48,16 +48,14 @@ class RankPruner(FieldPruner):
                 whole[name][mended.mask] = value
             rewrite(self.params, self.optimizers, whole)
         if dropped:
-            self.shards.level(self.params, self.optimizers, self.states, mended.mask)
+            self._keep(mended.mask)
         return dropped
 
-    def drop(self, mask: Tensor, *, at_most: float) -> int:
-        """As :meth:`FieldPruner.drop`. Collective."""
-        count = sum(found for (found,) in self.shards.numbers(int(mask.sum())))
-        if not 0 < count <= at_most * self.total:
-            return 0
-        self.shards.level(self.params, self.optimizers, self.states, ~mask)
-        return count
+    def _keep(self, mask: Tensor) -> None:
+        self.shards.level(self.params, self.optimizers, self.states, mask)
+
+    def _over_all(self, number: int) -> int:
+        return sum(found for (found,) in self.shards.numbers(number))
 
     @torch.no_grad()
     def cut(self, rule: PruneRule, count: int, contribution: Tensor | None = None) -> Decision:
@@ -86,7 +84,7 @@ class RankPruner(FieldPruner):
         figures, names = outcome
 
         dist.broadcast(mask, 0)
-        shards.level(self.params, self.optimizers, self.states, mask[self._rows()])
+        self._keep(mask[self._rows()])
         rows = self._rows()
         for name in names:
             own = self.params[name]

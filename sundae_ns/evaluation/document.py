@@ -59,6 +59,11 @@ def heads_of(runs: Sequence[Measured]) -> list[str]:
     return [*heads, f"LPIPS ({', '.join(nets)})" if nets else "LPIPS", "JOD"]
 
 
+def devices_of(runs: Sequence[Measured]) -> str:
+    """Names of the devices that rendered the runs."""
+    return ", ".join(sorted({run.gpu or "CPU" for run in runs}))
+
+
 def row_of(run: Measured, configuration: Configuration) -> list[str]:
     """Cells of a configuration below :func:`heads_of`."""
     return [
@@ -87,9 +92,8 @@ def document(
     """
     lines = ["# Quality, speed and size", "", f"    {command}", ""]
     runs = [run for own in scenes.values() for run in own]
-    devices = sorted({run.gpu or "CPU" for run in runs})
     lines += [
-        f"Rendered on {', '.join(devices)}.",
+        f"Rendered on {devices_of(runs)}.",
         "",
         *("\n".join(wrap(f"- {line}", 120, subsequent_indent="  ")) for line in EXPLANATIONS),
         "",

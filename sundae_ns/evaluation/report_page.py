@@ -17,7 +17,7 @@ from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup
 
 from sundae_ns.evaluation.count_curve import CountCurve
-from sundae_ns.evaluation.document import EXPLANATIONS, METRICS, heads_of, number, row_of
+from sundae_ns.evaluation.document import EXPLANATIONS, METRICS, devices_of, heads_of, number, row_of
 from sundae_ns.evaluation.measured import MEGABYTE, Measured, ViewQuality
 from sundae_ns.evaluation.plots import PALETTE, plot_counts
 from sundae_ns.evaluation.shown_views import LARGEST_ERROR, LONGEST_SIDE, ShownView, error_colors
@@ -73,7 +73,7 @@ def report_page(
     return _template().render(
         title=", ".join(scenes),
         command=command,
-        devices=", ".join(sorted({run.measured.gpu or "CPU" for run in runs})),
+        devices=devices_of([run.measured for run in runs]),
         heads=heads_of([run.measured for run in runs]),
         scenes=sections,
         runs=[(numbers[run.measured.label], run.measured.label) for run in runs],

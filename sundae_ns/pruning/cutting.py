@@ -50,7 +50,7 @@ class FieldPruner:
         if not mended.field.num_primitives:
             raise diverged(mended.dropped)
         if mended.dropped:
-            keep(self.params, self.optimizers, self.states, mended.mask)
+            self._keep(mended.mask)
         if mended.clamped:
             rewrite(self.params, self.optimizers, mended.field)
         return mended.dropped
@@ -65,11 +65,19 @@ class FieldPruner:
         Returns:
             Number of removed primitives of the whole field.
         """
-        count = int(mask.sum())
+        count = self._over_all(int(mask.sum()))
         if not 0 < count <= at_most * self.total:
             return 0
-        keep(self.params, self.optimizers, self.states, ~mask)
+        self._keep(~mask)
         return count
+
+    def _keep(self, mask: Tensor) -> None:
+        """Keep the primitives of this process under a mask ``[N]``."""
+        keep(self.params, self.optimizers, self.states, mask)
+
+    def _over_all(self, number: int) -> int:
+        """The sum of a number over all processes."""
+        return number
 
     @torch.no_grad()
     def cut(self, rule: PruneRule, count: int, contribution: Tensor | None = None) -> Decision:
@@ -82,7 +90,7 @@ class FieldPruner:
             The decision over the whole field.
         """
         decision = decide(self.params, rule, count, contribution)
-        keep(self.params, self.optimizers, self.states, decision.mask)
+        self._keep(decision.mask)
         if decision.values is not None:
             rewrite(self.params, self.optimizers, decision.values)
         return decision

@@ -15,8 +15,8 @@ NEAREST = 0.01
 FREE = 2 / 3
 """Share of that distance which is taken to be empty."""
 SUPPORT, REACH = 3, 0.5
-"""A primitive with so many sparse points about it, within this share of the empty distance, is no floater: a few photos
-may be of something near. Wrong points lie alone."""
+"""A primitive is no floater if this many sparse points are within this share of the empty distance from it: a few
+photos may be of something near. Wrong points lie alone."""
 MOST = 0.05
 """Largest share of the primitives that can be floaters; with more of them the points do not say where the scene is."""
 _ROWS = 1 << 14

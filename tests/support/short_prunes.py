@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-SHORT = """
+STEPS, VIEWS, SIDE = 4, 8, 64
+SHORT = f"""
 from sundae_ns.api import refit, virtual
-refit.STEPS["cpu"], virtual.VIEWS["cpu"], virtual.SIDES["cpu"] = 4, 8, 64
+refit.STEPS["cpu"], virtual.VIEWS["cpu"], virtual.SIDES["cpu"] = {STEPS}, {VIEWS}, {SIDE}
 """
-"""The same as lines of a program of its own."""
+"""What the fixture does, as lines of a program of its own."""
 
 
 @pytest.fixture
@@ -16,6 +17,6 @@ def short_prunes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Prunes by few small views and few steps; they train nothing by themselves."""
     from sundae_ns.api import refit, virtual
 
-    monkeypatch.setitem(refit.STEPS, "cpu", 4)
-    monkeypatch.setitem(virtual.VIEWS, "cpu", 8)
-    monkeypatch.setitem(virtual.SIDES, "cpu", 64)
+    monkeypatch.setitem(refit.STEPS, "cpu", STEPS)
+    monkeypatch.setitem(virtual.VIEWS, "cpu", VIEWS)
+    monkeypatch.setitem(virtual.SIDES, "cpu", SIDE)
