@@ -19,10 +19,16 @@ queue() { cd /tmp || exit; setsid nohup python3 $R/lab/curve/slots.py > /tmp/log
 wait_for_all() { touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$1" ]; do sleep 1; done
   tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log; nvidia-smi --query-gpu=name --format=csv,noheader | sort | uniq -c; }
 node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C /tmp/node.part; mv /tmp/node.part /tmp/node; }
+chain() { job $2-$1-chain "python3 $Q /tmp/scenes/$1 -o /tmp/chain/$1 --arms $R/lab/arms.yaml --seeds 42; cp /tmp/chain/$1/done/*.json $O/"; }
+# tuned CAPTURE ORDER AFTER FOLDER WAY ...: ways to fine-tune the run in FOLDER
+tuned() { c=$1 o=$2 a=$3 f=$4; shift 4; AFTER=$a job $o-$c-ways "python3 $R/lab/tune.py \$(dirname \$(find $f/jobs -name config.yml | grep -v warm-up | head -1)) $O/ways-$c.jsonl $*"; }
 case $1 in
-1) setup; take 1; export RESERVED="1 2 3"; stock bonsai 3; auto bonsai 06 43; auto bonsai 06 44; queue ;;
-2) take 2; stock garden 2; full garden 02; full dinosaur 02; auto garden 05 43; auto dinosaur 06 44; node ;;
-3) take 3 4; stock south_building 1; full south_building 02
-  decimated garden 04; decimated dinosaur 04; decimated south_building 04; auto fox 06 43 ;;
-4) wait_for_all "${2:-300}"; for f in /tmp/packs/*-43.sundae /tmp/packs/*-theirs.sog; do cp $f "$OUT/"; done ;;
+1) setup; take 1 2; tenth bonsai 01; auto dinosaur 02 44; auto garden 02 43; full dinosaur 03; full garden 03; queue ;;
+2) take 3; auto fox 01 43; auto stone_horse 01 43; auto fox 04 44; auto stone_horse 04 44; auto garden 04 44
+  tuned fox 05 fox-43 /tmp/oracle/fox-43 now slow fast long cheap fine-dear coarse-cheap positions
+  tuned stone_horse 05 stone_horse-43 /tmp/oracle/stone_horse-43 now slow fast long cheap fine-dear coarse-cheap positions
+  tuned bonsai 05 bonsai-tenth /tmp/tenth/bonsai now slow fast long cheap fine-dear coarse-cheap positions head features ;;
+3) take 4; auto south_building 02 44; full south_building 03; chain stone_horse 06; chain dinosaur 06 ;;
+4) wait_for_all "${2:-300}"; for f in garden dinosaur south_building; do cp $(find /tmp/full/$f/jobs -name "*.sundae" | grep -v tuned | head -1) "$OUT/$f-full.sundae"; done
+  for f in garden south_building; do for p in /tmp/packs/$f-4*.sundae; do cp $p "$OUT/" && break; done; done; find /tmp/full -name "*.sundae" ;;
 esac
