@@ -23,8 +23,8 @@ chain() { job $2-$1-chain "python3 $Q /tmp/scenes/$1 -o /tmp/chain/$1 --arms $R/
 # tuned CAPTURE ORDER AFTER FOLDER WAY ...: ways to fine-tune the run in FOLDER
 tuned() { c=$1 o=$2 a=$3 f=$4; shift 4; AFTER=$a job $o-$c-ways "python3 $R/lab/tune.py \$(dirname \$(find $f/jobs -name config.yml | grep -v warm-up | head -1)) $O/ways-$c.jsonl $*"; }
 case $1 in
-1) setup; take 1 2; tenth bonsai 01; auto dinosaur 02 44; auto garden 02 43; full dinosaur 03; full garden 03; queue ;;
-2) take 3; auto fox 01 43; auto stone_horse 01 43; auto fox 04 44; auto stone_horse 04 44; auto garden 04 44
+1) setup; take 1; tenth bonsai 01; queue ;;
+2) take 2 3; auto dinosaur 02 44; auto garden 02 43; full dinosaur 03; full garden 03; auto fox 01 43; auto stone_horse 01 43; auto fox 04 44; auto stone_horse 04 44; auto garden 04 44
   tuned fox 05 fox-43 /tmp/oracle/fox-43 now slow fast long cheap fine-dear coarse-cheap positions
   tuned stone_horse 05 stone_horse-43 /tmp/oracle/stone_horse-43 now slow fast long cheap fine-dear coarse-cheap positions
   tuned bonsai 05 bonsai-tenth /tmp/tenth/bonsai now slow fast long cheap fine-dear coarse-cheap positions head features ;;
