@@ -74,8 +74,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Growth of the field: by gradients (3DGS), or as a Markov chain with an exact cap (3DGS-MCMC)."""
     stop_split_at: int = 12000
     """Step at which densification ends, that of the prune; longer growth gains nothing that the prune keeps."""
-    mcmc_cap: int = 1_000_000
-    """Highest number of primitives in a warm-up by mcmc."""
+    mcmc_cap: int = 500_000
+    """Highest number of primitives in a warm-up by mcmc: about as many as densification makes of most captures."""
     evaluate_prune: bool = True
     """Evaluate all test views right before and right after the prune, and at the end."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from sundae_ns.distributed.shards import DRIFT, Shards
 from sundae_ns.distributed.source import send_statistics, statistics_of
+from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.parameters import num_primitives
 from sundae_ns.training.densification import CappedStrategy, ChainStrategy, Densification
 from sundae_ns.training.field_state import FieldState
@@ -17,10 +18,20 @@ class ShardedDensification(Densification):
         self.shards = shards
 
     def before_backward(self, state: FieldState) -> None:
-        """Keep the gradients that densification reads, and let its statistics travel back with them."""
+        """Keep the gradients that densification reads, and let its statistics travel back with them.
+
+        Raises:
+            ConfigError: the field, of a resumed run, still grows as a Markov chain.
+        """
         super().before_backward(state)
-        if state.densifying:
-            send_statistics(state.info, absgrad=isinstance(self.strategy, CappedStrategy) and self.strategy.absgrad)
+        if not state.densifying:
+            return
+        if isinstance(self.strategy, ChainStrategy):
+            raise ConfigError(
+                "this run still grows as a Markov chain, which does not work on several GPUs yet; resume it with "
+                f"--machine.num-devices 1 up to step {state.densify_until:,}"
+            )
+        send_statistics(state.info, absgrad=self.strategy.absgrad)
 
     def densify(self, state: FieldState) -> None:
         """Densify every shard, and balance the ranks if the largest shard exceeds the mean by :data:`DRIFT`."""

@@ -19,9 +19,12 @@ from torch.optim import Optimizer
 
 from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.gaussians.surgery import change_parameter, moments_of
+from sundae_ns.gpu.fused_noise import add_noise, noise_kernel
 
 MAX_COPIES = 51
 """Larger numbers of copies are clamped to this: the terms of the alternating sum grow with N."""
+GATE = {"sharpness": 100.0, "threshold": 0.005}
+"""Noise is times ``sigmoid(sharpness * (threshold - opacity))`` (equation 8 of the paper)."""
 
 
 def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
@@ -115,10 +118,17 @@ def jitter(params: Mapping[str, Tensor], strength: float) -> None:
     Args:
         strength: factor of the noise; in the paper 5e5 times the learning rate of the centres.
     """
-    means, scales = params["means"], params["scales"].exp()
-    gate = torch.sigmoid(100 * (0.005 - params["opacities"].sigmoid()))  # 1 below an opacity of 0.005, 0 above
+    means = params["means"]
+    noise = torch.randn_like(means)
+    kernel = noise_kernel(means.device) if means.is_cuda and means.dtype == torch.float32 else None
+    if kernel is not None:
+        shape = (params[name].detach().contiguous() for name in ("scales", "quats", "opacities"))
+        add_noise(kernel, means.data, *shape, noise, strength, **GATE)
+        return
+    scales = params["scales"].exp()
+    gate = torch.sigmoid(GATE["sharpness"] * (GATE["threshold"] - params["opacities"].sigmoid()))
     rotation = rotation_matrices(params["quats"])
-    noise = torch.randn_like(means) * gate * strength
+    noise = noise * gate * strength
     # R S^2 R^T e, without building the covariance.
     local = torch.einsum("nji,nj->ni", rotation, noise) * scales.square()
     means.data.add_(torch.einsum("nij,nj->ni", rotation, local))

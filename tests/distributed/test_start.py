@@ -69,6 +69,11 @@ def test_options_that_several_ranks_cannot_use_are_refused(config: Any, option: 
         distributed.check_options(config)
 
 
+def test_a_resumed_chain_may_have_ended(config: Any) -> None:
+    config.pipeline.model.warmup, config.load_dir = "mcmc", Path("models")
+    distributed.check_options(config)
+
+
 def test_more_ranks_than_gpus_are_refused_before_anything_is_written(
     config: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
