@@ -188,6 +188,7 @@ sundae_paper = method(
     average_share=0.0,
     loss_after_prune="l1",
     prior_after_prune=0.0,
+    dense_start_views=0,
     ssim_lambda=0.25,
 )
 
@@ -206,6 +207,7 @@ sundae_tiny = method(
     reset_alpha_every=100,
     densify_grad_thresh=0.0016,
     cull_alpha_thresh=0.02,
+    dense_start_views=0,
 )
 sundae_tiny.config.vis = "tensorboard"
 sundae_tiny.config.steps_per_save = 400

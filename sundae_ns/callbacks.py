@@ -17,7 +17,7 @@ from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.rendering import FieldSource, RenderSettings, TrainingView
 from sundae_ns.storage.accounting import BYTES_PER_FLOAT, bytes_of_module, megabytes
 from sundae_ns.storage.runs.folder import find_config, take_records
-from sundae_ns.training.extension import Extension, HeldOutView
+from sundae_ns.training.extension import Extension, Photo
 from sundae_ns.training.field_state import FieldState
 
 
@@ -86,13 +86,28 @@ class NerfstudioRun:
         """Hold out these training views from the next step on."""
         self._datamanager.hold_back(indices)
 
-    def heldout_views(self) -> Iterator[HeldOutView]:
+    def heldout_views(self) -> Iterator[Photo]:
         """The held-out training views, loaded one at a time."""
+        return self._photos(self._datamanager.holdout_indices)
+
+    def photos(self) -> Iterator[Photo]:
+        """The training views that are not held out for the whole training."""
+        for index, photo in zip(self.view_indices(), self._photos(self.view_indices()), strict=True):
+            image, mask = self._datamanager.cached_train[index]["image"], photo.mask
+            if image.shape[-1] == 4:
+                opaque = (image[..., 3] > image.new_tensor(127 if image.dtype == torch.uint8 else 0.5)).to(
+                    photo.target.device
+                )
+                mask = opaque if mask is None else mask & opaque
+            yield photo._replace(mask=mask)
+
+    @torch.no_grad()  # a camera optimizer moves views
+    def _photos(self, indices: Iterable[int]) -> Iterator[Photo]:
         model = self.model
-        for camera, batch in self._datamanager.holdout_views():
+        for camera, batch in self._datamanager.views(indices):
             target = model.truth(batch, {"background": self.background}, downscale=1)
             mask = batch["mask"].to(target.device).squeeze(-1) > 0 if "mask" in batch else None
-            yield HeldOutView(model.view_of(camera), target, mask)
+            yield Photo(model.view_of(camera), target, mask)
 
     def evaluate(self) -> dict[str, float]:
         """Mean ``psnr`` and ``ssim`` over all test views."""
@@ -130,6 +145,7 @@ class NerfstudioRun:
         self._take_records()
         for extension in self.model.extensions:
             extension.before_training(self)
+        self._hand_over()
 
     def _take_records(self) -> None:
         """Take over the records of the run that is resumed, which may lie in another folder."""
@@ -147,7 +163,10 @@ class NerfstudioRun:
         """Let extensions act after a step, in their order."""
         for extension in extensions:
             extension.after_step(self)
-        # Surgery makes new parameters; nerfstudio keeps a list of its own.
+        self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Give nerfstudio's own list the parameters of the field: surgery makes new ones."""
         assert self._optimizers is not None
         for name, value in self.state.field.items():
             self._optimizers.parameters[name] = [value]

@@ -277,10 +277,9 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             mask = self.cached_train[index].get("mask") if masked else None
             yield self.train_dataset.cameras[index : index + 1], mask
 
-    def holdout_views(self) -> Iterator[tuple[Cameras, dict[str, torch.Tensor]]]:
-        """Held-out views as camera and batch, as nerfstudio's evaluation takes them; loaded one at a time."""
-        for index in self.holdout_indices:
-            yield self._view(index)
+    def views(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, torch.Tensor]]]:
+        """Training views as camera and batch, as nerfstudio's evaluation takes them; loaded one at a time."""
+        return map(self._view, indices)
 
     def _view(self, index: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         batch = dict(self.cached_train[index])

@@ -86,7 +86,7 @@ def test_held_out_views_are_never_trained_on(capture: Path) -> None:
     assert made.train_indices == [0, 1, 3, 4, 6]
     assert {made.view_of_step(step) for step in range(50)} == {0, 1, 3, 4, 6}
     assert len(list(made.training_views())) == 5
-    held_back = list(made.holdout_views())
+    held_back = list(made.views(made.holdout_indices))
     assert [batch["image_idx"] for _, batch in held_back] == [2, 5]
     camera, batch = held_back[0]
     assert torch.equal(camera.camera_to_worlds[0], made.train_dataset.cameras.camera_to_worlds[2])
@@ -99,7 +99,7 @@ def test_a_held_back_view_goes_to_the_device_when_its_turn_comes(
     made = manager(capture, holdout_every=3)
     moved: list[int] = []
     monkeypatch.setattr(made, "_view", moved.append)
-    views = made.holdout_views()
+    views = made.views(made.holdout_indices)
     assert moved == []
     next(views)
     assert moved == [2]
@@ -108,7 +108,7 @@ def test_a_held_back_view_goes_to_the_device_when_its_turn_comes(
 def test_nothing_is_held_back_unless_asked_for(capture: Path) -> None:
     made = manager(capture)
     assert made.holdout_indices == []
-    assert list(made.holdout_views()) == []
+    assert list(made.views(made.holdout_indices)) == []
     cameras, masks = zip(*made.training_views(), strict=True)
     assert masks == (None,) * VIEWS
     assert all(camera.shape == (1,) for camera in cameras)

@@ -14,8 +14,8 @@ from sundae_ns.rendering.views import View
 from sundae_ns.training.field_state import FieldState
 
 
-class HeldOutView(NamedTuple):
-    """A training view that is held back from training."""
+class Photo(NamedTuple):
+    """A training view with its image."""
 
     view: View
     target: Tensor
@@ -67,8 +67,11 @@ class TrainingRun(Protocol):
     def hold_out(self, indices: Iterable[int]) -> None:
         """Hold out these training views too, from the next step on, until the next call."""
 
-    def heldout_views(self) -> Iterator[HeldOutView]:
+    def heldout_views(self) -> Iterator[Photo]:
         """The held-out training views, loaded one at a time."""
+
+    def photos(self) -> Iterator[Photo]:
+        """The training views that are not held out for the whole training, in full size; transparent pixels masked."""
 
     def evaluate(self) -> dict[str, float]:
         """Mean ``psnr`` (dB) and ``ssim`` over all test views; empty without any. With several ranks, collective."""

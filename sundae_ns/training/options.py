@@ -16,6 +16,7 @@ class ModelOptions(Protocol):
     head: HeadConfig
     warmup: Literal["densify", "mcmc"]
     mcmc_cap: int
+    dense_start_views: int
     warm_start: Path | None
     warm_start_frame: Literal["auto", "model", "capture"]
     evaluate_prune: bool

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -44,7 +44,14 @@ def _build(
             **{"mode": "residual", "size": "tiny", "num_features": 5, "pixel_unshuffle": 1, **(head or {})}
         ),
         camera_optimizer=CameraOptimizerConfig(mode="off"),
-        **{"sh_degree": 1, "sh_degree_interval": 1, "num_downscales": 0, "background_color": "random", **options},
+        **{
+            "sh_degree": 1,
+            "sh_degree_interval": 1,
+            "num_downscales": 0,
+            "background_color": "random",
+            "dense_start_views": 0,
+            **options,
+        },
     )
     box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
     seeds = _points(n) if isinstance(seed_points, str) else seed_points
@@ -72,9 +79,17 @@ class FakeDatamanager:
     eval_dataset = None
     place = (0, 1)
     holdout_indices: tuple[int, ...] = ()
+    train_indices = (0, 1, 2)
 
     mask: Tensor | None = None
     """Of each view."""
+
+    @property
+    def cached_train(self) -> list[dict[str, Tensor]]:
+        return [_batch() for _ in self.train_indices]
+
+    def views(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, Tensor]]]:
+        yield from ((_camera(shift=(-0.5, 0.0, 0.5)[index]), _batch()) for index in indices)
 
     def training_views(self) -> Iterator[tuple[Cameras, Tensor | None]]:
         yield from ((_camera(shift=shift), self.mask) for shift in (-0.5, 0.0, 0.5))

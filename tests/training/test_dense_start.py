@@ -1,0 +1,168 @@
+"""The dense start: who gets it, what it puts into the field, and that it happens once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import ConfigError
+from sundae_ns.gaussians.parameters import sh_to_rgb
+from sundae_ns.model import SundaeModel
+from sundae_ns.training import dense_start
+from sundae_ns.training.dense_start import DenseStart
+
+Build = Callable[..., SundaeModel]
+TrainingOf = Callable[..., Any]
+FOUND = 40
+
+
+class FakeSweep:
+    """Finds points at a known place, of a known colour."""
+
+    longest = 0
+    seen: Tensor
+    most = FOUND
+
+    def __init__(self, photos: list[Any], sparse: Tensor, longest: int) -> None:
+        self.photos, self.swept = photos, set[int]()
+        FakeSweep.longest, FakeSweep.seen = longest, sparse
+
+    def add(self, index: int) -> None:
+        self.swept.add(index)
+
+    def points(self) -> tuple[Tensor, Tensor]:
+        assert self.swept == {0, 1, 2}
+        place = torch.arange(3.0 * self.most).reshape(-1, 3) / self.most + 5
+        return place, torch.tensor([[0.2, 0.4, 0.6]]).repeat(self.most, 1)
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dense_start, "Sweep", FakeSweep)
+    monkeypatch.setattr(FakeSweep, "most", FOUND)
+
+
+def few(build: Build, **options: Any) -> SundaeModel:
+    return build(**{"dense_start_views": 24, **options})
+
+
+def test_the_field_starts_from_both_clouds(
+    build: Build, training_of: TrainingOf, points: Callable[..., Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = few(build, sh_degree=1)
+    alone = model.scales.detach().clone()
+    training = training_of(model)
+    assert model.num_points == 60 + FOUND
+    assert torch.equal(model.means[:60].detach(), points()[0])
+    assert torch.equal(FakeSweep.seen, points()[0])
+    assert FakeSweep.longest == dense_start.LIMITS["cpu"][0]
+    assert float((model.means[60:].detach() - 5).min()) >= 0
+    colours = sh_to_rgb(model.gauss_params["features_dc"][60:].detach())
+    assert torch.allclose(colours, torch.tensor([0.2, 0.4, 0.6]).expand(FOUND, 3), atol=1e-5)
+    # Widths follow the neighbours in both clouds: those of the dense one are a twentieth of the distances of the other.
+    assert float(model.scales[60:].detach().max()) < float(alone.median())
+    assert "40 points by a plane sweep beside 60 sparse ones" in " ".join(capsys.readouterr().out.split())
+    assert training.live()
+    training.step(0)
+    assert training.live()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"dense_start_views": 3},  # the model has 4 training images
+        {"dense_start_views": 0},
+        {"random_init": True, "num_random": 60},
+        {"seed_points": None, "num_random": 60},
+    ],
+)
+def test_other_fields_stay_as_they_are(build: Build, training_of: TrainingOf, options: dict[str, Any]) -> None:
+    model = few(build, **options)
+    before = {name: value.detach().clone() for name, value in model.gauss_params.items()}
+    training_of(model)
+    assert all(torch.equal(before[name], value) for name, value in model.gauss_params.items())
+
+
+def test_four_images_are_few_up_to_a_limit_of_four(build: Build, training_of: TrainingOf) -> None:
+    model = few(build, dense_start_views=4)
+    training_of(model)
+    assert model.num_points == 60 + FOUND
+
+
+def test_a_resumed_run_goes_on_with_its_own_field(build: Build, training_of: TrainingOf) -> None:
+    training = training_of(few(build))
+    training.step(0)
+    saved = {
+        name: value.clone() if isinstance(value, Tensor) else value
+        for name, value in training.model.state_dict().items()
+    }
+    model = few(build)
+    model.load_state_dict(saved)
+    training_of(model)
+    assert model.num_points == 60 + FOUND
+    assert torch.equal(model.means.detach(), saved["gauss_params.means"])
+
+
+def test_more_points_than_wanted_are_thinned_evenly(
+    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FakeSweep, "most", 900)
+    monkeypatch.setitem(dense_start.LIMITS, "cpu", (160, 90))
+    model = few(build)
+    training_of(model)
+    added = model.means[60:, 0].detach()
+    assert len(added) == 90
+    # Each tenth of the row has a tenth of them.
+    assert torch.histc(added, bins=9, min=5, max=8).tolist() == pytest.approx([10] * 9, abs=1)
+
+
+def test_the_cap_holds(build: Build, training_of: TrainingOf) -> None:
+    model = few(build, warmup="mcmc", mcmc_cap=70)
+    training_of(model)
+    assert model.num_points == 70
+
+
+def test_ranks_start_from_the_sparse_points(build: Build, capsys: pytest.CaptureFixture[str]) -> None:
+    model = few(build)
+    (dense,) = (one for one in model.extensions if isinstance(one, DenseStart))
+    dense.before_training(SimpleNamespace(source=SimpleNamespace(collective=True)))  # type: ignore[arg-type]
+    assert model.num_points == 60
+    assert "several GPUs start from the sparse points alone" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_negative_number_of_views_is_an_error(build: Build) -> None:
+    with pytest.raises(ConfigError, match="dense-start-views is -1; give a number of images, 0 for no sweep"):
+        build(dense_start_views=-1)
+
+
+def test_photos_are_the_training_images_with_their_views(build: Build, training_of: TrainingOf) -> None:
+    training = training_of(build())
+    run = training.callbacks[0].func.__self__
+    photos = list(run.photos())
+    assert [float(photo.view.center[0]) for photo in photos] == pytest.approx([-0.5, 0.0, 0.5])
+    assert [photo.mask for photo in photos] == [None] * 3
+    (_, batch), *_ = run._datamanager.views([0])
+    assert torch.allclose(photos[0].target, batch["image"].float() / 255)
+
+
+def test_transparent_and_masked_pixels_are_masked(
+    build: Build, training_of: TrainingOf, batch: Callable[..., dict[str, Tensor]], camera: Callable[..., Any]
+) -> None:
+    training = training_of(build())
+    run = training.callbacks[0].func.__self__
+    image = {**batch(channels=4), "mask": torch.ones(32, 40, 1, dtype=torch.bool)}
+    image["mask"][:4] = False
+    image["image"][..., 3] = 255
+    image["image"][:, :7, 3] = 100
+    run._pipeline.datamanager = SimpleNamespace(
+        train_indices=[0], cached_train=[image], views=lambda indices: [(camera(), image) for _ in indices]
+    )
+    (photo,) = run.photos()
+    expected = torch.ones(32, 40, dtype=torch.bool)
+    expected[:4] = expected[:, :7] = False
+    assert torch.equal(photo.mask, expected)
