@@ -19,16 +19,14 @@ queue() { cd /tmp || exit; setsid nohup python3 $R/lab/curve/slots.py > /tmp/log
 wait_for_all() { touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$1" ]; do sleep 1; done
   tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log; nvidia-smi --query-gpu=name --format=csv,noheader | sort | uniq -c; }
 node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C /tmp/node.part; mv /tmp/node.part /tmp/node; }
-chain() { job $2-$1-chain "python3 $Q /tmp/scenes/$1 -o /tmp/chain/$1 --arms $R/lab/arms.yaml --seeds 42; cp /tmp/chain/$1/done/*.json $O/"; }
-# tuned CAPTURE ORDER AFTER FOLDER WAY ...: ways to fine-tune the run in FOLDER
-tuned() { c=$1 o=$2 a=$3 f=$4; shift 4; AFTER=$a job $o-$c-ways "python3 $R/lab/tune.py \$(dirname \$(find $f/jobs -name config.yml | grep -v warm-up | head -1)) $O/ways-$c.jsonl $*"; }
+# few CAPTURE ARM OPTION ...: 16 views, made by lab/few_views.py
+few() { c=$1 a=$2; shift 2; job 03-few-$c-$a "ns-train sundae --data /tmp/scenes/$c-16 --output-dir /tmp/few/$a --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode filename && ns-eval --load-config /tmp/few/$a/$c/sundae/run/config.yml --output-path $O/few-$c-$a.json"; }
+FEW="garden bonsai stone_horse south_building"
 case $1 in
-1) setup; take 1; tenth bonsai 01; queue ;;
-2) take 2 3; auto dinosaur 02 44; auto garden 02 43; full dinosaur 03; full garden 03; auto fox 01 43; auto stone_horse 01 43; auto fox 04 44; auto stone_horse 04 44; auto garden 04 44
-  tuned fox 05 fox-43 /tmp/oracle/fox-43 now slow fast long cheap fine-dear coarse-cheap positions
-  tuned stone_horse 05 stone_horse-43 /tmp/oracle/stone_horse-43 now slow fast long cheap fine-dear coarse-cheap positions
-  tuned bonsai 05 bonsai-tenth /tmp/tenth/bonsai now slow fast long cheap fine-dear coarse-cheap positions head features ;;
-3) take 4; auto south_building 02 44; full south_building 03; chain stone_horse 06; chain dinosaur 06 ;;
-4) wait_for_all "${2:-300}"; for f in garden dinosaur south_building; do cp $(find /tmp/full/$f/jobs -name "*.sundae" | grep -v tuned | head -1) "$OUT/$f-full.sundae"; done
-  for f in garden south_building; do for p in /tmp/packs/$f-4*.sundae; do cp $p "$OUT/" && break; done; done; find /tmp/full -name "*.sundae" ;;
+1) setup; take 1; export RESERVED=3; GPU=3 job 00-alone-time "cd /tmp; python3 $R/benchmarks/bench_training.py /tmp/scenes/bonsai --arms sundae sundae-densify -o $O/time.jsonl"; auto bonsai 01 42; queue ;;
+2) take 2 3; auto garden 01 42; auto dinosaur 01 42; auto fox 01 42; auto stone_horse 01 42 ;;
+3) take 4; auto south_building 01 42; full bonsai 04 ;;
+4) take 5; for c in $FEW; do few $c chain; few $c grow --pipeline.model.warmup densify; few $c sparse --pipeline.model.warmup densify --pipeline.model.dense-start-views 0; done
+  job 05-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests/gpu tests/gaussians tests/training tests/rasterization)" ;;
+5) wait_for_all "${2:-300}"; cp $(find /tmp/full/bonsai/jobs -name scene.sundae | head -1) "$OUT/bonsai-full.sundae"; cp /tmp/packs/{bonsai,garden,south_building}-42.sundae "$OUT/"; tail -n 4 /tmp/logs/05*.log ;;
 esac
