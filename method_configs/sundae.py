@@ -114,20 +114,15 @@ def method(
     return MethodSpecification(config=config, description=description)
 
 
-CHAIN: dict[str, Any] = {"warmup": "mcmc"}
-"""Fields that grow as a Markov chain have fewer primitives that no image needs, and a known number of them."""
-
-
 def _keep(percent: int) -> MethodSpecification:
     description = f"SUNDAE that keeps {percent}% of the primitives, with a head where it pays."
-    return method(f"sundae-{percent}", description, pruning=PruningConfig(keep_ratio=percent / 100), **CHAIN)
+    return method(f"sundae-{percent}", description, pruning=PruningConfig(keep_ratio=percent / 100))
 
 
 sundae = method(
     "sundae",
     "SUNDAE: spectrally pruned Gaussian field with neural compensation, as small as held-out training views allow.",
     pruning=PruningConfig(keep_ratio=None),
-    **CHAIN,
 )
 # The paper's shares; --pipeline.model.pruning.keep-ratio takes any other.
 sundae_1 = _keep(1)
@@ -147,7 +142,6 @@ sundae_auto = method(
     "sundae-auto",
     "Another name of sundae.",
     pruning=PruningConfig(keep_ratio=None),
-    **CHAIN,
 )
 
 sundae_fast = method(
@@ -162,7 +156,6 @@ sundae_fast = method(
     stop_screen_size_at=2400,
     resolution_schedule=1800,
     sh_degree_interval=600,
-    **CHAIN,
 )
 
 sundae_paper = method(

@@ -153,7 +153,7 @@ def tune(opened: Opened, path: Path) -> dict[str, Any] | None:
     Returns:
         None for a run that cannot be fine-tuned, such as one that still densifies.
     """
-    config = PackConfig(**FINETUNED)
+    config = PackConfig(**FINETUNED)  # type: ignore[arg-type]
     try:
         scene, codecs = finetune(opened.source, contents_of_run(opened.source), config, FINETUNE_STEPS)
         _forget()

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 class Precision:
     """Options of ``PackConfig`` whose defaults a fine-tune changes."""
 
+    position_bits: int | None = None
+    """bits per coordinate within a block, 4 to 16; by default 13, 12 with a fine-tune."""
     scale_step: float | None = None
     """rounding step of log-scales; by default 0.05, 0.1 with a fine-tune."""
     rotation_step: float | None = None
@@ -56,7 +58,6 @@ def pack(
     data: Path | None = None,
     json: bool = False,
     overwrite: Overwrite = False,
-    position_bits: int = 13,
     block: int = 1024,
     precision: Annotated[Precision, tyro.conf.arg(name="")] = Precision(),  # noqa: B008
     cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
@@ -78,7 +79,6 @@ def pack(
         data: folder of the capture, if it moved.
         json: print one JSON object in place of the table.
         overwrite: replace an existing file, once the new one is complete.
-        position_bits: bits of each coordinate within a block, 4 to 16.
         block: number of primitives per block of positions; smaller blocks are more exact and larger on disk.
     """
     from rich.console import Console
@@ -106,9 +106,9 @@ def pack(
             f"--finetune and --target-drop look at photos of the whole scene; leave out {cleaning.chosen[0]}, or cut "
             "the scene by `sundae export` or `sundae prune` afterwards"
         )
-    chosen = {name: value for name, value in asdict(precision).items() if value is not None}
-    plain = PackConfig(position_bits=position_bits, block=block, **chosen)
-    config = replace(plain, **{**FINETUNED, **chosen}) if finetune else plain
+    chosen = {name: value for name, value in {**asdict(precision), "block": block}.items() if value is not None}
+    plain = PackConfig(**chosen)  # type: ignore[arg-type]
+    config = PackConfig(**{**FINETUNED, **chosen}) if finetune else plain  # type: ignore[arg-type]
     config.validate()
     check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
     has_photos = _has_photos(run, {"--finetune": finetune, "--target-drop": target_drop, "--data": data})

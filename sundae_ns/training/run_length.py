@@ -71,10 +71,6 @@ def set_schedule(config: Any, words: Iterable[str]) -> None:
         raise ConfigError(
             f"the length of the run is {config.schedule_length}; give --max-num-iterations 30000, or fewer"
         )
-    model = config.pipeline.model
-    if config.machine.num_devices > 1 and model.warmup == "mcmc" and "pipeline.model.warmup" not in given:
-        model.warmup = "densify"
-        warn("on several GPUs the field grows by densification, not as a Markov chain")
     if usual is not None:
         fit_to_length(config, usual, given)
 

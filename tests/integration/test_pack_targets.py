@@ -136,7 +136,7 @@ class Tuned(NamedTuple):
 @pytest.fixture(scope="module")
 def tuned(tiny: Any) -> Tuned:
     """A scene whose rows have moved since its codecs were fitted, as training moves them."""
-    config = PackConfig(**FINETUNED)
+    config = PackConfig(**FINETUNED)  # type: ignore[arg-type]
     scene, codecs = fit_scene(contents_of_run(tiny.folder, max_cameras=0), config)
     generator = torch.Generator().manual_seed(0)
     for name in codecs.field:

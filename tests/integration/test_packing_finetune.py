@@ -130,7 +130,7 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     meta = read_header(file).meta
     assert meta["source"]["finetuned"] == 3
     stored = meta["attributes"]
-    config = PackConfig(**{**FINETUNED, "feature_step": 0.01})
+    config = PackConfig(**{**FINETUNED, "feature_step": 0.01})  # type: ignore[arg-type]
     _, codecs = fit_scene(contents_of_run(run, data=tiny.scene), config)
     for name in codecs.field:
         assert stored[name]["step"] == codecs.field[name].step, name  # type: ignore[attr-defined]

@@ -15,7 +15,6 @@ from sundae_ns.training.run_length import (
     fit_to_length,
     given_options,
     schedule_table,
-    set_schedule,
     step_options,
     take_options,
 )
@@ -73,7 +72,7 @@ def test_every_option_follows_and_once_is_enough(method: str, share: float) -> N
 
 def test_a_twentieth_of_the_steps() -> None:
     """The run of a user that stayed at a quarter of the resolution to its end."""
-    config = fitted("sundae", 1500, warmup="densify")
+    config = fitted("sundae", 1500)
     model = config.pipeline.model
     assert (model.resolution_schedule * model.num_downscales, model.pruning.prune_at) == (300, 600)
     assert (model.stop_split_at, model.sh_degree_interval) == (600, 50)
@@ -92,10 +91,9 @@ def test_a_twentieth_of_the_steps() -> None:
 
 
 def test_resets_keep_their_share_of_a_run_that_has_time_for_them() -> None:
-    config = fitted("sundae", 15000, warmup="densify")
-    model = config.pipeline.model
+    model = fitted("sundae", 15000).pipeline.model
     assert model.reset_alpha_every * model.refine_every == 1500 >= LEAST_RECOVERY
-    resets = dict(schedule_table(config))["densification"]
+    resets = dict(schedule_table(fitted("sundae", 15000)))["densification"]
     assert resets == "250 to 6,000, every 50; opacities reset every 1,500"
 
 
@@ -110,23 +108,11 @@ def test_options_set_by_hand_keep_their_value() -> None:
 
 
 def test_a_chain_keeps_its_number_of_rounds() -> None:
-    config = fitted("sundae", 3000)
-    assert (config.pipeline.model.refine_every, config.pipeline.model.stop_split_at) == (10, 1200)
-    assert dict(schedule_table(config))["densification"] == "50 to 1,200, every 10 (MCMC)"
-
-
-def test_on_several_gpus_a_field_grows_by_densification_unless_told_otherwise(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    config = deepcopy(all_methods["sundae"])
-    config.machine.num_devices, config.max_num_iterations = 2, 3000
-    told = deepcopy(config)
-    set_schedule(config, ["ns-train", "sundae"])
-    assert config.pipeline.model.warmup == "densify"
-    assert config.pipeline.model.refine_every == LEAST_IMAGES, "the schedule is that of densification"
-    assert "on several GPUs the field grows by densification" in capsys.readouterr().out
-    set_schedule(told, ["ns-train", "sundae", "--pipeline.model.warmup", "mcmc"])
-    assert told.pipeline.model.warmup == "mcmc", "which is refused afterwards"
+    model = fitted("sundae", 3000, warmup="mcmc").pipeline.model
+    assert (model.refine_every, model.stop_split_at) == (10, 1200)
+    assert (
+        dict(schedule_table(fitted("sundae", 3000, warmup="mcmc")))["densification"] == "50 to 1,200, every 10 (MCMC)"
+    )
 
 
 @pytest.mark.parametrize("length", [300, 1500, 7000, 50000])

@@ -45,7 +45,8 @@ class PackConfig:
 
 STEPS = ("scale_step", "rotation_step", "color_step", "opacity_step", "harmonics_step", "feature_step", "head_step")
 
-FINETUNED = {
+FINETUNED: dict[str, int | float] = {
+    "position_bits": 12,
     "scale_step": 0.1,
     "rotation_step": 0.018,
     "color_step": 0.07,
