@@ -51,6 +51,7 @@ class StepLosses:
         base: Tensor,
         target: Tensor,
         mask: Tensor | None,
+        count: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """The terms by name, each ``[]``.
 
@@ -61,6 +62,7 @@ class StepLosses:
             base: its base colours ``[H, W, 3]``.
             target: the truth ``[H, W, 3]``.
             mask: pixels that count ``[H, W, 1]``; None for all.
+            count: number of primitives ``[]``, where further rows are transparent and without width; None for N.
         """
         if mask is not None:
             target, rgb, base = target * mask, rgb * mask, base * mask
@@ -78,8 +80,9 @@ class StepLosses:
         if weight > 0:
             # Unused primitives become transparent and small (equation 10 of 3DGS-MCMC). A chain moves such primitives;
             # in a pruned field they would fit what differs between the training images.
-            losses["opacity_loss"] = weight * params["opacities"].sigmoid().mean()
-            losses["scale_loss"] = weight * params["scales"].exp().mean()
+            for name, values in (("opacity", params["opacities"].sigmoid()), ("scale", params["scales"].exp())):
+                mean = values.mean() if count is None else values.sum() / (values.shape[1] * count)
+                losses[f"{name}_loss"] = weight * mean
         return losses
 
     def emphasis(self, state: FieldState) -> float:

@@ -99,19 +99,21 @@ class RecordedStep:
             BackendError: the step cannot be recorded. Nothing has changed.
             torch.cuda.OutOfMemoryError: the same.
         """
-        # A prior is a mean over all rows, so it allows no spare ones.
-        growing = state.densifying and self._losses.prior_weight(state) == 0
+        growing = state.densifying
         held = self._held
         if held is None or not held.unchanged(state, settings, growing=growing):
             held = self._held = self._hold(state, settings, growing=growing)
         self._recordings.keep_for(self._losses.emphasis(state))
         # Pinned: copying from other memory would wait until the GPU has finished the last step.
-        rates = torch.tensor(
-            [float(group["lr"]) for _, _, group in held.groups], pin_memory=state.device.type == "cuda"
-        )
+        numbers = torch.tensor(
+            [*(float(group["lr"]) for _, _, group in held.groups), float(state.field.num_primitives)],
+            pin_memory=state.device.type == "cuda",
+        ).to(state.device, non_blocking=True)
+        # The prior of a field that grows is a mean over fewer rows than the buffers have.
+        count = numbers[-1] if growing and self._losses.prior_weight(state) > 0 else None
         result = self._recordings.run(
             partial(self._step, state, held),
-            replace(inputs, rates=rates.to(state.device, non_blocking=True)),
+            replace(inputs, rates=numbers[:-1], count=count),
             settings,
             kind=_kind(state, inputs, settings),
             addresses=held.addresses,

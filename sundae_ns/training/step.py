@@ -38,18 +38,21 @@ class StepInputs:
     """The part of the training image that is shown; None for the whole image."""
     rates: Tensor | None = None
     """Learning rates of the groups of parameters ``[G]``; None where the optimizer holds them."""
+    count: Tensor | None = None
+    """Number of primitives ``[]``, where parameters have rows for more and a loss is a mean over them."""
 
     def _tensors(self) -> list[Tensor]:
-        tensors = (self.view.viewmat, self.view.K, self.target, self.background, self.mask, self.rates)
+        always = (self.view.viewmat, self.view.K, self.target, self.background)
+        tensors = (*always, self.mask, self.rates, self.count)
         return [value.detach() for value in tensors if value is not None]
 
     def clone(self) -> StepInputs:
         """A copy, so that a recording reads it where it stays."""
         copies = [value.clone(memory_format=torch.contiguous_format) for value in self._tensors()]
         viewmat, K, target, background, *rest = copies
-        mask, rates = (None if one is None else rest.pop(0) for one in (self.mask, self.rates))
+        mask, rates, count = (None if one is None else rest.pop(0) for one in (self.mask, self.rates, self.count))
         view = self.view._replace(viewmat=viewmat, K=K)
-        return StepInputs(view, target, mask, background, self.window, rates)
+        return StepInputs(view, target, mask, background, self.window, rates, count)
 
     def copy_to(self, other: StepInputs) -> None:
         """Write these into the inputs of a recording."""
@@ -107,9 +110,11 @@ class TrainingStep(NamedTuple):
         """The first half: primitives, one splatting pass, and the head; see :func:`sundae_ns.rendering.render_view`."""
         return render_view(self.source, view, background, settings, depth=depth, at=at)
 
-    def terms(self, images: Mapping[str, Tensor], target: Tensor, mask: Tensor | None) -> dict[str, Tensor]:
+    def terms(
+        self, images: Mapping[str, Tensor], target: Tensor, mask: Tensor | None, count: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """The second half: the terms of the loss by name, each ``[]``; see :class:`StepInputs` for the arguments."""
-        return self.losses(self.state, self.params, images["rgb"], images["base_rgb"], target, mask)
+        return self.losses(self.state, self.params, images["rgb"], images["base_rgb"], target, mask, count)
 
     def __call__(self, inputs: StepInputs, settings: RenderSettings) -> tuple[Tensor, Rasterization, StepResult]:
         """Both halves.
@@ -119,7 +124,7 @@ class TrainingStep(NamedTuple):
         """
         with torch.enable_grad():
             images, splatted = self.images(inputs.view, inputs.background, settings)
-            terms = self.terms(images, inputs.target, inputs.mask)
+            terms = self.terms(images, inputs.target, inputs.mask, inputs.count)
             loss = functools.reduce(torch.add, terms.values())
         shown = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
         return loss, splatted, StepResult(shown, {name: value.detach() for name, value in terms.items()}, loss.detach())
