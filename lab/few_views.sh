@@ -15,10 +15,10 @@ arm() { # CAPTURE NAME OPTIONS
 gpu=0
 for path in "$captures"/*/; do
   s=$(basename "$path")
-  arm "$s" none --pipeline.model.dense-start-views 0 --pipeline.model.dropout-views 0 &
-  arm "$s" dense --pipeline.model.dropout-views 0 &
-  arm "$s" dropout --pipeline.model.dense-start-views 0 &
-  arm "$s" both &
+  arm "$s" none --pipeline.model.dense-start-views 0 &
+  arm "$s" dense &
+  arm "$s" dropout --pipeline.model.dense-start-views 0 --pipeline.model.dropout-views 24 &
+  arm "$s" both --pipeline.model.dropout-views 24 &
   gpu=$(((gpu + 1) % ${GPUS:-4}))
 done
 wait

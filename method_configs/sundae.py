@@ -182,7 +182,6 @@ sundae_paper = method(
     loss_after_prune="l1",
     prior_after_prune=0.0,
     dense_start_views=0,
-    dropout_views=0,
     ssim_lambda=0.25,
 )
 
@@ -202,7 +201,6 @@ sundae_tiny = method(
     densify_grad_thresh=0.0016,
     cull_alpha_thresh=0.02,
     dense_start_views=0,
-    dropout_views=0,
 )
 sundae_tiny.config.vis = "tensorboard"
 sundae_tiny.config.steps_per_save = 400

@@ -68,8 +68,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
     dense_start_views: int = 24
     """Up to so many training images the field starts from points by a plane sweep through them too; 0 for never."""
-    dropout_views: int = 24
-    """Up to so many training images, steps leave out primitives at random, in the end a fifth of them; 0 for never."""
+    dropout_views: int = 0
+    """Up to so many training images, steps leave out primitives at random, in the end a fifth; loses after a prune."""
     warm_start: Path | None = None
     """Start from a finished field without a warm-up: a splatfacto or sundae .ckpt (or its folder), or a 3DGS .ply."""
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"
