@@ -1,0 +1,45 @@
+"""A run of few views starts from more points than its sparse cloud, and resumes without looking for them again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+
+from sundae_ns.training import dense_start
+
+
+def test_a_whole_run_and_its_resume(
+    trainer_of: Callable[[Callable[[TrainerConfig], Any]], Trainer],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tiny: Any,
+) -> None:
+    monkeypatch.setitem(dense_start.LIMITS, "cpu", (48, 500))
+
+    def change(config: Any) -> None:
+        config.pipeline.model.dense_start_views = config.pipeline.model.dropout_views = 12
+        config.steps_per_save, config.save_only_latest_checkpoint, config.max_num_iterations = 5, False, 10
+
+    whole: Any = trainer_of(change)
+    whole.train()
+    assert whole.model.num_points == tiny.points + 500
+    assert "500 points by a plane sweep beside 300 sparse ones" in " ".join(capsys.readouterr().out.split())
+
+    def resume(config: Any) -> None:
+        change(config)
+        config.timestamp, config.load_dir, config.load_step, config.max_num_iterations = (
+            "resumed",
+            whole.checkpoint_dir,
+            5,
+            4,
+        )
+
+    monkeypatch.setattr(dense_start, "Sweep", None)
+    resumed: Any = trainer_of(resume)
+    resumed.train()
+    for name, value in whole.model.gauss_params.items():
+        assert torch.equal(resumed.model.gauss_params[name], value), name
