@@ -68,8 +68,6 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
     dense_start_views: int = 24
     """Up to so many training images the field starts from points by a plane sweep through them too; 0 for never."""
-    dropout_views: int = 0
-    """Up to so many training images, steps leave out primitives at random, in the end a fifth; loses after a prune."""
     warm_start: Path | None = None
     """Start from a finished field without a warm-up: a splatfacto or sundae .ckpt (or its folder), or a 3DGS .ply."""
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"
@@ -346,7 +344,8 @@ class SundaeModel(SplatfactoModel):
         """The true image as floats on the model's device; by default at the resolution of this step."""
         image = image.float() / 255 if image.dtype == torch.uint8 else image
         factor = self._get_downscale_factor() if downscale is None else downscale
-        return cast(Tensor, image if factor == 1 else resize_image(image, factor)).to(self.device)
+        smaller: Tensor = image if factor == 1 else resize_image(image, factor)
+        return smaller.to(self.device)
 
     def truth(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
         """The true image of outputs, over their background ``[H, W, 3]``; by default at the resolution of this step."""
@@ -397,4 +396,5 @@ class SundaeModel(SplatfactoModel):
         for suffix, image in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
             found = {"psnr": psnr(image, target), "ssim": ssim(image, target), "lpips": self.lpips(image, target)}
             metrics |= {name + suffix: float(value) for name, value in found.items() if value is not None}
-        return metrics, {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}
+        images = {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}
+        return metrics, images

@@ -23,8 +23,8 @@ from sundae_ns.gpu.fused_noise import add_noise, noise_kernel
 
 MAX_COPIES = 51
 """Larger numbers of copies are clamped to this: the terms of the alternating sum grow with N."""
-GATE = {"sharpness": 100.0, "threshold": 0.005}
-"""Noise is times ``sigmoid(sharpness * (threshold - opacity))`` (equation 8 of the paper)."""
+GATE = (100.0, 0.005)
+"""Sharpness and threshold: noise is times ``sigmoid(sharpness * (threshold - opacity))``, as in the paper."""
 
 
 def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
@@ -122,11 +122,12 @@ def jitter(params: Mapping[str, Tensor], strength: float) -> None:
     noise = torch.randn_like(means)
     kernel = noise_kernel(means.device) if means.is_cuda and means.dtype == torch.float32 else None
     if kernel is not None:
-        shape = (params[name].detach().contiguous() for name in ("scales", "quats", "opacities"))
-        add_noise(kernel, means.data, *shape, noise, strength, **GATE)
+        scales, quats, opacities = (params[name].detach().contiguous() for name in ("scales", "quats", "opacities"))
+        add_noise(kernel, means.data, scales, quats, opacities, noise, strength, GATE)
         return
+    sharpness, threshold = GATE
     scales = params["scales"].exp()
-    gate = torch.sigmoid(GATE["sharpness"] * (GATE["threshold"] - params["opacities"].sigmoid()))
+    gate = torch.sigmoid(sharpness * (threshold - params["opacities"].sigmoid()))
     rotation = rotation_matrices(params["quats"])
     noise = noise * gate * strength
     # R S^2 R^T e, without building the covariance.

@@ -63,9 +63,7 @@ def add_noise(
     opacities: Tensor,
     noise: Tensor,
     strength: float,
-    *,
-    sharpness: float,
-    threshold: float,
+    gate: tuple[float, float],
 ) -> None:
     """Move centres by noise with the shape of their primitives, the less the more opaque these are, in place.
 
@@ -77,7 +75,7 @@ def add_noise(
         opacities: logits ``[N, 1]``.
         noise: standard normal ``[N, 3]``.
         strength: factor of the noise.
-        sharpness, threshold: noise is times ``sigmoid(sharpness * (threshold - opacity))``.
+        gate: sharpness and threshold: noise is times ``sigmoid(sharpness * (threshold - opacity))``.
     """
     count = len(means)
-    launch(count, [count, means, scales, quats, opacities, noise, strength, sharpness, threshold])
+    launch(count, [count, means, scales, quats, opacities, noise, strength, *gate])

@@ -35,24 +35,9 @@ class RenderSettings(ColorSettings):
     trained_focal: tuple[float, float] | None = None
     """Shortest and longest focal length of the images that the head was trained on, pixels."""
 
-    dropped: float = 0.0
-    """Share of the primitives that a training image leaves out, drawn anew for each image; below 1."""
-
     def without_head(self) -> RenderSettings:
         """The same settings with the head disabled."""
         return replace(self, head=None)
-
-
-def left_out(opacities: Tensor, share: float) -> Tensor:
-    """Opacities ``[N]`` of which a share, drawn at random, is 0, and the others are larger to make up for them.
-
-    The expected opacity stays, unless it is above ``1 - share``: none is larger than 1. That is dropout of primitives
-    (DropGaussian, Park et al., 2025).
-    """
-    if share == 0:
-        return opacities
-    stays = torch.rand_like(opacities) >= share
-    return torch.where(stays, opacities / (1 - share), 0.0).clamp_max(1.0)
 
 
 def pass_options(params: Mapping[str, Tensor], view: View, settings: RenderSettings) -> dict[str, Any]:
@@ -61,7 +46,7 @@ def pass_options(params: Mapping[str, Tensor], view: View, settings: RenderSetti
         "means": params["means"],
         "quats": params["quats"],
         "scales": params["scales"].exp(),
-        "opacities": left_out(params["opacities"].sigmoid().squeeze(-1), settings.dropped),
+        "opacities": params["opacities"].sigmoid().squeeze(-1),
         "viewmat": view.viewmat,
         "K": view.K,
         "width": view.width,

@@ -12,7 +12,6 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.training.averaging import Averaging
 from sundae_ns.training.dense_start import DenseStart
 from sundae_ns.training.densification import Densification, make_strategy
-from sundae_ns.training.dropout import Dropout
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.floaters import FloaterRemoval
@@ -40,9 +39,8 @@ def check(options: ModelOptions) -> None:
     for name in ("base_loss_weight", "prior_after_prune"):
         if getattr(options, name) < 0:
             raise ConfigError(f"{name.replace('_', '-')} is {getattr(options, name)}; give 0 or more")
-    for name in ("dense_start_views", "dropout_views"):
-        if getattr(options, name) < 0:
-            raise ConfigError(f"{name.replace('_', '-')} is {getattr(options, name)}; give a number of images, or 0")
+    if options.dense_start_views < 0:
+        raise ConfigError(f"dense-start-views is {options.dense_start_views}; give a number of images, 0 for no sweep")
     if not 0 <= options.average_share <= 1:
         raise ConfigError(
             f"average-share is {options.average_share}; give a share of the schedule, 0.1 for the last tenth"
@@ -65,9 +63,9 @@ def build(
         frame: transform from the capture's coordinates to the model's, if known.
 
     Returns:
-        State of field and head; extensions in their order (dense start, densification, removal of floaters, dropout,
-        trials of counts, scheduled pruning, trials of the head and stopping, averaging; dropout, trials and averaging
-        optional); what to announce when training starts.
+        State of field and head; extensions in their order (dense start, densification, removal of floaters, trials of
+        counts, scheduled pruning, trials of the head and stopping, averaging; trials and averaging optional); what to
+        announce when training starts.
 
     Raises:
         ConfigError: an option cannot work.
@@ -94,7 +92,6 @@ def build(
     removal = FloaterRemoval(None if points is None else points[0])
     dense = DenseStart(options, points, num_images, num_features=num_features, cap=strategy.cap)
     extensions: list[Extension] = [dense, densification, removal]
-    extensions += [Dropout()] if num_images <= options.dropout_views else []
     counts = CountTrials(pruning, densification, engine, alone=options.head.mode != "auto") if pruning.decides else None
     extensions += [] if counts is None else [counts]
     extensions.append(ScheduledPruning(schedule, evaluate=options.evaluate_prune))

@@ -21,8 +21,6 @@ from sundae_ns.rasterization import Backend
 from sundae_ns.rendering.render import RenderSettings
 
 _HEAD = "head"
-_STAIRS = 20
-"""Number of stairs: a recorded step holds the share as a constant, so each one makes new recordings."""
 
 
 @dataclass
@@ -64,8 +62,6 @@ class FieldState:
     """Number of images in the batch of a step."""
     restored: int = 0
     """Number of times in this process that other weights took the place of the trained ones."""
-    dropout: tuple[float, int] | None = None
-    """Share of the primitives that images leave out at the end of the schedule, and its length; None for no dropout."""
     sh_degree_interval: int | None = None
     """Steps after which the next SH degree is enabled; None enables all at once, as after a warm start."""
 
@@ -99,14 +95,6 @@ class FieldState:
     def head(self) -> CompensationHead | None:
         """The head; None if the field has none."""
         return self.networks[_HEAD] if _HEAD in self.networks else None  # type: ignore[return-value]
-
-    @property
-    def dropped(self) -> float:
-        """Share of the primitives that a training image leaves out at this step: it rises in even stairs."""
-        if self.dropout is None:
-            return 0.0
-        share, length = self.dropout
-        return share * (_STAIRS * min(self.schedule_step, length) // length) / _STAIRS
 
     @property
     def head_enabled(self) -> bool:
@@ -155,7 +143,6 @@ class FieldState:
             absgrad=absgrad and training and self.densifying,
             head=self.head if self.head_enabled else None,
             trained_focal=self.trained_focal,
-            dropped=self.dropped if training else 0.0,
         )
 
     def snapshot(self, *, head: bool) -> dict[str, Snapshot]:

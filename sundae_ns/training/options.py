@@ -17,7 +17,6 @@ class ModelOptions(Protocol):
     warmup: Literal["densify", "mcmc"]
     mcmc_cap: int
     dense_start_views: int
-    dropout_views: int
     warm_start: Path | None
     warm_start_frame: Literal["auto", "model", "capture"]
     evaluate_prune: bool

@@ -21,7 +21,7 @@ def test_a_whole_run_and_its_resume(
     monkeypatch.setitem(dense_start.LIMITS, "cpu", (48, 500))
 
     def change(config: Any) -> None:
-        config.pipeline.model.dense_start_views = config.pipeline.model.dropout_views = 12
+        config.pipeline.model.dense_start_views = 12
         config.steps_per_save, config.save_only_latest_checkpoint, config.max_num_iterations = 5, False, 10
 
     whole: Any = trainer_of(change)

@@ -50,7 +50,6 @@ def _build(
             "num_downscales": 0,
             "background_color": "random",
             "dense_start_views": 0,
-            "dropout_views": 0,
             **options,
         },
     )

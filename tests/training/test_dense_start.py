@@ -136,7 +136,7 @@ def test_ranks_start_from_the_sparse_points(build: Build, capsys: pytest.Capture
 
 
 def test_a_negative_number_of_views_is_an_error(build: Build) -> None:
-    with pytest.raises(ConfigError, match="dense-start-views is -1; give a number of images, or 0"):
+    with pytest.raises(ConfigError, match="dense-start-views is -1; give a number of images, 0 for no sweep"):
         build(dense_start_views=-1)
 
 

@@ -1,9 +1,11 @@
-"""A capture of few training views from a COLMAP capture: python3 few_views.py CAPTURE OUT [-n 16] [--smaller 4].
+"""Make a capture of few training views from a COLMAP capture.
 
-Training and test views are spread evenly over the capture. Names of images start with train_ or eval_, so train with
-`colmap --colmap-path sparse/0 --eval-mode filename --downscale-factor 1` (or 4 after --smaller 4). Points are those
-that SfM of the training photos would find: of the capture's own, those that two of them see; by pycolmap from the
-capture's poses, where its points have no tracks (as those of ../shared/scenes). --all-points keeps all.
+    python benchmarks/harness/few_views.py CAPTURE OUT -n 16
+    ns-train sundae --data OUT colmap --colmap-path sparse/0 --eval-mode filename --downscale-factor 1
+
+Training and test views are spread evenly over the capture; names of images start with train_ or eval_. Points are those
+that structure from motion of the training photos finds: of the capture's own, those that two of them see; where these
+have no tracks, by pycolmap from the capture's poses. --all-points keeps all.
 """
 
 import argparse
@@ -14,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from nerfstudio.data.utils import colmap_parsing_utils as colmap
-from PIL import Image
 
 
 def spread(count: int, n: int) -> list[int]:
@@ -63,12 +64,11 @@ def triangulated(cameras: dict[int, Any], placed: list[Any], images: Path) -> di
 
 def main() -> None:
     """Write the capture."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("-n", type=int, default=16, help="number of training views")
     parser.add_argument("--tests", type=int, default=40, help="number of test views")
-    parser.add_argument("--smaller", type=int, default=1, help="also write images_N with sides N times shorter")
     parser.add_argument("--all-points", action="store_true", help="keep the points of all photos")
     args = parser.parse_args()
     model = args.out / "sparse/0"
@@ -78,20 +78,14 @@ def main() -> None:
     left = [i for i in range(len(order)) if i not in train]
     kinds = {order[i].id: "train" for i in train}
     kinds |= {order[left[i]].id: "eval" for i in spread(len(left), args.tests)}
-    for folder in {"images", f"images_{args.smaller}" if args.smaller > 1 else "images", "sparse/0"}:
+    for folder in ("images", "sparse/0"):
         (args.out / folder).mkdir(parents=True, exist_ok=True)
     chosen, none = {}, np.zeros(0, int)
     for key, kind in kinds.items():
         image = images[key]
         name = f"{kind}_{image.name.replace('/', '_')}"
         chosen[key] = image._replace(name=name, xys=np.zeros((0, 2)), point3D_ids=none)
-        source = args.capture / "images" / image.name
-        shutil.copyfile(source, args.out / "images" / name)
-        if args.smaller > 1:
-            with Image.open(source) as full:
-                size = full.width // args.smaller, full.height // args.smaller
-                small = full.convert("RGB").resize(size, Image.Resampling.LANCZOS)
-            small.save(args.out / f"images_{args.smaller}" / name, quality=98)
+        shutil.copyfile(args.capture / "images" / image.name, args.out / "images" / name)
     tracked = any(len(point.image_ids) for point in points.values())
     kept = points if args.all_points else seen_twice(points, {order[i].id for i in train}) if tracked else {}
     if not kept:
