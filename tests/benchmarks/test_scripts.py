@@ -21,8 +21,9 @@ from bench_jobs import measured
 from csv_rows import read_rows
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
-from harness import today
+from harness import stored, today
 from harness.plan import Job
+from harness.take_over import merged, take_over
 from harness.today import fingerprints
 from sundae_ns.graphs import build_graph
 
@@ -173,7 +174,7 @@ def test_pages_are_not_current_after_a_default_changes(monkeypatch: pytest.Monke
 def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     tables = loaded(monkeypatch, "tables.py")
     results = shutil.copytree(RESULTS, tmp_path / "results")
-    monkeypatch.setitem(tables["take_over"].__globals__, "RESULTS", results)
+    monkeypatch.setattr(stored, "RESULTS", results)
     written = []
     for seed, ratio, arm, kind in (
         *((seed, 0.1, "sundae", "whole") for seed in (42, 43, 44)),
@@ -190,7 +191,7 @@ def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     source = tmp_path / "results.jsonl"
     source.write_text("".join(json.dumps(line) + "\n" for line in written))
     before = read_rows(RESULTS / "runs.csv")
-    tables["take_over"](source)
+    take_over(source)
 
     rows = read_rows(results / "runs.csv")
     fox = [(row.variant, row.keep_ratio, row.seed) for row in rows if row.scene == "fox" and row.gpu == "NVIDIA X"]
@@ -225,20 +226,19 @@ def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
         assert make()[2:], name
 
 
-def test_a_mean_over_seeds_mixes_no_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
-    tables = loaded(monkeypatch, "tables.py")
+def test_a_mean_over_seeds_mixes_no_defaults() -> None:
     (today, *_) = sorted(fingerprints("sundae", 0.1))
     first, second, earlier, other = (
         {"scene": scene, "variant": "sundae", "keep_ratio": "0.1", "seed": str(seed), "fingerprint": fingerprint}
         for scene, seed, fingerprint in (("a", 42, today), ("a", 43, today), ("a", 44, "older"), ("b", 44, "older"))
     )
     places = ("scene", "variant", "keep_ratio", "seed")
-    assert tables["_merged"]([second, earlier, other], [first], places) == [second, other, first]
+    assert merged([second, earlier, other], [first], places) == [second, other, first]
 
 
 def test_packed_formats_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     tables = loaded(monkeypatch, "tables.py")
-    monkeypatch.setitem(tables["lines_of"].__globals__, "RESULTS", tmp_path)
+    monkeypatch.setattr(stored, "RESULTS", tmp_path)
     heads = "capture,method,format,program,bytes,psnr,ssim,primitives,seed,fingerprint,command\n"
     (ours, *_), (stock, *_) = (sorted(fingerprints(name, 0.1)) for name in ("sundae-auto", "splatfacto"))
     (tmp_path / "formats.csv").write_text(
