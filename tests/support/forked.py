@@ -35,6 +35,11 @@ def _run(program: str, arguments: list[str], output: Connection) -> None:
         # As Python does; multiprocessing asks no hook.
         sys.excepthook(type(error), error, error.__traceback__)
         raise SystemExit(1) from error
+    finally:
+        measured = sys.modules.get("coverage")
+        if measured is not None and (coverage := measured.Coverage.current()) is not None:
+            coverage.stop()
+            coverage.save()  # multiprocessing leaves without it
 
 
 @contextmanager
