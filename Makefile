@@ -13,7 +13,7 @@ INSTALLED := $(VENV)/.installed
 # Files stay whole, because their tests share trained runs. tests/conftest.py puts long files first.
 SIDE_BY_SIDE := --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-# Tests start some sixty processes of Python; compiled modules save each a quarter of a second.
+# Tests start some forty processes of Python; compiled modules save each a quarter of a second.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-all lint types pytest browser web coverage mutants install clean

@@ -33,11 +33,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from browser import WEBGPU, Browser, find_chromium, wait_for
 from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 from torch import Tensor
 
+from harness.chromium import WEBGPU, Browser, find_chromium, wait_for
 from sundae_ns.api.packing import scene_of, stored_cameras
 from sundae_ns.api.page import write_page
 from sundae_ns.scenes.packed import model_of

@@ -30,9 +30,9 @@ from typing import Any
 import numpy as np
 import torch
 from bench_page import SECONDS, SIDE, bundled, has_packages, psnr, scaled, truths
-from browser import Browser, find_chromium, wait_for
 from numpy.typing import NDArray
 
+from harness.chromium import Browser, find_chromium, wait_for
 from sundae_ns.api.packing import scene_of, stored_cameras
 from sundae_ns.api.saving import save_for_viewers
 from sundae_ns.gaussians import FEATURES

@@ -16,7 +16,8 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import NullFormatter
-from tables import MB, lines_of
+
+from harness.stored import MB, lines_of
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 MARKERS = {"bonsai": "o", "fox": "s"}

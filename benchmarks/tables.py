@@ -6,61 +6,32 @@
     measured
 
 A page holds the markers ``<!-- table: NAME -->`` and ``<!-- end of table -->``; the lines between them are made here.
-``tests/test_benchmarks.py`` checks that every page is current. A row whose options are not those that its arm has today
-says "earlier default"; a suite takes the place of those that it measured again, with all their seeds.
+``tests/benchmarks/test_scripts.py`` checks that every page is current. A row whose options are not those that its arm
+has today says "earlier default"; a suite takes the place of those that it measured again, with all their seeds.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 from harness.results import spread
+from harness.stored import MB, METHODS, lines_of
+from harness.take_over import take_over
 from harness.today import EARLIER, SHARE, is_of_today
-from sundae_ns.evaluation import COLUMNS, csv_text
 from sundae_ns.evaluation.document import number, table
-from sundae_ns.storage.packing import FINETUNE_STEPS
 
 ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
-MB = 1e6
-
-METHODS = {
-    "splatfacto": "splatfacto, 30,000 steps",
-    "splatfacto-7k": "splatfacto, 7,000 steps",
-    "sundae-warm-up": "full field, not pruned",
-    "sundae": "**sundae**, fixed share",
-    "sundae-fast": "sundae-fast",
-    "sundae-auto": "**sundae**",
-    "sundae-with-head": "sundae, with a head in any case",
-    "sundae-no-head": "the same primitives, no head",
-    "sundae-no-head-bytes": "more primitives in place of a head",
-    "mcmc": "3DGS-MCMC",
-    "band": "the paper's band rule",
-    "random-no-head": "random primitives",
-    "contribution-no-head": "highest contribution, as LightGaussian",
-}
-"""Arms of runs.csv in the order of a table, by the names that readers see."""
 LEFT_OUT = ("splatfacto-7k", "sundae-with-head", "sundae-no-head-bytes")
 """Methods of runs.csv that the table of quality leaves out; the text gives what they show."""
 FORMATS = {".spz": ".spz", ".sog": ".sog", ".sog theirs": ".sog by splat-transform", ".sundae": ".sundae"}
 """Packed formats in the order of a table, by the heads that readers see."""
-
-
-def lines_of(name: str) -> list[dict[str, Any]]:
-    """Rows of a results file, ``.jsonl`` or ``.csv``; cells of a CSV are text."""
-    text = (RESULTS / name).read_text(encoding="utf-8")
-    if name.endswith(".jsonl"):
-        return [json.loads(line) for line in text.splitlines()]
-    return list(csv.DictReader(text.splitlines()))
 
 
 def runs() -> list[dict[str, Any]]:
@@ -400,121 +371,6 @@ def with_tables(text: str) -> str:
         KeyError: a marker names no table.
     """
     return MARKED.sub(lambda found: found[1] + "\n".join(TABLES[found["name"]]()) + "\n" + found[3], text)
-
-
-# ------------------------------------------------------------------------------------------------------------ the suite
-
-
-def take_over(results: Path) -> None:
-    """Replace rows of runs.csv, frames, training times and packs by those of ``suite.py``.
-
-    Other rows stay, but for earlier defaults at other seeds of what was measured.
-
-    Args:
-        results: ``results.jsonl`` of the suite.
-    """
-    found = [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]
-    measured = [_rounded({**result["measured"], "command": _public(result["measured"]["command"])}) for result in found]
-    rows = list(csv.DictReader(csv_text(measured).splitlines()))
-    kept = _merged(lines_of("runs.csv"), rows, ("scene", "variant", "keep_ratio", "seed"))
-    with (RESULTS / "runs.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(kept)
-    seed = found[0]["job"]["seed"]
-    own = [r for r in map(_rounded, found) if r["job"]["seed"] == seed and (r["job"]["keep_ratio"] or SHARE) == SHARE]
-    for name, lines, places in (
-        ("frames.jsonl", [_frame_line(r) for r in own if r["measured"]["ms_head"] is not None], ("config",)),
-        ("training_time.jsonl", [_training_line(r) for r in own if _is_timed(r)], ("scene", "arm")),
-        ("pack.jsonl", [line for r in own for line in _pack_lines(r)], ("run", "variant", "finetune_steps")),
-    ):
-        kept = _merged(lines_of(name), lines, places)
-        (RESULTS / name).write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
-
-
-def _merged(
-    old: Iterable[dict[str, Any]], new: Sequence[dict[str, Any]], places: Sequence[str]
-) -> list[dict[str, Any]]:
-    """New lines after the old ones that stay: those of other places, and today's of other seeds.
-
-    A mean over seeds would mix an earlier default with today's.
-    """
-
-    def at(line: dict[str, Any], names: Iterable[str]) -> tuple[Any, ...]:
-        return tuple(line.get(name) for name in names)
-
-    all_seeds = [place for place in places if place != "seed"]
-    taken, measured = ({at(line, names) for line in new} for names in (places, all_seeds))
-
-    def stays(line: dict[str, Any]) -> bool:
-        if at(line, all_seeds) not in measured:
-            return True
-        return at(line, places) not in taken and is_of_today({"variant": line.get("arm", "sundae"), **line})
-
-    return [*filter(stays, old), *new]
-
-
-def _public(command: str) -> str:
-    """A command without the place of its warm-up on this machine."""
-    return re.sub(r"(--pipeline\.model\.warm-start) .*?nerfstudio_models", r"\1 WARM_UP", command)
-
-
-def _rounded(value: Any) -> Any:
-    """Plain values with four decimals."""
-    if isinstance(value, dict):
-        return {name: _rounded(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return [_rounded(inner) for inner in value]
-    return round(value, 4) if isinstance(value, float) else value
-
-
-def _is_timed(result: dict[str, Any]) -> bool:
-    return result["job"]["kind"] in ("whole", "mcmc") and result["measured"]["train_s"] is not None
-
-
-def _common(result: dict[str, Any]) -> dict[str, Any]:
-    """Entries of every line of a result."""
-    run = result["measured"]
-    full = run["configurations"][0]["mean"]
-    share = {"keep_ratio": result["job"]["keep_ratio"], "fingerprint": run["fingerprint"]}
-    return {"primitives": run["primitives"], "psnr": full["psnr"], "ssim": full["ssim"], **share}
-
-
-def _frame_line(result: dict[str, Any]) -> dict[str, Any]:
-    run = result["measured"]
-    width, height = (int(side) for side in run["resolution"].split()[0].split("x"))
-    full, base = run["configurations"][0], run["configurations"][-1]
-    return {
-        "config": f"{run['scene']}, {METHODS.get(run['variant'], run['variant']).strip('*')}",
-        "variant": run["variant"],
-        "device": run["gpu"],
-        **{"width": width, "height": height, "precision": run["precision"]},
-        **{"ms_frame": full["ms"], "ms_splat": base["ms"], "ms_head": run["ms_head"]},
-        **_common(result),
-    }
-
-
-def _training_line(result: dict[str, Any]) -> dict[str, Any]:
-    run = result["measured"]
-    return {
-        **{"arm": run["variant"], "scene": run["scene"], "steps": run["steps"], "seed": run["seed"]},
-        **{"train_s": run["train_s"], "peak_mib": run["peak_vram_mib"], "gpu": run["gpu"]},
-        **_common(result),
-    }
-
-
-def _pack_lines(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Lines of the default pack and of the fine-tuned one, as far as they were made."""
-    run = result["measured"]
-    return [
-        {
-            **{"run": run["scene"], "variant": run["variant"], "finetune_steps": steps, "bytes": packed["bytes"]},
-            **_common(result),
-            **{"psnr_packed": packed["psnr"], "ssim_packed": packed["ssim"]},
-        }
-        for steps, packed in ((0, result["packed"]), (FINETUNE_STEPS, result.get("tuned")))
-        if packed
-    ]
 
 
 def main() -> None:

@@ -30,8 +30,10 @@ Once = Callable[[str, Callable[[Path], None]], Path]
 gc.set_threshold(100_000)
 
 ALL_SEEDS = os.environ.get("SUNDAE_ALL_SEEDS") == "1"
-_FIRST = ("integration", "distributed", "cli")
-"""Folders with long files, the longest first. Workers that start with these end together."""
+_FIRST = ("integration/test_commands.py", "distributed/test_whole_runs.py", "integration", "distributed", "cli")
+"""Long files and folders with long files, the longest first. Workers that start with these end together.
+
+While one worker trains the tiny run, which most of tests/integration waits for, another needs something else to do."""
 
 # Definitions that a GPU's compiler has built in, and a setter of the block index. A block has one thread here, so
 # memory that threads of a block share is filled before it is read, and a warp of one lane exchanges with itself.
@@ -93,8 +95,12 @@ def pytest_collection() -> Generator[None, object, object]:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
-    order = {name: place for place, name in enumerate(_FIRST)}
-    items.sort(key=lambda item: order.get(item.path.relative_to(here).parts[0], len(order)))
+
+    def place(item: pytest.Item) -> int:
+        name = item.path.relative_to(here)
+        return next((number for number, first in enumerate(_FIRST) if name.is_relative_to(first)), len(_FIRST))
+
+    items.sort(key=place)
     if not ALL_SEEDS:
         for item in items:
             if item.get_closest_marker("long"):

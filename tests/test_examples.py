@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import re
-import subprocess
+import runpy
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from packed_scenes import KINDS, write_kind
 from PIL import Image
+from short_prunes import short_prunes  # noqa: F401
 
 import sundae_ns as sn
 
+Run = Callable[..., str]
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-def run(name: str, *words: object) -> str:
-    command = [sys.executable, str(EXAMPLES / name), *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def run(short_prunes: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:  # noqa: F811
+    """Run a program in this process; returns what it printed."""
+
+    def run(name: str, *words: object) -> str:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -41,21 +49,21 @@ def test_every_example_is_tested() -> None:
     assert {path.name for path in EXAMPLES.iterdir() if path.is_file()} == {"notebook.ipynb", *programs}
 
 
-def test_prune_ply(cloud: Path, tmp_path: Path) -> None:
+def test_prune_ply(run: Run, cloud: Path, tmp_path: Path) -> None:
     text = run("prune_ply.py", cloud, tmp_path / "a.spz", "--keep", 0.5, "--views", 8)
     assert "300 of 600 primitives" in text
     assert float(re.findall(r"PSNR ([\d.]+) dB", text)[0]) > 20
     assert sn.load(tmp_path / "a.spz").num_primitives == 300
 
 
-def test_render_packed(tmp_path: Path) -> None:
+def test_render_packed(run: Run, tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
     assert "tiny head" in run("render_packed.py", packed, tmp_path / "a.png", "--view", 1)
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.size == (3 * 50, 37)
 
 
-def test_plot_curve(cloud: Path, tmp_path: Path) -> None:
+def test_plot_curve(run: Run, cloud: Path, tmp_path: Path) -> None:
     text = run("plot_curve.py", cloud, tmp_path / "a.png", "--views", 4)
     quality = [float(value) for value in re.findall(r"merged: [\d,]+ primitives, ([\d.]+) dB", text)]
     assert len(quality) == 10

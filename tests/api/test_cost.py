@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from fields import random_field
+from short_prunes import short_prunes  # noqa: F401
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -35,6 +36,7 @@ def unreachable(*_: object, **__: object) -> None:
     pytest.fail("it was started")
 
 
+@pytest.mark.usefixtures("short_prunes")
 def test_a_prune_that_does_not_fit_is_refused_before_it_starts(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = sn.load(file)
     monkeypatch.setattr(cost, "free_memory", lambda: 500_000)
@@ -62,6 +64,7 @@ def test_a_file_that_does_not_fit_is_refused_before_it_is_read(
     assert capsys.readouterr().err.startswith("sundae: a prune of 2,000 primitives takes about 0.0 GB of memory")
 
 
+@pytest.mark.usefixtures("short_prunes")
 def test_a_long_prune_states_its_cost(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -115,7 +115,7 @@ def test_a_view_straight_down_is_passed_over() -> None:
 
 @pytest.mark.parametrize(("stored", "factor"), [(0, 1.0), (1, 1000.0), (4, 1.0)])
 def test_a_scene_without_a_path_is_seen_from_all_around(stored: int, factor: float) -> None:
-    scene = ball()
+    scene = ball(1500)
     grown = {"means": factor * scene.field["means"], "scales": scene.field["scales"] + math.log(factor)}
     view = looking([(0.0, -5.0 * factor, 0.0)], [(0.0, 0.0, 0.0)])
     scene = dataclasses.replace(scene, field=scene.field.replaced(grown), views=stored * view, up=(0.0, -1.0, 0.0))

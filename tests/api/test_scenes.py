@@ -233,8 +233,9 @@ def test_a_scene_of_opaque_and_flat_primitives_is_saved_whole(tmp_path: Path, ki
         assert found.num_primitives == truth.num_primitives - 1
         assert all(value.isfinite().all() for value in found.field.values())
         assert int((found.field["opacities"].sigmoid() > 0.999).sum()) == 89
-    small = sn.prune(truth, keep=0.5, views=truth.views)
-    assert all(value.isfinite().all() for value in small.field.values())
+    if kind == ".ply":
+        small = sn.prune(truth, keep=0.5, views=truth.views)
+        assert all(value.isfinite().all() for value in small.field.values())
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import run
+from short_prunes import short_prunes  # noqa: F401
 
 import sundae_ns as sn
 from sundae_ns.api.opening import START_FILE
@@ -50,6 +51,7 @@ def same(one: sn.Scene, other: sn.Scene) -> bool:
     return alike and one.start[2:] == pytest.approx(other.start[2:]) and one.up == pytest.approx(other.up)
 
 
+@pytest.mark.usefixtures("short_prunes")
 def test_files_and_scenes_made_of_a_scene_keep_both(tmp_path: Path) -> None:
     truth = started()
     sn.save(truth, tmp_path / "a.sundae")

@@ -21,8 +21,9 @@ from bench_jobs import measured
 from csv_rows import read_rows
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
-from harness import today
+from harness import stored, today
 from harness.plan import Job
+from harness.take_over import merged, take_over
 from harness.today import fingerprints
 from sundae_ns.graphs import build_graph
 
@@ -83,10 +84,12 @@ def test_results_are_small_and_can_be_read() -> None:
 def test_commands_of_rows_are_ones_that_ns_train_takes() -> None:
     rows = [row for row in read_rows(RESULTS / "runs.csv") if row.command.startswith("ns-train ")]
     assert len(rows) >= 5
-    for row in rows:
-        words = row.command.partition(";")[0].split()[1:]
+    # Rows of other captures and seeds have the same options.
+    commands = {re.sub(r"(?<=--data )\S+|(?<=--machine\.seed )\S+", "7", row.command): row.steps for row in rows}
+    for command, steps in commands.items():
+        words = command.partition(";")[0].split()[1:]
         config = tyro.cli(AnnotatedBaseConfigUnion, args=words)  # type: ignore[arg-type]
-        assert config.max_num_iterations == row.steps  # type: ignore[attr-defined]
+        assert config.max_num_iterations == steps  # type: ignore[attr-defined]
 
 
 # --------------------------------------------------------------------------------------------------------------- tables
@@ -173,7 +176,7 @@ def test_pages_are_not_current_after_a_default_changes(monkeypatch: pytest.Monke
 def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     tables = loaded(monkeypatch, "tables.py")
     results = shutil.copytree(RESULTS, tmp_path / "results")
-    monkeypatch.setitem(tables["take_over"].__globals__, "RESULTS", results)
+    monkeypatch.setattr(stored, "RESULTS", results)
     written = []
     for seed, ratio, arm, kind in (
         *((seed, 0.1, "sundae", "whole") for seed in (42, 43, 44)),
@@ -190,7 +193,7 @@ def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     source = tmp_path / "results.jsonl"
     source.write_text("".join(json.dumps(line) + "\n" for line in written))
     before = read_rows(RESULTS / "runs.csv")
-    tables["take_over"](source)
+    take_over(source)
 
     rows = read_rows(results / "runs.csv")
     fox = [(row.variant, row.keep_ratio, row.seed) for row in rows if row.scene == "fox" and row.gpu == "NVIDIA X"]
@@ -225,20 +228,19 @@ def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
         assert make()[2:], name
 
 
-def test_a_mean_over_seeds_mixes_no_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
-    tables = loaded(monkeypatch, "tables.py")
+def test_a_mean_over_seeds_mixes_no_defaults() -> None:
     (today, *_) = sorted(fingerprints("sundae", 0.1))
     first, second, earlier, other = (
         {"scene": scene, "variant": "sundae", "keep_ratio": "0.1", "seed": str(seed), "fingerprint": fingerprint}
         for scene, seed, fingerprint in (("a", 42, today), ("a", 43, today), ("a", 44, "older"), ("b", 44, "older"))
     )
     places = ("scene", "variant", "keep_ratio", "seed")
-    assert tables["_merged"]([second, earlier, other], [first], places) == [second, other, first]
+    assert merged([second, earlier, other], [first], places) == [second, other, first]
 
 
 def test_packed_formats_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     tables = loaded(monkeypatch, "tables.py")
-    monkeypatch.setitem(tables["lines_of"].__globals__, "RESULTS", tmp_path)
+    monkeypatch.setattr(stored, "RESULTS", tmp_path)
     heads = "capture,method,format,program,bytes,psnr,ssim,primitives,seed,fingerprint,command\n"
     (ours, *_), (stock, *_) = (sorted(fingerprints(name, 0.1)) for name in ("sundae-auto", "splatfacto"))
     (tmp_path / "formats.csv").write_text(

@@ -327,9 +327,12 @@ def without(package: str, commands: list[list[str]], folder: Path) -> tuple[list
     return json.loads(done.stdout.splitlines()[-1]), done.stderr.splitlines()
 
 
-def test_files_are_exported_and_pruned_without_nerfstudio(tmp_path: Path) -> None:
+def test_files_are_exported_pruned_and_refused_without_nerfstudio(tmp_path: Path) -> None:
     write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": MODEL}))
     write_kind(tmp_path / "head.sundae", KINDS["residual"])
+    unpacked = tmp_path / "outputs" / "a" / "sundae" / "unpacked"
+    unpacked.mkdir(parents=True)
+    (unpacked / "config.yml").touch()
     commands = [
         ["export", "a.sundae", "-o", "a.ply"],
         ["export", "a.ply", "-o", "a.spz"],
@@ -339,23 +342,14 @@ def test_files_are_exported_and_pruned_without_nerfstudio(tmp_path: Path) -> Non
         ["export", "head.sundae", "-o", "head.html"],
         ["pack", "a.ply", "-o", "packed.sundae"],
     ]
-    codes, errors = without("nerfstudio", commands, tmp_path)
-    assert codes == [0] * len(commands), errors
-    for words in commands:
-        assert (tmp_path / words[3]).stat().st_size > 0
-
-
-def test_what_needs_no_nerfstudio_to_be_refused(tmp_path: Path) -> None:
-    write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": MODEL}))
-    write_ply(tmp_path / "a.ply", field())
-    run = tmp_path / "outputs" / "a" / "sundae" / "unpacked"
-    run.mkdir(parents=True)
-    (run / "config.yml").touch()
     refused = {"unpack a.sundae": "is a run already"}
     refused |= dict.fromkeys(("pack gone -o x", "export gone -o x.html"), "give the folder of a")
-    codes, errors = without("nerfstudio", [command.split() for command in refused], tmp_path)
-    assert codes == [2] * len(refused)
-    for error, reason in zip(errors, refused.values(), strict=True):
+    codes, errors = without("nerfstudio", [*commands, *(command.split() for command in refused)], tmp_path)
+    assert codes == [0] * len(commands) + [2] * len(refused), errors
+    for words in commands:
+        assert (tmp_path / words[3]).stat().st_size > 0
+    told = [line for line in errors if line.startswith("sundae: ")]
+    for error, reason in zip(told, refused.values(), strict=True):
         assert reason in error
 
 

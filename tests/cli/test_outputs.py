@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from short_prunes import SHORT
 
 from sundae_ns.cli import main
 from sundae_ns.cli.outputs import check_file, check_folder
@@ -247,7 +248,7 @@ def test_commands_on_fields_import_no_nerfstudio(here: Path) -> None:
     state = {f"_model.gauss_params.{name}": value for name, value in field.items()}
     torch.save({"step": 3, "pipeline": state}, here / "run" / "nerfstudio_models" / "step-000000003.ckpt")
     code = (
-        "import json, sys\nfrom sundae_ns.cli import main\n"
+        f"import json, sys\nfrom sundae_ns.cli import main\n{SHORT}"
         "for words in json.loads(sys.argv[1]):\n"
         "    try:\n        main(words)\n    except SystemExit as end:\n        assert not end.code, words\n"
         "    assert 'nerfstudio' not in sys.modules, words"

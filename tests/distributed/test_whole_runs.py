@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import forked
 import pytest
 import torch
 import torch.distributed as dist
@@ -214,6 +215,11 @@ class StoppedTrainer(SundaeTrainer):
         return super().train_iteration(step)
 
 
+def start_ranks(meeting: Path, config: Any) -> None:
+    """Forked ranks have imported nerfstudio; ns-train spawns them."""
+    torch.multiprocessing.start_processes(train_rank, (meeting, config), nprocs=RANKS, start_method="fork")
+
+
 def main(folder: Path, name: str) -> None:
     """Two ranks resume from a checkpoint, and one is killed; or one gets SIGINT, which ends this program."""
     torch.set_num_threads(1)
@@ -222,14 +228,12 @@ def main(folder: Path, name: str) -> None:
         sys.argv = ["ns-train"]
         show_in_one_line()
         stopped = StoppedTrainerConfig(**{k: v for k, v in vars(plain).items() if k != "_target"})
-        # Forked ranks have imported nerfstudio; those that are killed are spawned, as ns-train does.
-        meeting = folder / "meeting-of-the-stopped"
-        torch.multiprocessing.start_processes(train_rank, (meeting, stopped), nprocs=RANKS, start_method="fork")
+        start_ranks(folder / "meeting-of-the-stopped", stopped)
         return
     config = DyingTrainerConfig(**{k: v for k, v in vars(plain).items() if k != "_target"})
     config.load_checkpoint = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
     try:
-        torch.multiprocessing.spawn(train_rank, (folder / "meeting-of-the-dead", config), nprocs=RANKS)
+        start_ranks(folder / "meeting-of-the-dead", config)
     except ProcessExitedException as error:
         (folder / "died.txt").write_text(str(rank_ended(error)))
 
@@ -344,17 +348,17 @@ def test_one_process_resumes_a_run_of_two(folder: Path) -> None:
 
 def test_a_killed_rank_ends_all_with_one_line(folder: Path) -> None:
     """It resumes on two ranks first, from a checkpoint of two."""
-    subprocess.run([sys.executable, __file__, str(folder), "dies"], timeout=LIMIT, check=True)
+    code, printed = forked.run(Path(__file__), folder, "dies")
+    assert code == 0, printed
     line = (folder / "died.txt").read_text()
     assert re.fullmatch(r"rank 1 ended \(killed by SIGKILL\).*--load-dir.*--machine\.num-devices", line)
     assert not (models(folder, "dies") / f"step-{SAVED_AT + STEPS:09d}.ckpt").exists()
 
 
 def test_ranks_stop_together_and_save_when_one_gets_a_signal(folder: Path) -> None:
-    command = [sys.executable, __file__, str(folder), "stops"]
-    result = subprocess.run(command, timeout=LIMIT, check=False, capture_output=True, text=True)
-    assert result.returncode == 130, result.stderr
-    assert result.stdout.count("--load-dir") == 1, "the first rank says how to resume"
+    code, printed = forked.run(Path(__file__), folder, "stops")
+    assert code == 130, printed
+    assert printed.count("--load-dir") == 1, "the first rank says how to resume"
     # They agree after the seventeenth batch.
     saved = checkpoint.read(models(folder, "stops") / f"step-{17 * RANKS - 1:09d}.ckpt")
     assert checkpoint.checkpoints(models(folder, "stops"))[-1].name == f"step-{saved['step']:09d}.ckpt"
@@ -367,6 +371,9 @@ import torch.distributed as dist
 import sundae_ns.distributed
 from nerfstudio.scripts import train
 from nerfstudio.utils import comms
+from sundae_ns.errors import show_in_one_line
+
+show_in_one_line()  # as the first import of our methods does
 
 def worker(rank, train_loop, ranks, _, __, url, config, *___):
     torch.set_num_threads(1)
@@ -396,18 +403,13 @@ def test_signals_to_the_command_of_two_ranks(
     (tmp_path / "ns-train").write_text(ON_CPUS)
     options = "--timestamp now --vis tensorboard --machine.num-devices 2 --machine.device-type cpu"
     words = ["sundae-tiny", "--data", str(folder / "scene"), "--output-dir", str(tmp_path), *options.split()]
-    process = subprocess.Popen(
-        [sys.executable, str(tmp_path / "ns-train"), *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-    assert process.stdout is not None
-    assert any(after in line for line in process.stdout)
-    (os.killpg if whole_group else os.kill)(process.pid, number)
-    said = process.communicate(timeout=LIMIT)[0]
-    assert process.returncode == 128 + number
+    with forked.started(tmp_path / "ns-train", *words) as (process, output):
+        assert process.pid is not None
+        assert any(after in line for line in output)
+        (os.killpg if whole_group else os.kill)(process.pid, number)
+        said = output.read()
+        process.join()
+    assert process.exitcode == 128 + number
     assert said.count("--load-dir") == (1 if saves else 0)
     assert "Traceback" not in said
     saved = list(tmp_path.glob("*/*/now/nerfstudio_models/step-*.ckpt"))

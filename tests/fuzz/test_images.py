@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import struct
@@ -183,8 +184,12 @@ def compiled(scene: Path) -> None:
     train_a_step(scene)
 
 
-@pytest.mark.parametrize("folder", ["scene", "a folder, with spaces", "ünï cöde 像"])
-@pytest.mark.parametrize("kind", FINE)
+FOLDERS = ("scene", "a folder, with spaces", "ünï cöde 像")
+
+
+@pytest.mark.parametrize(
+    ("kind", "folder"), [*zip(FINE, itertools.cycle(FOLDERS)), *(("unchanged", folder) for folder in FOLDERS[1:])]
+)
 def test_unusual_captures_train(compiled: None, capture: Path, verdict: Any, kind: str, folder: str) -> None:
     data = capture.rename(capture.with_name(folder))
     FINE[kind](data)

@@ -90,17 +90,17 @@ def call(environment: dict[str, str]) -> Call:
     return run
 
 
-@pytest.fixture
-def call_here(environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> CallHere:
+@pytest.fixture(scope="session")
+def call_here(environment: dict[str, str]) -> CallHere:
     """Run an installed command in this process, which has imported nerfstudio; returns what it printed."""
 
     def run(*arguments: object) -> str:
         words = [str(word) for word in arguments]
         (command,) = entry_points(group="console_scripts", name=words[0])
-        monkeypatch.setattr(sys, "argv", words)
-        for name, value in environment.items():
-            monkeypatch.setenv(name, value)
-        with redirect_stdout(io.StringIO()) as out:
+        with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out:
+            patch.setattr(sys, "argv", words)
+            for name, value in environment.items():
+                patch.setenv(name, value)
             try:
                 command.load()()
             except SystemExit as end:
@@ -147,11 +147,11 @@ def tiny(call: Call, once: Once) -> TinyRun:
 
 
 @pytest.fixture(scope="session")
-def exported(tiny: TinyRun, call: Call, open3d: None, once: Once) -> Path:
+def exported(tiny: TinyRun, call_here: CallHere, open3d: None, once: Once) -> Path:
     """The .ply that ns-export writes of the tiny run; skips where open3d does not import."""
 
     def export(folder: Path) -> None:
-        call("ns-export", "gaussian-splat", "--load-config", tiny.config, "--output-dir", folder)
+        call_here("ns-export", "gaussian-splat", "--load-config", tiny.config, "--output-dir", folder)
 
     return once("exported", export) / "splat.ply"
 

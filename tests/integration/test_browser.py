@@ -23,6 +23,7 @@ from PIL import Image
 from torch import Tensor
 from viser import transforms
 
+from harness.viewer_page import Server, ViewerPage
 from sundae_ns.pruning import kept_count, prune_field
 from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.viewer import previewed_rule
@@ -39,14 +40,14 @@ MEAN, SHARE = 3.0, 0.02
 def server(tiny: Any, tmp_path: Path) -> Iterator[Any]:
     """``ns-viewer`` on the tiny run."""
     command = ("ns-viewer", "--load-config", tiny.config)
-    server = browser.Server(command, tmp_path / "viewer.log", "Caching / undistorting")
+    server = Server(command, tmp_path / "viewer.log", "Caching / undistorting")
     yield server
     server.stop()
 
 
 @pytest.fixture
 def page() -> Iterator[Any]:
-    with browser.ViewerPage(CHROMIUM, 640, 400) as page:
+    with ViewerPage(CHROMIUM, 640, 400) as page:
         yield page
 
 

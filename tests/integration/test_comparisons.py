@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import forked
 import numpy as np
 import pytest
 from csv_rows import read_rows
@@ -38,7 +39,28 @@ def in_process(job: Job, out: Path, on_percent: Callable[[float], object]) -> No
     perform(job, out)
 
 
-def test_stopped_and_continued(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def forked_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Fork the processes of jobs off one that has imported nerfstudio; their command lines."""
+    started: list[list[str]] = []
+
+    def run_logged(words: list[str], log: Path, on_line: Callable[[str], object]) -> None:
+        python, option, code, *arguments = words
+        assert (python, option) == (sys.executable, "-c")
+        (tmp_path / "job.py").write_text(code)
+        status, printed = forked.run(tmp_path / "job.py", *arguments)
+        assert status == 0, printed
+        for line in printed.splitlines():
+            on_line(line)
+        started.append(words)
+
+    monkeypatch.setattr("harness.run.run_logged", run_logged)
+    return started
+
+
+def test_stopped_and_continued(
+    tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forked_jobs: list[list[str]]
+) -> None:
     arms, out = ["sundae", "random-no-head", "mcmc"], tmp_path / "out"
     jobs = plan_scene(
         tiny.scene.resolve(),
@@ -63,10 +85,10 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path, monkeypatch: pytest.Mo
     words += ["--method", "sundae-tiny", "--steps-scale", SCALE, "--seeds", 42]
     words += ["--keep-ratios", 0.5, "--repeat-at", 0.5]
     monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-    # It starts a process for its job.
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(words[0]), run_name="__main__")
     assert ended.value.code == 0
+    assert [words[-1] for words in forked_jobs] == [random.key]
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
     assert not leftover.exists()
     rows = {row.variant: row for row in read_rows(out / "results.csv")}

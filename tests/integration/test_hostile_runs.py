@@ -112,7 +112,7 @@ def test_no_command_and_no_script_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.usefixtures("hostile")
+@pytest.mark.usefixtures("hostile", "short_prunes")
 def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
@@ -131,6 +131,7 @@ def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("sundae_ns.cli.run.run_in_group", start)
     monkeypatch.setattr("sundae_ns.cli.run.measured_step", lambda *_: None)
     monkeypatch.setattr("sundae_ns.cli.demo.run_logged", start)
+    monkeypatch.setattr("sundae_ns.scenes.distill.CAMERAS", 8)
     monkeypatch.setattr(os, "execvp", lambda program, words: start(words))
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", stop)
     with pytest.raises(SystemExit):

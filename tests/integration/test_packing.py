@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,14 +33,16 @@ class Packed(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def packed(tiny: Any, call: Any, tmp_path_factory: pytest.TempPathFactory) -> Packed:
+def packed(tiny: Any, tmp_path_factory: pytest.TempPathFactory) -> Packed:
     folder = tmp_path_factory.mktemp("packed")
     file = folder / "tiny.sundae"
     with redirect_stdout(io.StringIO()) as output, pytest.raises(SystemExit, match="0"):
         main(["pack", str(tiny.folder), "-o", str(file)])
     with pytest.raises(SystemExit, match="0"):
         main(["unpack", str(file), "-o", str(folder / "runs"), "--name", "blind"])
-    assert call("sundae", "unpack", file, "-o", folder / "runs", "--data", tiny.scene).stderr == ""
+    with redirect_stderr(io.StringIO()) as errors, pytest.raises(SystemExit, match="0"):
+        main(["unpack", str(file), "-o", str(folder / "runs"), "--data", str(tiny.scene)])
+    assert errors.getvalue() == ""
     config, blind = (folder / "runs" / name / "sundae" / "unpacked" / "config.yml" for name in ("tiny", "blind"))
     return Packed(file, output.getvalue(), config, blind)
 

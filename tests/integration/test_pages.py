@@ -70,6 +70,7 @@ def commands_of(page: Path, *programs: str) -> Iterator[list[str]]:
 def test_commands_run_as_they_stand(page: Path, tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sundae_ns.scenes.distill.CAMERAS", 8)
+    monkeypatch.setattr("sundae_ns.cli.render.SECONDS", 1)
     shutil.copytree(tiny.folder, "RUN")
     shutil.copytree(tiny.scene, "CAPTURE")
 

@@ -110,15 +110,19 @@ def test_help_of_ns_train(call_here: Any) -> None:
     assert "Share of the N primitives that one prune keeps" in " ".join(text.split())
 
 
-def test_import_is_light() -> None:
+def test_import_is_light_and_errors_of_ns_train_are_one_line() -> None:
     masked = ("open3d", "torchmetrics", "wandb", "comet_ml", "tinycudann")
     # An import error here would break every ns-* command, and so would importing what imports the entry points.
     code = (
         "import sys\n"
+        "sys.argv = ['/usr/bin/ns-train']\n"
         f"for name in {masked!r}: sys.modules[name] = None\n"
         "import sundae_ns.method_configs as configs\n"
         "assert configs.sundae.config.method_name == 'sundae'\n"
         "assert 'nerfstudio.configs.method_configs' not in sys.modules\n"
+        "from sundae_ns.errors import DataError\n"
+        "raise DataError('the cause; the mend')\n"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
+    assert (result.returncode, result.stderr.splitlines()[-1]) == (1, "sundae: the cause; the mend"), result.stderr
+    assert "Traceback" not in result.stderr

@@ -301,7 +301,7 @@ def test_a_model_trained_ten_times_too_fast_may_be_bad_but_not_broken(
     training = training_of(model)
     for name, optimizer in training.optimizers.optimizers.items():
         optimizer.param_groups[0]["lr"] = 10 * sundae.config.optimizers[name]["optimizer"].lr
-    for step in range(1000 if os.environ.get("SUNDAE_ALL_SEEDS") == "1" else 200):
+    for step in range(1000 if os.environ.get("SUNDAE_ALL_SEEDS") == "1" else 100):
         training.step(step)
     outputs = model.eval().get_outputs_for_camera(camera())
     assert all(torch.isfinite(outputs[name]).all() for name in ("rgb", "base_rgb", "accumulation"))

@@ -1,4 +1,4 @@
-"""The scripts of ``benchmarks`` that drive a Chromium as modules, and the Chromium that they find."""
+"""The modules of ``benchmarks`` that drive a Chromium and the Chromium that they find."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from harness import chromium as browser
+
 
 def _script(name: str) -> Any:
     spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[2] / "benchmarks" / f"{name}.py")
@@ -20,9 +22,8 @@ def _script(name: str) -> Any:
     return module
 
 
-browser = _script("browser")
-bench_page = _script("bench_page")  # imports the one before
-bench_viewers = _script("bench_viewers")  # imports both
+bench_page = _script("bench_page")
+bench_viewers = _script("bench_viewers")  # imports the one before
 
 CHROMIUM = browser.find_chromium()
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (apt-get install chromium)")

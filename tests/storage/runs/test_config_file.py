@@ -74,7 +74,7 @@ HOSTILE = {
     "a class of ours that is gone": "!!python/name:sundae_ns.gone.Class ''",
     "a tag of nobody": "!unknown 3",
     "half a file": "a: [1",
-    "deep lists": "[" * 3000,
+    "deep lists": "[" * 1000,
     "an impossible date": "a: 2024-99-99",
     "a list as a key": "? {{a: 1}}\n: 2",
     "a merge of a number": "!!python/object:nerfstudio.engine.trainer.TrainerConfig\n<<: 3",
