@@ -2,8 +2,7 @@
 
     python benchmarks/tables.py            # rewrite every table between its markers
     python benchmarks/tables.py quality    # print one table
-    python benchmarks/tables.py --suite DIR/results.jsonl    # first take over what ``suite.py CAPTURES -o DIR``
-    measured
+    python benchmarks/tables.py --suite DIR/results.jsonl    # first take over what suite.py has measured
 
 A page holds the markers ``<!-- table: NAME -->`` and ``<!-- end of table -->``; the lines between them are made here.
 ``tests/benchmarks/test_scripts.py`` checks that every page is current. A row whose options are not those that its arm
@@ -181,27 +180,35 @@ def training_time() -> list[str]:
 
 
 def packing() -> list[str]:
-    """What the default keeps of each capture, and its packs without and with a fine-tune."""
-    heads = ["capture", "stock", "kept", "head", "sundae", "MB", "bits", "packed"]
+    """What the default keeps of each capture, and its packs without and with a fine-tune, by means over seeds."""
     stock = {row["scene"]: row for row in runs() if row["variant"] == "splatfacto"}
-    rows = [
-        [
-            named(row["capture"], is_of_today({"variant": "sundae-auto", **row})),
-            f"{stock[row['capture']]['psnr']:.2f}, {stock[row['capture']]['ssim']:.4f}",
-            *(number(int(row["primitives"]), 0), "yes" if row["head"] == "yes" else ""),
-            *(f"{float(row['psnr']):.2f}, {row['ssim']}", *_packed(row, "packed"), *_packed(row, "tuned")),
-        ]
-        for row in lines_of("curve.csv")
-        if row["chosen"] == "yes"
-    ]
-    return table([*heads, "MB", "bits", "fine-tuned"], first_of_each(rows))
+    made = []
+    for capture, (name, rows) in _defaults().items():
+        count = _mean(rows, "primitives")
+        cells = [name, _quality([stock[capture]], ""), number(count, 0), "yes" if rows[0]["head"] == "yes" else ""]
+        cells.append(_quality(rows, ""))
+        for kind in ("packed_", "tuned_"):
+            size = _mean(rows, f"{kind}bytes")
+            cells += [number(size / MB, 2), number(8 * size / count, 0), _quality(rows, kind)]
+        made.append(cells)
+    return table("capture,stock,kept,head,sundae,MB,bits,packed,MB,bits,fine-tuned".split(","), made)
 
 
-def _packed(row: dict[str, Any], kind: str) -> tuple[str, str, str]:
-    """Megabytes, bits a primitive, and quality of a pack of a row of curve.csv."""
-    size = int(row[f"{kind}_bytes"])
-    quality = f"{float(row[f'{kind}_psnr']):.2f}, {row[f'{kind}_ssim']}"
-    return number(size / MB, 2), number(8 * size / int(row["primitives"]), 0), quality
+def _defaults() -> dict[str, tuple[str, list[dict[str, Any]]]]:
+    """Rows of curve.csv that the default has chosen, one for each seed, and their name in a table, by capture."""
+    chosen: dict[str, list[dict[str, Any]]] = {}
+    for row in (row for row in lines_of("curve.csv") if row["chosen"] == "yes"):
+        chosen.setdefault(row["capture"], []).append({"variant": "sundae-auto", **row})
+    return {capture: (named(capture, all(map(is_of_today, rows))), rows) for capture, rows in chosen.items()}
+
+
+def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:
+    return fmean(float(row[name]) for row in rows)
+
+
+def _quality(rows: Sequence[dict[str, Any]], kind: str) -> str:
+    """PSNR and SSIM over the seeds of a capture in curve.csv: ``31.51 ± 0.04, 0.9277``."""
+    return f"{spread([float(row[f'{kind}psnr']) for row in rows], 2)}, {_mean(rows, f'{kind}ssim'):.4f}"
 
 
 def format_rows() -> list[dict[str, Any]]:
@@ -247,17 +254,15 @@ def packed_headline() -> list[str]:
         return f"{number(size / MB, 1)} MB, {number(psnr, 1)} dB"
 
     stock: dict[str, dict[str, str]] = {}
-    for row in format_rows():
-        if row["kind"] in FORMATS and row["method"] == METHODS["splatfacto"]:
-            stock.setdefault(row["capture"], {})[row["kind"]] = cell(row["bytes"], row["psnr"])
+    for row in (row for row in format_rows() if row["method"] == METHODS["splatfacto"]):
+        stock.setdefault(row["capture"], {})[row["kind"]] = cell(row["bytes"], row["psnr"])
     rows = [
         [
-            named(row["capture"], is_of_today({"variant": "sundae-auto", **row})),
-            *(stock.get(row["capture"], {}).get(kind, "") for kind in FORMATS),
-            *(cell(int(row[f"{kind}_bytes"]), float(row[f"{kind}_psnr"])) for kind in ("packed", "tuned")),
+            name,
+            *(stock.get(capture, {}).get(kind, "") for kind in FORMATS),
+            *(cell(_mean(found, f"{kind}_bytes"), _mean(found, f"{kind}_psnr")) for kind in ("packed", "tuned")),
         ]
-        for row in lines_of("curve.csv")
-        if row["chosen"] == "yes" and row["seed"] == "42"
+        for capture, (name, found) in _defaults().items()
     ]
     kinds = list(FORMATS.values())
     return table(["capture", f"splatfacto, {kinds[0]}", *kinds[1:], "sundae", "fine-tuned"], rows)
@@ -340,10 +345,11 @@ def prune() -> list[str]:
         pair = f"{float(row['psnr_to_field']):.1f}, {float(row['psnr']):.1f}"
         device = "" if row["tool"] == "splat-transform" else "cpu" if row["device"] == "cpu" else "gpu"
         cells.setdefault((row["capture"], float(row["share"])), {})[row["rule"], row["training"], device] = pair
+    captures = dict.fromkeys(capture for capture, _ in cells)
     made = [
-        [f"{capture}, {share:.0%}", *(found.get(name, "") for name in PRUNES)]
-        for (capture, share), found in cells.items()
-        if share in (0.5, 0.1)
+        [f"{capture}, {share:.0%}", *(cells.get((capture, share), {}).get(name, "") for name in PRUNES)]
+        for capture in captures
+        for share in (0.5, 0.1)
     ]
     return table(["capture, kept", *PRUNES.values()], made)
 
