@@ -181,17 +181,15 @@ def training_time() -> list[str]:
 
 def packing() -> list[str]:
     """What the default keeps of each capture, and its packs without and with a fine-tune, by means over seeds."""
-    stock = {row["scene"]: row for row in runs() if row["variant"] == "splatfacto"}
-    made = []
+    stock, made = {row["scene"]: row for row in runs() if row["variant"] == "splatfacto"}, []
     for capture, (name, rows) in _defaults().items():
-        count = _mean(rows, "primitives")
-        cells = [name, _quality([stock[capture]], ""), number(count, 0), "yes" if rows[0]["head"] == "yes" else ""]
-        cells.append(_quality(rows, ""))
-        for kind in ("packed_", "tuned_"):
-            size = _mean(rows, f"{kind}bytes")
-            cells += [number(size / MB, 2), number(8 * size / count, 0), _quality(rows, kind)]
+        count, head = _mean(rows, "primitives"), "yes" if rows[0]["head"] == "yes" else ""
+        cells = [name, _quality([stock[capture]], ""), number(count, 0), head, _quality(rows, "")]
+        packed, tuned = (_mean(rows, f"{kind}_bytes") for kind in ("packed", "tuned"))
+        cells += [number(packed / MB, 1), _quality(rows, "packed_")]
+        cells += [number(tuned / MB, 2), number(8 * tuned / count, 0), _quality(rows, "tuned_")]
         made.append(cells)
-    return table("capture,stock,kept,head,sundae,MB,bits,packed,MB,bits,fine-tuned".split(","), made)
+    return table("capture,stock,kept,head,sundae,MB,packed,MB,bits,fine-tuned".split(","), made)
 
 
 def _defaults() -> dict[str, tuple[str, list[dict[str, Any]]]]:
@@ -207,8 +205,9 @@ def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:
 
 
 def _quality(rows: Sequence[dict[str, Any]], kind: str) -> str:
-    """PSNR and SSIM over the seeds of a capture in curve.csv: ``31.51 ± 0.04, 0.9277``."""
-    return f"{spread([float(row[f'{kind}psnr']) for row in rows], 2)}, {_mean(rows, f'{kind}ssim'):.4f}"
+    """PSNR, of what is kept with its spread, and SSIM over the seeds of a capture: ``31.51 ± 0.04, 0.9277``."""
+    decibels = number(_mean(rows, f"{kind}psnr"), 2) if kind else spread([float(row["psnr"]) for row in rows], 2)
+    return f"{decibels}, {_mean(rows, f'{kind}ssim'):.4f}"
 
 
 def format_rows() -> list[dict[str, Any]]:

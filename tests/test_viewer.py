@@ -67,6 +67,7 @@ def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:
         sh_degree=1,
         num_downscales=0,
         background_color="black",
+        dense_start_views=0,
     )
     box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
     model = config.setup(scene_box=box, num_train_data=2, metadata={}, seed_points=(xyz, rgb))

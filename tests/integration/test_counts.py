@@ -39,7 +39,7 @@ def make(scene: Path, tmp_path: Path) -> Iterator[Make]:
         *, head: str = "off", data: Path = scene, pruning: dict[str, Any] | None = None, **options: Any
     ) -> Trainer:
         def change(config: Any) -> None:
-            config.pipeline.model.head.mode = head
+            config.pipeline.model.head.mode, config.pipeline.model.dense_start_views = head, 0
             config.pipeline.model.pruning = PruningConfig(keep_ratio=None, prune_at=PRUNE_AT)
             for name, value in (pruning or {}).items():
                 setattr(config.pipeline.model.pruning, name, value)
