@@ -9,9 +9,9 @@ auto() { n=$1-$3; job $2-$n "python3 $Q /tmp/scenes/$1 -o /tmp/oracle/$n --arms 
 tenth() { job $2-$1-tenth "python3 $Q /tmp/scenes/$1 -o /tmp/tenth/$1 --arms sundae --keep-ratios 0.1 --seeds 42; cp /tmp/tenth/$1/done/*.json $O/"; }
 full() { job $2-$1-full "python3 $Q /tmp/scenes/$1 -o /tmp/full/$1 --arms sundae-no-head --keep-ratios 1 --seeds 42; cp /tmp/full/$1/done/*no-head*.json $O/"; }
 decimated() { AFTER="$1-full" job $2-$1-decimated "RUN=\$(dirname \$(find /tmp/full/$1/jobs -name config.yml | grep no-head | head -1)); python3 $P \$RUN -o $O/prune-$1.csv --shares 0.5 0.1 --training none --splat-transform /tmp/node/splat-transform; python3 $P \$RUN -o $O/prune-$1.csv --shares 0.1 --training distill --steps 8000"; }
-# stock CAPTURE GPU: splatfacto with a GPU of its own, then its packs; splat-transform's as a last and separate step
-stock() { GPU=$2 job 00-alone-$1-stock "python3 $Q /tmp/scenes/$1 -o /tmp/stock/$1 --arms splatfacto --seeds 42; cp /tmp/stock/$1/done/*.json $O/"
-  AFTER="$1-stock" job 01-$1-formats "RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); (cd /tmp; sundae export \$RUN -o /tmp/stock/$1.ply && splat-transform --quiet --overwrite --gpu cpu /tmp/stock/$1.ply /tmp/packs/$1-theirs.sog) & PATH=\${PATH#/tmp/node:} python3 $F \$RUN -o $O/formats-$1.csv; wait; python3 $F \$RUN -o $O/theirs-$1.csv --ply /tmp/packs/$1-theirs.sog --program 'splat-transform 3.7.0'"; }
+# stock CAPTURE GPU: splatfacto with a GPU of its own (480 s on an H100 beside others), its .sog by splat-transform, its packs
+stock() { GPU=$2 job 00-alone-$1-stock "python3 $Q /tmp/scenes/$1 -o /tmp/stock/$1 --arms splatfacto --seeds 42; cp /tmp/stock/$1/done/*.json $O/; RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); sundae export \$RUN -o /tmp/stock/$1.ply; splat-transform --quiet --overwrite --gpu cpu /tmp/stock/$1.ply /tmp/packs/$1-theirs.sog"
+  AFTER="$1-stock" job 01-$1-formats "RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); python3 $F \$RUN -o $O/theirs-$1.csv --ply /tmp/packs/$1-theirs.sog --program 'splat-transform 3.7.0'; PATH=\${PATH#/tmp/node:} python3 $F \$RUN -o $O/formats-$1.csv"; }
 take() { mkdir -p /tmp/scenes /tmp/full /tmp/packs; for s in $*; do [ ! -d "$ROOT/.gpu/s$s" ] || cp -r "$ROOT"/.gpu/s$s/* /tmp/scenes/; done; ls /tmp/scenes; }
 setup() { bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; python3 lab/console_scripts.py
   mkdir -p $R /tmp/logs $O $J; cp -r benchmarks tests lab docs examples web *.md pyproject.toml Makefile mkdocs.yml method_configs $R/; }
@@ -21,12 +21,12 @@ wait_for_all() { touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [
 node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C /tmp/node.part; mv /tmp/node.part /tmp/node; }
 # few CAPTURE ARM OPTION ...: 16 views, made by lab/few_views.py
 few() { c=$1 a=$2; shift 2; job 03-few-$c-$a "ns-train sundae --data /tmp/scenes/$c-16 --output-dir /tmp/few/$a --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode filename && ns-eval --load-config /tmp/few/$a/$c/sundae/run/config.yml --output-path $O/few-$c-$a.json"; }
-FEW="garden bonsai stone_horse south_building"
+# ways CAPTURE NAME WAYS OPTION ...: the default with parts of a chain in its densification (lab/hybrid.py)
+ways() { c=$1 n=$2 w=$3; shift 3; job 02-$c-$n "python3 $R/lab/hybrid.py $w -- sundae --data /tmp/scenes/$c --output-dir /tmp/ways/$n --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8 && ns-eval --load-config /tmp/ways/$n/$c/sundae/run/config.yml --output-path $O/ways-$c-$n.json && cp /tmp/ways/$n/$c/sundae/run/curve.json $O/curve-$c-$n.json && python3 $R/lab/tune.py /tmp/ways/$n/$c/sundae/run $O/tuned-$c-$n.jsonl now"; }
+six() { ways $1 mcmc none --pipeline.model.warmup mcmc; ways $1 prior prior --pipeline.model.reset-alpha-every 1000; }
 case $1 in
-1) setup; take 1; export RESERVED=3; GPU=3 job 00-alone-time "cd /tmp; python3 $R/benchmarks/bench_training.py /tmp/scenes/bonsai --arms sundae sundae-densify -o $O/time.jsonl"; auto bonsai 01 42; queue ;;
-2) take 2 3; auto garden 01 42; auto dinosaur 01 42; auto fox 01 42; auto stone_horse 01 42 ;;
-3) take 4; auto south_building 01 42; full bonsai 04 ;;
-4) take 5; for c in $FEW; do few $c chain; few $c grow --pipeline.model.warmup densify; few $c sparse --pipeline.model.warmup densify --pipeline.model.dense-start-views 0; done
-  job 05-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests/gpu tests/gaussians tests/training tests/rasterization)" ;;
-5) wait_for_all "${2:-300}"; cp $(find /tmp/full/bonsai/jobs -name scene.sundae | head -1) "$OUT/bonsai-full.sundae"; cp /tmp/packs/{bonsai,garden,south_building}-42.sundae "$OUT/"; tail -n 4 /tmp/logs/05*.log ;;
+1) setup; take 1; export RESERVED=3; GPU=3 job 00-alone-time "python3 $R/benchmarks/bench_training.py /tmp/scenes/bonsai --arms sundae sundae-mcmc -o $O/time.jsonl"; six bonsai; queue ;;
+2) take 2 3; for c in garden dinosaur fox stone_horse; do six $c; done ;;
+3) take 4; six south_building; job 05-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests)" ;;
+4) wait_for_all "${2:-300}"; tail -n 4 /tmp/logs/05*.log ;;
 esac
