@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -88,26 +89,23 @@ class NerfstudioRun:
 
     def heldout_views(self) -> Iterator[Photo]:
         """The held-out training views, loaded one at a time."""
-        return self._photos(self._datamanager.holdout_indices)
+        for camera, batch in self._datamanager.views(self._datamanager.holdout_indices):
+            yield self._photo(camera, batch)
 
     def photos(self) -> Iterator[Photo]:
         """The training views that are not held out for the whole training."""
-        for index, photo in zip(self.view_indices(), self._photos(self.view_indices()), strict=True):
-            image, mask = self._datamanager.cached_train[index]["image"], photo.mask
+        for camera, batch in self._datamanager.views(self.view_indices()):
+            photo, image = self._photo(camera, batch), batch["image"]
             if image.shape[-1] == 4:
-                opaque = (image[..., 3] > image.new_tensor(127 if image.dtype == torch.uint8 else 0.5)).to(
-                    photo.target.device
-                )
-                mask = opaque if mask is None else mask & opaque
-            yield photo._replace(mask=mask)
+                opaque = (image[..., 3] > (127 if image.dtype == torch.uint8 else 0.5)).to(photo.target.device)
+                photo = photo._replace(mask=opaque if photo.mask is None else photo.mask & opaque)
+            yield photo
 
     @torch.no_grad()  # a camera optimizer moves views
-    def _photos(self, indices: Iterable[int]) -> Iterator[Photo]:
-        model = self.model
-        for camera, batch in self._datamanager.views(indices):
-            target = model.truth(batch, {"background": self.background}, downscale=1)
-            mask = batch["mask"].to(target.device).squeeze(-1) > 0 if "mask" in batch else None
-            yield Photo(model.view_of(camera), target, mask)
+    def _photo(self, camera: Cameras, batch: dict[str, Any]) -> Photo:
+        target = self.model.truth(batch, {"background": self.background}, downscale=1)
+        mask = batch["mask"].to(target.device).squeeze(-1) > 0 if "mask" in batch else None
+        return Photo(self.model.view_of(camera), target, mask)
 
     def evaluate(self) -> dict[str, float]:
         """Mean ``psnr`` and ``ssim`` over all test views."""

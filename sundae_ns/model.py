@@ -67,7 +67,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     average_share: float = 0.1
     """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
     dense_start_views: int = 24
-    """Up to so many training images the field starts from points by a plane sweep through them too; 0 for never."""
+    """With at most this many training images, a plane sweep finds more points to start from; 0 turns it off."""
     warm_start: Path | None = None
     """Start from a finished field without a warm-up: a splatfacto or sundae .ckpt (or its folder), or a 3DGS .ply."""
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"

@@ -23,7 +23,8 @@ from PIL import Image
 from torch import Tensor
 
 import sundae_ns as sn
-from sundae_ns.evaluation.jod import JOD_DISPLAY, jod
+from sundae_ns.data.camera_axes import world_to_camera
+from sundae_ns.evaluation.jod import INSTALL_JOD, jod, jod_available, jod_metric
 
 FRAMES, FPS, BETWEEN = 20, 30, 30
 """Frames of a film, their number a second, and the number from one camera to its neighbour."""
@@ -31,11 +32,9 @@ FRAMES, FPS, BETWEEN = 20, 30, 30
 
 def moved(views: list[sn.View], pair: tuple[int, int], share: float) -> sn.View:
     """The view a share of the way from one camera of a pair to the other."""
-    first, second = (torch.linalg.inv(views[index].viewmat.double())[:3] for index in pair)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3] = between(first, second, share)
-    view = views[pair[0]]
-    return view._replace(viewmat=torch.linalg.inv(pose).to(view.viewmat))
+    first, second = (views[index] for index in pair)
+    pose = between(first.pose.double(), second.pose.double(), share)
+    return first._replace(viewmat=world_to_camera(pose).to(first.viewmat))
 
 
 def film(scene: sn.Scene, views: list[sn.View], pair: tuple[int, int], *, head: bool) -> Tensor:
@@ -46,12 +45,9 @@ def film(scene: sn.Scene, views: list[sn.View], pair: tuple[int, int], *, head: 
 
 def rows(small: sn.Scene, full: sn.Scene, capture: Path, places: int, photos: int) -> Any:
     """Figures of each path, and of the photos."""
-    import pycvvdp
-
-    metric = pycvvdp.cvvdp(display_name=JOD_DISPLAY, device=small.device, quiet=True)
+    metric = jod_metric(small.device)
     views, others = (list(sn.views_of(capture / "sparse/0", scene)) for scene in (small, full))
-    poses = torch.stack([torch.linalg.inv(view.viewmat.double())[:3] for view in views])
-    for pair in neighbours(poses, places):
+    for pair in neighbours(torch.stack([view.pose for view in views]), places):
         reference = film(full, others, pair, head=True)
         row: dict[str, Any] = {"pair": pair}
         for name, head in (("on", True), ("off", False)):
@@ -76,8 +72,7 @@ def _of_photo(scene: sn.Scene, view: sn.View, path: Path, head: bool) -> float:
 
 def _jod(image: Tensor, truth: Tensor) -> float:
     found = jod(image, truth)
-    if found is None:
-        raise SystemExit("JOD needs a package: pip install cvvdp")
+    assert found is not None
     return float(found)
 
 
@@ -91,6 +86,8 @@ def main() -> None:
     parser.add_argument("--places", type=int, default=3, help="number of paths")
     parser.add_argument("--photos", type=int, default=8, help="number of test photos")
     args = parser.parse_args()
+    if not jod_available():
+        parser.error(f"JOD needs a package: {INSTALL_JOD}")
     for row in rows(sn.load(args.small), sn.load(args.full), args.capture, args.places, args.photos):
         rounded = {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()}
         with args.out.open("a", encoding="utf-8") as file:

@@ -42,12 +42,13 @@ def jod(pred: Tensor, target: Tensor) -> Tensor | None:
     if not jod_available():
         return None
     test, reference = (image.float().clamp(0, 1) for image in (pred, target))
-    quality, _ = _metric(pred.device).predict(test, reference, dim_order="HWC")
+    quality, _ = jod_metric(pred.device).predict(test, reference, dim_order="HWC")
     return torch.as_tensor(quality, dtype=torch.float32, device=pred.device).reshape(())
 
 
 @lru_cache(maxsize=2)
-def _metric(device: torch.device) -> Any:
+def jod_metric(device: torch.device) -> Any:
+    """The package's metric on a device; it also compares films ``[F, H, W, 3]``. Ask :func:`jod_available` first."""
     import pycvvdp
 
     return pycvvdp.cvvdp(display_name=JOD_DISPLAY, device=device, quiet=True)

@@ -110,7 +110,7 @@ class Sweep:
     def _limits(self, view: View) -> tuple[float, float] | None:
         """Nearest and farthest depth to look at; None where too few sparse points are seen."""
         x, y, z = _project(view, self._sparse)
-        seen = z[(z > 0) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)].sort().values
+        seen = z[_in_view(view, x, y, z)].sort().values
         if len(seen) < SEEN:
             return None
         ends = seen[[int(0.02 * (len(seen) - 1)), int(0.98 * (len(seen) - 1))]].tolist()
@@ -127,14 +127,12 @@ class Sweep:
             if other is photo:
                 continue
             there_x, there_y, z = _project(other.view, points)
-            inside = (z > 0) & (there_x >= 0) & (there_y >= 0)
-            inside &= (there_x < other.view.width) & (there_y < other.view.height)
             column = there_x.nan_to_num().clamp(0, other.view.width - 1).long()
             row = there_y.nan_to_num().clamp(0, other.view.height - 1).long()
             found = depths[row, column]
             theirs = _to_world(other, other.rays[row, column] * found[:, None])
             back_x, back_y, _ = _project(photo.view, theirs)
-            agrees = inside & (found > 0) & ((found - z).abs() < LARGEST_ERROR * z)
+            agrees = _in_view(other.view, there_x, there_y, z) & (found > 0) & ((found - z).abs() < LARGEST_ERROR * z)
             agrees &= torch.hypot(back_x - x, back_y - y) < LARGEST_SHIFT
             total += torch.where(agrees[:, None], theirs, 0.0)
             count += agrees
@@ -167,6 +165,11 @@ def _project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return x / z, y / z, z
 
 
+def _in_view(view: View, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Whether projected points lie in the image, in front of the camera, bool."""
+    return (z > 0) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
+
+
 def _to_world(photo: _Reduced, points: Tensor) -> Tensor:
     return points @ photo.pose[:3, :3].T + photo.pose[:3, 3]
 
@@ -177,8 +180,7 @@ def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[list[int]]:
         return [[] for _ in photos]
     directions, seen = [], []
     for photo in photos:
-        x, y, z = _project(photo.view, sparse)
-        seen.append((z > 0) & (x >= 0) & (y >= 0) & (x < photo.view.width) & (y < photo.view.height))
+        seen.append(_in_view(photo.view, *_project(photo.view, sparse)))
         directions.append(normalize(sparse - photo.pose[:3, 3], dim=-1))
     found = []
     for i in range(len(photos)):

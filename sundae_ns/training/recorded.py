@@ -46,7 +46,7 @@ class _Held:
     """What a recording reads beside the buffers: the head's weights, and the counts of steps."""
 
     @classmethod
-    def of(cls, state: FieldState, trained: tuple[str, ...], head: CompensationHead | None, *, growing: bool) -> _Held:
+    def of(cls, state: FieldState, trained: tuple[str, ...], head: CompensationHead | None) -> _Held:
         names = trained if head is None else (*trained, HEAD)
         groups = [
             (name, state.optimizers[name], group) for name in names for group in state.optimizers[name].param_groups
@@ -59,13 +59,13 @@ class _Held:
             *((state.densification, *item) for item in state.densification.items() if isinstance(item[1], Tensor)),
         ]
         addresses = tuple(own[name].data_ptr() for _, _, own in states for name in (*MOMENTS, "step"))
-        return cls(trained, growing, groups, tensors, (addresses, None if head is None else head.addresses()))
+        return cls(trained, state.densifying, groups, tensors, (addresses, None if head is None else head.addresses()))
 
-    def unchanged(self, state: FieldState, settings: RenderSettings, *, growing: bool) -> bool:
+    def unchanged(self, state: FieldState, settings: RenderSettings) -> bool:
         """Whether the state still consists of these tensors."""
         with_head = self.groups[-1][0] == HEAD
         return (
-            growing == self.growing
+            self.growing == state.densifying
             and with_head == (settings.head is not None)
             and all(mapping.get(key) is value for mapping, key, value in self.tensors)
             and self.trained == trained_parameters(state)
@@ -99,10 +99,9 @@ class RecordedStep:
             BackendError: the step cannot be recorded. Nothing has changed.
             torch.cuda.OutOfMemoryError: the same.
         """
-        growing = state.densifying
         held = self._held
-        if held is None or not held.unchanged(state, settings, growing=growing):
-            held = self._held = self._hold(state, settings, growing=growing)
+        if held is None or not held.unchanged(state, settings):
+            held = self._held = self._hold(state, settings)
         self._recordings.keep_for(self._losses.emphasis(state))
         # Pinned: copying from other memory would wait until the GPU has finished the last step.
         numbers = torch.tensor(
@@ -110,7 +109,7 @@ class RecordedStep:
             pin_memory=state.device.type == "cuda",
         ).to(state.device, non_blocking=True)
         # The prior of a field that grows is a mean over fewer rows than the buffers have.
-        count = numbers[-1] if growing and self._losses.prior_weight(state) > 0 else None
+        count = numbers[-1] if state.densifying and self._losses.prior_weight(state) > 0 else None
         result = self._recordings.run(
             partial(self._step, state, held),
             replace(inputs, rates=numbers[:-1], count=count),
@@ -121,15 +120,15 @@ class RecordedStep:
         state.info = {COUNTED: True}
         return result
 
-    def _hold(self, state: FieldState, settings: RenderSettings, *, growing: bool) -> _Held:
+    def _hold(self, state: FieldState, settings: RenderSettings) -> _Held:
         """Let the field be rows of the buffers, with all states that its optimizers need."""
         trained = trained_parameters(state)
         start_moments(state, trained if settings.head is None else (*trained, HEAD))
         if state.densifying:
             start_counting(state.densification, state.field["means"])
-        if self._buffers.hold(state, trained, growing=growing):
-            self._recordings.forget(pairs=not growing)  # a pruned field needs far fewer pairs
-        return _Held.of(state, trained, settings.head, growing=growing)
+        if self._buffers.hold(state, trained, growing=state.densifying):
+            self._recordings.forget(pairs=not state.densifying)  # a pruned field needs far fewer pairs
+        return _Held.of(state, trained, settings.head)
 
     def _step(
         self, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None

@@ -29,9 +29,9 @@ def package(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
             return 10 - (test - reference).abs().max(), None
 
     monkeypatch.setitem(sys.modules, "pycvvdp", SimpleNamespace(cvvdp=Metric, __spec__=object()))
-    module._metric.cache_clear()
+    module.jod_metric.cache_clear()
     yield asked  # type: ignore[misc]
-    module._metric.cache_clear()
+    module.jod_metric.cache_clear()
 
 
 def test_the_rendering_is_judged_against_its_truth(package: list[dict[str, Any]]) -> None:
