@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# bash lab/next.sh PART [LIMIT] on four GPUs (kind nvidia-h100-x4); lab/README.md says what lies in .gpu.
+# bash lab/next.sh PART [LIMIT] on one GPU or more (GPUS); lab/README.md says what lies in .gpu.
 set -u
-export PYTHONPATH=/opt/site PATH=/tmp/node:/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 SLOTS=${SLOTS:-4} GPUS=4 ROOT=$PWD
+export PYTHONPATH=/opt/site PATH=/tmp/node:/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 SLOTS=${SLOTS:-4} GPUS=${GPUS:-1} ROOT=$PWD
 R=/tmp/repo; J=/tmp/jobs; O=/tmp/out; Q=$R/benchmarks/quality.py; P=$R/benchmarks/prune_without_photos.py; F=$R/benchmarks/bench_formats.py
 job() { { [ -z "${AFTER:-}" ] || printf "# after %s\n" $AFTER; [ -z "${GPU:-}" ] || echo "# gpu $GPU"; echo "$2"; } > $J/$1.sh.new; mv $J/$1.sh.new $J/$1.sh; }
 # auto CAPTURE ORDER SEED: the default, its records, and its fine-tuned pack (for JOD and flicker on a CPU)
@@ -23,10 +23,11 @@ node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C 
 few() { c=$1 a=$2; shift 2; job 03-few-$c-$a "ns-train sundae --data /tmp/scenes/$c-16 --output-dir /tmp/few/$a --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode filename && ns-eval --load-config /tmp/few/$a/$c/sundae/run/config.yml --output-path $O/few-$c-$a.json"; }
 # ways CAPTURE NAME WAYS OPTION ...: the default with parts of a chain in its densification (lab/hybrid.py)
 ways() { c=$1 n=$2 w=$3; shift 3; job 02-$c-$n "python3 $R/lab/hybrid.py $w -- sundae --data /tmp/scenes/$c --output-dir /tmp/ways/$n --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8 && ns-eval --load-config /tmp/ways/$n/$c/sundae/run/config.yml --output-path $O/ways-$c-$n.json && cp /tmp/ways/$n/$c/sundae/run/curve.json $O/curve-$c-$n.json && python3 $R/lab/tune.py /tmp/ways/$n/$c/sundae/run $O/tuned-$c-$n.jsonl now"; }
-six() { ways $1 mcmc none --pipeline.model.warmup mcmc; ways $1 prior prior --pipeline.model.reset-alpha-every 1000; }
-case $1 in
-1) setup; take 1; export RESERVED=3; GPU=3 job 00-alone-time "python3 $R/benchmarks/bench_training.py /tmp/scenes/bonsai --arms sundae sundae-mcmc -o $O/time.jsonl"; six bonsai; queue ;;
-2) take 2 3; for c in garden dinosaur fox stone_horse; do six $c; done ;;
-3) take 4; six south_building; job 05-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests)" ;;
-4) wait_for_all "${2:-300}"; tail -n 4 /tmp/logs/05*.log ;;
-esac
+six() { ways $1 mcmc none --pipeline.model.warmup mcmc; ways $1 late late,probe; }
+train() { echo "--data /tmp/scenes/$1 --experiment-name $1 --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000"; }
+C="colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8"
+# base CAPTURE: the default with all checkpoints; trick CAPTURE NAME WAYS: from its step 18,000 on
+base() { job 01-$1-base "ns-train sundae $(train $1) --output-dir /tmp/base --save-only-latest-checkpoint False $C && ns-eval --load-config /tmp/base/$1/sundae/run/config.yml --output-path $O/base-$1.json && cp /tmp/base/$1/sundae/run/curve.json $O/curve-$1.json"
+  job 03-$1-pack "sundae pack /tmp/base/$1/sundae/run -o $O/$1.sundae --finetune"; AFTER="$1-base"; }
+trick() { AFTER="$1-base" job 02-$1-trick-$2 "python3 $R/lab/hybrid.py $3 -- sundae $(train $1) --output-dir /tmp/tricks/$2 --load-checkpoint /tmp/base/$1/sundae/run/nerfstudio_models/step-000018000.ckpt $C && ns-eval --load-config /tmp/tricks/$2/$1/sundae/run/config.yml --output-path $O/trick-$1-$2.json; rm -rf /tmp/tricks/$2/$1/sundae/run/nerfstudio_models"; }
+tricks() { base $1; for w in none none2 nomirror noshrink nodecay; do trick $1 $w ${w%2}; done; }

@@ -24,7 +24,7 @@ from torch import Tensor
 from sundae_ns.callbacks import NerfstudioRun, training_views
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window
 from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, no_images_error, view_index
-from sundae_ns.evaluation import Lpips, psnr, ssim
+from sundae_ns.evaluation import Lpips, fitted_psnr, psnr, ssim
 from sundae_ns.evaluation.count_curve import CurvePoint
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.parsing import check_projection
@@ -390,11 +390,11 @@ class SundaeModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Any], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR, SSIM and, if its weights are installed, LPIPS; each with the head and without (``_base``)."""
+        """PSNR, also with fitted colours, SSIM and, with its weights, LPIPS; each also without the head (``_base``)."""
         target = self.truth(batch, outputs)
         metrics = {"gaussian_count": float(self.source.total)}
         for suffix, image in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
-            found = {"psnr": psnr(image, target), "ssim": ssim(image, target), "lpips": self.lpips(image, target)}
+            found = {"psnr": psnr(image, target), "psnr_fitted": fitted_psnr(image, target)}
+            found |= {"ssim": ssim(image, target), "lpips": self.lpips(image, target)}
             metrics |= {name + suffix: float(value) for name, value in found.items() if value is not None}
-        images = {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}
-        return metrics, images
+        return metrics, {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}

@@ -5,7 +5,7 @@ from sundae_ns.evaluation.comparison_image import ComparisonRow, comparison_shee
 from sundae_ns.evaluation.document import COLUMNS, csv_text, report_text
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
 from sundae_ns.evaluation.measured import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality, without_nan
-from sundae_ns.evaluation.metrics import flip, flip_available, psnr, ssim
+from sundae_ns.evaluation.metrics import fitted_psnr, flip, flip_available, psnr, ssim
 from sundae_ns.evaluation.timing import median_ms, peak_memory
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "comparison_sheet",
     "csv_text",
     "display",
+    "fitted_psnr",
     "flip",
     "flip_available",
     "lpips_weights_available",

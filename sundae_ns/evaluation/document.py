@@ -15,13 +15,14 @@ from sundae_ns.evaluation.jod import JOD_VARIANT
 from sundae_ns.evaluation.measured import MEGABYTE, Configuration, Measured
 from sundae_ns.evaluation.metrics import FLIP_VARIANT
 
-METRICS = (("psnr", 2), ("ssim", 4), ("flip", 4), ("lpips", 4), ("jod", 3))
+METRICS = (("psnr", 2), ("ssim", 4), ("psnr_fitted", 2), ("flip", 4), ("lpips", 4), ("jod", 3))
 """Metrics in the order of a table's columns, with their number of decimals."""
 Stage = tuple[str, int, Mapping[str, float] | None]
 """Name of a stage of a run, number of primitives, and means over the test views by name; None for a skipped stage."""
 EXPLANATIONS = (
     "Each row is one configuration of rendering a field. Its time and its metrics come from the same calls.",
-    "Metrics are means over the test views. PSNR is over all pixels and channels, SSIM is pytorch_msssim's "
+    "Metrics are means over the test views. PSNR is over all pixels and channels, and fitted after the affine map of "
+    "colours that fits an image best, so that changing light counts less. SSIM is pytorch_msssim's "
     f"(11 x 11 window, no padding), FLIP is {FLIP_VARIANT}, and LPIPS names its net.",
     f"JOD is {JOD_VARIANT}: 10 for equal images, and three of four viewers see 1 less.",
     "Higher PSNR, SSIM and JOD are better; lower FLIP, LPIPS, ms and MB are better.",
@@ -32,7 +33,7 @@ EXPLANATIONS = (
 """Sentences on the figures of a report's table."""
 COLUMNS = (
     *("scene", "method", "variant", "keep_ratio", "seed", "steps", "primitives"),
-    *("psnr", "ssim", "psnr_base", "ssim_base", "lpips", "lpips_net"),
+    *("psnr", "ssim", "psnr_base", "ssim_base", "psnr_fitted", "lpips", "lpips_net"),
     *("bytes_primitives", "bytes_head", "bytes_total", "ms_frame", "ms_splat", "ms_head"),
     *("train_s", "prune_s", "peak_primitives", "peak_vram_mib", "gpu", "resolution", "fingerprint", "command"),
 )
@@ -55,7 +56,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, words: int = 2
 def heads_of(runs: Sequence[Measured]) -> list[str]:
     """Heads of the table of the runs of a report; LPIPS names the nets that the runs have."""
     nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})
-    heads = ["run", "rendered with", "primitives", "MB", "ms per frame", "PSNR, dB", "SSIM", "FLIP"]
+    heads = ["run", "rendered with", "primitives", "MB", "ms per frame", "PSNR, dB", "SSIM", "fitted, dB", "FLIP"]
     return [*heads, f"LPIPS ({', '.join(nets)})" if nets else "LPIPS", "JOD"]
 
 

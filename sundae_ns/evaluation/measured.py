@@ -22,6 +22,8 @@ class ViewQuality:
     """pytorch_msssim's variant, without padding; NaN for images smaller than its window."""
     flip: float | None = None
     lpips: float | None = None
+    psnr_fitted: float | None = None
+    """dB, after the affine map of colours that fits best (:func:`sundae_ns.evaluation.metrics.fitted_psnr`)."""
     jod: float | None = None
     """Visibility of the difference, 10 for none (:func:`sundae_ns.evaluation.jod.jod`)."""
 

@@ -17,6 +17,8 @@ from torch import Tensor
 from sundae_ns.errors import DataError
 from sundae_ns.gpu.fused_loss import SSIM_WINDOW
 
+MOST_PSNR = 100.0
+"""Highest PSNR that a decision or a fit of colours gives, dB; 8-bit images carry no more."""
 FLIP_VARIANT = "LDR-FLIP, 67 pixels per degree"
 """Variant of FLIP: low dynamic range, at the default viewing distance of the authors' tools."""
 INSTALL_FLIP = "pip install flip-evaluator"
@@ -45,6 +47,35 @@ def psnr(pred: Tensor, target: Tensor) -> Tensor:
     """
     check_pair(pred, target)
     return -10 * torch.log10(torch.mean((pred - target) ** 2))
+
+
+@torch.no_grad()
+def fitted_psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """PSNR after the affine map of colours (12 numbers) that brings an image nearest to its target.
+
+    What is left if light and exposure of the photo differ from the others'.
+
+    Args:
+        pred: ``[H, W, 3]``, nominally in [0, 1]; not clamped here.
+        target: ``[H, W, 3]`` in [0, 1].
+        mask: pixels that count, bool ``[H, W]``; None for all.
+
+    Returns:
+        A float64 scalar on the inputs' device, dB, at most :data:`MOST_PSNR`; NaN if the image is not finite.
+
+    Raises:
+        DataError: the shapes differ, or are not ``[H, W, 3]``.
+    """
+    check_pair(pred, target)
+    chosen = ... if mask is None else mask
+    colors, truth = pred[chosen].reshape(-1, 3).double(), target[chosen].reshape(-1, 3).double()
+    if not bool(torch.isfinite(colors).all()):
+        return colors.new_full((), float("nan"))
+    rows = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1)
+    # A ridge far below 8-bit steps keeps images of one colour solvable.
+    normal = rows.T @ rows + 1e-6 * len(rows) * torch.eye(4, dtype=rows.dtype, device=rows.device)
+    error = rows @ torch.linalg.solve(normal, rows.T @ truth) - truth
+    return (-10 * error.square().mean().clamp_min(1e-30).log10()).clamp_max(MOST_PSNR)
 
 
 def ssim(pred: Tensor, target: Tensor) -> Tensor:

@@ -22,8 +22,15 @@ from sundae_ns.evaluation.measured import MEGABYTE, Measured, ViewQuality
 from sundae_ns.evaluation.plots import PALETTE, plot_counts
 from sundae_ns.evaluation.shown_views import LARGEST_ERROR, LONGEST_SIDE, ShownView, error_colors
 
-_NAMES = {"psnr": "PSNR", "ssim": "SSIM", "flip": "FLIP", "lpips": "LPIPS", "jod": "JOD"}
-_UNITS = {"psnr": " dB"}
+_NAMES = {
+    "psnr": "PSNR",
+    "psnr_fitted": "colours fitted",
+    "ssim": "SSIM",
+    "flip": "FLIP",
+    "lpips": "LPIPS",
+    "jod": "JOD",
+}
+_UNITS = {"psnr": " dB", "psnr_fitted": " dB"}
 _INK = "#010203"
 _COLORS = {_INK: "currentColor", PALETTE[0].lower(): "var(--line)", PALETTE[1].lower(): "var(--choice)"}
 """Colours of a drawing, and those of the page, light or dark, that it takes instead."""

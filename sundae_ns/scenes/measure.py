@@ -25,6 +25,7 @@ from sundae_ns.evaluation import (
     Lpips,
     Measured,
     ViewQuality,
+    fitted_psnr,
     flip,
     median_ms,
     psnr,
@@ -257,11 +258,11 @@ def evaluation(run: Path, *, data: Path | None = None) -> dict[str, Any]:
 
 def quality(image: Tensor, truth: Tensor, lpips: Lpips | None = None, *, visible: bool = True) -> ViewQuality:
     """Every metric of one image ``[H, W, 3]`` against its truth; ``visible`` is that of :func:`measure_scene`."""
-    learned = None if lpips is None else lpips(image, truth)
-    others = (flip(image, truth) if visible else None, learned, jod(image, truth) if visible else None)
-    return ViewQuality(
-        float(psnr(image, truth)), float(ssim(image, truth)), *(None if one is None else float(one) for one in others)
-    )
+    found: dict[str, Any] = {"psnr": psnr(image, truth), "psnr_fitted": fitted_psnr(image, truth)}
+    found |= {"ssim": ssim(image, truth), "lpips": None if lpips is None else lpips(image, truth)}
+    if visible:
+        found |= {"flip": flip(image, truth), "jod": jod(image, truth)}
+    return ViewQuality(**{name: float(value) for name, value in found.items() if value is not None})
 
 
 def comparison_of(model: SundaeModel, camera: Cameras, truth: Tensor, title: str) -> ComparisonRow:

@@ -10,12 +10,9 @@ import torch
 from torch import Tensor
 
 from sundae_ns.evaluation import psnr, ssim
-from sundae_ns.evaluation.metrics import SSIM_WINDOW
+from sundae_ns.evaluation.metrics import MOST_PSNR, SSIM_WINDOW, fitted_psnr
 from sundae_ns.rendering.render import render_view
 from sundae_ns.training.extension import TrainingRun
-
-EXACT = 100.0
-"""Highest PSNR of a view, dB; 8-bit images carry no more."""
 
 
 class HeldOutQuality(NamedTuple):
@@ -24,7 +21,7 @@ class HeldOutQuality(NamedTuple):
     pixels: int
     """Number of pixels that count: those under the mask."""
     psnr: float
-    """PSNR of these pixels, dB, at most :data:`EXACT`."""
+    """PSNR of these pixels, dB, at most :data:`MOST_PSNR`."""
     ssim: float
     """SSIM of these pixels; 0 for an image that is smaller than the window of SSIM."""
     fitted: float = math.nan
@@ -50,7 +47,7 @@ def measure_heldout(run: TrainingRun, *, with_fitted: bool = False) -> list[Held
         images, _ = render_view(run.source, view, run.background, run.settings, depth=False)
         quality = view_quality(images["rgb"], target, mask)
         if quality.pixels:
-            fitted = fitted_psnr(images["rgb"], target, mask) if with_fitted else math.nan
+            fitted = float(fitted_psnr(images["rgb"], target, mask)) if with_fitted else math.nan
             qualities.append(quality._replace(fitted=fitted))
     return qualities
 
@@ -74,29 +71,7 @@ def view_quality(image: Tensor, target: Tensor, mask: Tensor | None) -> HeldOutQ
     similarity = 0.0
     if min(target.shape[:2]) >= SSIM_WINDOW:
         similarity = 1 - (1 - float(ssim(compared, target))) / share
-    return HeldOutQuality(pixels, min(decibels, EXACT), similarity)
-
-
-def fitted_psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
-    """PSNR after the affine map of colours (12 numbers) that brings an image nearest to its target, dB.
-
-    Args:
-        image: ``[H, W, 3]``.
-        target: the truth ``[H, W, 3]``.
-        mask: pixels that count, bool ``[H, W]``; None for all.
-
-    Returns:
-        At most :data:`EXACT`; NaN if the image is not finite.
-    """
-    chosen = torch.ones_like(target[..., 0], dtype=torch.bool) if mask is None else mask
-    colors, truth = image[chosen].double(), target[chosen].double()
-    if not bool(torch.isfinite(colors).all()):
-        return math.nan
-    rows = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1)
-    # A ridge far below 8-bit steps keeps images of one colour solvable.
-    normal = rows.T @ rows + 1e-6 * len(rows) * torch.eye(4, dtype=rows.dtype, device=rows.device)
-    error = rows @ torch.linalg.solve(normal, rows.T @ truth) - truth
-    return min(-10 * math.log10(max(float(error.square().mean()), 1e-10)), EXACT)
+    return HeldOutQuality(pixels, min(decibels, MOST_PSNR), similarity)
 
 
 def mean_quality(views: Sequence[HeldOutQuality]) -> tuple[float, float]:

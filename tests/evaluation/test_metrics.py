@@ -5,7 +5,8 @@ import torch
 from scipy.ndimage import correlate1d
 
 from sundae_ns.errors import DataError
-from sundae_ns.evaluation import psnr, ssim
+from sundae_ns.evaluation import fitted_psnr, psnr, ssim
+from sundae_ns.evaluation.metrics import MOST_PSNR
 
 
 def _pair(height=40, width=30, noise=0.1):
@@ -34,6 +35,23 @@ def test_psnr_of_a_known_error():
     target = torch.full((4, 5, 3), 0.5)
     assert psnr(target + 0.1, target).item() == pytest.approx(20.0, abs=1e-4)
     assert psnr(target, target).item() == math.inf
+
+
+def test_a_fit_of_colours_takes_away_what_light_and_exposure_change():
+    image, target = _pair()
+    mask = torch.rand(target.shape[:2], generator=torch.Generator().manual_seed(1)) > 0.3
+    mix = torch.tensor([[0.7, 0.1, 0.0], [0.0, 0.8, 0.1], [0.05, 0.0, 0.6]], dtype=target.dtype)
+    changed = target @ mix + 0.1
+    assert psnr(changed, target) < 30
+    assert 60 < fitted_psnr(changed, target, mask) <= MOST_PSNR
+    assert fitted_psnr(target, target) == MOST_PSNR
+    # What no map of colours explains stays, and a fit loses nothing.
+    assert fitted_psnr(image, target) >= psnr(image, target) - 1e-3
+    assert fitted_psnr(target[..., [2, 0, 1]].flip(0), target) < 30
+    grey = torch.full_like(target, 0.5)
+    expected = -10 * math.log10(float((target - target.mean((0, 1))).square().mean()))
+    assert fitted_psnr(grey, target).item() == pytest.approx(expected, abs=1e-2)
+    assert math.isnan(fitted_psnr(torch.full_like(target, torch.nan), target))
 
 
 def test_ssim_follows_the_definition():

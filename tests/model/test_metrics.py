@@ -31,13 +31,14 @@ def test_metrics_with_and_without_the_head(
     with torch.no_grad():
         outputs = model.get_outputs_for_camera(camera())
     metrics, images = model.get_image_metrics_and_images(outputs, batch())
-    assert set(metrics) == {"gaussian_count", "psnr", "ssim", "psnr_base", "ssim_base"}
+    assert set(metrics) == {"gaussian_count"} | {a + b for a in ("psnr", "psnr_fitted", "ssim") for b in ("", "_base")}
     assert all(type(value) is float for value in metrics.values())
     truth = batch()["image"].float() / 255
     for suffix, name in (("", "rgb"), ("_base", "base_rgb")):
         mse = ((outputs[name] - truth) ** 2).mean()
         assert metrics["psnr" + suffix] == pytest.approx(float(-10 * mse.log10()), abs=1e-4)
     assert metrics["psnr"] != metrics["psnr_base"]
+    assert metrics["psnr_fitted"] > metrics["psnr"]
     assert images["img"].shape == (32, 80, 3)
     # A picture with alpha is composited over the background that it was rendered with.
     assert torch.isfinite(torch.tensor(model.get_image_metrics_and_images(outputs, batch(channels=4))[0]["psnr"]))
