@@ -6,7 +6,8 @@
 
 The formats are fp32 (the run itself), .ply, .spz and .sog by ``sundae export``, .sundae by ``sundae pack`` with the
 head if there is one, and .sog by PlayCanvas's ``splat-transform`` where it is in PATH (``npm install -g
-@playcanvas/splat-transform``, node 22). Each file is loaded again by ``sundae_ns.load`` and rendered over the
+@playcanvas/splat-transform``, node 22; it needs a GPU by Vulkan: with ``--splat-transform "splat-transform --gpu cpu"``
+100,000 primitives take more than ten minutes). Each file is loaded again by ``sundae_ns.load`` and rendered over the
 background of the run. Bytes are those of the whole file; fp32 counts primitives, features and head. With ``-o``, rows
 take the place of those of the same capture, method, format, program and seed. ``benchmarks/tables.py`` shows
 results/formats.csv.
@@ -18,6 +19,7 @@ import argparse
 import csv
 import dataclasses
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -68,9 +70,9 @@ def packed_files(run: Path, scene: sn.Scene, folder: Path, data: Path | None, pr
     yield Packed(packed, OURS, "sundae pack RUN -o scene.sundae")
     if program is not None:
         theirs = folder / "theirs.sog"
-        words = [program, "--quiet", "--overwrite", "--gpu", "cpu", str(folder / "scene.ply"), str(theirs)]
-        subprocess.run(words, check=True)
-        yield Packed(theirs, version_of(program), f"{OTHER} --gpu cpu scene.ply scene.sog")
+        words = shlex.split(program)
+        subprocess.run([*words, "--quiet", "--overwrite", str(folder / "scene.ply"), str(theirs)], check=True)
+        yield Packed(theirs, version_of(words[0]), shlex.join([OTHER, *words[1:], "scene.ply", "scene.sog"]))
 
 
 def rows_of(opened: Opened, method: str, files: Iterator[Packed], scene: sn.Scene) -> Iterator[dict[str, Any]]:
@@ -129,7 +131,9 @@ def main() -> int:
     parser.add_argument("--method", help="name in the rows; by default the run's method")
     parser.add_argument("--ply", type=Path, nargs="+", default=[], metavar="FILE", help="measure these files instead")
     parser.add_argument("--program", default="other", help="the program that made the files of --ply")
-    parser.add_argument("--splat-transform", default=shutil.which(OTHER), metavar="PROGRAM")
+    parser.add_argument(
+        "--splat-transform", default=shutil.which(OTHER), help="its command, with options if it needs any"
+    )
     options = parser.parse_args()
 
     opened = open_scene(options.run, data=options.data)

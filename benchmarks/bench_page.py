@@ -183,7 +183,7 @@ def bundled(source: str, out: Path, *options: str) -> Path:
     """A program of ``web/tests`` with all that it imports, as one module."""
     esbuild = WEB / "node_modules" / ".bin" / "esbuild"
     words = [f"tests/{source}", "--bundle", "--format=esm", "--loader:.wgsl=text", "--log-level=error", *options]
-    subprocess.run([esbuild, *words, f"--outfile={out}"], cwd=WEB, check=True)
+    subprocess.run([esbuild, *words, f"--outfile={out.resolve()}"], cwd=WEB, check=True)
     return out
 
 

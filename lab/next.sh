@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # bash lab/next.sh PART [LIMIT] on one GPU or more (GPUS); lab/README.md says what lies in .gpu.
 set -u
-export PYTHONPATH=/opt/site PATH=/tmp/node:/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 SLOTS=${SLOTS:-4} GPUS=${GPUS:-1} ROOT=$PWD
+export PYTHONPATH=/opt/site PATH=/tmp/node:/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 SLOTS=${SLOTS:-4} GPUS=${GPUS:-4} ROOT=$PWD
 R=/tmp/repo; J=/tmp/jobs; O=/tmp/out; Q=$R/benchmarks/quality.py; P=$R/benchmarks/prune_without_photos.py; F=$R/benchmarks/bench_formats.py
 job() { { [ -z "${AFTER:-}" ] || printf "# after %s\n" $AFTER; [ -z "${GPU:-}" ] || echo "# gpu $GPU"; echo "$2"; } > $J/$1.sh.new; mv $J/$1.sh.new $J/$1.sh; }
 # auto CAPTURE ORDER SEED: the default, its records, and its fine-tuned pack (for JOD and flicker on a CPU)
@@ -9,9 +9,10 @@ auto() { n=$1-$3; job $2-$n "python3 $Q /tmp/scenes/$1 -o /tmp/oracle/$n --arms 
 tenth() { job $2-$1-tenth "python3 $Q /tmp/scenes/$1 -o /tmp/tenth/$1 --arms sundae --keep-ratios 0.1 --seeds 42; cp /tmp/tenth/$1/done/*.json $O/"; }
 full() { job $2-$1-full "python3 $Q /tmp/scenes/$1 -o /tmp/full/$1 --arms sundae-no-head --keep-ratios 1 --seeds 42; cp /tmp/full/$1/done/*no-head*.json $O/"; }
 decimated() { AFTER="$1-full" job $2-$1-decimated "RUN=\$(dirname \$(find /tmp/full/$1/jobs -name config.yml | grep no-head | head -1)); python3 $P \$RUN -o $O/prune-$1.csv --shares 0.5 0.1 --training none --splat-transform /tmp/node/splat-transform; python3 $P \$RUN -o $O/prune-$1.csv --shares 0.1 --training distill --steps 8000"; }
-# stock CAPTURE GPU: splatfacto with a GPU of its own (480 s on an H100 beside others), its .sog by splat-transform, its packs
-stock() { GPU=$2 job 00-alone-$1-stock "python3 $Q /tmp/scenes/$1 -o /tmp/stock/$1 --arms splatfacto --seeds 42; cp /tmp/stock/$1/done/*.json $O/; RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); sundae export \$RUN -o /tmp/stock/$1.ply; splat-transform --quiet --overwrite --gpu cpu /tmp/stock/$1.ply /tmp/packs/$1-theirs.sog"
-  AFTER="$1-stock" job 01-$1-formats "RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); python3 $F \$RUN -o $O/theirs-$1.csv --ply /tmp/packs/$1-theirs.sog --program 'splat-transform 3.7.0'; PATH=\${PATH#/tmp/node:} python3 $F \$RUN -o $O/formats-$1.csv"; }
+# stock CAPTURE: splatfacto (480 s on an H100), then its packs, splat-transform's too where Vulkan is
+stock() { job 00-$1-stock "python3 $Q /tmp/scenes/$1 -o /tmp/stock/$1 --arms splatfacto --seeds 42; cp /tmp/stock/$1/done/*.json $O/"
+  AFTER="$1-stock" job 01-$1-formats "RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); python3 $F \$RUN -o $O/formats-$1.csv"; }
+export XDG_RUNTIME_DIR=/tmp VK_DRIVER_FILES=/usr/local/nvidia/share/vulkan/icd.d/nvidia_icd.json
 take() { mkdir -p /tmp/scenes /tmp/full /tmp/packs; for s in $*; do [ ! -d "$ROOT/.gpu/s$s" ] || cp -r "$ROOT"/.gpu/s$s/* /tmp/scenes/; done; ls /tmp/scenes; }
 setup() { bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; python3 lab/console_scripts.py
   mkdir -p $R /tmp/logs $O $J; cp -r benchmarks tests lab docs examples web *.md pyproject.toml Makefile mkdocs.yml method_configs $R/; }
@@ -28,6 +29,16 @@ train() { echo "--data /tmp/scenes/$1 --experiment-name $1 --timestamp run --vis
 C="colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8"
 # base CAPTURE: the default with all checkpoints; trick CAPTURE NAME WAYS: from its step 18,000 on
 base() { job 01-$1-base "ns-train sundae $(train $1) --output-dir /tmp/base --save-only-latest-checkpoint False $C && ns-eval --load-config /tmp/base/$1/sundae/run/config.yml --output-path $O/base-$1.json && cp /tmp/base/$1/sundae/run/curve.json $O/curve-$1.json"
-  job 03-$1-pack "sundae pack /tmp/base/$1/sundae/run -o $O/$1.sundae --finetune"; AFTER="$1-base"; }
+  AFTER="$1-base" job 01-$1-pack "sundae pack /tmp/base/$1/sundae/run -o $O/$1.sundae --finetune 1500"; }
 trick() { AFTER="$1-base" job 02-$1-trick-$2 "python3 $R/lab/hybrid.py $3 -- sundae $(train $1) --output-dir /tmp/tricks/$2 --load-checkpoint /tmp/base/$1/sundae/run/nerfstudio_models/step-000018000.ckpt $C && ns-eval --load-config /tmp/tricks/$2/$1/sundae/run/config.yml --output-path $O/trick-$1-$2.json; rm -rf /tmp/tricks/$2/$1/sundae/run/nerfstudio_models"; }
 tricks() { base $1; for w in none none2 nomirror noshrink nodecay; do trick $1 $w ${w%2}; done; }
+light() { ways $1 affine50 affine50; ways $1 affine50-pruned affine50-pruned; }
+case $1 in
+1) setup; take 1; stock bonsai; queue ;;
+2) take 2 3; for c in garden stone_horse dinosaur; do stock $c; done; tenth garden 02; tenth fox 02 ;;
+3) for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; /tmp/node/splat-transform --list-gpus; cp -r "$ROOT/.gpu/dawn" /tmp/dawn; mkdir -p /tmp/dawn/node_modules/webgpu/dist; cp /tmp/node/node_modules/webgpu/dist/* /tmp/dawn/node_modules/webgpu/dist/; nvidia-smi | head -15 ;;
+4) take 4; tenth south_building 02 ;;
+5) touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$2" ]; do sleep 1; done; tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log ;;
+6) cd /tmp; (cd /tmp/dawn; timeout 60 /tmp/node/node timing.mjs /tmp/dawn > $O/dawn.jsonl 2> /tmp/logs/dawn.err); cat $O/dawn.jsonl | cut -c1-500; tail -n 3 /tmp/logs/dawn.err
+  RUN=$(dirname $(find /tmp/stock/bonsai/jobs -name config.yml | head -1)); timeout "$2" python3 $P $RUN -o $O/prune-bonsai.csv --shares 0.1 --training distill --steps 8000 > /tmp/logs/distill.log 2>&1; cat $O/prune-bonsai.csv; tar -czf "$OUT/out.tgz" -C /tmp out logs ;;
+esac
