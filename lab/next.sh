@@ -35,7 +35,7 @@ tricks() { base $1; for w in none none2 nomirror noshrink nodecay; do trick $1 $
 light() { ways $1 affine50 affine50; ways $1 affine50-pruned affine50-pruned; }
 case $1 in
 1) setup; take 1; stock bonsai; queue ;;
-2) take 2 3; for c in garden stone_horse dinosaur; do stock $c; done; tenth garden 02; tenth fox 02 ;;
+2) take 2 3; for c in garden stone_horse; do stock $c; done; tenth garden 02; tenth fox 02 ;;
 3) for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; /tmp/node/splat-transform --list-gpus; cp -r "$ROOT/.gpu/dawn" /tmp/dawn; mkdir -p /tmp/dawn/node_modules/webgpu/dist; cp /tmp/node/node_modules/webgpu/dist/* /tmp/dawn/node_modules/webgpu/dist/; nvidia-smi | head -15 ;;
 4) take 4; tenth south_building 02 ;;
 5) touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$2" ]; do sleep 1; done; tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log ;;

@@ -20,6 +20,9 @@ from sundae_ns.training.densification import start_of_chain
 from sundae_ns.training.options import ModelOptions
 from sundae_ns.training.warning import warn
 
+FEWEST_POINTS = 50
+"""With fewer sparse points a user hears that photos overlap too little."""
+
 Points = tuple[Tensor, Tensor]
 """Positions ``[N, 3]`` and colours in 0 to 255 ``[N, 3]``."""
 
@@ -84,6 +87,11 @@ def _sparse_field(
     warnings: list[str] = []
     if points is not None and len(points[0]) > 0 and not options.random_init:
         xyz, rgb = points[0], points[1].float() / 255 if len(points[1]) else torch.full_like(points[0], 0.5)
+        if len(xyz) < FEWEST_POINTS:
+            warnings.append(
+                f"the capture has only {len(xyz)} sparse points: its photos hardly overlap and the scene will be poor; "
+                "add photos between them"
+            )
     else:
         if not options.random_init:
             warnings.append(

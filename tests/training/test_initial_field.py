@@ -16,6 +16,7 @@ from sundae_ns.datamanager import DATASET_FRAME
 from sundae_ns.errors import CheckpointError
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage import similarity, write_ply
+from sundae_ns.training.initial_field import FEWEST_POINTS
 
 Build = Callable[..., SundaeModel]
 Points = Callable[[], tuple[Tensor, Tensor]]
@@ -41,6 +42,16 @@ def test_without_a_sparse_cloud_points_are_random(
     assert model.means.abs().max() <= 1
     training_of(model)
     assert "no sparse point cloud" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(("n", "warned"), [(FEWEST_POINTS - 1, True), (FEWEST_POINTS, False)])
+def test_who_has_hardly_any_points_hears_that_photos_do_not_overlap(
+    build: Build, training_of: TrainingOf, n: int, warned: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = build(seed_points=(torch.rand(n, 3), torch.full((n, 3), 99, dtype=torch.uint8)))
+    training_of(model)
+    said = " ".join(capsys.readouterr().out.split())
+    assert (f"only {n} sparse points" in said) == warned
 
 
 def test_a_finished_run_is_not_warned_of_what_it_did_not_start_from(
