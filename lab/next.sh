@@ -11,7 +11,7 @@ full() { job $2-$1-full "python3 $Q /tmp/scenes/$1 -o /tmp/full/$1 --arms sundae
 decimated() { AFTER="$1-full" job $2-$1-decimated "RUN=\$(dirname \$(find /tmp/full/$1/jobs -name config.yml | grep no-head | head -1)); python3 $P \$RUN -o $O/prune-$1.csv --shares 0.5 0.1 --training none --splat-transform /tmp/node/splat-transform; python3 $P \$RUN -o $O/prune-$1.csv --shares 0.1 --training distill --steps 8000"; }
 # stock CAPTURE: splatfacto (480 s on an H100), then its packs, splat-transform's too where Vulkan is
 stock() { job 00-$1-stock "python3 $Q /tmp/scenes/$1 -o /tmp/stock/$1 --arms splatfacto --seeds 42; cp /tmp/stock/$1/done/*.json $O/"
-  AFTER="$1-stock" job 01-$1-formats "RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); python3 $F \$RUN -o $O/formats-$1.csv"; }
+  AFTER="$1-stock" job 01-$1-formats "RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); sundae pack \$RUN -o /tmp/packs/stock-$1.sundae; python3 $F \$RUN -o $O/formats-$1.csv"; }
 export XDG_RUNTIME_DIR=/tmp VK_DRIVER_FILES=/usr/local/nvidia/share/vulkan/icd.d/nvidia_icd.json
 take() { mkdir -p /tmp/scenes /tmp/full /tmp/packs; for s in $*; do [ ! -d "$ROOT/.gpu/s$s" ] || cp -r "$ROOT"/.gpu/s$s/* /tmp/scenes/; done; ls /tmp/scenes; }
 setup() { bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; python3 lab/console_scripts.py
@@ -33,12 +33,20 @@ base() { job 01-$1-base "ns-train sundae $(train $1) --output-dir /tmp/base --sa
 trick() { AFTER="$1-base" job 02-$1-trick-$2 "python3 $R/lab/hybrid.py $3 -- sundae $(train $1) --output-dir /tmp/tricks/$2 --load-checkpoint /tmp/base/$1/sundae/run/nerfstudio_models/step-000018000.ckpt $C && ns-eval --load-config /tmp/tricks/$2/$1/sundae/run/config.yml --output-path $O/trick-$1-$2.json; rm -rf /tmp/tricks/$2/$1/sundae/run/nerfstudio_models"; }
 tricks() { base $1; for w in none none2 nomirror noshrink nodecay; do trick $1 $w ${w%2}; done; }
 light() { ways $1 affine50 affine50; ways $1 affine50-pruned affine50-pruned; }
+gpu_tests() { job 05-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests)"; }
+vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; splat-transform --list-gpus; }
+# .gpu/dawn: bench_page.py bonsai.sundae --dawn 800x533 1920x1080 --folder .gpu/dawn (35 MB)
+dawn() { cp -r "$ROOT/.gpu/dawn" /tmp/dawn; cd /tmp/dawn; timeout 60 /tmp/node/node timing.mjs /tmp/dawn > $O/dawn.jsonl 2> /tmp/logs/dawn.err; cut -c1-400 $O/dawn.jsonl; tail -n 3 /tmp/logs/dawn.err; }
 case $1 in
-1) setup; take 1; stock bonsai; queue ;;
-2) take 2 3; for c in garden stone_horse; do stock $c; done; tenth garden 02; tenth fox 02 ;;
-3) for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; /tmp/node/splat-transform --list-gpus; cp -r "$ROOT/.gpu/dawn" /tmp/dawn; mkdir -p /tmp/dawn/node_modules/webgpu/dist; cp /tmp/node/node_modules/webgpu/dist/* /tmp/dawn/node_modules/webgpu/dist/; nvidia-smi | head -15 ;;
-4) take 4; tenth south_building 02 ;;
-5) touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$2" ]; do sleep 1; done; tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log ;;
-6) cd /tmp; (cd /tmp/dawn; timeout 60 /tmp/node/node timing.mjs /tmp/dawn > $O/dawn.jsonl 2> /tmp/logs/dawn.err); cat $O/dawn.jsonl | cut -c1-500; tail -n 3 /tmp/logs/dawn.err
-  RUN=$(dirname $(find /tmp/stock/bonsai/jobs -name config.yml | head -1)); timeout "$2" python3 $P $RUN -o $O/prune-bonsai.csv --shares 0.1 --training distill --steps 8000 > /tmp/logs/distill.log 2>&1; cat $O/prune-bonsai.csv; tar -czf "$OUT/out.tgz" -C /tmp out logs ;;
+# first lease, nvidia-h100-x4: GPUS=4 from part 1 on, because the queue starts there
+1) setup; take 1; tricks bonsai; queue ;;
+2) take 2 3; tricks garden ;;
+3) take 4; ways south_building mcmc none --pipeline.model.warmup mcmc; gpu_tests ;;
+4) wait_for_all "${2:-400}"; tail -n 4 /tmp/logs/05*.log ;;
+# second lease, nvidia-h100-x1 (half the price): GPUS=1; stock of four captures side by side and its packs
+11) setup; take 1; stock bonsai; queue ;;
+12) take 2 3; for c in garden stone_horse dinosaur; do stock $c; done ;;
+13) vulkan ;;
+14) dawn ;;
+15) touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$2" ]; do sleep 1; done; tar -czf "$OUT/out.tgz" -C /tmp out logs; cp /tmp/packs/stock-*.sundae "$OUT/"; tail -n 60 /tmp/logs/queue.log ;;
 esac
