@@ -19,7 +19,8 @@ from torch.optim import Optimizer
 
 from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.gaussians.surgery import change_parameter, moments_of
-from sundae_ns.gpu.fused_noise import add_noise, noise_kernel
+from sundae_ns.gpu.fused_noise import add_noise, noise_kernels
+from sundae_ns.gpu.nvrtc import kernels_where_possible
 
 MAX_COPIES = 51
 """Larger numbers of copies are clamped to this: the terms of the alternating sum grow with N."""
@@ -120,10 +121,12 @@ def jitter(params: Mapping[str, Tensor], strength: float) -> None:
     """
     means = params["means"]
     noise = torch.randn_like(means)
-    kernel = noise_kernel(means.device) if means.is_cuda and means.dtype == torch.float32 else None
-    if kernel is not None:
+    kernels = None
+    if means.is_cuda and means.dtype == torch.float32:
+        kernels = kernels_where_possible(noise_kernels, means.device, "noise on centres takes forty kernels, not one")
+    if kernels is not None:
         scales, quats, opacities = (params[name].detach().contiguous() for name in ("scales", "quats", "opacities"))
-        add_noise(kernel, means.data, scales, quats, opacities, noise, strength, GATE)
+        add_noise(kernels, means.data, scales, quats, opacities, noise, strength, GATE)
         return
     sharpness, threshold = GATE
     scales = params["scales"].exp()

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import functools
-import logging
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import BackendError
 from sundae_ns.gpu.nvrtc import Launch, load_kernels
-
-_log = logging.getLogger(__name__)
 
 THREADS = 256
 
@@ -44,19 +40,18 @@ extern "C" __global__ void add_noise(int n, float* __restrict__ means, const flo
 """
 
 
-@functools.cache
-def noise_kernel(device: torch.device) -> Launch | None:
-    """The kernel on a device; None, with a line in the log, where it cannot be compiled or loaded."""
-    try:
-        return load_kernels(SOURCE, ("add_noise",), (), device, THREADS)["add_noise"]
-    except BackendError as error:
-        _log.warning("noise on centres runs kernel by kernel, slower, on %s: %s", device, error)
-        return None
+def noise_kernels(device: torch.device) -> dict[str, Launch]:
+    """The kernel for a CUDA device, compiled on the first call.
+
+    Raises:
+        BackendError: it cannot be compiled or loaded.
+    """
+    return load_kernels(SOURCE, ("add_noise",), (), device, THREADS)
 
 
 @torch.no_grad()
 def add_noise(
-    launch: Launch,
+    launches: Mapping[str, Launch],
     means: Tensor,
     scales: Tensor,
     quats: Tensor,
@@ -68,7 +63,7 @@ def add_noise(
     """Move centres by noise with the shape of their primitives, the less the more opaque these are, in place.
 
     Args:
-        launch: from :func:`noise_kernel`.
+        launches: from :func:`noise_kernels`.
         means: centres, float32 on a CUDA device, contiguous like all others ``[N, 3]``.
         scales: log-scales ``[N, 3]``.
         quats: wxyz quaternions of any length ``[N, 4]``.
@@ -78,4 +73,4 @@ def add_noise(
         gate: sharpness and threshold: noise is times ``sigmoid(sharpness * (threshold - opacity))``.
     """
     count = len(means)
-    launch(count, [count, means, scales, quats, opacities, noise, strength, *gate])
+    launches["add_noise"](count, [count, means, scales, quats, opacities, noise, strength, *gate])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import logging
 from collections.abc import Callable, Sequence
 from ctypes import byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_void_p
 
@@ -18,6 +19,8 @@ from sundae_ns.errors import BackendError
 Argument = Tensor | int | float | None
 Launch = Callable[[int, Sequence[Argument]], None]
 """Launches a kernel for at least a number of threads: see :meth:`Kernel.__call__`."""
+
+_log = logging.getLogger(__name__)
 
 
 def compile_cubin(source: str, architecture: str, options: Sequence[str] = ()) -> bytes:
@@ -105,6 +108,24 @@ def load_kernels(
         BackendError: the kernels cannot be compiled or loaded.
     """
     return {name: Kernel(source, name, device, options, block) for name in names}
+
+
+@functools.cache
+def kernels_where_possible(
+    load: Callable[[torch.device], dict[str, Launch]], device: torch.device, instead: str
+) -> dict[str, Launch] | None:
+    """Kernels of a device; None, with one line in the log, where they cannot be compiled or loaded.
+
+    Args:
+        load: gives the kernels by name.
+        device: a CUDA device.
+        instead: what happens without them.
+    """
+    try:
+        return load(device)
+    except BackendError as error:
+        _log.warning("%s, on %s: %s", instead, device, error)
+        return None
 
 
 @functools.cache

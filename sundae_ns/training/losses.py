@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,8 +10,8 @@ import torch
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-from sundae_ns.errors import BackendError
 from sundae_ns.gpu.fused_loss import SSIM_WINDOW, fused_loss, loss_kernels
+from sundae_ns.gpu.nvrtc import kernels_where_possible
 from sundae_ns.rasterization.select import numba_problem
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.options import ModelOptions
@@ -26,10 +24,9 @@ HALF_AFTER = 800
 FIRST_PASSES = 8
 """With fewer passes a head has learnt no image by heart."""
 
+CONVOLVED = "SSIM runs as convolutions, not in its kernel"
 LEAST_SQUARE = 1e-8
 """Added to the mean square, so that its root has a gradient for equal images."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -142,7 +139,13 @@ def _losses(
     """``l1_weight L1 + weight (1 - SSIM)`` of an image, and the L1 loss of its base colours."""
     single = all(one.dtype == torch.float32 for one in (image, target, base) if one is not None)
     large = min(target.shape[:2]) >= SSIM_WINDOW
-    if weight > 0 and large and single and image.is_cuda and _kernel_runs(image.device):
+    if (
+        weight > 0
+        and large
+        and single
+        and image.is_cuda
+        and kernels_where_possible(loss_kernels, image.device, CONVOLVED)
+    ):
         return fused_loss(image, target, weight, base, l1_weight=l1_weight)
     if weight > 0 and large and single and image.device.type == "cpu" and numba_problem() is None:
         from sundae_ns.training.cpu_loss import compiled_loss  # imports numba
@@ -162,14 +165,3 @@ def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_
     planes, truth = (one.permute(2, 0, 1)[None].contiguous() for one in (image, target))
     similarity: Tensor = ssim(planes, truth)
     return l1_weight * (image - target).abs().mean() + weight * (1 - similarity)
-
-
-@functools.cache
-def _kernel_runs(device: torch.device) -> bool:
-    """Whether the kernel runs on a device; logs the reason once if it does not."""
-    try:
-        loss_kernels(device)
-    except BackendError as error:
-        _log.warning("SSIM runs as convolutions, not in its kernel, on %s: %s", device, error)
-        return False
-    return True

@@ -16,7 +16,7 @@ from torch import Tensor
 from sundae_ns.errors import BackendError, DataError, SundaeError
 from sundae_ns.gpu import fused_loss as fused
 from sundae_ns.gpu.fused_loss import fused_loss
-from sundae_ns.training import losses
+from sundae_ns.gpu.nvrtc import Launch, kernels_where_possible
 from sundae_ns.training.losses import image_losses
 
 SIZES = [(11, 11), (11, 300), (12, 43), (26, 42), (27, 43), (64, 97)]
@@ -170,16 +170,12 @@ def test_no_second_gradient_and_none_for_the_target() -> None:
     assert not fused_loss(image.detach(), target, 0.2)[0].requires_grad
 
 
-def test_missing_kernels_are_reported_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    def refuse(_: torch.device) -> None:
+def test_missing_kernels_are_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    def refuse(_: torch.device) -> dict[str, Launch]:
         raise BackendError("NVRTC fails: update torch")
 
-    monkeypatch.setattr(losses, "loss_kernels", refuse)
-    losses._kernel_runs.cache_clear()
-    device = torch.device("cpu")
-    assert [losses._kernel_runs(device), losses._kernel_runs(device)] == [False, False]
-    assert caplog.text.count("NVRTC fails") == 1
-    losses._kernel_runs.cache_clear()
+    assert [kernels_where_possible(refuse, torch.device("cpu"), "it is slow") for _ in range(2)] == [None, None]
+    assert caplog.text.count("it is slow, on cpu: NVRTC fails") == 1
 
 
 @pytest.mark.gpu

@@ -30,9 +30,9 @@ def test_it_moves_centres_as_pytorch_does(load_on_cpu: Any, monkeypatch: pytest.
     noise = torch.randn(777, 3)
     monkeypatch.setattr(torch, "randn_like", lambda value: noise.to(value.dtype))
     relocation.jitter(expected, 0.7)
-    launch = load_on_cpu(fused_noise.SOURCE, ("add_noise",), (), torch.device("cpu"), fused_noise.THREADS)["add_noise"]
+    kernels = load_on_cpu(fused_noise.SOURCE, ("add_noise",), (), torch.device("cpu"), fused_noise.THREADS)
     shape = (params["scales"], params["quats"], params["opacities"])
-    fused_noise.add_noise(launch, params["means"], *shape, noise, 0.7, relocation.GATE)
+    fused_noise.add_noise(kernels, params["means"], *shape, noise, 0.7, relocation.GATE)
     moved, exact = params["means"].double() - before, expected["means"] - before
     torch.testing.assert_close(moved, exact, rtol=1e-4, atol=1e-6)
     assert exact[0].abs().max() > 1e-3  # a quaternion of zeros turns nothing, and its noise counts
