@@ -1,6 +1,6 @@
 """Primitives in glTF: binary files (.glb) with Khronos' extension ``KHR_gaussian_splatting``.
 
-three.js, PlayCanvas, Babylon.js and Cesium read them. Values are exact: centres, widths and opacities after activation,
+three.js, PlayCanvas and Babylon.js read them. Values are exact: centres, widths and opacities after activation,
 unit quaternions (xyzw) and SH coefficients in float32. Programs without the extension show coloured points.
 
 In glTF +y points up. A scene of nerfstudio's model, where z does, is turned to that and says so, and is turned back
