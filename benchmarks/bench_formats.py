@@ -71,7 +71,10 @@ def packed_files(run: Path, scene: sn.Scene, folder: Path, data: Path | None, pr
     if program is not None:
         theirs = folder / "theirs.sog"
         words = shlex.split(program)
-        subprocess.run([*words, "--quiet", "--overwrite", str(folder / "scene.ply"), str(theirs)], check=True)
+        made = subprocess.run([*words, "--quiet", "--overwrite", str(folder / "scene.ply"), str(theirs)], check=False)
+        if made.returncode:
+            print(f"{program} has failed, so its row is missing; has it a GPU?", file=sys.stderr)
+            return
         yield Packed(theirs, version_of(words[0]), shlex.join([OTHER, *words[1:], "scene.ply", "scene.sog"]))
 
 

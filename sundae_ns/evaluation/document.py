@@ -21,8 +21,9 @@ Stage = tuple[str, int, Mapping[str, float] | None]
 """Name of a stage of a run, number of primitives, and means over the test views by name; None for a skipped stage."""
 EXPLANATIONS = (
     "Each row is one configuration of rendering a field. Its time and its metrics come from the same calls.",
-    "Metrics are means over the test views. PSNR is over all pixels and channels, and fitted after the affine map of "
-    "colours that fits an image best, so that changing light counts less. SSIM is pytorch_msssim's "
+    "Metrics are means over the test views. PSNR is over all pixels and channels; fitted, it is taken after the "
+    "affine map of colours that brings the image nearest to its photo, so that changing light counts less. SSIM is "
+    "pytorch_msssim's "
     f"(11 x 11 window, no padding), FLIP is {FLIP_VARIANT}, and LPIPS names its net.",
     f"JOD is {JOD_VARIANT}: 10 for equal images, and three of four viewers see 1 less.",
     "Higher PSNR, SSIM and JOD are better; lower FLIP, LPIPS, ms and MB are better.",

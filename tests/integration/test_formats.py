@@ -74,6 +74,16 @@ def test_each_format_has_a_row(tiny: Any, transform: Path, tmp_path: Path, monke
     assert sizes["fp32", ""] > sizes[".sundae", "sundae_ns"]
 
 
+def test_a_program_that_fails_costs_its_own_row_alone(
+    tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "path", [str(SCRIPT.parent), *sys.path])
+    files = runpy.run_path(str(SCRIPT))["packed_files"]
+    made = [one.file.suffix for one in files(tiny.folder, sn.load(tiny.folder), tmp_path, None, "false --gpu cpu")]
+    assert made == [".ply", ".spz", ".sog", ".sundae"]
+    assert "false --gpu cpu has failed" in capsys.readouterr().err
+
+
 def test_a_file_of_another_program_takes_the_place_of_its_own_row(
     tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
