@@ -16,7 +16,7 @@ export XDG_RUNTIME_DIR=/tmp VK_DRIVER_FILES=/usr/local/nvidia/share/vulkan/icd.d
 take() { mkdir -p /tmp/scenes /tmp/full /tmp/packs; for s in $*; do [ ! -d "$ROOT/.gpu/s$s" ] || cp -r "$ROOT"/.gpu/s$s/* /tmp/scenes/; done; ls /tmp/scenes; }
 setup() { bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; python3 lab/console_scripts.py
   mkdir -p $R /tmp/logs $O $J; cp -r benchmarks tests lab docs examples web *.md pyproject.toml Makefile mkdocs.yml method_configs $R/; }
-queue() { cd /tmp || exit; setsid nohup python3 $R/lab/curve/slots.py > /tmp/logs/q.out 2>&1 & sleep 1; }
+queue() { cd /tmp || exit; setsid nohup python3 $R/lab/slots.py > /tmp/logs/q.out 2>&1 & sleep 1; }
 wait_for_all() { touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$1" ]; do sleep 1; done
   tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log; nvidia-smi --query-gpu=name --format=csv,noheader | sort | uniq -c; }
 node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C /tmp/node.part; mv /tmp/node.part /tmp/node; }
@@ -37,12 +37,14 @@ gpu_tests() { job 05-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q
 vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; splat-transform --list-gpus; }
 # .gpu/dawn: bench_page.py bonsai.sundae --dawn 800x533 1920x1080 --folder .gpu/dawn (35 MB)
 dawn() { cp -r "$ROOT/.gpu/dawn" /tmp/dawn; cd /tmp/dawn; timeout 60 /tmp/node/node timing.mjs /tmp/dawn > $O/dawn.jsonl 2> /tmp/logs/dawn.err; cut -c1-400 $O/dawn.jsonl; tail -n 3 /tmp/logs/dawn.err; }
+# dense CAPTURE: the default from points of a sweep through all views
+dense() { ways $1 dense none --pipeline.model.dense-start-views 1000; }
 case $1 in
 # first lease, nvidia-h100-x4: GPUS=4 from part 1 on, because the queue starts there
-1) setup; take 1; tricks bonsai; queue ;;
-2) take 2 3; tricks garden ;;
-3) take 4; ways south_building mcmc none --pipeline.model.warmup mcmc; gpu_tests ;;
-4) wait_for_all "${2:-400}"; tail -n 4 /tmp/logs/05*.log ;;
+1) setup; take 1; dense bonsai; tricks bonsai; queue ;;
+2) take 2 3; for c in garden dinosaur fox stone_horse; do dense $c; done; tricks garden ;;
+3) take 4; dense south_building; ways south_building mcmc none --pipeline.model.warmup mcmc; gpu_tests ;;
+4) wait_for_all "${2:-400}"; tail -n 4 /tmp/logs/05*.log; grep -h "plane sweep" /tmp/logs/*dense*.log ;;
 # second lease, nvidia-h100-x1 (half the price): GPUS=1; stock of four captures side by side and its packs
 11) setup; take 1; stock bonsai; queue ;;
 12) take 2 3; for c in garden stone_horse dinosaur; do stock $c; done ;;
