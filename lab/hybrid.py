@@ -2,7 +2,8 @@
 
 WAYS by commas: prior, light-prior (0.01 and 0.003 from the start); late (0.01 from step 2,900); probe (what an affine fit
 gains at held-out views at some steps); affineNN, centredNN, gainNN, each
--pruned (the loss compares after NN% of the affine fit of colours; less the mean fit; by gains and offsets)."""
+-pruned (the loss compares after NN% of the affine fit of colours; less the mean fit; by gains and offsets);
+denseNN (points of a sweep through NN views)."""
 import re
 import sys
 import torch
@@ -66,5 +67,10 @@ if "nodecay" in ways:
             group["weight_decay"] = 0.0
     callbacks.NerfstudioRun.start = lambda self: (start(self), without(self))[0]
     callbacks.NerfstudioRun.act = lambda self, extensions: (act(self, extensions), without(self))[0]
+most = next((int(w[5:]) for w in ways if re.fullmatch(r"dense\d+", w)), 0)
+if most:  # with --pipeline.model.dense-start-views 1000: a sweep through a spread of the views
+    from sundae_ns.training import dense_start
+    sweep = dense_start.Sweep
+    dense_start.Sweep = lambda photos, sparse, longest: sweep(photos[:: -(-len(photos) // most)], sparse, longest)
 from nerfstudio.scripts.train import entrypoint
 entrypoint()

@@ -38,7 +38,7 @@ vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; sp
 # .gpu/dawn: bench_page.py bonsai.sundae --dawn 800x533 1920x1080 --folder .gpu/dawn (35 MB)
 dawn() { cp -r "$ROOT/.gpu/dawn" /tmp/dawn; cd /tmp/dawn; timeout 60 /tmp/node/node timing.mjs /tmp/dawn > $O/dawn.jsonl 2> /tmp/logs/dawn.err; cut -c1-400 $O/dawn.jsonl; tail -n 3 /tmp/logs/dawn.err; }
 # dense CAPTURE: the default from points of a sweep through all views
-dense() { ways $1 dense none --pipeline.model.dense-start-views 1000; }
+dense() { ways $1 dense none --pipeline.model.dense-start-views 1000; ways $1 dense48 dense48 --pipeline.model.dense-start-views 1000; }
 case $1 in
 # first lease, nvidia-h100-x4: GPUS=4 from part 1 on, because the queue starts there
 1) setup; take 1; dense bonsai; tricks bonsai; queue ;;
