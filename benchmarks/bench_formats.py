@@ -7,7 +7,7 @@
 The formats are fp32 (the run itself), .ply, .spz and .sog by ``sundae export``, .sundae by ``sundae pack`` with the
 head if there is one, and .sog by PlayCanvas's ``splat-transform`` where it is in PATH (``npm install -g
 @playcanvas/splat-transform``, node 22; it needs a GPU by Vulkan: with ``--splat-transform "splat-transform --gpu cpu"``
-100,000 primitives take more than ten minutes). Each file is loaded again by ``sundae_ns.load`` and rendered over the
+100,000 primitives took more than eight minutes). Each file is loaded again by ``sundae_ns.load`` and rendered over the
 background of the run. Bytes are those of the whole file; fp32 counts primitives, features and head. With ``-o``, rows
 take the place of those of the same capture, method, format, program and seed. ``benchmarks/tables.py`` shows
 results/formats.csv.

@@ -4,11 +4,7 @@ set -u
 export PYTHONPATH=/opt/site PATH=/tmp/node:/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 SLOTS=${SLOTS:-4} GPUS=${GPUS:-4} ROOT=$PWD
 R=/tmp/repo; J=/tmp/jobs; O=/tmp/out; Q=$R/benchmarks/quality.py; P=$R/benchmarks/prune_without_photos.py; F=$R/benchmarks/bench_formats.py
 job() { { [ -z "${AFTER:-}" ] || printf "# after %s\n" $AFTER; [ -z "${GPU:-}" ] || echo "# gpu $GPU"; echo "$2"; } > $J/$1.sh.new; mv $J/$1.sh.new $J/$1.sh; }
-# auto CAPTURE ORDER SEED: the default, its records, and its fine-tuned pack (for JOD and flicker on a CPU)
-auto() { n=$1-$3; job $2-$n "python3 $Q /tmp/scenes/$1 -o /tmp/oracle/$n --arms sundae-auto --seeds $3; cp /tmp/oracle/$n/done/*.json $O/; for f in curve trials prune; do cp \$(find /tmp/oracle/$n/jobs -name \$f.json | head -1) $O/\$f-$n.json; done; cp \$(find /tmp/oracle/$n/jobs -name tuned.sundae | head -1) /tmp/packs/$n.sundae"; }
 tenth() { job $2-$1-tenth "python3 $Q /tmp/scenes/$1 -o /tmp/tenth/$1 --arms sundae --keep-ratios 0.1 --seeds 42; cp /tmp/tenth/$1/done/*.json $O/"; }
-full() { job $2-$1-full "python3 $Q /tmp/scenes/$1 -o /tmp/full/$1 --arms sundae-no-head --keep-ratios 1 --seeds 42; cp /tmp/full/$1/done/*no-head*.json $O/"; }
-decimated() { AFTER="$1-full" job $2-$1-decimated "RUN=\$(dirname \$(find /tmp/full/$1/jobs -name config.yml | grep no-head | head -1)); python3 $P \$RUN -o $O/prune-$1.csv --shares 0.5 0.1 --training none --splat-transform /tmp/node/splat-transform; python3 $P \$RUN -o $O/prune-$1.csv --shares 0.1 --training distill --steps 8000"; }
 # stock CAPTURE: splatfacto (480 s on an H100), then its packs, splat-transform's too where Vulkan is
 stock() { job 00-$1-stock "python3 $Q /tmp/scenes/$1 -o /tmp/stock/$1 --arms splatfacto --seeds 42; cp /tmp/stock/$1/done/*.json $O/"
   AFTER="$1-stock" job 01-$1-formats "RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); sundae pack \$RUN -o /tmp/packs/stock-$1.sundae; python3 $F \$RUN -o $O/formats-$1.csv"; }

@@ -23,8 +23,7 @@ EXPLANATIONS = (
     "Each row is one configuration of rendering a field. Its time and its metrics come from the same calls.",
     "Metrics are means over the test views. PSNR is over all pixels and channels; fitted, it is taken after the "
     "affine map of colours that brings the image nearest to its photo, so that changing light counts less. SSIM is "
-    "pytorch_msssim's "
-    f"(11 x 11 window, no padding), FLIP is {FLIP_VARIANT}, and LPIPS names its net.",
+    f"pytorch_msssim's (11 x 11 window, no padding), FLIP is {FLIP_VARIANT}, and LPIPS names its net.",
     f"JOD is {JOD_VARIANT}: 10 for equal images, and three of four viewers see 1 less.",
     "Higher PSNR, SSIM and JOD are better; lower FLIP, LPIPS, ms and MB are better.",
     "ms per frame is the median over the test views, synchronised with the device.",

@@ -24,7 +24,6 @@ HALF_AFTER = 800
 FIRST_PASSES = 8
 """With fewer passes a head has learnt no image by heart."""
 
-CONVOLVED = "SSIM runs as convolutions, not in its kernel"
 LEAST_SQUARE = 1e-8
 """Added to the mean square, so that its root has a gradient for equal images."""
 
@@ -139,18 +138,13 @@ def _losses(
     """``l1_weight L1 + weight (1 - SSIM)`` of an image, and the L1 loss of its base colours."""
     single = all(one.dtype == torch.float32 for one in (image, target, base) if one is not None)
     large = min(target.shape[:2]) >= SSIM_WINDOW
-    if (
-        weight > 0
-        and large
-        and single
-        and image.is_cuda
-        and kernels_where_possible(loss_kernels, image.device, CONVOLVED)
-    ):
-        return fused_loss(image, target, weight, base, l1_weight=l1_weight)
-    if weight > 0 and large and single and image.device.type == "cpu" and numba_problem() is None:
-        from sundae_ns.training.cpu_loss import compiled_loss  # imports numba
+    if weight > 0 and large and single:
+        if image.is_cuda and kernels_where_possible(loss_kernels, image.device, "SSIM runs as slower convolutions"):
+            return fused_loss(image, target, weight, base, l1_weight=l1_weight)
+        if image.device.type == "cpu" and numba_problem() is None:
+            from sundae_ns.training.cpu_loss import compiled_loss  # imports numba
 
-        return compiled_loss(image, target, weight, base, l1_weight)
+            return compiled_loss(image, target, weight, base, l1_weight)
     of_base = None if base is None else (base - target).abs().mean()
     if weight == 0 or not large:
         return (image - target).abs().mean(), of_base
