@@ -72,5 +72,15 @@ if most:  # with --pipeline.model.dense-start-views 1000: a sweep through a spre
     from sundae_ns.training import dense_start
     sweep = dense_start.Sweep
     dense_start.Sweep = lambda photos, sparse, longest: sweep(photos[:: -(-len(photos) // most)], sparse, longest)
+from sundae_ns.training import dense_start as _dense
+import time
+_swept = _dense.DenseStart._swept
+def timed(self, run, sparse):
+    began = time.time()
+    found = _swept(self, run, sparse)
+    torch.cuda.synchronize() if torch.cuda.is_available() else None
+    print(f"SWEEP {sys.argv[sys.argv.index('--data') + 1]} {ways} {time.time() - began:.1f} s {len(found[0])} points beside {len(sparse)}", flush=True)
+    return found
+_dense.DenseStart._swept = timed
 from nerfstudio.scripts.train import entrypoint
 entrypoint()

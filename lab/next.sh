@@ -19,7 +19,7 @@ node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C 
 # few CAPTURE ARM OPTION ...: 16 views, made by benchmarks/harness/few_views.py
 few() { c=$1 a=$2; shift 2; job 03-few-$c-$a "ns-train sundae --data /tmp/scenes/$c-16 --output-dir /tmp/few/$a --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode filename && ns-eval --load-config /tmp/few/$a/$c/sundae/run/config.yml --output-path $O/few-$c-$a.json"; }
 # ways CAPTURE NAME WAYS OPTION ...: the default with parts of a chain in its densification (lab/hybrid.py)
-ways() { c=$1 n=$2 w=$3; shift 3; job 02-$c-$n "python3 $R/lab/hybrid.py $w -- sundae --data /tmp/scenes/$c --output-dir /tmp/ways/$n --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8 && ns-eval --load-config /tmp/ways/$n/$c/sundae/run/config.yml --output-path $O/ways-$c-$n.json && cp /tmp/ways/$n/$c/sundae/run/curve.json $O/curve-$c-$n.json && python3 $R/lab/tune.py /tmp/ways/$n/$c/sundae/run $O/tuned-$c-$n.jsonl now"; }
+ways() { c=$1 n=$2 w=$3; shift 3; job ${PRE:-02}-$c-$n "python3 $R/lab/hybrid.py $w -- sundae --data /tmp/scenes/$c --output-dir /tmp/ways/$n --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8 && ns-eval --load-config /tmp/ways/$n/$c/sundae/run/config.yml --output-path $O/ways-$c-$n.json && cp /tmp/ways/$n/$c/sundae/run/curve.json $O/curve-$c-$n.json && python3 $R/lab/tune.py /tmp/ways/$n/$c/sundae/run $O/tuned-$c-$n.jsonl now"; }
 six() { ways $1 mcmc none --pipeline.model.warmup mcmc; ways $1 late late,probe; }
 train() { echo "--data /tmp/scenes/$1 --experiment-name $1 --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000"; }
 C="colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8"
@@ -29,22 +29,18 @@ base() { job 01-$1-base "ns-train sundae $(train $1) --output-dir /tmp/base --sa
 trick() { AFTER="$1-base" job 02-$1-trick-$2 "python3 $R/lab/hybrid.py $3 -- sundae $(train $1) --output-dir /tmp/tricks/$2 --load-checkpoint /tmp/base/$1/sundae/run/nerfstudio_models/step-000018000.ckpt $C && ns-eval --load-config /tmp/tricks/$2/$1/sundae/run/config.yml --output-path $O/trick-$1-$2.json; rm -rf /tmp/tricks/$2/$1/sundae/run/nerfstudio_models"; }
 tricks() { base $1; for w in none none2 nomirror noshrink nodecay; do trick $1 $w ${w%2}; done; }
 light() { ways $1 affine50 affine50; ways $1 affine50-pruned affine50-pruned; }
-gpu_tests() { job 05-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests)"; }
+gpu_tests() { job 025-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests)"; }
 vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; splat-transform --list-gpus; }
 # .gpu/dawn: bench_page.py bonsai.sundae --dawn 800x533 1920x1080 --folder .gpu/dawn (35 MB)
 dawn() { cp -r "$ROOT/.gpu/dawn" /tmp/dawn; cd /tmp/dawn; timeout 60 /tmp/node/node timing.mjs /tmp/dawn > $O/dawn.jsonl 2> /tmp/logs/dawn.err; cut -c1-400 $O/dawn.jsonl; tail -n 3 /tmp/logs/dawn.err; }
 # dense CAPTURE: the default from points of a sweep through all views
-dense() { ways $1 dense none --pipeline.model.dense-start-views 1000; ways $1 dense48 dense48 --pipeline.model.dense-start-views 1000; }
+dense() { ways $1 dense none --pipeline.model.dense-start-views 1000; PRE=03 ways $1 dense48 dense48 --pipeline.model.dense-start-views 1000; }
 case $1 in
-# first lease, nvidia-h100-x4: GPUS=4 from part 1 on, because the queue starts there
-1) setup; take 1; dense bonsai; tricks bonsai; queue ;;
-2) take 2 3; for c in garden dinosaur fox stone_horse; do dense $c; done; tricks garden ;;
-3) take 4; dense south_building; ways south_building mcmc none --pipeline.model.warmup mcmc; gpu_tests ;;
-4) wait_for_all "${2:-400}"; tail -n 4 /tmp/logs/05*.log; grep -h "plane sweep" /tmp/logs/*dense*.log ;;
-# second lease, nvidia-h100-x1 (half the price): GPUS=1; stock of four captures side by side and its packs
-11) setup; take 1; stock bonsai; queue ;;
-12) take 2 3; for c in garden stone_horse dinosaur; do stock $c; done ;;
-13) vulkan ;;
-14) dawn ;;
-15) touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$2" ]; do sleep 1; done; tar -czf "$OUT/out.tgz" -C /tmp out logs; cp /tmp/packs/stock-*.sundae "$OUT/"; tail -n 60 /tmp/logs/queue.log ;;
+# nvidia-h100-x1 (half the price): GPUS=1 SLOTS=6; stock of three captures, the sweep through all views, pytest
+1) setup; take 1; stock bonsai; dense bonsai; queue ;;
+2) take 2 3; for c in garden stone_horse; do stock $c; done; for c in garden dinosaur fox stone_horse; do dense $c; done; rm $J/03-fox-* ;;
+3) take 4; dense south_building; gpu_tests ;;
+5) vulkan ;;
+4) SECONDS=0; wait_for_all "${2:-400}"; tail -n 4 /tmp/logs/025*.log; grep -h "SWEEP" /tmp/logs/*dense*.log; cat $O/formats-*.csv
+  for f in /tmp/packs/stock-*.sundae; do split -b 15000000 -d -a 1 $f "$OUT/$(basename $f)."; done; ls -l "$OUT" ;;
 esac

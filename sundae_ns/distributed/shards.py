@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import torch
 import torch.distributed as dist
@@ -20,6 +20,8 @@ from torch.optim import Optimizer
 from sundae_ns.gaussians.parameters import num_primitives
 from sundae_ns.gaussians.surgery import change_parameter, check_wiring, per_primitive
 from sundae_ns.rasterization.sharded import swap
+
+T = TypeVar("T")
 
 DRIFT = 1.1
 """Rows move between ranks when the largest shard has more than this times the mean."""
@@ -77,6 +79,10 @@ class Shards:
         box = [thing]
         dist.broadcast_object_list(box, src=0, device=self.device)
         return box[0]
+
+    def by_first(self, compute: Callable[[], T]) -> T:
+        """What rank 0 computes, in host memory, on every rank. Collective."""
+        return cast(T, self.announce(compute() if self.rank == 0 else None))
 
     def gather(self, rows: Tensor, *, host: bool = False) -> Tensor | None:
         """Rows of all ranks, in order, on rank 0; None on the others. Collective.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 import torch.distributed as dist
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.distributed.ahead import Timetable
@@ -22,6 +23,7 @@ from sundae_ns.distributed.shards import Shards, bounds
 from sundae_ns.distributed.source import ShardedField
 from sundae_ns.distributed.start import check_options, without_viewer
 from sundae_ns.rendering.source import FieldSource
+from sundae_ns.training.dense_start import DenseStart, put
 from sundae_ns.training.densification import CappedStrategy, Densification
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
@@ -121,6 +123,8 @@ class Team:
             return ShardedDensification(strategy, self.shards)
         if isinstance(extension, (ScheduledPruning, FloaterRemoval)):
             extension.pruner = partial(RankPruner, shards=self.shards)
+        if isinstance(extension, DenseStart):
+            extension.found, extension.put = self.shards.by_first, partial(_put_block, shards=self.shards)
         return extension
 
     def optimizers(self, make: Callable[[], Optimizers], config: Any, groups: Any, names: list[str]) -> Optimizers:
@@ -165,10 +169,21 @@ class Team:
 
 def take_shard(state: FieldState, shards: Shards) -> None:
     """Give all ranks the field and the head of rank 0, and keep this rank's block of the field. Collective."""
-    head = [] if state.head is None else [*state.head.parameters(), *state.head.buffers()]
-    for value in [*state.field.values(), *head]:
+    for value in [] if state.head is None else [*state.head.parameters(), *state.head.buffers()]:
+        dist.broadcast(value.data, 0)
+    _take_block(state, shards)
+
+
+def _take_block(state: FieldState, shards: Shards) -> None:
+    for value in state.field.values():
         dist.broadcast(value.data, 0)
     start, end = bounds(state.field.num_primitives, shards.ranks)[shards.rank : shards.rank + 2]
     for value in state.field.values():
         value.data = value.data[start:end].clone()
     shards.recount(state.field)
+
+
+def _put_block(state: FieldState, params: Mapping[str, Tensor], *, shards: Shards) -> None:
+    """Begin with this rank's block of another field, of which all ranks have as many rows. Collective."""
+    put(state, params)
+    _take_block(state, shards)

@@ -6,7 +6,7 @@ image by what is near its camera, and other views do not agree.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -45,6 +45,10 @@ class DenseStart(Extension):
         self._options, self._points, self._num_features, self._cap = options, points, num_features, cap
         wanted = 2 <= num_images <= options.dense_start_views and options.warm_start is None and not options.random_init
         self._done = not wanted or points is None or len(points[0]) == 0
+        self.found: Callable[[Callable[[], Points]], Points] = lambda sweep: sweep()
+        """Runs the sweep; several ranks take what the first finds."""
+        self.put: Callable[[FieldState, Mapping[str, Tensor]], None] = put
+        """Puts a field in the place of another; each of several ranks keeps its block."""
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing: a checkpoint holds the field that has begun."""
@@ -60,19 +64,15 @@ class DenseStart(Extension):
             return
         self._done = True
         assert self._points is not None
-        if run.source.collective:
-            CONSOLE.log("few views: several GPUs start from the sparse points alone; one GPU would find more points")
-            return
-        state = run.state
-        xyz, rgb = self._swept(run, self._points[0].to(state.device))
-        sparse, colours = self._points[0], self._points[1].float()
+        state, (sparse, colours) = run.state, self._points
+        xyz, rgb = self.found(lambda: self._swept(run, sparse.to(state.device)))
+        colours = colours.float()
         colours = colours if len(colours) else torch.full_like(sparse, 127.5)
         points = torch.cat([sparse, xyz.to(sparse)]), torch.cat([colours, 255 * rgb.to(colours)])
         params, _ = initial_field(self._options, points, None, num_features=self._num_features, cap=self._cap)
-        for name, value in params.items():
-            replace_parameter(state.field.data, state.optimizers, name, value.to(state.device), {})
+        self.put(state, params)
         CONSOLE.log(
-            f"few views: {len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones "
+            f"{len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones "
             "(--pipeline.model.dense-start-views 0 leaves them out)"
         )
 
@@ -80,11 +80,17 @@ class DenseStart(Extension):
     def _swept(self, run: TrainingRun, sparse: Tensor) -> tuple[Tensor, Tensor]:
         """Positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``; evenly spread ones if too many are found."""
         longest, most = LIMITS.get(run.state.device.type, LIMITS["cpu"])
-        sweep = Sweep(list(run.photos()), sparse[sparse.isfinite().all(dim=1)], longest)
+        sweep = Sweep(run.photos(), sparse[sparse.isfinite().all(dim=1)], longest)
         for i in track(range(len(sweep.photos)), "Plane sweep", transient=True, console=CONSOLE):
             sweep.add(i)
         xyz, rgb = sweep.points()
         if len(xyz) > most:
             even = select_systematic(torch.ones(len(xyz)), most, neighbor_order(xyz), self._options.pruning.seed)
             xyz, rgb = xyz[even.to(xyz.device)], rgb[even.to(rgb.device)]
-        return xyz, rgb
+        return xyz.cpu(), rgb.cpu()
+
+
+def put(state: FieldState, params: Mapping[str, Tensor]) -> None:
+    """Begin with another field, without moments of its optimizers."""
+    for name, value in params.items():
+        replace_parameter(state.field.data, state.optimizers, name, value.to(state.device), {})

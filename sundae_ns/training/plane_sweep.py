@@ -1,4 +1,4 @@
-"""Points from a few images with known cameras: planes are swept through each view and compared with its neighbours.
+"""Points from images with known cameras: planes are swept through each view and compared with its neighbours.
 
 The sweep is that of Collins ("A Space-Sweep Approach to True Multi-Image Matching", 1996), with planes of several
 directions (Gallup et al., 2007). Patches are compared by their normalised cross-correlation. A depth stays if it comes
@@ -7,8 +7,9 @@ back to its pixel through the depth that another view has found there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,6 +26,10 @@ CORRELATION = 0.6
 """Least correlation with one of the views."""
 NEIGHBORS = 3
 """Number of views that a view is compared with. The best one counts at a pixel, as often only one sees the place."""
+CONFIRMING = 24
+"""Number of views, in the same order, whose depths may agree with those of a view."""
+JUDGES = 5000
+"""Most sparse points, evenly drawn, that tell which views see the same places."""
 STEP, FEWEST, MOST = 1.5, 16, 256
 """Pixels by which another view moves from plane to plane, and the limits of the number of planes."""
 NEARER, FARTHER = 0.7, 4.0
@@ -58,26 +63,33 @@ class _Reduced:
     """Camera-to-world, OpenCV axes ``[4, 4]``."""
 
 
+class _Neighbors(NamedTuple):
+    """Indices of other views, by how much they tell about the depths of a view."""
+
+    compared: list[int]
+    confirming: list[int]
+
+
 class Sweep:
     """The sweep through all views, one at a time.
 
     Args:
-        photos: images and cameras.
+        photos: images and cameras; one in full size is held at a time.
         sparse: finite points of the scene that state the range of depths ``[P, 3]``.
         longest: longest side of the compared images, pixels.
     """
 
-    def __init__(self, photos: Sequence[Photo], sparse: Tensor, longest: int) -> None:
+    def __init__(self, photos: Iterable[Photo], sparse: Tensor, longest: int) -> None:
         self.photos = [_reduced(photo, longest) for photo in photos]
         self._sparse = sparse
-        self._neighbors = _neighbors(self.photos, sparse)
-        upward = [-photo.view.viewmat[1, :3] for photo in photos]
+        self._neighbors = _neighbors(self.photos, sparse[:: -(-len(sparse) // JUDGES)] if len(sparse) else sparse)
+        upward = [-photo.view.viewmat[1, :3] for photo in self.photos]
         self._up = torch.stack(upward).mean(dim=0) if upward else sparse.new_zeros(3)
         self._depths = [torch.zeros_like(photo.usable, dtype=torch.float32) for photo in self.photos]
 
     def add(self, index: int) -> Tensor:
         """Find the depths of a view ``[H, W]``, along its axis; 0 where there are none."""
-        photo, others = self.photos[index], [self.photos[i] for i in self._neighbors[index]]
+        photo, others = self.photos[index], [self.photos[i] for i in self._neighbors[index].compared]
         limits = self._limits(photo.view)
         if limits is None or not others:
             return self._depths[index]
@@ -123,9 +135,8 @@ class Sweep:
         points = _to_world(photo, photo.rays[chosen] * depth[chosen][:, None])
         x, y, _ = _project(photo.view, points)
         total, count = points.clone(), torch.ones_like(x)
-        for other, depths in zip(self.photos, self._depths):
-            if other is photo:
-                continue
+        for i in self._neighbors[index].confirming:
+            other, depths = self.photos[i], self._depths[i]
             there_x, there_y, z = _project(other.view, points)
             column = there_x.nan_to_num().clamp(0, other.view.width - 1).long()
             row = there_y.nan_to_num().clamp(0, other.view.height - 1).long()
@@ -174,10 +185,10 @@ def _to_world(photo: _Reduced, points: Tensor) -> Tensor:
     return points @ photo.pose[:3, :3].T + photo.pose[:3, 3]
 
 
-def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[list[int]]:
+def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[_Neighbors]:
     """For each view the others that see most of its sparse points, from directions that differ by some degrees."""
     if len(photos) < 2 or not len(sparse):
-        return [[] for _ in photos]
+        return [_Neighbors([], []) for _ in photos]
     directions, seen = [], []
     for photo in photos:
         seen.append(_in_view(photo.view, *_project(photo.view, sparse)))
@@ -188,9 +199,9 @@ def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[list[int]]:
         # Near directions tell little about depths; from far ones places look different.
         weights = [(angle / (angle + 4) * torch.exp(-((angle / 36) ** 2))) for angle in angles]
         shared = torch.stack([(weight * (seen[i] & other)).sum() for weight, other in zip(weights, seen)])
-        shared[i] = 0
-        order = torch.argsort(shared, descending=True, stable=True)[:NEIGHBORS].tolist()
-        found.append([j for j in order if shared[j] > 0])
+        shared[i] = -1
+        order = torch.argsort(shared, descending=True, stable=True)[: len(photos) - 1].tolist()
+        found.append(_Neighbors([j for j in order[:NEIGHBORS] if shared[j] > 0], order[:CONFIRMING]))
     return found
 
 

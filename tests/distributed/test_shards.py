@@ -36,7 +36,7 @@ from sundae_ns.distributed import Shards
 from sundae_ns.distributed.batches import average_gradients
 from sundae_ns.distributed.densification import ShardedDensification
 from sundae_ns.distributed.pruning import RankPruner
-from sundae_ns.distributed.team import take_shard
+from sundae_ns.distributed.team import _put_block, take_shard
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning.cutting import FieldPruner
@@ -252,6 +252,19 @@ def check_taking_a_shard(shards: Shards) -> None:
     assert shards.apart(networks.parameters()) == 0
 
 
+def check_beginning_anew(shards: Shards) -> None:
+    """The first rank's points are everyone's, and all begin with their block of its field."""
+    assert shards.by_first(lambda: torch.full((2,), 3.0 + shards.rank)).tolist() == [3, 3]
+    field = Field({name: Parameter(value[:10].clone()) for name, value in a_field().items()})
+    state = FieldState(field=field, networks=torch.nn.ModuleDict())
+    state.optimizers = adams(field, 0)
+    _put_block(state, {name: value + shards.rank for name, value in a_field().items()}, shards=shards)
+    assert shards.counts == [45, 45]
+    for name, value in own_half(shards).items():
+        assert torch.equal(state.field[name], value), name
+        assert state.optimizers[name].param_groups[0]["params"][0] is state.field[name]
+
+
 def checks(_: Path) -> dict[str, Callable[[Shards], None]]:
     """The checks of each rank, in this order."""
     plain = (
@@ -260,7 +273,7 @@ def checks(_: Path) -> dict[str, Callable[[Shards], None]]:
         check_drift,
         check_pruning,
     )
-    rest = (check_mending, check_drop, check_refusal, check_averages, check_taking_a_shard)
+    rest = (check_mending, check_drop, check_refusal, check_averages, check_taking_a_shard, check_beginning_anew)
     by_response = partial(check_pruning, redistribution="none", score="response-contribution", selection="top")
     return {
         **{check.__name__: check for check in plain},

@@ -16,6 +16,7 @@ from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.rendering import LocalField
+from sundae_ns.training.dense_start import DenseStart
 from sundae_ns.training.densification import CappedStrategy, ChainStrategy, Densification
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
@@ -73,7 +74,7 @@ def test_a_chain_that_goes_on_is_refused_and_one_that_has_ended_is_not() -> None
 
 
 def test_ranks_densify_and_prune_as_one() -> None:
-    team, shards = Team(0, 2), object()
+    team, shards = Team(0, 2), SimpleNamespace(by_first=lambda compute: compute())
     team.shards = shards  # type: ignore[assignment]
     strategy = CappedStrategy(refine_every=6)
     densification = team._sharded(Densification(strategy), 7)
@@ -86,5 +87,8 @@ def test_ranks_densify_and_prune_as_one() -> None:
     pruner = pruning.pruner({}, {}, [])
     assert isinstance(pruner, RankPruner)
     assert pruner.shards is shards
+    dense = DenseStart(sundae_tiny.config.pipeline.model, None, 7, num_features=0, cap=None)  # type: ignore[attr-defined]
+    assert team._sharded(dense, 7) is dense
+    assert dense.found is shards.by_first
     other = Extension()
     assert team._sharded(other, 7) is other

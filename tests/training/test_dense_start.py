@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,8 +28,8 @@ class FakeSweep:
     seen: Tensor
     most = FOUND
 
-    def __init__(self, photos: list[Any], sparse: Tensor, longest: int) -> None:
-        self.photos, self.swept = photos, set[int]()
+    def __init__(self, photos: Iterable[Any], sparse: Tensor, longest: int) -> None:
+        self.photos, self.swept = list(photos), set[int]()
         FakeSweep.longest, FakeSweep.seen = longest, sparse
 
     def add(self, index: int) -> None:
@@ -127,12 +127,14 @@ def test_the_cap_holds(build: Build, training_of: TrainingOf) -> None:
     assert model.num_points == 70
 
 
-def test_ranks_start_from_the_sparse_points(build: Build, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ranks_take_what_the_first_finds(build: Build, training_of: TrainingOf) -> None:
     model = few(build)
     (dense,) = (one for one in model.extensions if isinstance(one, DenseStart))
-    dense.before_training(SimpleNamespace(source=SimpleNamespace(collective=True)))  # type: ignore[arg-type]
-    assert model.num_points == 60
-    assert "several GPUs start from the sparse points alone" in " ".join(capsys.readouterr().out.split())
+    put: list[int] = []
+    dense.found = lambda sweep: (torch.full((7, 3), 9.0), torch.zeros(7, 3))
+    dense.put = lambda state, params: put.append(len(params["means"]))
+    training_of(model)
+    assert (model.num_points, put) == (60, [67])
 
 
 def test_a_negative_number_of_views_is_an_error(build: Build) -> None:
