@@ -1,13 +1,15 @@
-"""The extension that gives a field of few views more points to start from, by a plane sweep through its images.
+"""The extension that gives a field more points to start from, by a plane sweep through its images.
 
-Structure from motion of a dozen photos leaves a few hundred points. Where a field begins without any, it explains each
-image by what is near its camera, and other views do not agree.
+Structure from motion of a dozen photos leaves a few hundred points, and of a hundred some ten thousand, on what has
+corners. Where a field begins without any, it explains each image by what is near its camera, and other views do not
+agree; densification fills the gap late and in the wrong places.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -22,8 +24,14 @@ from sundae_ns.training.initial_field import Points, initial_field
 from sundae_ns.training.options import ModelOptions
 from sundae_ns.training.plane_sweep import Sweep
 
-LIMITS = {"cuda": (640, 100_000), "cpu": (160, 20_000)}
-"""Longest side of the swept images, pixels, and most points that are added, by device: a CPU takes minutes for more."""
+T = TypeVar("T")
+
+SIDES = {"cuda": (640, 320), "cpu": (160, 160)}
+"""Longest side of the swept images of few views and of many, pixels, by device: a CPU takes minutes for more."""
+FEW = 24
+"""Up to as many views are swept in the larger size; between them and many the pixels of all images stay the same."""
+FILLED = {"cuda": 100_000, "cpu": 20_000}
+"""Number of points up to which a sparse cloud is filled; a larger one stays as it is."""
 
 
 class DenseStart(Extension):
@@ -65,6 +73,8 @@ class DenseStart(Extension):
         self._done = True
         assert self._points is not None
         state, (sparse, colours) = run.state, self._points
+        if len(sparse) >= _of(FILLED, run):
+            return
         xyz, rgb = self.found(lambda: self._swept(run, sparse.to(state.device)))
         colours = colours.float()
         colours = colours if len(colours) else torch.full_like(sparse, 127.5)
@@ -77,9 +87,10 @@ class DenseStart(Extension):
         )
 
     @torch.no_grad()
-    def _swept(self, run: TrainingRun, sparse: Tensor) -> tuple[Tensor, Tensor]:
+    def _swept(self, run: TrainingRun, sparse: Tensor) -> Points:
         """Positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``; evenly spread ones if too many are found."""
-        longest, most = LIMITS.get(run.state.device.type, LIMITS["cpu"])
+        most, (large, small) = _of(FILLED, run) - len(sparse), _of(SIDES, run)
+        longest = max(small, int(large * min(1.0, math.sqrt(FEW / max(1, len(run.view_indices()))))))
         sweep = Sweep(run.photos(), sparse[sparse.isfinite().all(dim=1)], longest)
         for i in track(range(len(sweep.photos)), "Plane sweep", transient=True, console=CONSOLE):
             sweep.add(i)
@@ -88,6 +99,10 @@ class DenseStart(Extension):
             even = select_systematic(torch.ones(len(xyz)), most, neighbor_order(xyz), self._options.pruning.seed)
             xyz, rgb = xyz[even.to(xyz.device)], rgb[even.to(rgb.device)]
         return xyz.cpu(), rgb.cpu()
+
+
+def _of(limits: Mapping[str, T], run: TrainingRun) -> T:
+    return limits.get(run.state.device.type, limits["cpu"])
 
 
 def put(state: FieldState, params: Mapping[str, Tensor]) -> None:

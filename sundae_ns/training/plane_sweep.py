@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample, interpolate, normalize, pad
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate, normalize, pad
 
 from sundae_ns.rendering.views import View
 from sundae_ns.training.extension import Photo
@@ -263,7 +263,9 @@ def _peaks(scores: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _box(image: Tensor) -> Tensor:
-    """Sum over the patch of each pixel ``[N, 1, H, W]``; in few additions, as pooling is slow on a CPU."""
+    """Sum over the patch of each pixel ``[N, 1, H, W]``; in few additions on a CPU, where pooling is slow."""
+    if image.is_cuda:
+        return WINDOW**2 * avg_pool2d(image, WINDOW, stride=1, padding=WINDOW // 2)
     image = pad(image, (WINDOW // 2,) * 4)
     for axis in (2, 3):
         length, power, size, offset = image.shape[axis] - WINDOW + 1, image, 1, 0

@@ -60,7 +60,7 @@ def test_the_field_starts_from_both_clouds(
     assert model.num_points == 60 + FOUND
     assert torch.equal(model.means[:60].detach(), points()[0])
     assert torch.equal(FakeSweep.seen, points()[0])
-    assert FakeSweep.longest == dense_start.LIMITS["cpu"][0]
+    assert FakeSweep.longest == dense_start.SIDES["cpu"][0]
     assert float((model.means[60:].detach() - 5).min()) >= 0
     colours = sh_to_rgb(model.gauss_params["features_dc"][60:].detach())
     assert torch.allclose(colours, torch.tensor([0.2, 0.4, 0.6]).expand(FOUND, 3), atol=1e-5)
@@ -112,13 +112,37 @@ def test_more_points_than_wanted_are_thinned_evenly(
     build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(FakeSweep, "most", 900)
-    monkeypatch.setitem(dense_start.LIMITS, "cpu", (160, 90))
+    monkeypatch.setitem(dense_start.FILLED, "cpu", 60 + 90)
     model = few(build)
     training_of(model)
     added = model.means[60:, 0].detach()
     assert len(added) == 90
     # Each tenth of the row has a tenth of them.
     assert torch.histc(added, bins=9, min=5, max=8).tolist() == pytest.approx([10] * 9, abs=1)
+
+
+def test_a_cloud_that_is_not_sparse_stays_as_it_is(
+    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(dense_start.FILLED, "cpu", 60)
+    monkeypatch.setattr(dense_start, "Sweep", None)
+    model = few(build)
+    training_of(model)
+    assert model.num_points == 60
+
+
+@pytest.mark.parametrize(("views", "longest"), [(3, 640), (24, 640), (54, 426), (96, 320), (250, 320)])
+def test_images_of_many_views_are_smaller(
+    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch, views: int, longest: int
+) -> None:
+    monkeypatch.setitem(dense_start.SIDES, "cpu", (640, 320))
+    model = build(dense_start_views=0)
+    run = training_of(model).callbacks[0].func.__self__
+    monkeypatch.setattr(type(run), "view_indices", lambda self: list(range(views)))
+    monkeypatch.setattr(type(run), "photos", lambda self: iter(range(3)))
+    (dense,) = (one for one in model.extensions if isinstance(one, DenseStart))
+    dense._swept(run, torch.zeros(60, 3))
+    assert FakeSweep.longest == longest
 
 
 def test_the_cap_holds(build: Build, training_of: TrainingOf) -> None:
