@@ -20,6 +20,8 @@ node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C 
 few() { c=$1 a=$2; shift 2; job 03-few-$c-$a "ns-train sundae --data /tmp/scenes/$c-16 --output-dir /tmp/few/$a --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode filename && ns-eval --load-config /tmp/few/$a/$c/sundae/run/config.yml --output-path $O/few-$c-$a.json"; }
 # ways CAPTURE NAME WAYS OPTION ...: the default with parts of a chain in its densification (lab/hybrid.py)
 ways() { c=$1 n=$2 w=$3; shift 3; job ${PRE:-02}-$c-$n "python3 $R/lab/hybrid.py $w -- sundae --data /tmp/scenes/$c --output-dir /tmp/ways/$n --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8 && ns-eval --load-config /tmp/ways/$n/$c/sundae/run/config.yml --output-path $O/ways-$c-$n.json && cp /tmp/ways/$n/$c/sundae/run/curve.json $O/curve-$c-$n.json && python3 $R/lab/tune.py /tmp/ways/$n/$c/sundae/run $O/tuned-$c-$n.jsonl now"; }
+default() { job 02-$2-$1 "python3 $Q /tmp/scenes/$1 -o /tmp/default/$1-$2 --arms sundae-auto --seeds $2; mkdir -p $O/$1-$2; cp /tmp/default/$1-$2/done/*.json $O/$1-$2/"; }
+alone() { job 00-alone-$1 "python3 $R/benchmarks/bench_training.py /tmp/scenes/$1 --arms sundae -o $O/time-$1.jsonl"; }
 six() { ways $1 mcmc none --pipeline.model.warmup mcmc; ways $1 late late,probe; }
 train() { echo "--data /tmp/scenes/$1 --experiment-name $1 --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000"; }
 C="colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8"
@@ -36,11 +38,11 @@ dawn() { cp -r "$ROOT/.gpu/dawn" /tmp/dawn; cd /tmp/dawn; timeout 60 /tmp/node/n
 # dense CAPTURE: the default from points of a sweep through all views
 dense() { ways $1 dense none --pipeline.model.dense-start-views 1000; PRE=03 ways $1 dense48 dense48 --pipeline.model.dense-start-views 1000; }
 case $1 in
-# nvidia-h100-x1 (half the price): GPUS=1 SLOTS=6; stock of three captures, the sweep through all views, pytest
-1) setup; take 1; stock bonsai; dense bonsai; queue ;;
-2) take 2 3; for c in garden stone_horse; do stock $c; done; for c in garden dinosaur fox stone_horse; do dense $c; done; rm $J/03-fox-* ;;
-3) take 4; dense south_building; gpu_tests ;;
-5) vulkan ;;
-4) SECONDS=0; wait_for_all "${2:-400}"; tail -n 4 /tmp/logs/025*.log; grep -h "SWEEP" /tmp/logs/*dense*.log; cat $O/formats-*.csv
+# nvidia-h100-x1 (half the price): GPUS=1 SLOTS=4. The default on five captures, stock of bonsai, its time alone
+1) setup; take 2; for c in garden dinosaur; do (cd /tmp && python3 $R/lab/sweep_time.py /tmp/scenes/$c 320 100); done; (cd /tmp && python3 $R/lab/sweep_time.py /tmp/scenes/garden 640 8) ;;
+2) take 1 4; alone south_building; stock bonsai; for s in 42 43 44; do for c in garden dinosaur south_building; do default $c $s; done; done; queue ;;
+3) take 3; for s in 42 43 44; do for c in fox stone_horse; do default $c $s; done; done ;;
+4) SECONDS=0; wait_for_all "${2:-400}"; cat /tmp/logs/00-alone*.log | tail -n 3 | cut -c1-500; cat $O/formats-*.csv
   for f in /tmp/packs/stock-*.sundae; do split -b 15000000 -d -a 1 $f "$OUT/$(basename $f)."; done; ls -l "$OUT" ;;
+5) vulkan ;;
 esac
