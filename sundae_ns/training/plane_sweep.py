@@ -244,9 +244,10 @@ def _correlations(photo: _Reduced, others: Sequence[_Reduced], facing: Tensor, n
             valid = (z > 1e-6) & (grid.abs() < 1).all(dim=-1)
             grey = other.grey.expand(len(part), -1, -1, -1)
             seen = grid_sample(grey, grid, mode="bilinear", padding_mode="border", align_corners=False)
-            average = _box(seen) / size
-            variance = (_box(seen * seen) / size - average * average).clamp_min(1e-5)
-            score = (_box(seen * photo.grey) / size - average * mean) / (deviation * variance.sqrt())
+            moments = _box(torch.cat([seen, seen * seen, seen * photo.grey], dim=1)) / size
+            average, square, product = moments.split(1, dim=1)
+            variance = (square - average * average).clamp_min(1e-5)
+            score = (product - average * mean) / (deviation * variance.sqrt())
             scores.append(torch.where(valid, score[:, 0], -1.0))
         found.append(torch.stack(scores).amax(dim=0))
     return torch.cat(found)
@@ -263,10 +264,12 @@ def _peaks(scores: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _box(image: Tensor) -> Tensor:
-    """Sum over the patch of each pixel ``[N, 1, H, W]``; in few additions on a CPU, where pooling is slow."""
+    """Sum over the patch of each pixel ``[N, C, H, W]``; in few additions on a CPU, where pooling is slow."""
+    half = WINDOW // 2
     if image.is_cuda:
-        return WINDOW**2 * avg_pool2d(image, WINDOW, stride=1, padding=WINDOW // 2)
-    image = pad(image, (WINDOW // 2,) * 4)
+        columns = avg_pool2d(image, (WINDOW, 1), stride=1, padding=(half, 0))
+        return WINDOW**2 * avg_pool2d(columns, (1, WINDOW), stride=1, padding=(0, half))
+    image = pad(image, (half,) * 4)
     for axis in (2, 3):
         length, power, size, offset = image.shape[axis] - WINDOW + 1, image, 1, 0
         total = image.new_zeros(())
