@@ -13,8 +13,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, interpolate, normalize, pad
+from torch.nn.functional import grid_sample, interpolate, normalize, pad
 
+from sundae_ns.gpu.fused_sweep import Patches, correlate, sweep_kernels
+from sundae_ns.gpu.nvrtc import Launch, kernels_where_possible
 from sundae_ns.rendering.views import View
 from sundae_ns.training.extension import Photo
 
@@ -22,6 +24,8 @@ WINDOW = 7
 """Side of the patches, pixels of the reduced images as all lengths here."""
 CONTRAST = 0.02
 """Least standard deviation of the grey values of a patch: a flat one fits anywhere."""
+LEAST_VARIANCE = 1e-5
+"""Least variance of the grey values of a patch of another view, so that a flat one fits nothing."""
 CORRELATION = 0.6
 """Least correlation with one of the views."""
 NEIGHBORS = 3
@@ -48,19 +52,25 @@ _BATCH = 16
 
 @dataclass(frozen=True)
 class _Reduced:
-    """A photo of reduced size."""
+    """A photo of reduced size; a capture of hundreds holds 12 bytes for each of their pixels."""
 
     view: View
     image: Tensor
-    """``[H, W, 3]``."""
+    """uint8 ``[H, W, 3]``."""
     grey: Tensor
     """``[1, 1, H, W]``."""
     usable: Tensor
     """Pixels that count and have contrast, bool ``[H, W]``."""
-    rays: Tensor
-    """Points at depth 1 behind the middles of the pixels, camera coordinates ``[H, W, 3]``."""
     pose: Tensor
     """Camera-to-world, OpenCV axes ``[4, 4]``."""
+
+    @property
+    def rays(self) -> Tensor:
+        """Points at depth 1 behind the middles of the pixels, camera coordinates ``[H, W, 3]``."""
+        K, height, width = self.view.K, self.view.height, self.view.width
+        x, y = (torch.arange(length, device=K.device) + 0.5 for length in (width, height))
+        pixels = torch.stack([*torch.meshgrid(x, y, indexing="xy"), torch.ones(height, width, device=K.device)], dim=-1)
+        return pixels.to(K) @ torch.linalg.inv(K).T
 
 
 class _Neighbors(NamedTuple):
@@ -95,19 +105,17 @@ class Sweep:
             return self._depths[index]
         low, high = limits
         best = torch.full_like(self._depths[index], -1.0)
-        depth = torch.zeros_like(best)
+        depth, rays = torch.zeros_like(best), photo.rays
         for normal in _directions(photo.view, self._up):
             # A plane is normal . X = 1 / s, so a pixel has the inverse depth facing * s.
-            facing = photo.rays @ normal
-            steep = facing > STEEPEST * photo.rays.norm(dim=-1)
+            facing = rays @ normal
+            steep = facing > STEEPEST * rays.norm(dim=-1)
             if not steep.any():
                 continue
             ends = 1 / (high * float(facing[steep].max())), 1 / (low * float(facing[steep].min()))
             s = torch.linspace(*ends, _number_of_planes(photo, others, normal, ends), device=facing.device)
-            scores = _correlations(photo, others, facing, normal, s)
-            inverse = facing * s[:, None, None]
-            scores = torch.where((inverse >= 1 / high) & (inverse <= 1 / low) & steep, scores, -1.0)
-            score, place = _peaks(scores)
+            score, place = _peaks(_correlations(photo, others, facing, s, (1 / high, 1 / low)))
+            score = torch.where(steep, score, -1.0)
             found = 1 / (facing * (s[0] + place * (s[1] - s[0]))).clamp_min(1e-12)
             depth, best = torch.where(score > best, found, depth), torch.maximum(score, best)
         self._depths[index] = torch.where((best > CORRELATION) & photo.usable, depth, 0.0)
@@ -148,7 +156,7 @@ class Sweep:
             total += torch.where(agrees[:, None], theirs, 0.0)
             count += agrees
         good = count >= 2
-        return total[good] / count[good][:, None], photo.image[chosen][good]
+        return total[good] / count[good][:, None], photo.image[chosen][good] / 255
 
 
 def _reduced(photo: Photo, longest: int) -> _Reduced:
@@ -163,11 +171,8 @@ def _reduced(photo: Photo, longest: int) -> _Reduced:
     size = _box(torch.ones_like(grey))
     deviation = (_box(grey * grey) / size - (_box(grey) / size) ** 2).clamp_min(0).sqrt()
     usable = (deviation > CONTRAST) & (_box(mask) / size > 0.99)
-    x = torch.arange(view.width, device=grey.device) + 0.5
-    y = torch.arange(view.height, device=grey.device) + 0.5
-    pixels = torch.stack([*torch.meshgrid(x, y, indexing="xy"), torch.ones_like(grey[0, 0])], dim=-1)
-    rays = pixels @ torch.linalg.inv(view.K).T
-    return _Reduced(view, image[0].permute(1, 2, 0), grey, usable[0, 0], rays, torch.linalg.inv(view.viewmat))
+    colours = (255 * image[0].permute(1, 2, 0)).round().clamp(0, 255).to(torch.uint8)
+    return _Reduced(view, colours, grey, usable[0, 0], torch.linalg.inv(view.viewmat))
 
 
 def _project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -224,33 +229,58 @@ def _number_of_planes(photo: _Reduced, others: Sequence[_Reduced], normal: Tenso
     return int(min(max(longest / STEP, FEWEST), MOST))
 
 
-def _correlations(photo: _Reduced, others: Sequence[_Reduced], facing: Tensor, normal: Tensor, s: Tensor) -> Tensor:
-    """Highest correlation of patches with those of other views, by planes ``normal . X = 1 / s``: ``[S, H, W]``."""
-    size = _box(torch.ones_like(photo.grey))
-    mean = _box(photo.grey) / size
-    deviation = (_box(photo.grey * photo.grey) / size - mean * mean).clamp_min(1e-8).sqrt()
-    ways = []
-    for other in others:
-        # X' = R X + t with s normal . X = 1: the ray r goes to K (R r + s (normal . r) t), here in [-1, 1].
-        relative, view = other.view.viewmat @ photo.pose, other.view
-        K = view.K.new_tensor([[2 / view.width, 0, -1], [0, 2 / view.height, -1], [0, 0, 1]]) @ view.K
-        ways.append((photo.rays @ (K @ relative[:3, :3]).T, facing[..., None] * (K @ relative[:3, 3])))
+def _correlations(
+    photo: _Reduced, others: Sequence[_Reduced], facing: Tensor, s: Tensor, inverses: tuple[float, float]
+) -> Tensor:
+    """Highest correlation of patches with those of other views, by planes ``normal . X = 1 / s``: ``[S, H, W]``.
+
+    It is -1 where no other view sees the place, and where its inverse depth lies outside ``inverses``.
+    """
+    grey = photo.grey
+    size = _box(torch.ones_like(grey))
+    mean = _box(grey) / size
+    deviation = (_box(grey * grey) / size - mean * mean).clamp_min(1e-8).sqrt()
+    # X' = R X + t with s normal . X = 1: the ray r goes to K (R r + s (normal . r) t).
+    relatives = [other.view.viewmat @ photo.pose for other in others]
+    ways = [other.view.K @ relative[:3] for other, relative in zip(others, relatives)]
+    if kernels := _kernels(grey):
+        pixels = torch.linalg.inv(photo.view.K)
+        maps = torch.stack([torch.cat([way[:, :3] @ pixels, way[:, 3:]], dim=1) for way in ways])
+        patches = Patches(*(value[0, 0] for value in (grey, size, mean, deviation)))
+        return correlate(
+            kernels, patches, facing, s, [other.grey[0, 0] for other in others], maps, inverses, LEAST_VARIANCE
+        )
+    lines = [(photo.rays @ way[:, :3].T, facing[..., None] * way[:, 3]) for way in ways]
     found = []
     for part in s.split(_BATCH):
-        scores = []
-        for other, (start, slope) in zip(others, ways):
+        scores, inverse = [], facing * part[:, None, None]
+        inside = (inverse >= inverses[0]) & (inverse <= inverses[1])
+        for other, (start, slope) in zip(others, lines):
             x, y, z = (start[..., i] + part[:, None, None] * slope[..., i] for i in range(3))
-            grid = torch.stack([x, y], dim=-1) / z.clamp_min(1e-6)[..., None]
-            valid = (z > 1e-6) & (grid.abs() < 1).all(dim=-1)
-            grey = other.grey.expand(len(part), -1, -1, -1)
-            seen = grid_sample(grey, grid, mode="bilinear", padding_mode="border", align_corners=False)
-            moments = _box(torch.cat([seen, seen * seen, seen * photo.grey], dim=1)) / size
+            sides = z.new_tensor([other.view.width, other.view.height])
+            grid = 2 * torch.stack([x, y], dim=-1) / (z.clamp_min(1e-6)[..., None] * sides) - 1
+            valid = inside & (z > 1e-6) & (grid.abs() < 1).all(dim=-1)
+            seen = grid_sample(
+                other.grey.expand(len(part), -1, -1, -1), grid, padding_mode="border", align_corners=False
+            )
+            moments = _box(torch.cat([seen, seen * seen, seen * grey], dim=1)) / size
             average, square, product = moments.split(1, dim=1)
-            variance = (square - average * average).clamp_min(1e-5)
+            variance = (square - average * average).clamp_min(LEAST_VARIANCE)
             score = (product - average * mean) / (deviation * variance.sqrt())
             scores.append(torch.where(valid, score[:, 0], -1.0))
         found.append(torch.stack(scores).amax(dim=0))
     return torch.cat(found)
+
+
+def _kernels(image: Tensor) -> dict[str, Launch] | None:
+    """The kernel for patches of :data:`WINDOW`, on a GPU that can have it."""
+    if not image.is_cuda:
+        return None
+    return kernels_where_possible(_load, image.device, "a plane sweep takes some hundred kernels for each direction")
+
+
+def _load(device: torch.device) -> dict[str, Launch]:
+    return sweep_kernels(device, WINDOW)
 
 
 def _peaks(scores: Tensor) -> tuple[Tensor, Tensor]:
@@ -264,12 +294,8 @@ def _peaks(scores: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _box(image: Tensor) -> Tensor:
-    """Sum over the patch of each pixel ``[N, C, H, W]``; in few additions on a CPU, where pooling is slow."""
-    half = WINDOW // 2
-    if image.is_cuda:
-        columns = avg_pool2d(image, (WINDOW, 1), stride=1, padding=(half, 0))
-        return WINDOW**2 * avg_pool2d(columns, (1, WINDOW), stride=1, padding=(0, half))
-    image = pad(image, (half,) * 4)
+    """Sum over the patch of each pixel ``[N, C, H, W]``; in few additions, as pooling is slow on a CPU."""
+    image = pad(image, (WINDOW // 2,) * 4)
     for axis in (2, 3):
         length, power, size, offset = image.shape[axis] - WINDOW + 1, image, 1, 0
         total = image.new_zeros(())
