@@ -6,7 +6,7 @@ R=/tmp/repo; J=/tmp/jobs; O=/tmp/out; Q=$R/benchmarks/quality.py; P=$R/benchmark
 job() { { [ -z "${AFTER:-}" ] || printf "# after %s\n" $AFTER; [ -z "${GPU:-}" ] || echo "# gpu $GPU"; echo "$2"; } > $J/$1.sh.new; mv $J/$1.sh.new $J/$1.sh; }
 tenth() { job $2-$1-tenth "python3 $Q /tmp/scenes/$1 -o /tmp/tenth/$1 --arms sundae --keep-ratios 0.1 --seeds 42; cp /tmp/tenth/$1/done/*.json $O/"; }
 # stock CAPTURE: splatfacto (480 s on an H100), then its packs, splat-transform's too where Vulkan is
-stock() { job 00-$1-stock "python3 $Q /tmp/scenes/$1 -o /tmp/stock/$1 --arms splatfacto --seeds 42; cp /tmp/stock/$1/done/*.json $O/"
+stock() { job 00-alone-$1-stock "python3 $Q /tmp/scenes/$1 -o /tmp/stock/$1 --arms splatfacto --seeds 42; cp /tmp/stock/$1/done/*.json $O/"
   AFTER="$1-stock" job 01-$1-formats "RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); sundae pack \$RUN -o /tmp/packs/stock-$1.sundae; python3 $F \$RUN -o $O/formats-$1.csv"; }
 export XDG_RUNTIME_DIR=/tmp VK_DRIVER_FILES=/usr/local/nvidia/share/vulkan/icd.d/nvidia_icd.json
 take() { mkdir -p /tmp/scenes /tmp/full /tmp/packs; for s in $*; do [ ! -d "$ROOT/.gpu/s$s" ] || cp -r "$ROOT"/.gpu/s$s/* /tmp/scenes/; done; ls /tmp/scenes; }
@@ -38,11 +38,21 @@ dawn() { cp -r "$ROOT/.gpu/dawn" /tmp/dawn; cd /tmp/dawn; timeout 60 /tmp/node/n
 # dense CAPTURE: the default from points of a sweep through all views
 dense() { ways $1 dense none --pipeline.model.dense-start-views 1000; PRE=03 ways $1 dense48 dense48 --pipeline.model.dense-start-views 1000; }
 case $1 in
-# nvidia-h100-x1 (half the price): GPUS=1 SLOTS=4. The default on five captures, stock of bonsai, its time alone
-1) setup; take 2; for c in garden dinosaur; do (cd /tmp && python3 $R/lab/sweep_time.py /tmp/scenes/$c 320 100); done; (cd /tmp && python3 $R/lab/sweep_time.py /tmp/scenes/garden 640 8) ;;
-2) take 1 4; alone south_building; stock bonsai; for s in 42 43 44; do for c in garden dinosaur south_building; do default $c $s; done; done; queue ;;
-3) take 3; for s in 42 43 44; do for c in fox stone_horse; do default $c $s; done; done ;;
-4) SECONDS=0; wait_for_all "${2:-400}"; cat /tmp/logs/00-alone*.log | tail -n 3 | cut -c1-500; cat $O/formats-*.csv
+# First lease, nvidia-h100-x1, GPUS=1 SLOTS=4: the kernel of the sweep; stock of bonsai alone with its packs (580 s);
+# then the default from swept points of five captures, in images of 640 pixels where the kernel takes at most 60 ms a view
+1) setup; take 2; (cd /tmp; python3 $R/lab/sweep_time.py /tmp/scenes/garden 320,640 160 | tee /tmp/logs/sweep.log
+     cd $R; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--import-mode=importlib' tests/gpu/test_fused_sweep.py | tail -n 3)
+   sed -i 's/dense_start_views: int = 24/dense_start_views: int = 300/' /opt/site/sundae_ns/model.py
+   ms=$(sed -n 's/.*again side 640.*(\([0-9]*\) ms.*/\1/p' /tmp/logs/sweep.log); [ "${ms:-999}" -gt 60 ] || sed -i 's/(640, 320)/(640, 640)/' /opt/site/sundae_ns/training/dense_start.py
+   grep -h "cuda.: (640" /opt/site/sundae_ns/training/dense_start.py ;;
+2) take 1 4; stock bonsai; for s in 42 43; do for c in garden dinosaur south_building; do default $c $s; done; done; queue ;;
+3) take 3; for s in 42 43; do for c in fox stone_horse; do default $c $s; done; done ;;
+4) SECONDS=0; wait_for_all "${2:-400}"; cat $O/formats-*.csv
   for f in /tmp/packs/stock-*.sundae; do split -b 15000000 -d -a 1 $f "$OUT/$(basename $f)."; done; ls -l "$OUT" ;;
 5) vulkan ;;
+# second lease, nvidia-h100-x2, GPUS=2: the tricks on both captures with a head, south_building's seconds, bonsai in less time
+11) setup; take 1; alone bonsai; tricks bonsai; queue ;;
+12) take 2 4; tricks garden; alone south_building
+  for o in "--max-num-iterations 20000" "--pipeline.model.pruning.prune-at 6000 --pipeline.model.stop-split-at 6000 --max-num-iterations 24000" "--pipeline.model.resolution-schedule 5000"; do
+    job 00-alone-b$((n = ${n:-0} + 1)) "python3 $R/benchmarks/bench_training.py /tmp/scenes/bonsai --arms sundae $(for w in $o; do echo "--option=$w"; done | tr '\n' ' ') -o $O/ways-of-time.jsonl"; done ;;
 esac

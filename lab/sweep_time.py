@@ -32,9 +32,5 @@ def timed(name, side):
     print(f"SWEEPTIME {root.name} {name} side {side}: reduce {a-t:.2f} s, sweep {b-a:.2f} s ({1000*(b-a)/len(photos):.0f} ms a view), points {time.time()-b:.2f} s, {len(xyz)} points", flush=True)
 with torch.no_grad():
     for side in map(int, sys.argv[2].split(",")):
-        timed("pool", side)
-        if dev == "cuda":
-            timed("pool again", side)
-            for batch in (48, 128):
-                plane_sweep._BATCH = batch; timed(f"batch {batch}", side)
-            plane_sweep._BATCH = 16
+        timed("first", side)
+        timed("again", side)
