@@ -56,6 +56,7 @@ def test_a_row_for_each_size_with_the_head_off_and_on(as_trained: bool, tmp_path
         assert row["primitives"] == len(read_scene(packed).field["means"])
         assert row["frames"] == 4
         assert row["undrawn"] == 0
+        assert row["ms_first"] > 0
         assert len(row["psnr"]) == row["cameras"] == len(row["ms_frame_by_camera"]) == 2
         assert min(row["psnr"]) > LEAST
         assert 0 < row["ms_frame_tenths"][0] <= row["ms_frame"] <= row["ms_frame_tenths"][1]

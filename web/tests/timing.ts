@@ -87,6 +87,7 @@ const stopwatch = timed ? new Stopwatch(device) : null;
 
 for (const { file, compared, step } of task.scenes) {
   const scene = await readScene(new Uint8Array(readFileSync(join(folder, file))));
+  const decoded = performance.now();
   const views = scene.cameras.map(viewOf);
   const { width, height } = views[0]!;
   const texture = device.createTexture({
@@ -97,6 +98,9 @@ for (const { file, compared, step } of task.scenes) {
   /** Stands for the canvas: the page's last pass draws on its texture. */
   const context = { configure: () => undefined, getCurrentTexture: () => texture };
   const renderer = new Renderer(gpu, scene, { getContext: () => context } as unknown as HTMLCanvasElement);
+  await renderer.render(views[0]!, false, 1);
+  /** From the decoded scene to its first image, shaders included. */
+  const first = performance.now() - decoded;
   for (const head of scene.head ? [false, true] : [false]) {
     const psnr: number[] = [];
     for (const camera of compared) {
@@ -143,6 +147,7 @@ for (const { file, compared, step } of task.scenes) {
       cameras: views.length,
       frames: whole.length,
       undrawn,
+      ms_first: first,
       ms_frame: medianOf(whole),
       ms_frame_tenths: [quantileOf(whole, 0.1), quantileOf(whole, 0.9)],
       ms_frame_by_camera: byCamera.map(medianOf),
