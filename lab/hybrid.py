@@ -3,7 +3,8 @@
 WAYS by commas: prior, light-prior (0.01 and 0.003 from the start); late (0.01 from step 2,900); probe (what an affine fit
 gains at held-out views at some steps); affineNN, centredNN, gainNN, each
 -pruned (the loss compares after NN% of the affine fit of colours; less the mean fit; by gains and offsets);
-denseNN (points of a sweep through NN views)."""
+denseNN (points of a sweep through NN views); shading (what the loss compares darkens away from the middle, by three
+numbers for each channel of the whole capture; lab/shaded.py measures with them)."""
 import re
 import sys
 import torch
@@ -72,6 +73,36 @@ if most:  # with --pipeline.model.dense-start-views 1000: a sweep through a spre
     from sundae_ns.training import dense_start
     sweep = dense_start.Sweep
     dense_start.Sweep = lambda photos, sparse, longest: sweep(photos[:: -(-len(photos) // most)], sparse, longest)
+if "shading" in ways:
+    import atexit
+    from pathlib import Path
+    unshaded, shading = losses.StepLosses.__call__, {}
+    class Shade(torch.autograd.Function):  # Adam's step is part of the backward pass, so that it can be recorded
+        @staticmethod
+        def forward(ctx, x):
+            if not shading:
+                shading.update({k: torch.zeros(3, 3, device=x.device) for k in ("a", "m", "v")})
+            h, w = x.shape[:2]
+            y, x_ = ((torch.arange(n, device=x.device) + 0.5 - n / 2) / (w / 2) for n in (h, w))
+            r = (y[:, None] ** 2 + x_[None] ** 2)[..., None]
+            powers = torch.stack([r, r * r, r**3])
+            ctx.save_for_backward(x, powers)
+            return x * (1 + (powers * shading["a"][:, None, None]).sum(0))
+        @staticmethod
+        def backward(ctx, g):
+            x, powers = ctx.saved_tensors
+            gain, a, m, v = 1 + (powers * shading["a"][:, None, None]).sum(0), *(shading[k] for k in "amv")
+            grad = (powers * (g * x)).sum((1, 2))
+            m.lerp_(grad, 0.1), v.lerp_(grad * grad, 0.01)
+            a.sub_(0.002 * m / (v.sqrt() + 1e-12))
+            return g * gain
+    def shaded(self, state, params, rgb, base, target, mask, count=None):
+        same, rgb = base is rgb, Shade.apply(rgb)
+        return unshaded(self, state, params, rgb, rgb if same else Shade.apply(base), target, mask, count)
+    losses.StepLosses.__call__ = shaded
+    words = {k: sys.argv[sys.argv.index(k) + 1] for k in ("--output-dir", "--experiment-name")}
+    where = Path(words["--output-dir"]) / words["--experiment-name"] / "shading.pt"
+    atexit.register(lambda: torch.save(shading["a"].cpu(), where))
 from sundae_ns.training import dense_start as _dense
 import time
 _swept = _dense.DenseStart._swept

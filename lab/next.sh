@@ -37,6 +37,9 @@ vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; sp
 dawn() { cp -r "$ROOT/.gpu/dawn" /tmp/dawn; cd /tmp/dawn; timeout 60 /tmp/node/node timing.mjs /tmp/dawn > $O/dawn.jsonl 2> /tmp/logs/dawn.err; cut -c1-400 $O/dawn.jsonl; tail -n 3 /tmp/logs/dawn.err; }
 # dense CAPTURE: the default from points of a sweep through all views
 dense() { ways $1 dense none --pipeline.model.dense-start-views 1000; PRE=03 ways $1 dense48 dense48 --pipeline.model.dense-start-views 1000; }
+# shading CAPTURE: a darkening that all photos share, beside the same without it, with a head
+shading() { o="--pipeline.model.pruning.keep-ratio 0.3 --pipeline.model.head.mode residual --pipeline.model.head.num-features 29"; for w in none shading; do ways $1 shade-$w $w $o; done
+  AFTER="$1-shade-shading" job 03-$1-shaded "python3 $R/lab/shaded.py /tmp/ways/shade-shading/$1/sundae/run/config.yml /tmp/ways/shade-shading/$1/shading.pt $O/shaded-$1.json"; }
 case $1 in
 # First lease, nvidia-h100-x1, GPUS=1 SLOTS=4: the kernel of the sweep; stock of bonsai alone with its packs (580 s);
 # then the default from swept points of five captures, in images of 640 pixels where the kernel takes at most 60 ms a view
@@ -51,7 +54,7 @@ case $1 in
   for f in /tmp/packs/stock-*.sundae; do split -b 15000000 -d -a 1 $f "$OUT/$(basename $f)."; done; ls -l "$OUT" ;;
 5) vulkan ;;
 # second lease, nvidia-h100-x2, GPUS=2: the tricks on both captures with a head, south_building's seconds, bonsai in less time
-11) setup; take 1; alone bonsai; tricks bonsai; queue ;;
+11) setup; take 1; alone bonsai; tricks bonsai; shading bonsai; queue ;;
 12) take 2 4; tricks garden; alone south_building
   for o in "--max-num-iterations 20000" "--pipeline.model.pruning.prune-at 6000 --pipeline.model.stop-split-at 6000 --max-num-iterations 24000" "--pipeline.model.resolution-schedule 5000"; do
     job 00-alone-b$((n = ${n:-0} + 1)) "python3 $R/benchmarks/bench_training.py /tmp/scenes/bonsai --arms sundae $(for w in $o; do echo "--option=$w"; done | tr '\n' ' ') -o $O/ways-of-time.jsonl"; done ;;
