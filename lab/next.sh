@@ -53,6 +53,7 @@ case $1 in
 4) SECONDS=0; wait_for_all "${2:-400}"; cat $O/formats-*.csv
   for f in /tmp/packs/stock-*.sundae; do split -b 15000000 -d -a 1 $f "$OUT/$(basename $f)."; done; ls -l "$OUT" ;;
 5) vulkan ;;
+6) dawn ;;
 # second lease, nvidia-h100-x2, GPUS=2: the tricks on both captures with a head, south_building's seconds, bonsai in less time
 11) setup; take 1; alone bonsai; tricks bonsai; shading bonsai; queue ;;
 12) take 2 4; tricks garden; alone south_building
