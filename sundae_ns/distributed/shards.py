@@ -81,7 +81,7 @@ class Shards:
         return box[0]
 
     def by_first(self, compute: Callable[[], T]) -> T:
-        """What rank 0 computes, in host memory, on every rank. Collective."""
+        """Compute a value in host memory on rank 0, and return it on every rank. Collective."""
         return cast(T, self.announce(compute() if self.rank == 0 else None))
 
     def gather(self, rows: Tensor, *, host: bool = False) -> Tensor | None:

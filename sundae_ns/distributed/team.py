@@ -184,6 +184,6 @@ def _take_block(state: FieldState, shards: Shards) -> None:
 
 
 def _put_block(state: FieldState, params: Mapping[str, Tensor], *, shards: Shards) -> None:
-    """Begin with this rank's block of another field, of which all ranks have as many rows. Collective."""
+    """Replace the field by this rank's rows of a new one, which has equally many rows on all ranks. Collective."""
     put(state, params)
     _take_block(state, shards)

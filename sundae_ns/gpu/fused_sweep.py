@@ -1,7 +1,7 @@
-"""Correlations of an image's patches with those of other images, seen through planes: one GPU kernel.
+"""Correlations between the patches of one image and those of other images warped through planes, in one GPU kernel.
 
-Built from PyTorch's operations, a plane sweep writes and reads each image of a plane dozens of times. Here a block of
-threads samples another image for a tile of one plane into shared memory, and sums patches there by rows and columns.
+PyTorch's operations write and read the warped image of a plane dozens of times. Here a block of threads samples another
+image for one tile and one plane into shared memory, and sums the patches there by rows and columns.
 
 The source is plain C++ except for the thread indices, so the tests compile the same source for the CPU.
 """
@@ -9,12 +9,16 @@ The source is plain C++ except for the thread indices, so the tests compile the 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from sundae_ns.gpu.nvrtc import Launch, load_kernels
+
+WINDOW = 7
+"""Side of the square patches, pixels."""
 
 TILE_WIDTH, TILE_HEIGHT = 32, 16
 THREADS = 256
@@ -28,7 +32,7 @@ __device__ __forceinline__ float limited(float value, float highest) {
     return fminf(fmaxf(value, 0.0f), highest);  // NaN becomes 0
 }
 
-// An image between the middles of its pixels; beyond the outer ones it stays as it is there.
+// Bilinear interpolation between pixel centres; coordinates are clamped to the outermost centres.
 __device__ __forceinline__ float sample(const float* __restrict__ image, int height, int width, float x, float y) {
     x = limited(x - 0.5f, width - 1);
     y = limited(y - 0.5f, height - 1);
@@ -39,9 +43,19 @@ __device__ __forceinline__ float sample(const float* __restrict__ image, int hei
            down * ((1 - across) * below[left] + across * below[right]);
 }
 
-// A block has one tile of one plane. A pixel p, homogeneous, is seen by another image at M p + facing s t, of which
-// `maps` has M and t row by row. `shapes` has where each other image starts in `images`, its height and its width.
-// Sums count the pixels of the image alone; `size` has their number, `mean` and `deviation` are those of its patches.
+// Projects a pixel's centre into another image, homogeneous: M (x, y, 1) + along t. `map` holds the rows of [M | t].
+__device__ __forceinline__ void project(const float* __restrict__ map, int row, int column, float along,
+                                        float* point) {
+#pragma unroll
+    for (int k = 0; k < 3; ++k) {
+        const float* m = map + 4 * k;
+        point[k] = m[0] * (column + 0.5f) + m[1] * (row + 0.5f) + m[2] + along * m[3];
+    }
+}
+
+// Each block computes the scores of one tile for one plane. `maps` holds the projection into each other image, `shapes`
+// the offset of that image in `images`, its height and its width. Pixels outside the image do not count: `size` is the
+// number of pixels of each patch, `mean` and `deviation` are those of its grey values.
 extern "C" __global__ void correlate(int height, int width, int planes, int others, double farthest,
                                      double nearest, double least,
                                      const float* __restrict__ grey, const float* __restrict__ size,
@@ -54,23 +68,23 @@ extern "C" __global__ void correlate(int height, int width, int planes, int othe
     const int tile = blockIdx.x % (across * down), plane = blockIdx.x / (across * down);
     if (plane >= planes) return;
     const int top = tile / across * TILE_HEIGHT - HALO / 2, left = tile % across * TILE_WIDTH - HALO / 2;
-    const float place = s[plane];
+    const float inverse = s[plane];
+    for (int i = threadIdx.x; i < ROWS * COLUMNS; i += blockDim.x) {
+        const int row = top + i / COLUMNS, column = left + i % COLUMNS;
+        const bool outside = row < 0 || column < 0 || row >= height || column >= width;
+        own[i] = outside ? 0 : grey[row * width + column];
+    }
     for (int other = 0; other < others; ++other) {
         const float *map = maps + 12 * other, *image = images + shapes[3 * other];
         const int other_height = shapes[3 * other + 1], other_width = shapes[3 * other + 2];
         for (int i = threadIdx.x; i < ROWS * COLUMNS; i += blockDim.x) {
             const int row = top + i / COLUMNS, column = left + i % COLUMNS;
-            own[i] = seen[i] = 0;
+            seen[i] = 0;
             if (row < 0 || column < 0 || row >= height || column >= width) continue;
-            const float along = facing[row * width + column] * place;
             float point[3];
-            for (int k = 0; k < 3; ++k) {
-                const float* m = map + 4 * k;
-                point[k] = m[0] * (column + 0.5f) + m[1] * (row + 0.5f) + m[2] + along * m[3];
-            }
-            const float nearer = 1 / fmaxf(point[2], 1e-6f);
-            own[i] = grey[row * width + column];
-            seen[i] = sample(image, other_height, other_width, point[0] * nearer, point[1] * nearer);
+            project(map, row, column, facing[row * width + column] * inverse, point);
+            const float scale = 1 / fmaxf(point[2], 1e-6f);
+            seen[i] = sample(image, other_height, other_width, point[0] * scale, point[1] * scale);
         }
         __syncthreads();
         for (int i = threadIdx.x; i < ROWS * TILE_WIDTH; i += blockDim.x) {
@@ -96,10 +110,10 @@ extern "C" __global__ void correlate(int height, int width, int planes, int othe
 #pragma unroll
                 for (int k = 0; k < WINDOW; ++k) sums[t] += partial[t][i + k * TILE_WIDTH];
             const int at = row * width + column;
-            const float along = facing[at] * place, x = column + 0.5f, y = row + 0.5f;
-            const float z = map[8] * x + map[9] * y + map[10] + along * map[11];
-            const float u = map[0] * x + map[1] * y + map[2] + along * map[3];
-            const float v = map[4] * x + map[5] * y + map[6] + along * map[7];
+            const float along = facing[at] * inverse;
+            float point[3];
+            project(map, row, column, along, point);
+            const float u = point[0], v = point[1], z = point[2];
             const bool inside = along >= (float)farthest && along <= (float)nearest;
             const bool visible = inside && z > 1e-6f && u > 0 && v > 0 && u < z * other_width && v < z * other_height;
             const float average = sums[0] / size[at];
@@ -115,70 +129,76 @@ extern "C" __global__ void correlate(int height, int width, int planes, int othe
 """
 
 
+OPTIONS = (f"-DWINDOW={WINDOW}", f"-DTILE_WIDTH={TILE_WIDTH}", f"-DTILE_HEIGHT={TILE_HEIGHT}")
+"""Compiler options of :data:`SOURCE`."""
+
+
 class Patches(NamedTuple):
-    """An image whose patches are compared, float32 on a CUDA device ``[H, W]`` each."""
+    """The patches around the pixels of an image, float32 ``[H, W]`` each."""
 
     grey: Tensor
+    """Grey value of the central pixel."""
     size: Tensor
-    """Number of pixels of each patch that lie in the image."""
+    """Number of pixels inside the image."""
     mean: Tensor
     deviation: Tensor
 
 
-def sweep_kernels(device: torch.device, window: int) -> dict[str, Launch]:
-    """The kernel for a CUDA device and patches of ``window`` x ``window`` pixels, compiled on the first call.
+def sweep_kernels(device: torch.device) -> dict[str, Launch]:
+    """The kernel for a CUDA device, compiled on the first call.
 
     Raises:
         BackendError: the kernel cannot be compiled or loaded.
     """
-    return load_kernels(SOURCE, ("correlate",), options(window), device, THREADS)
+    return load_kernels(SOURCE, ("correlate",), OPTIONS, device, THREADS)
 
 
-def options(window: int) -> tuple[str, ...]:
-    """Compiler options of :data:`SOURCE`."""
-    return f"-DWINDOW={window}", f"-DTILE_WIDTH={TILE_WIDTH}", f"-DTILE_HEIGHT={TILE_HEIGHT}"
-
-
-def correlate(
-    kernels: dict[str, Launch],
-    patches: Patches,
-    facing: Tensor,
-    s: Tensor,
-    others: Sequence[Tensor],
-    maps: Tensor,
-    inverses: tuple[float, float],
-    least: float,
-) -> Tensor:
-    """Highest correlation of each patch with those of other images, by planes ``normal . X = 1 / s``: ``[S, H, W]``.
-
-    It is -1 where no other image has the place, and where its inverse depth lies outside ``inverses``.
+class FusedCorrelations:
+    """Correlations between the patches of one image and those of other images.
 
     Args:
-        kernels: by :func:`sweep_kernels`.
-        patches: of the image.
-        facing: products of a normal with the points at depth 1 behind the middles of the pixels ``[H, W]``.
-        s: inverse distances of the planes ``[S]``.
-        others: grey values of one other image or more ``[H', W']`` each.
-        maps: from a homogeneous pixel ``(x, y, 1)`` at infinity to a homogeneous one of another image, and the other's
-            image of this camera, ``[len(others), 3, 4]``.
+        kernels: returned by :func:`sweep_kernels`.
+        patches: of the image, on the device of the kernels.
+        others: grey values of the other images, at least one, ``[H', W']`` each.
+        maps: projections into the other images ``[len(others), 3, 4]``: a pixel ``(x, y)`` at inverse depth d projects
+            to the homogeneous ``map @ (x, y, 1, d)``.
         inverses: lowest and highest inverse depth.
-        least: least variance of a patch of another image.
+        least_variance: lower limit for the variance of a patch of another image.
     """
-    height, width = facing.shape
-    shapes, start = [], 0
-    for image in others:
-        shapes.append((start, *image.shape))
-        start += image.numel()
-    tiles = -(-height // TILE_HEIGHT) * -(-width // TILE_WIDTH)
-    scores = facing.new_empty(len(s), height, width)
-    kernels["correlate"](
-        len(s) * tiles * THREADS,
-        (
-            *(height, width, len(s), len(others), *inverses, least),
-            *(value.contiguous() for value in (*patches, facing, s, maps)),
-            torch.tensor(shapes, dtype=torch.int32, device=facing.device),
+
+    def __init__(
+        self,
+        kernels: dict[str, Launch],
+        patches: Patches,
+        others: Sequence[Tensor],
+        maps: Tensor,
+        inverses: tuple[float, float],
+        least_variance: float,
+    ) -> None:
+        ends = list(accumulate(image.numel() for image in others))
+        shapes = [(end - image.numel(), *image.shape) for end, image in zip(ends, others)]
+        self._launch, self._limits = kernels["correlate"], (*inverses, least_variance)
+        self._patches = [value.contiguous() for value in patches]
+        self._others = [
+            maps.contiguous(),
+            torch.tensor(shapes, dtype=torch.int32, device=maps.device),
             torch.cat([image.flatten() for image in others]),
-            scores,
-        ),
-    )
-    return scores
+        ]
+        self._num_others = len(others)
+
+    def __call__(self, facing: Tensor, s: Tensor) -> Tensor:
+        """Highest correlation over the other images, for planes ``normal . X = 1 / s``: float32 ``[S, H, W]``.
+
+        It is -1 where no other image contains the projected pixel, and where the inverse depth is outside the limits.
+
+        Args:
+            facing: dot products of the normal and the points at depth 1 behind the pixel centres ``[H, W]``.
+            s: inverse distances of the planes ``[S]``.
+        """
+        height, width = facing.shape
+        tiles = -(-height // TILE_HEIGHT) * -(-width // TILE_WIDTH)
+        scores = facing.new_empty(len(s), height, width)
+        numbers = (height, width, len(s), self._num_others, *self._limits)
+        arrays = (*self._patches, facing.contiguous(), s.contiguous(), *self._others, scores)
+        self._launch(len(s) * tiles * THREADS, (*numbers, *arrays))
+        return scores

@@ -1,8 +1,7 @@
 """The extension that gives a field more points to start from, by a plane sweep through its images.
 
-Structure from motion of a dozen photos leaves a few hundred points, and of a hundred some ten thousand, on what has
-corners. Where a field begins without any, it explains each image by what is near its camera, and other views do not
-agree; densification fills the gap late and in the wrong places.
+Structure from motion of a dozen photos leaves a few hundred points. Where a field begins without any, it explains each
+image by primitives near its camera, and other views do not agree.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ T = TypeVar("T")
 SIDES = {"cuda": (640, 320), "cpu": (160, 160)}
 """Longest side of the swept images of few views and of many, pixels, by device: a CPU takes minutes for more."""
 FEW = 24
-"""Up to as many views are swept in the larger size; between them and many the pixels of all images stay the same."""
+"""Most views that are swept at the larger size. For more views, the side shrinks with the root of their number."""
 FILLED = {"cuda": 100_000, "cpu": 20_000}
 """Number of points up to which a sparse cloud is filled; a larger one stays as it is."""
 
@@ -54,9 +53,9 @@ class DenseStart(Extension):
         wanted = 2 <= num_images <= options.dense_start_views and options.warm_start is None and not options.random_init
         self._done = not wanted or points is None or len(points[0]) == 0
         self.found: Callable[[Callable[[], Points]], Points] = lambda sweep: sweep()
-        """Runs the sweep; several ranks take what the first finds."""
+        """Runs the sweep and returns its points; with several ranks, those of the first."""
         self.put: Callable[[FieldState, Mapping[str, Tensor]], None] = put
-        """Puts a field in the place of another; each of several ranks keeps its block."""
+        """Replaces the field; each of several ranks keeps its own rows."""
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing: a checkpoint holds the field that has begun."""
@@ -106,6 +105,6 @@ def _of(limits: Mapping[str, T], run: TrainingRun) -> T:
 
 
 def put(state: FieldState, params: Mapping[str, Tensor]) -> None:
-    """Begin with another field, without moments of its optimizers."""
+    """Replace the field, and drop the moments of its optimizers."""
     for name, value in params.items():
         replace_parameter(state.field.data, state.optimizers, name, value.to(state.device), {})

@@ -7,7 +7,7 @@ back to its pixel through the depth that another view has found there.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,27 +15,25 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, normalize, pad
 
-from sundae_ns.gpu.fused_sweep import Patches, correlate, sweep_kernels
+from sundae_ns.gpu.fused_sweep import WINDOW, FusedCorrelations, Patches, sweep_kernels
 from sundae_ns.gpu.nvrtc import Launch, kernels_where_possible
 from sundae_ns.rendering.views import View
 from sundae_ns.training.extension import Photo
 
-WINDOW = 7
-"""Side of the patches, pixels of the reduced images as all lengths here."""
 CONTRAST = 0.02
 """Least standard deviation of the grey values of a patch: a flat one fits anywhere."""
 LEAST_VARIANCE = 1e-5
-"""Least variance of the grey values of a patch of another view, so that a flat one fits nothing."""
+"""Lower limit for the variance of a patch of another view, so that a flat one does not correlate."""
 CORRELATION = 0.6
 """Least correlation with one of the views."""
 NEIGHBORS = 3
 """Number of views that a view is compared with. The best one counts at a pixel, as often only one sees the place."""
 CONFIRMING = 24
-"""Number of views, in the same order, whose depths may agree with those of a view."""
+"""Number of best neighbours whose depths may confirm those of a view."""
 JUDGES = 5000
-"""Most sparse points, evenly drawn, that tell which views see the same places."""
+"""Most sparse points, evenly drawn, that decide which views are neighbours."""
 STEP, FEWEST, MOST = 1.5, 16, 256
-"""Pixels by which another view moves from plane to plane, and the limits of the number of planes."""
+"""Distance of two planes in another view, pixels of the reduced image, and the limits of the number of planes."""
 NEARER, FARTHER = 0.7, 4.0
 """Range of the depths, as shares of those of the nearest and farthest sparse points (without 2% on either side)."""
 SEEN = 8
@@ -52,7 +50,7 @@ _BATCH = 16
 
 @dataclass(frozen=True)
 class _Reduced:
-    """A photo of reduced size; a capture of hundreds holds 12 bytes for each of their pixels."""
+    """A photo of reduced size, 12 bytes a pixel with its depth: captures have hundreds."""
 
     view: View
     image: Tensor
@@ -64,17 +62,18 @@ class _Reduced:
     pose: Tensor
     """Camera-to-world, OpenCV axes ``[4, 4]``."""
 
-    @property
-    def rays(self) -> Tensor:
-        """Points at depth 1 behind the middles of the pixels, camera coordinates ``[H, W, 3]``."""
-        K, height, width = self.view.K, self.view.height, self.view.width
-        x, y = (torch.arange(length, device=K.device) + 0.5 for length in (width, height))
-        pixels = torch.stack([*torch.meshgrid(x, y, indexing="xy"), torch.ones(height, width, device=K.device)], dim=-1)
-        return pixels.to(K) @ torch.linalg.inv(K).T
+    unproject: Tensor
+    """Inverse intrinsics ``[3, 3]``."""
+
+    def rays(self, row: Tensor, column: Tensor) -> Tensor:
+        """Points at depth 1 behind pixel centres, camera coordinates ``[..., 3]``; rows and columns broadcast."""
+        row, column = torch.broadcast_tensors(row, column)
+        pixels = torch.stack([column + 0.5, row + 0.5, torch.ones_like(row)], dim=-1)
+        return pixels.to(self.unproject) @ self.unproject.T
 
 
 class _Neighbors(NamedTuple):
-    """Indices of other views, by how much they tell about the depths of a view."""
+    """Indices of the views that are compared with a view, and of those that confirm its depths; the best come first."""
 
     compared: list[int]
     confirming: list[int]
@@ -105,16 +104,19 @@ class Sweep:
             return self._depths[index]
         low, high = limits
         best = torch.full_like(self._depths[index], -1.0)
-        depth, rays = torch.zeros_like(best), photo.rays
+        depth = torch.zeros_like(best)
+        rows, columns = (torch.arange(side, device=best.device) for side in best.shape)
+        rays = photo.rays(rows[:, None], columns)
+        lengths, correlations = rays.norm(dim=-1), _correlations(photo, others, rays, (1 / high, 1 / low))
         for normal in _directions(photo.view, self._up):
             # A plane is normal . X = 1 / s, so a pixel has the inverse depth facing * s.
             facing = rays @ normal
-            steep = facing > STEEPEST * rays.norm(dim=-1)
+            steep = facing > STEEPEST * lengths
             if not steep.any():
                 continue
             ends = 1 / (high * float(facing[steep].max())), 1 / (low * float(facing[steep].min()))
             s = torch.linspace(*ends, _number_of_planes(photo, others, normal, ends), device=facing.device)
-            score, place = _peaks(_correlations(photo, others, facing, s, (1 / high, 1 / low)))
+            score, place = _peaks(correlations(facing, s))
             score = torch.where(steep, score, -1.0)
             found = 1 / (facing * (s[0] + place * (s[1] - s[0]))).clamp_min(1e-12)
             depth, best = torch.where(score > best, found, depth), torch.maximum(score, best)
@@ -140,7 +142,7 @@ class Sweep:
         """Points of a view that others confirm: their means with those of the others, and colours."""
         photo, depth = self.photos[index], self._depths[index]
         chosen = depth > 0
-        points = _to_world(photo, photo.rays[chosen] * depth[chosen][:, None])
+        points = _to_world(photo, photo.rays(*chosen.nonzero().T) * depth[chosen][:, None])
         x, y, _ = _project(photo.view, points)
         total, count = points.clone(), torch.ones_like(x)
         for i in self._neighbors[index].confirming:
@@ -149,7 +151,7 @@ class Sweep:
             column = there_x.nan_to_num().clamp(0, other.view.width - 1).long()
             row = there_y.nan_to_num().clamp(0, other.view.height - 1).long()
             found = depths[row, column]
-            theirs = _to_world(other, other.rays[row, column] * found[:, None])
+            theirs = _to_world(other, other.rays(row, column) * found[:, None])
             back_x, back_y, _ = _project(photo.view, theirs)
             agrees = _in_view(other.view, there_x, there_y, z) & (found > 0) & ((found - z).abs() < LARGEST_ERROR * z)
             agrees &= torch.hypot(back_x - x, back_y - y) < LARGEST_SHIFT
@@ -168,11 +170,18 @@ def _reduced(photo: Photo, longest: int) -> _Reduced:
             interpolate(value, (view.height, view.width), mode="bilinear", antialias=True) for value in (image, mask)
         )
     grey = image.mean(dim=1, keepdim=True)
-    size = _box(torch.ones_like(grey))
-    deviation = (_box(grey * grey) / size - (_box(grey) / size) ** 2).clamp_min(0).sqrt()
-    usable = (deviation > CONTRAST) & (_box(mask) / size > 0.99)
+    patches = _patches(grey)
+    usable = (patches.deviation > CONTRAST) & (_box(mask)[0, 0] / patches.size > 0.99)
     colours = (255 * image[0].permute(1, 2, 0)).round().clamp(0, 255).to(torch.uint8)
-    return _Reduced(view, colours, grey, usable[0, 0], torch.linalg.inv(view.viewmat))
+    return _Reduced(view, colours, grey, usable, torch.linalg.inv(view.viewmat), torch.linalg.inv(view.K))
+
+
+def _patches(grey: Tensor) -> Patches:
+    """The patches of an image ``[1, 1, H, W]``; flat ones have a small deviation, not none."""
+    size = _box(torch.ones_like(grey))
+    mean = _box(grey) / size
+    deviation = (_box(grey * grey) / size - mean * mean).clamp_min(1e-8).sqrt()
+    return Patches(*(value[0, 0] for value in (grey, size, mean, deviation)))
 
 
 def _project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -219,7 +228,8 @@ def _directions(view: View, up: Tensor) -> list[Tensor]:
 
 def _number_of_planes(photo: _Reduced, others: Sequence[_Reduced], normal: Tensor, ends: tuple[float, float]) -> int:
     """Number of planes between two, by the way that the middle of the image takes in the other views."""
-    middle = photo.rays[photo.view.height // 2, photo.view.width // 2]
+    row, column = (torch.tensor([side // 2], device=normal.device) for side in (photo.view.height, photo.view.width))
+    (middle,) = photo.rays(row, column)
     points = _to_world(photo, torch.stack([middle / (torch.dot(middle, normal).clamp_min(STEEPEST) * s) for s in ends]))
     longest = 0.0
     for other in others:
@@ -230,57 +240,57 @@ def _number_of_planes(photo: _Reduced, others: Sequence[_Reduced], normal: Tenso
 
 
 def _correlations(
-    photo: _Reduced, others: Sequence[_Reduced], facing: Tensor, s: Tensor, inverses: tuple[float, float]
-) -> Tensor:
-    """Highest correlation of patches with those of other views, by planes ``normal . X = 1 / s``: ``[S, H, W]``.
+    photo: _Reduced, others: Sequence[_Reduced], rays: Tensor, inverses: tuple[float, float]
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """The function of :meth:`FusedCorrelations.__call__` for a view, its neighbours and the limits of inverse depths.
 
-    It is -1 where no other view sees the place, and where its inverse depth lies outside ``inverses``.
+    Args:
+        rays: of all pixels of the view ``[H, W, 3]``.
     """
-    grey = photo.grey
-    size = _box(torch.ones_like(grey))
-    mean = _box(grey) / size
-    deviation = (_box(grey * grey) / size - mean * mean).clamp_min(1e-8).sqrt()
-    # X' = R X + t with s normal . X = 1: the ray r goes to K (R r + s (normal . r) t).
-    relatives = [other.view.viewmat @ photo.pose for other in others]
-    ways = [other.view.K @ relative[:3] for other, relative in zip(others, relatives)]
-    if kernels := _kernels(grey):
-        pixels = torch.linalg.inv(photo.view.K)
-        maps = torch.stack([torch.cat([way[:, :3] @ pixels, way[:, 3:]], dim=1) for way in ways])
-        patches = Patches(*(value[0, 0] for value in (grey, size, mean, deviation)))
-        return correlate(
-            kernels, patches, facing, s, [other.grey[0, 0] for other in others], maps, inverses, LEAST_VARIANCE
-        )
-    lines = [(photo.rays @ way[:, :3].T, facing[..., None] * way[:, 3]) for way in ways]
-    found = []
-    for part in s.split(_BATCH):
-        scores, inverse = [], facing * part[:, None, None]
-        inside = (inverse >= inverses[0]) & (inverse <= inverses[1])
-        for other, (start, slope) in zip(others, lines):
-            x, y, z = (start[..., i] + part[:, None, None] * slope[..., i] for i in range(3))
-            sides = z.new_tensor([other.view.width, other.view.height])
-            grid = 2 * torch.stack([x, y], dim=-1) / (z.clamp_min(1e-6)[..., None] * sides) - 1
-            valid = inside & (z > 1e-6) & (grid.abs() < 1).all(dim=-1)
-            seen = grid_sample(
-                other.grey.expand(len(part), -1, -1, -1), grid, padding_mode="border", align_corners=False
-            )
-            moments = _box(torch.cat([seen, seen * seen, seen * grey], dim=1)) / size
-            average, square, product = moments.split(1, dim=1)
-            variance = (square - average * average).clamp_min(LEAST_VARIANCE)
-            score = (product - average * mean) / (deviation * variance.sqrt())
-            scores.append(torch.where(valid, score[:, 0], -1.0))
-        found.append(torch.stack(scores).amax(dim=0))
-    return torch.cat(found)
+    patches = _patches(photo.grey)
+    # X' = R X + t with s normal . X = 1: the ray r projects to K (R r + s (normal . r) t).
+    ways = [other.view.K @ (other.view.viewmat @ photo.pose)[:3] for other in others]
+    if kernels := _kernels(photo.grey):
+        maps = torch.stack([torch.cat([way[:, :3] @ photo.unproject, way[:, 3:]], dim=1) for way in ways])
+        images = [other.grey[0, 0] for other in others]
+        return FusedCorrelations(kernels, patches, images, maps, inverses, LEAST_VARIANCE)
+    starts = [rays @ way[:, :3].T for way in ways]
+    return lambda facing, s: torch.cat(
+        [_scores(patches, others, starts, ways, facing * part[:, None, None], inverses) for part in s.split(_BATCH)]
+    )
+
+
+def _scores(
+    patches: Patches,
+    others: Sequence[_Reduced],
+    starts: Sequence[Tensor],
+    ways: Sequence[Tensor],
+    inverse: Tensor,
+    inverses: tuple[float, float],
+) -> Tensor:
+    """What the kernel computes, by PyTorch's operations: scores ``[S, H, W]`` for inverse depths ``[S, H, W]``."""
+    inside = (inverse >= inverses[0]) & (inverse <= inverses[1])
+    scores = []
+    for other, start, way in zip(others, starts, ways):
+        x, y, z = (start[..., i] + inverse * way[i, 3] for i in range(3))
+        sides = z.new_tensor([other.view.width, other.view.height])
+        grid = 2 * torch.stack([x, y], dim=-1) / (z.clamp_min(1e-6)[..., None] * sides) - 1
+        valid = inside & (z > 1e-6) & (grid.abs() < 1).all(dim=-1)
+        grey = other.grey.expand(len(inverse), -1, -1, -1)
+        seen = grid_sample(grey, grid, padding_mode="border", align_corners=False)
+        moments = _box(torch.cat([seen, seen * seen, seen * patches.grey], dim=1)) / patches.size
+        average, square, product = moments.unbind(dim=1)
+        variance = (square - average * average).clamp_min(LEAST_VARIANCE)
+        score = (product - average * patches.mean) / (patches.deviation * variance.sqrt())
+        scores.append(torch.where(valid, score, -1.0))
+    return torch.stack(scores).amax(dim=0)
 
 
 def _kernels(image: Tensor) -> dict[str, Launch] | None:
-    """The kernel for patches of :data:`WINDOW`, on a GPU that can have it."""
+    """The kernel, on a GPU that can compile it."""
     if not image.is_cuda:
         return None
-    return kernels_where_possible(_load, image.device, "a plane sweep takes some hundred kernels for each direction")
-
-
-def _load(device: torch.device) -> dict[str, Launch]:
-    return sweep_kernels(device, WINDOW)
+    return kernels_where_possible(sweep_kernels, image.device, "a plane sweep runs as hundreds of kernels a direction")
 
 
 def _peaks(scores: Tensor) -> tuple[Tensor, Tensor]:

@@ -33,9 +33,10 @@ def scores(device: str = "cpu") -> torch.Tensor:
     """Correlations with two images of other sizes; some planes leave them, and some lie behind them."""
     photo = reduced(35, 50, 0.0, device)
     others = [reduced(40, 45, 0.4, device), reduced(21, 70, -0.7, device)]
-    facing = photo.rays @ torch.tensor([0.3, 0.0, 0.954], device=device)
+    rays = photo.rays(torch.arange(35, device=device)[:, None], torch.arange(50, device=device))
+    facing = rays @ torch.tensor([0.3, 0.0, 0.954], device=device)
     planes = torch.linspace(-0.2, 2.0, 23, device=device)
-    return plane_sweep._correlations(photo, others, facing, planes, (-0.1, 1.7))
+    return plane_sweep._correlations(photo, others, rays, (-0.1, 1.7))(facing, planes)
 
 
 def apart(found: torch.Tensor, expected: torch.Tensor) -> float:
@@ -45,9 +46,7 @@ def apart(found: torch.Tensor, expected: torch.Tensor) -> float:
 
 def test_it_correlates_as_pytorch_does(load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = scores()
-    loaded = load_on_cpu(
-        fused_sweep.SOURCE, ("correlate",), fused_sweep.options(plane_sweep.WINDOW), torch.device("cpu"), 1
-    )
+    loaded = load_on_cpu(fused_sweep.SOURCE, ("correlate",), fused_sweep.OPTIONS, torch.device("cpu"), 1)
     monkeypatch.setattr(plane_sweep, "_kernels", lambda image: loaded)
     assert apart(scores(), expected) < 1e-3
     assert (expected == -1).any()
@@ -55,7 +54,7 @@ def test_it_correlates_as_pytorch_does(load_on_cpu: Any, monkeypatch: pytest.Mon
 
 
 def test_it_compiles_for_gpus(compile_for_gpu: Callable[..., bytes]) -> None:
-    assert compile_for_gpu(fused_sweep.SOURCE, "sm_75", fused_sweep.options(plane_sweep.WINDOW))
+    assert compile_for_gpu(fused_sweep.SOURCE, "sm_75", fused_sweep.OPTIONS)
 
 
 @pytest.mark.gpu

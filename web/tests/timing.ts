@@ -100,7 +100,7 @@ for (const { file, compared, step } of task.scenes) {
   const renderer = new Renderer(gpu, scene, { getContext: () => context } as unknown as HTMLCanvasElement);
   await renderer.render(views[0]!, false, 1);
   /** From the decoded scene to its first image, shaders included. */
-  const first = performance.now() - decoded;
+  const first = Number((performance.now() - decoded).toFixed(1));
   for (const head of scene.head ? [false, true] : [false]) {
     const psnr: number[] = [];
     for (const camera of compared) {

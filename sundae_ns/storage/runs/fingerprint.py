@@ -27,7 +27,7 @@ LEFT_OUT = frozenset(
     "pipeline.model.evaluate_prune "
     # A count that comparisons take from the capture; it stands beside the row as its number of primitives.
     "pipeline.model.mcmc_cap "
-    # Points to start from belong to the capture, too; rows of few views name them.
+    # It acts on captures of few views alone, whose rows name what they start from.
     "pipeline.model.dense_start_views".split()
 )
 """Options of a trainer that decide neither quality nor time of what is trained, by their dotted names."""
