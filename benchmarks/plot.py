@@ -37,8 +37,8 @@ def plot_curve() -> Any:
     """PSNR and SSIM of packed scenes against their size: fixed shares as a line, what the default has chosen, and its
     fine-tuned pack."""
     rows = [row for row in lines_of("curve.csv") if row["seed"] == "42"]
-    stock = {row["capture"]: row for row in lines_of("formats.csv") if row["method"] == "splatfacto"}
-    stock = {row["capture"]: row for row in stock.values() if row["format"] == ".sundae"}
+    packs = [row for row in lines_of("formats.csv") if row["format"] == ".sundae"]
+    stock = {row["capture"]: row for row in packs if row["method"] == "splatfacto"}
     captures = list(dict.fromkeys(row["capture"] for row in rows))
     figure, panels = plt.subplots(
         2, len(captures), figsize=(3 * len(captures), 5.5), layout="constrained", sharex="col"

@@ -27,7 +27,7 @@ from sundae_ns.evaluation.document import number, table
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
-LEFT_OUT = ("splatfacto-7k", "sundae-with-head", "sundae-no-head-bytes")
+LEFT_OUT = ("splatfacto-7k", "sundae-with-head", "sundae-no-head-bytes", "band")
 """Methods of runs.csv that the table of quality leaves out; the text gives what they show."""
 FORMATS = {".spz": ".spz", ".sog": ".sog", ".sog theirs": ".sog by splat-transform", ".sundae": ".sundae"}
 """Packed formats in the order of a table, by the heads that readers see."""
@@ -88,7 +88,7 @@ def quality() -> list[str]:
     """All methods on the captures: quality and size; :func:`speed` has times, because suites share their GPUs."""
     heads = ["capture", "method", "keep", "primitives", "PSNR, dB", "SSIM", "PSNR, head off", "MB"]
     rows, found = [], default_runs()
-    compared = {row["scene"] for row in found if row["variant"] == "sundae"}
+    compared = {row["scene"] for row in found if row["variant"] in ("sundae", "sundae-auto")}
     for row in found:
         if row["variant"] in LEFT_OUT or row["scene"] not in compared:
             continue
@@ -205,9 +205,9 @@ def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:
 
 
 def _quality(rows: Sequence[dict[str, Any]], kind: str) -> str:
-    """PSNR, of what is kept with its spread, and SSIM over the seeds of a capture: ``31.51 ± 0.04, 0.9277``."""
+    """PSNR, of what is kept with its spread, and SSIM over the seeds of a capture: ``31.51 ± 0.04, 0.928``."""
     decibels = number(_mean(rows, f"{kind}psnr"), 2) if kind else spread([float(row["psnr"]) for row in rows], 2)
-    return f"{decibels}, {_mean(rows, f'{kind}ssim'):.4f}"
+    return f"{decibels}, {_mean(rows, f'{kind}ssim'):.3f}"
 
 
 def format_rows() -> list[dict[str, Any]]:
@@ -231,7 +231,7 @@ def format_rows() -> list[dict[str, Any]]:
 
 
 def formats() -> list[str]:
-    """Stock runs in each format: bytes of the whole file, and quality on the test views."""
+    """Stock runs in each packed format, and in fp32: bytes of the whole file, and quality on the test views."""
     heads = ["capture, method", "format", "program", "primitives", "MB", "PSNR, dB", "SSIM"]
     rows = [
         [
@@ -241,16 +241,16 @@ def formats() -> list[str]:
             *(number(row["psnr"], 2), number(row["ssim"], 4)),
         ]
         for row in format_rows()
-        if row["method"] == METHODS["splatfacto"]
+        if row["method"] == METHODS["splatfacto"] and row["kind"] != ".ply"
     ]
     return table(heads, first_of_each(rows), words=3)
 
 
 def packed_headline() -> list[str]:
-    """README's table of packed sizes: MB and dB of stock splatfacto in each format, beside our default."""
+    """README's table of packed sizes: MB, and PSNR in dB, of stock splatfacto in each format, beside our default."""
 
     def cell(size: float, psnr: float) -> str:
-        return f"{number(size / MB, 1)} MB, {number(psnr, 1)} dB"
+        return f"{number(size / MB, 1)}, {number(psnr, 1)}"
 
     stock: dict[str, dict[str, str]] = {}
     for row in (row for row in format_rows() if row["method"] == METHODS["splatfacto"]):
@@ -264,7 +264,7 @@ def packed_headline() -> list[str]:
         for capture, (name, found) in _defaults().items()
     ]
     kinds = list(FORMATS.values())
-    return table(["capture", f"splatfacto, {kinds[0]}", *kinds[1:], "sundae", "fine-tuned"], rows)
+    return table(["capture", f"splatfacto, {kinds[0]}", *kinds[1:], "sundae", "fine-tuned"], rows, words=1)
 
 
 def multi_gpu() -> list[str]:
@@ -327,7 +327,6 @@ def gpu(name: str) -> str:
 
 
 PRUNES = {
-    ("opacity", "none", "gpu"): "highest opacity",
     ("decimate", "none", ""): "`--decimate`",
     ("decimate-adaptive", "none", ""): "`--decimate-adaptive`",
     ("pairs", "none", "cpu"): "`prune`, CPU",

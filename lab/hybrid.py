@@ -58,8 +58,6 @@ if "nomirror" in ways:
     from sundae_ns import model
     resolution = model.SundaeModel.resolution
     model.SundaeModel.resolution = lambda self, step: resolution(self, step)._replace(mirror=False)
-if "noshrink" in ways:
-    losses.StepLosses.emphasis = lambda self, state: 1.0
 if "nodecay" in ways:
     from sundae_ns import callbacks
     start, act = callbacks.NerfstudioRun.start, callbacks.NerfstudioRun.act

@@ -28,9 +28,23 @@ def timed(name, side):
     a = time.time()
     for i in range(len(photos)): s.add(i)
     torch.cuda.synchronize() if dev == "cuda" else None
-    b = time.time(); xyz, _ = s.points(); torch.cuda.synchronize() if dev == "cuda" else None
+    b = time.time(); xyz, _ = s.points(100_000); torch.cuda.synchronize() if dev == "cuda" else None
     print(f"SWEEPTIME {root.name} {name} side {side}: reduce {a-t:.2f} s, sweep {b-a:.2f} s ({1000*(b-a)/len(photos):.0f} ms a view), points {time.time()-b:.2f} s, {len(xyz)} points", flush=True)
 with torch.no_grad():
     for side in map(int, sys.argv[2].split(",")):
         timed("first", side)
         timed("again", side)
+    if dev == "cuda":
+        from torch.profiler import ProfilerActivity, profile
+        s = Sweep(photos, pts, 640)
+        with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as prof:
+            for i in range(4): s.add(i)
+            torch.cuda.synchronize()
+        print("\n".join(line[:60] + line[-150:] for line in prof.key_averages().table(sort_by="cuda_time_total", row_limit=14).splitlines()))
+        for side in map(int, sys.argv[2].split(",")):
+            kernels, plane_sweep._kernels = plane_sweep._kernels, lambda image: None
+            few, photos[:] = list(photos), photos[:40]
+            timed("pytorch, 40 views", side)
+            plane_sweep._kernels = kernels
+            timed("kernel, 40 views", side)
+            photos[:] = few

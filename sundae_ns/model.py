@@ -66,7 +66,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Weight of opacities and scales in the loss of the pruned field, over the number of training images."""
     average_share: float = 0.1
     """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
-    dense_start_views: int = 24
+    dense_start_views: int = 300
     """With at most this many training images, a plane sweep fills a sparse cloud to start from; 0 turns it off."""
     warm_start: Path | None = None
     """Start from a finished field without a warm-up: a splatfacto or sundae .ckpt (or its folder), or a 3DGS .ply."""

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from sundae_ns.training import losses
 from sundae_ns.training.trials import head as trials
 from sundae_ns.training.trials import stopping
 
@@ -70,12 +69,6 @@ def test_the_pages_state_when_training_stops() -> None:
         assert words in text
         assert growth in text
     assert stopping.WINDOW_SHARE == 1 / 50  # "fiftieth"
-
-
-def test_the_page_states_when_a_correction_shrinks() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    assert rf"$e \ge {losses.FIRST_PASSES}$ passes" in text
-    assert rf"/ {losses.HALF_AFTER})" in text
 
 
 def test_the_checks_can_fail() -> None:

@@ -231,8 +231,12 @@ def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
 def fingerprint_of(job: Job) -> str:
     """Fingerprint of the run that the job makes with today's methods; its warm-up need not be done."""
     # Neither capture nor seed counts.
-    job = replace(job, data="capture", seed=0)
-    return fingerprint(parse(_arguments(job, ("--pipeline.model.warm-start", "DONE") if job.kind == "branch" else ())))
+    return fingerprint(config_of(replace(job, data="capture", seed=0)))
+
+
+def config_of(job: Job) -> TrainerConfig:
+    """Configuration of the run that the job makes with today's methods; its warm-up need not be done."""
+    return parse(_arguments(job, ("--pipeline.model.warm-start", "DONE") if job.kind == "branch" else ()))
 
 
 def parse(arguments: Sequence[str]) -> TrainerConfig:

@@ -167,6 +167,8 @@ def _job(base: Job, arm: Arm, ratio: float | None) -> Job:
             "pipeline.model.warmup": ("mcmc",),
             "pipeline.model.pruning.mode": ("off",),
             "pipeline.model.head.mode": ("off",),
+            # As its authors start.
+            "pipeline.model.dense-start-views": ("0",),
             # The share of its authors: 25,000 of 30,000.
             "pipeline.model.stop-split-at": (str(max(arm.steps * 5 // 6, 1)),),
             "optimizers.means.scheduler.max-steps": (steps,),

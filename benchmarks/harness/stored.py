@@ -13,10 +13,10 @@ MB = 1e6
 METHODS = {
     "splatfacto": "splatfacto, 30,000 steps",
     "splatfacto-7k": "splatfacto, 7,000 steps",
-    "sundae-warm-up": "full field, not pruned",
-    "sundae": "**sundae**, fixed share",
-    "sundae-fast": "sundae-fast",
     "sundae-auto": "**sundae**",
+    "sundae-warm-up": "full field, not pruned",
+    "sundae-fast": "sundae-fast",
+    "sundae": "sundae, fixed share",
     "sundae-with-head": "sundae, with a head in any case",
     "sundae-no-head": "the same primitives, no head",
     "sundae-no-head-bytes": "more primitives in place of a head",

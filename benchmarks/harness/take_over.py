@@ -10,14 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from harness import stored
+from harness.job import config_of
+from harness.plan import Job
 from harness.stored import METHODS, lines_of
 from harness.today import SHARE, is_of_today
 from sundae_ns.evaluation import COLUMNS, csv_text
 from sundae_ns.storage.packing import FINETUNE_STEPS
 
+CURVE = {"sundae": "sundae", "sundae-auto": "sundae", "sundae-no-head": "sundae-no-head"}
+"""Arms of curve.csv by the method in its rows."""
+
 
 def take_over(results: Path) -> None:
-    """Replace rows of runs.csv, frames, training times and packs by those of ``suite.py``.
+    """Replace rows of runs.csv, curve.csv, frames, training times and packs by those of ``suite.py``.
 
     Other rows stay, but for earlier defaults at other seeds of what was measured.
 
@@ -28,10 +33,8 @@ def take_over(results: Path) -> None:
     measured = [_rounded({**result["measured"], "command": _public(result["measured"]["command"])}) for result in found]
     rows = list(csv.DictReader(csv_text(measured).splitlines()))
     kept = merged(lines_of("runs.csv"), rows, ("scene", "variant", "keep_ratio", "seed"))
-    with (stored.RESULTS / "runs.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(kept)
+    _write("runs.csv", COLUMNS, kept)
+    _write("curve.csv", list(lines_of("curve.csv")[0]), _curve(lines_of("curve.csv"), list(map(_rounded, found))))
     seed = found[0]["job"]["seed"]
     own = [r for r in map(_rounded, found) if r["job"]["seed"] == seed and (r["job"]["keep_ratio"] or SHARE) == SHARE]
     for name, lines, places in (
@@ -61,6 +64,46 @@ def merged(old: Iterable[dict[str, Any]], new: Sequence[dict[str, Any]], places:
         return at(line, places) not in taken and is_of_today({"variant": line.get("arm", "sundae"), **line})
 
     return [*filter(stays, old), *new]
+
+
+def _write(name: str, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
+    with (stored.RESULTS / name).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _curve(old: list[dict[str, Any]], found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of curve.csv with those of packed results, capture by capture: what the default chose, and fixed shares."""
+    new = [_curve_line(result) for result in found if result["packed"] and result["job"]["arm"] in CURVE]
+    chosen = {kind: [row for row in new if row["chosen"] == kind] for kind in ("yes", "no")}
+    rows = merged(
+        [{"variant": "sundae-auto", **row} for row in old if row["chosen"] == "yes"],
+        chosen["yes"],
+        ("capture", "seed"),
+    )
+    # What trials keep differs from seed to seed.
+    places = ("capture", "method", "prune_at", "share", "seed")
+    rows += merged([row for row in old if row["chosen"] == "no"], chosen["no"], places)
+    captures = list(dict.fromkeys(row["capture"] for row in [*old, *new]))
+    rows.sort(key=lambda row: captures.index(row["capture"]))
+    return [{name: value for name, value in row.items() if name != "variant"} for row in rows]
+
+
+def _curve_line(result: dict[str, Any]) -> dict[str, Any]:
+    job, run, packed, tuned = (result.get(name) or {} for name in ("job", "measured", "packed", "tuned"))
+    full, config = run["configurations"][0]["mean"], config_of(Job(**job))
+    model: Any = config.pipeline.model
+    row = {
+        **{"capture": run["scene"], "method": CURVE[job["arm"]], "prune_at": str(model.pruning.prune_at)},
+        **{"share": str(run["keep_ratio"]), "primitives": run["primitives"], "packed_bytes": packed["bytes"]},
+        **{"psnr": full["psnr"], "ssim": full["ssim"]},
+        **{"packed_psnr": packed["psnr"], "packed_ssim": packed["ssim"]},
+        **{f"tuned_{name}": tuned.get(name, "") for name in ("bytes", "psnr", "ssim")},
+        **{"head": "yes" if run["bytes_head"] else "no", "seed": str(run["seed"])},
+        **{"chosen": "yes" if job["arm"] == "sundae-auto" else "no", "seconds": run["train_s"] or ""},
+    }
+    return {**row, "fingerprint": run["fingerprint"]}
 
 
 def _public(command: str) -> str:
@@ -94,7 +137,7 @@ def _frame_line(result: dict[str, Any]) -> dict[str, Any]:
     width, height = (int(side) for side in run["resolution"].split()[0].split("x"))
     full, base = run["configurations"][0], run["configurations"][-1]
     return {
-        "config": f"{run['scene']}, {METHODS.get(run['variant'], run['variant']).strip('*')}",
+        "config": f"{run['scene']}, {METHODS.get(run['variant'], run['variant']).replace('*', '')}",
         "variant": run["variant"],
         "device": run["gpu"],
         **{"width": width, "height": height, "precision": run["precision"]},

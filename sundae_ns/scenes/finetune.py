@@ -28,7 +28,6 @@ from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene
 from sundae_ns.storage.packing.rate import estimated_bits
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import UNPACKED, config_of
-from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.optimizers import NetworkAdamConfig
 from sundae_ns.training.recordings import StepRecordings
 from sundae_ns.training.step import StepInputs, StepResult
@@ -127,7 +126,7 @@ def finetune(
             if weights:
                 model.step = at  # chooses the window of a large image
             camera, batch = pipeline.datamanager.next_train(at)
-            result = step(model.state, model.step_inputs(camera, batch), model.render_settings(training=True))
+            result = step(model.step_inputs(camera, batch), model.render_settings(training=True))
             if progress is not None:
                 progress(result.loss)
     source = {**scene.meta.get("source", {}), "finetuned": steps}
@@ -227,14 +226,13 @@ class TunedStep:
         self._can_record = model.device.type == "cuda" and model.backend.name == "gsplat"
         self._recordings = StepRecordings()
 
-    def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+    def __call__(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train on one image.
 
         Raises:
             torch.cuda.OutOfMemoryError: the GPU's memory is full.
         """
         if self._can_record:
-            self._recordings.keep_for(self._model.losses.emphasis(state))
             kind = (inputs.view.width, inputs.view.height, inputs.mask is not None)
             try:
                 return self._recordings.run(self._run, inputs, settings, kind=kind)

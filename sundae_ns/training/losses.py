@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -18,11 +17,6 @@ from sundae_ns.training.options import ModelOptions
 
 CHAIN_PRIOR = 0.01
 """Weights of opacities and scales in the loss of a chain (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
-
-HALF_AFTER = 800
-"""Passes over the training images after which images show half of the correction that the loss asks for."""
-FIRST_PASSES = 8
-"""With fewer passes a head has learnt no image by heart."""
 
 LEAST_SQUARE = 1e-8
 """Added to the mean square, so that its root has a gradient for equal images."""
@@ -62,9 +56,6 @@ class StepLosses:
         """
         if mask is not None:
             target, rgb, base = target * mask, rgb * mask, base * mask
-        emphasis = self.emphasis(state)
-        if emphasis != 1:
-            rgb = torch.lerp(base, rgb, emphasis)
         options = self.options
         compared = base if state.head_enabled and options.base_loss_weight > 0 else None
         squares = options.loss_after_prune == "rms" and state.pruned
@@ -80,21 +71,6 @@ class StepLosses:
                 mean = values.mean() if count is None else values.sum() / (values.shape[1] * count)
                 losses[f"{name}_loss"] = weight * mean
         return losses
-
-    def emphasis(self, state: FieldState) -> float:
-        """How many times as strong as in images a residual head's correction is in the loss at this step.
-
-        With each pass over the training images a head learns more of them by heart, which it corrects in other views
-        too. So its correction shrinks (as an estimate does by James and Stein, 1961), the more the more often images
-        are seen. It shrinks at 8, 16, 32 ... passes, because recorded steps hold the number.
-        """
-        head = state.head
-        if head is None or head.config.mode != "residual" or not (state.head_enabled and self.num_images):
-            return 1.0
-        passes = state.head_images / self.num_images
-        if not FIRST_PASSES <= passes < math.inf:  # without a step at which the head starts
-            return 1.0
-        return 1 + 2 ** math.floor(math.log2(passes)) / HALF_AFTER
 
     def prior_weight(self, state: FieldState) -> float:
         """Weight of opacities and scales at this step."""

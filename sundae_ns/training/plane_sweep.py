@@ -46,6 +46,8 @@ _TILT = 0.766, 0.643
 """Cosine and sine of 40 degrees, by which planes are turned."""
 _BATCH = 16
 """Planes at a time."""
+_LOOKED_AT = 16
+"""Pixels that are looked at for each point that is asked for: not all agree, and the even ones are chosen of these."""
 
 
 @dataclass(frozen=True)
@@ -123,10 +125,15 @@ class Sweep:
         self._depths[index] = torch.where((best > CORRELATION) & photo.usable, depth, 0.0)
         return self._depths[index]
 
-    def points(self) -> tuple[Tensor, Tensor]:
-        """Points on which two or more views agree: positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``."""
+    def points(self, wanted: int) -> tuple[Tensor, Tensor]:
+        """Points on which two or more views agree: positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``.
+
+        Args:
+            wanted: about how many are of use. Hundreds of images have millions, of which an even part is looked at.
+        """
         empty = self._sparse.new_zeros(0, 3)
-        places, colours = zip((empty, empty), *(self._agreeing(index) for index in range(len(self.photos))))
+        every = max(1, sum(int((depth > 0).sum()) for depth in self._depths) // max(1, _LOOKED_AT * wanted))
+        places, colours = zip((empty, empty), *(self._agreeing(index, every) for index in range(len(self.photos))))
         return torch.cat(places), torch.cat(colours)
 
     def _limits(self, view: View) -> tuple[float, float] | None:
@@ -138,11 +145,11 @@ class Sweep:
         ends = seen[[int(0.02 * (len(seen) - 1)), int(0.98 * (len(seen) - 1))]].tolist()
         return NEARER * ends[0], FARTHER * ends[1]
 
-    def _agreeing(self, index: int) -> tuple[Tensor, Tensor]:
-        """Points of a view that others confirm: their means with those of the others, and colours."""
+    def _agreeing(self, index: int, every: int) -> tuple[Tensor, Tensor]:
+        """Points of each so many pixels of a view that others confirm: means with those of the others, and colours."""
         photo, depth = self.photos[index], self._depths[index]
-        chosen = depth > 0
-        points = _to_world(photo, photo.rays(*chosen.nonzero().T) * depth[chosen][:, None])
+        rows, columns = (depth > 0).nonzero()[::every].T
+        points = _to_world(photo, photo.rays(rows, columns) * depth[rows, columns][:, None])
         x, y, _ = _project(photo.view, points)
         total, count = points.clone(), torch.ones_like(x)
         for i in self._neighbors[index].confirming:
@@ -158,7 +165,7 @@ class Sweep:
             total += torch.where(agrees[:, None], theirs, 0.0)
             count += agrees
         good = count >= 2
-        return total[good] / count[good][:, None], photo.image[chosen][good] / 255
+        return total[good] / count[good][:, None], photo.image[rows, columns][good] / 255
 
 
 def _reduced(photo: Photo, longest: int) -> _Reduced:
@@ -203,16 +210,14 @@ def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[_Neighbors]:
     """For each view the others that see most of its sparse points, from directions that differ by some degrees."""
     if len(photos) < 2 or not len(sparse):
         return [_Neighbors([], []) for _ in photos]
-    directions, seen = [], []
-    for photo in photos:
-        seen.append(_in_view(photo.view, *_project(photo.view, sparse)))
-        directions.append(normalize(sparse - photo.pose[:3, 3], dim=-1))
+    seen = torch.stack([_in_view(photo.view, *_project(photo.view, sparse)) for photo in photos])
+    directions = torch.stack([normalize(sparse - photo.pose[:3, 3], dim=-1) for photo in photos])
     found = []
     for i in range(len(photos)):
-        angles = [torch.rad2deg((directions[i] * other).sum(dim=-1).clamp(-1, 1).acos()) for other in directions]
+        angles = torch.rad2deg((directions * directions[i]).sum(dim=-1).clamp(-1, 1).acos())
         # Near directions tell little about depths; from far ones places look different.
-        weights = [(angle / (angle + 4) * torch.exp(-((angle / 36) ** 2))) for angle in angles]
-        shared = torch.stack([(weight * (seen[i] & other)).sum() for weight, other in zip(weights, seen)])
+        weights = angles / (angles + 4) * torch.exp(-((angles / 36) ** 2))
+        shared = (weights * (seen & seen[i])).sum(dim=1)
         shared[i] = -1
         order = torch.argsort(shared, descending=True, stable=True)[: len(photos) - 1].tolist()
         found.append(_Neighbors([j for j in order[:NEIGHBORS] if shared[j] > 0], order[:CONFIRMING]))

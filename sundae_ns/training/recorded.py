@@ -102,7 +102,6 @@ class RecordedStep:
         held = self._held
         if held is None or not held.unchanged(state, settings):
             held = self._held = self._hold(state, settings)
-        self._recordings.keep_for(self._losses.emphasis(state))
         # Pinned: copying from other memory would wait until the GPU has finished the last step.
         numbers = torch.tensor(
             [*(float(group["lr"]) for _, _, group in held.groups), float(state.field.num_primitives)],

@@ -65,7 +65,6 @@ class StepRecordings:
         """Most tile/primitive pairs that a view has needed, on the device, int64 ``[]``."""
         self._most_on_host: Tensor | None = None
         """Its pinned copy, some steps late."""
-        self._constants: Hashable = None
 
     def forget(self, *, pairs: bool = False) -> None:
         """Drop all recordings; with ``pairs`` also measure again how many pairs a view needs."""
@@ -73,12 +72,6 @@ class StepRecordings:
         self._used.clear()
         if pairs:
             self._warm.clear()
-
-    def keep_for(self, constants: Hashable) -> None:
-        """Drop all recordings if numbers have changed that they hold as constants."""
-        if constants != self._constants:
-            self.forget()
-            self._constants = constants
 
     def run(
         self, work: StepWork, inputs: StepInputs, settings: RenderSettings, kind: Hashable, addresses: Hashable = None

@@ -131,9 +131,9 @@ def test_rows_of_earlier_defaults_say_so(monkeypatch: pytest.MonkeyPatch) -> Non
     seeds: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in csv.DictReader((RESULTS / "runs.csv").open(newline="")):
         shown_method = row["variant"] in tables["METHODS"] and row["variant"] not in tables["LEFT_OUT"]
-        if shown_method and row["keep_ratio"] in ("0.1", "0.13", "1.0"):
+        if shown_method and (row["keep_ratio"] in ("0.1", "0.13", "1.0") or row["variant"] == "sundae-auto"):
             seeds.setdefault((row["scene"], row["variant"]), []).append(row)
-    compared = {scene for scene, variant in seeds if variant == "sundae"}
+    compared = {scene for scene, variant in seeds if variant in ("sundae", "sundae-auto")}
     runs = {place: all(today_of(row, "") for row in rows) for place, rows in seeds.items() if place[0] in compared}
     lines = {
         name: [json.loads(line) for line in (RESULTS / f"{name}.jsonl").read_text().splitlines()]
@@ -180,14 +180,14 @@ def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     written = []
     for seed, ratio, arm, kind in (
         *((seed, 0.1, "sundae", "whole") for seed in (42, 43, 44)),
-        *[(42, 0.01, "sundae", "whole"), (42, 0.1, "band", "branch")],
+        *[(42, 0.01, "sundae", "whole"), (42, None, "sundae-auto", "whole"), (42, 0.1, "band", "branch")],
     ):
         job = Job(f"fox-{arm}-{ratio}-{seed}", kind, "fox", arm, "/data/fox", "sundae", 30_000, seed, ratio)  # type: ignore[arg-type]
-        (today, *_) = sorted(fingerprints(arm, ratio))
+        (today, *_) = sorted(fingerprints(arm, ratio or 0.1))
         command = "ns-train sundae --data fox --pipeline.model.warm-start /else where/nerfstudio_models colmap"
         run = replace(measured(job), fingerprint=today, command=command, ms_head=0.0, gpu="NVIDIA X").as_json()
         packed = {"bytes": 1_000_000, "psnr": 26.5, "ssim": 0.8, "psnr_base": 26.5, "ssim_base": 0.8}
-        tuned = {**packed, "bytes": 600_000} if arm == "sundae" else None
+        tuned = {**packed, "bytes": 600_000} if arm.startswith("sundae") else None
         written.append({"job": asdict(job), "measured": run, "packed": packed, "tuned": tuned, "alone": True})
     del written[-1]["tuned"]  # as in results of earlier versions
     source = tmp_path / "results.jsonl"
@@ -198,7 +198,7 @@ def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     rows = read_rows(results / "runs.csv")
     fox = [(row.variant, row.keep_ratio, row.seed) for row in rows if row.scene == "fox" and row.gpu == "NVIDIA X"]
     expected = [("band", 0.1, 42), ("sundae", 0.01, 42), *(("sundae", 0.1, seed) for seed in (42, 43, 44))]
-    assert sorted(fox) == expected
+    assert sorted(fox) == [*expected, ("sundae-auto", *fox[-2][1:])]
     stayed = [row for row in rows if row.gpu != "NVIDIA X"]
     measured_again = {("sundae", 0.1), ("sundae", 0.01), ("band", 0.1)}
     seeds = {42, 43, 44}
@@ -215,15 +215,22 @@ def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     assert "/else where" not in text
     (row,) = [line for line in tables["TABLES"]["quality"]() if "26.10 ± 0.10" in line]  # the mean of three seeds
     assert "earlier default" not in row
-    (line,) = [line for line in tables["TABLES"]["shares"]() if line.startswith("| fox | **sundae**")]
+    (line,) = [line for line in tables["TABLES"]["shares"]() if line.startswith("| fox | sundae, fixed share")]
     assert line.split("|")[3].strip() == "26.00 (1.0 MB)"
     assert "26.10 ± 0.10 (1.0 MB)" in line
-    for name, count in (("speed", 2), ("training-time", 1)):
+    for name, count in (("speed", 3), ("training-time", 2)):
         made = [line for line in tables["TABLES"][name]() if "X |" in line]
         assert len(made) == count, name
     packs = [json.loads(line) for line in (results / "pack.jsonl").read_text().splitlines()]
     made = {line["bytes"]: line["finetune_steps"] for line in packs if line["bytes"] in (1_000_000, 600_000)}
     assert made == {1_000_000: 0, 600_000: 1500}
+    with (results / "curve.csv").open() as file:
+        curve = [row for row in csv.DictReader(file) if row["packed_bytes"] == "1000000"]
+    assert {row["capture"] for row in curve} == {"fox"}
+    assert [(row["share"], row["seed"], row["chosen"], row["tuned_bytes"]) for row in curve] == [
+        *(("None", "42", "yes", "600000"), ("0.1", "42", "no", "600000")),
+        *(("0.1", "43", "no", "600000"), ("0.1", "44", "no", "600000"), ("0.01", "42", "no", "600000")),
+    ]
     for name, make in tables["TABLES"].items():
         assert make()[2:], name
 
@@ -257,8 +264,8 @@ def test_packed_formats_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, tmp_
         "lion,42,yes,older,2000000,31.0,1000000,30.0\n"
     )
     assert [line.split(" | ") for line in tables["packed_headline"]()[2:]] == [
-        ["| fox", "", "", "9.0 MB, 29.5 dB", "7.0 MB, 29.2 dB", "2.5 MB, 31.2 dB", "1.4 MB, 30.6 dB |"],
-        ["| lion, earlier default", "", "", "", "", "2.0 MB, 31.0 dB", "1.0 MB, 30.0 dB |"],
+        ["| fox", "", "", "9.0, 29.5", "7.0, 29.2", "2.5, 31.2", "1.4, 30.6 |"],
+        ["| lion, earlier default", "", "", "", "", "2.0, 31.0", "1.0, 30.0 |"],
     ]
     assert tables["formats"]()[-2:] == [
         "| fox, splatfacto, 30,000 steps | `.sog` | splat-transform 3.7.0 | 900 | 9.00 | 29.50 | 0.7000 |",

@@ -18,7 +18,7 @@ def test_a_whole_run_and_its_resume(
     monkeypatch: pytest.MonkeyPatch,
     tiny: Any,
 ) -> None:
-    monkeypatch.setitem(dense_start.SIDES, "cpu", (48, 48))
+    monkeypatch.setitem(dense_start.SIDES, "cpu", 48)
     monkeypatch.setitem(dense_start.FILLED, "cpu", 800)
 
     def change(config: Any) -> None:

@@ -245,5 +245,5 @@ def test_replayed_steps_train_the_same_scene(tiny: Any, monkeypatch: pytest.Monk
     assert len(steps) == 30
     assert steps[-1]._can_record
     assert steps[-1]._recordings._recordings
-    monkeypatch.setattr(TunedStep, "__call__", lambda step, _, *arguments: step._run(*arguments, None))
+    monkeypatch.setattr(TunedStep, "__call__", lambda step, *arguments: step._run(*arguments, None))
     assert recorded == pytest.approx(losses(), rel=0.05)

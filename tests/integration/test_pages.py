@@ -30,7 +30,6 @@ ELSEWHERE = {
     "python benchmarks/suite.py": "trains every method on every capture; test_comparisons.py trains one method",
     "python benchmarks/paper.py": "needs the archives of the paper's captures; test_comparisons.py makes two",
     "view scene.sundae": "serves until Ctrl-C; cli/test_view.py serves a page, and opens and ends it",
-    "report DIR/jobs/": "its runs are those of a comparison; test_report.py reports on several runs",
     "ns-train sundae --machine.num-devices 2": "needs two GPUs; distributed/test_whole_runs.py trains on two",
 }
 """Commands that do not run here, by how they start, with the reason and the test that covers them."""

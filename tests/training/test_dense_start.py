@@ -25,6 +25,7 @@ class FakeSweep:
     """Finds points at a known place, of a known colour."""
 
     longest = 0
+    wanted = 0
     seen: Tensor
     most = FOUND
 
@@ -35,8 +36,9 @@ class FakeSweep:
     def add(self, index: int) -> None:
         self.swept.add(index)
 
-    def points(self) -> tuple[Tensor, Tensor]:
+    def points(self, wanted: int) -> tuple[Tensor, Tensor]:
         assert self.swept == {0, 1, 2}
+        FakeSweep.wanted = wanted
         place = torch.arange(3.0 * self.most).reshape(-1, 3) / self.most + 5
         return place, torch.tensor([[0.2, 0.4, 0.6]]).repeat(self.most, 1)
 
@@ -60,7 +62,7 @@ def test_the_field_starts_from_both_clouds(
     assert model.num_points == 60 + FOUND
     assert torch.equal(model.means[:60].detach(), points()[0])
     assert torch.equal(FakeSweep.seen, points()[0])
-    assert FakeSweep.longest == dense_start.SIDES["cpu"][0]
+    assert (FakeSweep.longest, FakeSweep.wanted) == (dense_start.SIDES["cpu"], dense_start.FILLED["cpu"] - 60)
     assert float((model.means[60:].detach() - 5).min()) >= 0
     colours = sh_to_rgb(model.gauss_params["features_dc"][60:].detach())
     assert torch.allclose(colours, torch.tensor([0.2, 0.4, 0.6]).expand(FOUND, 3), atol=1e-5)
@@ -131,18 +133,14 @@ def test_a_cloud_that_is_not_sparse_stays_as_it_is(
     assert model.num_points == 60
 
 
-@pytest.mark.parametrize(("views", "longest"), [(3, 640), (24, 640), (54, 426), (96, 320), (250, 320)])
-def test_images_of_many_views_are_smaller(
-    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch, views: int, longest: int
+@pytest.mark.parametrize(("most", "swept"), [(2, False), (3, True)])
+def test_a_cpu_sweeps_few_views(
+    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch, most: int, swept: bool
 ) -> None:
-    monkeypatch.setitem(dense_start.SIDES, "cpu", (640, 320))
-    model = build(dense_start_views=0)
-    run = training_of(model).callbacks[0].func.__self__
-    monkeypatch.setattr(type(run), "view_indices", lambda self: list(range(views)))
-    monkeypatch.setattr(type(run), "photos", lambda self: iter(range(3)))
-    (dense,) = (one for one in model.extensions if isinstance(one, DenseStart))
-    dense._swept(run, torch.zeros(60, 3))
-    assert FakeSweep.longest == longest
+    monkeypatch.setattr(dense_start, "MOST_ON_CPU", most)
+    model = few(build)
+    training_of(model)
+    assert model.num_points == 60 + swept * FOUND
 
 
 def test_the_cap_holds(build: Build, training_of: TrainingOf) -> None:

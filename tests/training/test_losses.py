@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -96,45 +95,6 @@ def test_a_pruned_field_has_a_prior_that_counts_once(
         torch.testing.assert_close(found["scale_loss"], 0.6 / count * scales.mean())
     model.losses = StepLosses(build(prior_after_prune=0.0).config, model.ssim, 1)
     assert set(model.get_loss_dict(outputs, target)) == {"main_loss", "base_loss"}
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"step": 79}, 1.0),
-        ({"step": 80}, 1.01),
-        ({"step": 159}, 1.01),
-        ({"step": 1050}, 1.08),
-        ({"step": 50, "images_per_step": 2}, 1.01),
-        ({"step": 1050, "uncounted": 800}, 1.02),
-        ({"step": 525, "images_per_step": 2, "uncounted": 1000}, 1.0),
-        ({"step": 1050, "uncounted": math.inf}, 1.0),
-        ({"step": 1050, "head_starts_at": -math.inf}, 1.0),
-        ({"step": 1050, "head_starts_at": 1100}, 1.0),
-    ],
-)
-def test_a_correction_is_stronger_in_the_loss_the_more_often_images_were_seen(
-    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, changes: dict[str, Any], expected: float
-) -> None:
-    """With ten images from step 0 on: by 8 of 800 after 8 passes, by 64 after 105."""
-    model = perturb(build())
-    model.eval()
-    outputs, target = model.get_outputs(camera()), batch()
-    model.losses = StepLosses(model.config, model.ssim, 10)
-    model.state.head_starts_at = 0
-    for name, value in changes.items():
-        setattr(model.state, name, value)
-    assert model.losses.emphasis(model.state) == pytest.approx(expected)
-    rgb, base, truth = outputs["rgb"], outputs["base_rgb"], target["image"].float() / 255
-    assert (rgb - base).abs().max() > 0.01
-    compared, _ = image_losses(base + expected * (rgb - base), None, truth, model.ssim, model.config.ssim_lambda)
-    torch.testing.assert_close(model.get_loss_dict(outputs, target)["main_loss"], compared)
-
-
-def test_only_the_correction_of_a_known_number_of_images_shrinks(build: Build) -> None:
-    for model, count in ((build(head={"mode": "features"}), 10), (build(head={"mode": "off"}), 10), (build(), 0)):
-        model.state.step = 1050
-        assert StepLosses(model.config, model.ssim, count).emphasis(model.state) == 1
 
 
 def test_a_negative_prior_is_refused(build: Build) -> None:

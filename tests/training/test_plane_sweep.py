@@ -39,11 +39,11 @@ def capture() -> tuple[list[Photo], Tensor]:
     return photos, torch.from_numpy(xyz)
 
 
-def points_of(photos: list[Photo], sparse: Tensor, longest: int = SIDE) -> tuple[Tensor, Tensor]:
+def points_of(photos: list[Photo], sparse: Tensor, longest: int = SIDE, wanted: int = SIDE**2) -> tuple[Tensor, Tensor]:
     sweep = Sweep(photos, sparse, longest)
     for index in range(len(photos)):
         sweep.add(index)
-    return sweep.points()
+    return sweep.points(wanted)
 
 
 def gaps(photos: list[Photo], points: Tensor) -> Tensor:
@@ -90,6 +90,18 @@ def test_the_same_images_give_the_same_points(
     again = points_of(*capture)
     assert torch.equal(again[0], swept[0])
     assert torch.equal(again[1], swept[1])
+
+
+def test_of_more_points_than_wanted_an_even_part_is_found(
+    capture: tuple[list[Photo], Tensor], swept: tuple[Tensor, Tensor]
+) -> None:
+    points, colours = points_of(*capture, wanted=100)
+    assert 100 < len(points) == len(colours) < 100 * plane_sweep._LOOKED_AT
+    found, whole = torch.cat([points, colours], dim=1), torch.cat(swept, dim=1)
+    assert torch.allclose(
+        found, whole[torch.cdist(found, whole, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)], atol=1e-6
+    )
+    assert torch.allclose(points.mean(dim=0), swept[0].mean(dim=0), atol=0.05 * float(swept[0].std()))
 
 
 def test_larger_images_are_reduced(capture: tuple[list[Photo], Tensor]) -> None:

@@ -26,9 +26,7 @@ LEFT_OUT = frozenset(
     "pipeline.datamanager.eval_num_images_to_sample_from pipeline.datamanager.eval_num_times_to_repeat_images "
     "pipeline.model.evaluate_prune "
     # A count that comparisons take from the capture; it stands beside the row as its number of primitives.
-    "pipeline.model.mcmc_cap "
-    # It acts on captures of few views alone, whose rows name what they start from.
-    "pipeline.model.dense_start_views".split()
+    "pipeline.model.mcmc_cap".split()
 )
 """Options of a trainer that decide neither quality nor time of what is trained, by their dotted names."""
 GONE = {"pipeline.model.pruning": {"search_every": 250, "patience": 4}}
