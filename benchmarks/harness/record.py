@@ -1,15 +1,17 @@
 """Make every figure of docs/results.md anew, one program after the other, alone on one GPU. Stopped, it goes on.
 
-    cd benchmarks; python -m harness.record CAPTURES -o DIR            # six captures take about ten hours of an H100
+    cd benchmarks; python -m harness.record CAPTURES -o DIR            # six captures: some six hours of an H100
     cd benchmarks; python -m harness.record CAPTURES -o DIR --list     # its commands, and which are done
 
 Three seeds of the default, one of everything else. Each command that has ended well is a file in DIR/done; one that
-fails leaves its output in DIR/logs, the others go on, and the exit code is 1. Rows go to results/*.csv and *.jsonl,
-tables and plots are drawn at the end. ``splat-transform`` takes part where it is in PATH, JOD where cvvdp is installed.
+fails leaves its output in DIR/logs, the others go on, and the exit code is 1. Rows are gathered in DIR/results. A file
+of benchmarks/results is replaced once all commands that write to it have ended well; then tables and plots are drawn.
+``splat-transform`` takes part where it is in PATH, JOD where cvvdp is installed.
 """
 
 from __future__ import annotations
 
+import json
 import shlex
 import shutil
 import sys
@@ -26,7 +28,7 @@ from rich.progress import track
 from harness.plan import job_folder
 from harness.run import STOPPED
 from harness.script import run_script
-from harness.stored import RESULTS
+from harness.stored import METHODS, RESULTS
 from sundae_ns.cli.outputs import check_folder
 from sundae_ns.cli.process import run_logged
 from sundae_ns.errors import DataError, SundaeError
@@ -46,8 +48,10 @@ class Step(NamedTuple):
 
     name: str
     words: tuple[str, ...]
-    rows: str = ""
-    """File of results that takes the JSON lines of its output."""
+    table: str = ""
+    """File of results that it writes to, if any."""
+    label: str = ""
+    """Name of what it measures; then the file takes the JSON lines of its output."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,9 +78,10 @@ def steps_of(captures: Sequence[Path], out: Path, *, others: bool, films: bool) 
     folder, steps = str(captures[0].parent), []
     theirs = ("--splat-transform", "splat-transform") if others else ()
 
-    def add(name: str, script: str, *words: object, rows: str = "") -> None:
+    def add(name: str, script: str, *words: object, table: str = "", label: str = "") -> None:
         program = ("-m", script) if script.startswith("harness.") else (str(FOLDER / script),)
-        steps.append(Step(name, (sys.executable, *program, *map(str, words)), rows))
+        to = ("-o", out / "results" / table) if table and not label else ()
+        steps.append(Step(name, (sys.executable, *program, *map(str, (*words, *to))), table, label))
 
     def folder_of(capture: Path, arm: str, share: str = "") -> Path:
         place = out / ("default" if arm == "sundae-auto" else "others")
@@ -92,21 +97,20 @@ def steps_of(captures: Sequence[Path], out: Path, *, others: bool, films: bool) 
         add(f"{capture.name}-curve", "quality.py", capture, "-o", out / "curve" / capture.name, *shares)
         for run in (stock, ours):
             name = f"{capture.name}-formats-{run.parent.name}"
-            add(name, "bench_formats.py", run, *theirs, "-o", RESULTS / "formats.csv")
-        add(f"{capture.name}-prune", "prune_without_photos.py", stock, *theirs, "-o", RESULTS / "prune.csv")
-        run = with_head / "sundae-with-head/sundae/run"
-        add(f"{capture.name}-flicker", "flicker.py", "--load-config", run, "--json", rows="flicker.jsonl")
+            add(name, "bench_formats.py", run, *theirs, table="formats.csv")
+        add(f"{capture.name}-prune", "prune_without_photos.py", stock, *theirs, table="prune.csv")
+        run, label = with_head / "sundae-with-head/sundae/run", f"{capture.name}, {METHODS['sundae-with-head']}"
+        flicker = ("flicker.py", "--load-config", run, "--json")
+        add(f"{capture.name}-flicker", *flicker, table="flicker.jsonl", label=label)
         if films:
             full, program = out / "full" / f"{capture.name}.sundae", Path(sys.executable).with_name("sundae")
             words = (str(program), "pack", str(stock), "-o", str(full), "--overwrite")
             steps.append(Step(f"{capture.name}-full", words))
             small = with_head / "tuned.sundae"
-            add(f"{capture.name}-films", "harness.films", small, full, capture, "-o", RESULTS / "films.jsonl")
-        times = RESULTS / "training_time.jsonl"
-        add(f"{capture.name}-seconds", "bench_training.py", capture, "--arms", *TIMED, "-o", times)
+            add(f"{capture.name}-films", "harness.films", small, full, capture, table="films.jsonl")
+        add(f"{capture.name}-seconds", "bench_training.py", capture, "--arms", *TIMED, table="training_time.jsonl")
     for name in ("default", "others"):
         add(f"tables-{name}", "tables.py", "--suite", out / name / "results.jsonl")
-    add("plots", "plot.py")
     return steps
 
 
@@ -130,27 +134,32 @@ def record(options: RecordOptions, run: Callable[..., None] = run_logged, consol
             state = "done" if step.name in done else "    "
             console.print(f"{state}  {shlex.join(step.words)}", markup=False, highlight=False, soft_wrap=True)
         return 0
-    failed = []
-    for name in ("done", "logs", "full"):
+    for name in ("done", "logs", "full", "results"):
         (out / name).mkdir(parents=True, exist_ok=True)
     for step in track(steps, "Record", console=console):
         if step.name in done:
             continue
-        rows: list[str] = []
+        lines: list[str] = []
         try:
-            run(step.words, out / "logs" / f"{step.name}.log", rows.append)
+            run(step.words, out / "logs" / f"{step.name}.log", lines.append)
         except KeyboardInterrupt:
             return STOPPED
         except SundaeError as error:
-            failed.append(step.name)
             reason = str(error).strip().splitlines()[-1]
             console.print(f"[red]{step.name} failed: {escape(reason)}", highlight=False, soft_wrap=True)
             continue
-        if step.rows:
-            with (RESULTS / step.rows).open("a", encoding="utf-8") as file:
-                file.writelines(row.rstrip("\n") + "\n" for row in rows if row.startswith("{"))
+        if step.label:
+            rows = [{**json.loads(line), "config": step.label} for line in lines if line.startswith("{")]
+            with (out / "results" / step.table).open("a", encoding="utf-8") as file:
+                file.writelines(json.dumps(row) + "\n" for row in rows)
         write_text(out / "done" / step.name, shlex.join(step.words) + "\n")
-    return int(bool(failed))
+        done.add(step.name)
+    left = [step for step in steps if step.name not in done]
+    for table in sorted({step.table for step in steps if step.table} - {step.table for step in left}):
+        write_text(RESULTS / table, (out / "results" / table).read_text(encoding="utf-8"))
+    for script in ("tables.py", "plot.py"):
+        run((sys.executable, str(FOLDER / script)), out / "logs" / f"{script}.log", lambda line: None)
+    return int(bool(left))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """The extension that gives a field more points to start from, by a plane sweep through its images.
 
-Structure from motion of a dozen photos leaves a few hundred points. Where a field begins without any, it explains each
-image by primitives near its camera, and other views do not agree.
+Structure from motion finds points where it can tell one from another: a few hundred in a dozen photos, few on lawns and
+walls. Where a field begins without any, it explains each image by primitives near its camera, and other views do not
+agree.
 """
 
 from __future__ import annotations

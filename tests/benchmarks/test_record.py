@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -36,6 +37,9 @@ class Programs:
 
     def __call__(self, words: Sequence[str], log: Path, on_line: Callable[[str], object]) -> None:
         self.ran.append(log.stem)
+        if words[-2] == "-o":
+            with Path(words[-1]).open("a") as file:
+                file.write(f"{log.stem}\n")
         on_line("Loading\n")
         on_line(f'{{"log": "{log.stem}"}}\n')
         if self.broken is not None and log.stem == self.at:
@@ -64,23 +68,30 @@ def test_what_is_done_is_not_run_again(options: RecordOptions) -> None:
     rest = Programs()
     assert record(options, rest) == 0
     assert rest.ran[0] == "a-prune"
-    assert rest.ran[-1] == "plots"
+    assert rest.ran[-2:] == ["tables.py", "plot.py"]
     nothing = Programs()
     assert record(options, nothing) == 0
-    assert nothing.ran == []
-    flicker = (options.folder.parent / "results/flicker.jsonl").read_text()
-    assert flicker == '{"log": "a-flicker"}\n{"log": "b-flicker"}\n'
+    assert nothing.ran == ["tables.py", "plot.py"]
+    results = options.folder.parent / "results"
+    rows = [json.loads(line) for line in (results / "flicker.jsonl").read_text().splitlines()]
+    label = "sundae, with a head in any case"
+    assert rows == [{"log": f"{name}-flicker", "config": f"{name}, {label}"} for name in ("a", "b")]
+    # The one that was stopped had begun to write.
+    assert (results / "prune.csv").read_text().split() == ["a-prune", "a-prune", "b-prune"]
 
 
 def test_a_failure_leaves_the_others(options: RecordOptions, capsys: pytest.CaptureFixture[str]) -> None:
     programs = Programs(SundaeError("python failed with 1; its log is x, which ends with:\nno GPU"), at="a-flicker")
     assert record(options, programs) == 1
-    assert programs.ran[-1] == "plots"
+    assert programs.ran[-1] == "plot.py"
     assert "a-flicker failed: no GPU" in capsys.readouterr().out
-    assert not (options.folder.parent / "results/flicker.jsonl").read_text().startswith('{"log": "a')
+    results = options.folder.parent / "results"
+    assert (results / "films.jsonl").is_file()
+    assert not (results / "flicker.jsonl").exists()  # a part of a table is none
     again = Programs()
     assert record(options, again) == 0
-    assert again.ran == ["a-flicker"]
+    assert again.ran[0] == "a-flicker"
+    assert len((results / "flicker.jsonl").read_text().splitlines()) == 2
 
 
 def test_the_list_says_what_is_done(options: RecordOptions) -> None:
