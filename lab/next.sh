@@ -15,25 +15,16 @@ queue() { cd /tmp || exit; setsid nohup python3 $R/lab/slots.py > /tmp/logs/q.ou
 wait_for_all() { touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$1" ]; do sleep 1; done
   tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log; nvidia-smi --query-gpu=name --format=csv,noheader | sort | uniq -c; }
 node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C /tmp/node.part; mv /tmp/node.part /tmp/node; }
-# ways CAPTURE NAME WAYS OPTION ...: the default with parts of a chain in its densification (lab/hybrid.py)
-ways() { c=$1 n=$2 w=$3; shift 3; job ${PRE:-02}-$c-$n "python3 $R/lab/hybrid.py $w -- sundae --data /tmp/scenes/$c --output-dir /tmp/ways/$n --experiment-name $c --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000 $* colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8 && ns-eval --load-config /tmp/ways/$n/$c/sundae/run/config.yml --output-path $O/ways-$c-$n.json && cp /tmp/ways/$n/$c/sundae/run/curve.json $O/curve-$c-$n.json && python3 $R/lab/tune.py /tmp/ways/$n/$c/sundae/run $O/tuned-$c-$n.jsonl now"; }
-default() { job ${PRE:-02}-$2-$1 "python3 $Q /tmp/scenes/$1 -o /tmp/default/$1-$2 --arms sundae-auto --seeds $2; mkdir -p $O/$1-$2; cp /tmp/default/$1-$2/done/*.json $O/$1-$2/"; }
-alone() { job 00-alone-$2-$1 "python3 $R/benchmarks/bench_training.py /tmp/scenes/$1 --arms sundae -o $O/time-$1.jsonl"; }
-train() { echo "--data /tmp/scenes/$1 --experiment-name $1 --timestamp run --vis tensorboard --pipeline.model.evaluate-prune False --pipeline.datamanager.cache-images gpu --steps-per-eval-all-images 100000 --steps-per-eval-image 100000"; }
-C="colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8"
-# base CAPTURE: the default with all checkpoints; trick CAPTURE NAME WAYS: from its step 18,000 on
-base() { job 01-$1-base "ns-train sundae $(train $1) --output-dir /tmp/base --save-only-latest-checkpoint False $C && ns-eval --load-config /tmp/base/$1/sundae/run/config.yml --output-path $O/base-$1.json && cp /tmp/base/$1/sundae/run/curve.json $O/curve-$1.json"
-  AFTER="$1-base" job 01-$1-pack "sundae pack /tmp/base/$1/sundae/run -o $O/$1.sundae --finetune 1500"; }
-trick() { AFTER="$1-base" job 03-$1-trick-$2 "python3 $R/lab/hybrid.py $3 -- sundae $(train $1) --output-dir /tmp/tricks/$2 --load-checkpoint /tmp/base/$1/sundae/run/nerfstudio_models/step-000018000.ckpt $C && ns-eval --load-config /tmp/tricks/$2/$1/sundae/run/config.yml --output-path $O/trick-$1-$2.json; rm -rf /tmp/tricks/$2/$1/sundae/run/nerfstudio_models"; }
+default() { job ${PRE:-02}-$2-$1 "python3 $Q /tmp/scenes/$1 -o /tmp/default/$1-$2 --arms sundae-auto --seeds $2; mkdir -p $O/$1-$2; cp /tmp/default/$1-$2/done/*.json $O/$1-$2/; cp \$(find /tmp/default/$1-$2/jobs -name curve.json) $O/$1-$2/"; }
+# curves CAPTURE ORDER: seconds with PSNR and SSIM on the way, alone (530 s); others CAPTURE: the further rows of a suite
+curves() { job 00-alone-$2-$1-curves "python3 $R/benchmarks/bench_training.py /tmp/scenes/$1 --arms sundae sundae-fast splatfacto --curve 1000 2000 3000 4500 6000 8000 10000 12000 15000 18000 21000 25000 30000 -o $O/time-$1.jsonl"; }
+others() { job 05-$1-others "python3 $Q /tmp/scenes/$1 -o /tmp/others/$1 --arms sundae sundae-no-head sundae-fast mcmc --keep-ratios 0.1 --seeds 42; mkdir -p $O/$1-others; cp /tmp/others/$1/done/*.json $O/$1-others/"; }
 gpu_tests() { job 025-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests)"; }
 vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; splat-transform --list-gpus; }
-# .gpu/dawn: bench_page.py bonsai.sundae --dawn 800x533 1920x1080 --folder .gpu/dawn (35 MB)
-dawn() { cp -r "$ROOT/.gpu/dawn" /tmp/dawn; cd /tmp/dawn; timeout 60 /tmp/node/node timing.mjs /tmp/dawn > $O/dawn.jsonl 2> /tmp/logs/dawn.err; cut -c1-400 $O/dawn.jsonl; tail -n 3 /tmp/logs/dawn.err; }
 case $1 in
-# nvidia-h100-x1, GPUS=1 SLOTS=4: the default where it has a head, after the page's first image and GPU tests
-1) setup; take 1 ;;
-2) vulkan; take 2 ;;
-3) dawn; cd "$ROOT"; default bonsai 42; PRE=03; default garden 42; PRE=04; default bonsai 43; PRE=05; default garden 43; PRE=06; default bonsai 44; PRE=07; default garden 44; queue
-   sleep 2; (cd $R; PYTHONSAFEPATH=1 timeout 150 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--import-mode=importlib' tests/training tests/gpu tests/integration/test_packing_finetune.py tests/scenes 2>&1 | tail -n 12) ;;
-4) SECONDS=0; wait_for_all "${2:-400}" ;;
+# One lease, nvidia-h100-x4, GPUS=4 SLOTS=4 RESERVED="0 1 2": curves and stock alone on three GPUs, all else on the others
+1) setup; take 2; PRE=03; default garden 44; others garden; others dinosaur; GPU=1; curves garden a; GPU=; gpu_tests; queue ;;
+2) take 1 4; PRE=03; default bonsai 44; others bonsai; others south_building; GPU=0; curves bonsai a; stock south_building b ;;
+3) vulkan; take 3; PRE=04; default dinosaur 42; default dinosaur 43; default stone_horse 42; default stone_horse 44; others fox; others stone_horse; GPU=2; stock stone_horse a; curves fox b; GPU=1; stock fox b ;;
+4) SECONDS=0; wait_for_all "${2:-400}"; cat $O/formats-*.csv | cut -c1-150 ;;
 esac
