@@ -24,6 +24,14 @@ class Photo(NamedTuple):
     """Pixels that count, bool ``[H, W]``; None for all."""
 
 
+class LateViews(NamedTuple):
+    """Training views that catch up, because they were held out before."""
+
+    indices: list[int]
+    until: int
+    """Step before which half of the images are theirs."""
+
+
 class TrainingRun(Protocol):
     """What an extension may ask of the program that trains. nerfstudio's trainer stands behind it in ``ns-train``."""
 
@@ -64,8 +72,8 @@ class TrainingRun(Protocol):
     def view_indices(self) -> list[int]:
         """Indices of these views."""
 
-    def hold_out(self, indices: Iterable[int]) -> None:
-        """Hold out these training views too, from the next step on, until the next call."""
+    def hold_out(self, indices: Iterable[int], late: LateViews | None = None) -> None:
+        """Hold out these training views too, from the next step on, until the next call. Late views catch up."""
 
     def heldout_views(self) -> Iterator[Photo]:
         """The held-out training views, loaded one at a time."""

@@ -14,6 +14,7 @@ from torch.optim import SGD, Adam
 from torch.optim.lr_scheduler import LambdaLR
 
 from sundae_ns.errors import CheckpointError
+from sundae_ns.training.extension import LateViews
 from sundae_ns.training.heldout import HeldOutQuality
 from sundae_ns.training.schedulers import Decay
 from sundae_ns.training.trials import engine
@@ -28,10 +29,14 @@ class FakeRun:
     def __init__(self, state: Any) -> None:
         self.state = state
         self.held_out: list[int] = []
+        self.late: LateViews | None = None
         self.source = SimpleNamespace(total=20)
 
-    def hold_out(self, indices: Any) -> None:
-        self.held_out = list(indices)
+    def hold_out(self, indices: Any, late: LateViews | None = None) -> None:
+        self.held_out, self.late = list(indices), late
+
+    def view_indices(self) -> list[int]:
+        return list(range(10))
 
     def train(self, trials: TrialEngine, most: int = 100) -> int:
         """Train to the end of the trial, or ``most`` steps; returns their number."""
@@ -146,6 +151,43 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun) -> None:
     assert height(run) == 4.0  # of the steps 2 to 6
     other.go_back("first", state)
     assert (height(run), other.taken_back) == (0.0, 6)
+
+
+def test_views_that_were_held_out_catch_up(run: FakeRun) -> None:
+    """Of ten views two are held out for 40 steps, in which the others are seen five times. In 27 steps, half of which
+    are theirs, both sorts come to seven."""
+    trials, state = TrialEngine(), run.state
+    trials.hold(run, "count", [3, 6])  # type: ignore[arg-type]
+    state.step = 40
+    assert (run.held_out, run.late) == ([3, 6], LateViews([], 0))
+    trials.hold(run, "count", [])  # type: ignore[arg-type]
+    assert (run.held_out, run.late) == ([], LateViews([3, 6], 40 + 1 + 27))
+    trials.hold(run, "count", [])  # type: ignore[arg-type]
+    assert run.late == LateViews([3, 6], 68)
+
+
+def test_a_trial_postpones_the_catching_up_and_adds_to_it(run: FakeRun) -> None:
+    trials, state = TrialEngine(), run.state
+    trials.hold(run, "count", [3, 6])  # type: ignore[arg-type]
+    trials.hold(run, "trials", [6])  # type: ignore[arg-type]
+    state.step = 40
+    trials.keep("first", state, head=False)
+    trials.start(run, Trial(9, held_out=[3, 6]))  # type: ignore[arg-type]
+    assert (run.held_out, run.late) == ([3, 6], None)
+    run.train(trials)
+    trials.go_back("first", state)
+    trials.end(run, "count")  # type: ignore[arg-type]
+    # Nine of the 49 steps do not count; the other policy still holds one view.
+    assert (run.held_out, run.late) == ([6], LateViews([3], 49 + 1 + round(2 * 40 / (8 - 1))))
+    other = TrialEngine()
+    other.load_state_dict(state, copy.deepcopy(trials.state_dict()))
+    for one in (trials, other):
+        state.step = 54
+        one.start(run, Trial(3, held_out=[6]))  # type: ignore[arg-type]
+        run.train(one)
+        one.end(run, "trials")  # type: ignore[arg-type]
+        # 6 of its 11 steps were left before the trial; the second view has missed 48.
+        assert (run.held_out, run.late) == ([], LateViews([3, 6], 57 + 1 + 6 + round(2 * 48 * 2 / (8 - 2))))
 
 
 @pytest.mark.parametrize("saved", [{}, {"kept": {"first": {}}}, {"trial": {"length": 3}}])
