@@ -7,10 +7,9 @@
 A run of sundae or splatfacto is a full field, and its capture has the test views. ``psnr_to_field`` compares them
 with the full field's own images, ``psnr`` and ``ssim`` with the photographs, and ``psnr_virtual`` compares virtual
 views that no tool was given with the full field. Tools and rules: ``sundae_ns`` by virtual views (``pairs``, the
-default) or by the highest opacities, which needs no view, and ``splat-transform`` by ``--decimate`` and
-``--decimate-adaptive``, on its CPU path. Training is none, or that of ``sundae distill``: ``distill`` with a head where
-it pays, ``distill-no-head`` without. ``bytes`` are those of the
-.sundae file, ``bytes_sog`` of the base colours as .sog. With ``-o`` rows that are there are not measured again;
+default), and ``splat-transform`` by ``--decimate`` and ``--decimate-adaptive``, on its CPU path. Training is none, or
+that of ``sundae distill``: ``distill`` with a head where it pays, ``distill-no-head`` without. ``bytes`` are those of
+the .sundae file, ``bytes_sog`` of the base colours as .sog. With ``-o`` rows that are there are not measured again;
 ``--again`` does.
 """
 
@@ -44,10 +43,7 @@ COLUMNS = (
 PLACE = ("capture", "tool", "rule", "training", "share", "device", "seed", "steps")
 """Columns that name a row."""
 OURS, OTHER = "sundae_ns", "splat-transform"
-RULES = {
-    "pairs": sn.PruneRule(selection="pairs"),
-    "opacity": sn.PruneRule(score="opacity", selection="top", redistribution="none"),
-}
+RULES = {"pairs": sn.PruneRule(selection="pairs")}
 OTHER_RULES = ("decimate", "decimate-adaptive")
 TRAININGS = ("none", "distill", "distill-no-head")
 HELD_OUT = 32

@@ -24,9 +24,9 @@ _VIEWED = 140
 """Most bytes of a primitive while a view is rendered, or while the field is put into an order."""
 _PAIR = 80
 """Most bytes of an edge while pairs are merged."""
-_SECONDS, _SECONDS_OF_VIEW, _SECONDS_OF_PIXEL = 14e-6, 0.7e-6, 3e-6
+_SECONDS, _SECONDS_OF_VIEW, _SECONDS_OF_PIXEL = 14e-6, 0.7e-6, 0.5e-6
 """Of a primitive in the graph and the merge, of one in a view, and of a pixel; the last two on one thread."""
-_SECONDS_OF_FIT, _SECONDS_OF_FIT_PIXEL = 1.2e-6, 1e-6
+_SECONDS_OF_FIT, _SECONDS_OF_FIT_PIXEL = 1.2e-6, 0.5e-6
 """Of a kept primitive and of a pixel in a view of the refit, on one thread."""
 
 
@@ -70,7 +70,7 @@ def prune_cost(
         seconds = primitives * _SECONDS
     seen = primitives * views * _SECONDS_OF_VIEW + pixels * _SECONDS_OF_PIXEL
     if rule.refits and views:
-        fitted = keep * primitives * _SECONDS_OF_FIT + min(pixels / views, MOST_PIXELS["cpu"]) * _SECONDS_OF_FIT_PIXEL
+        fitted = keep * primitives * _SECONDS_OF_FIT + min(pixels / views, MOST_PIXELS) * _SECONDS_OF_FIT_PIXEL
         seen += STEPS["cpu"] * VIEWS * fitted
     seconds += seen / torch.get_num_threads()
     return PruneCost(field + added * primitives, field, seconds, field + drawn * primitives)

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 STEPS, VIEWS = {"cpu": 64, "cuda": 128}, 4
 """Steps by the device, and the views of each."""
-MOST_PIXELS = {"cpu": 256 * 256, "cuda": 512 * 512}
-"""Most pixels of a view by the device; larger ones are rendered smaller."""
+MOST_PIXELS = 512 * 512
+"""Most pixels of a view; larger ones are rendered smaller."""
 JUDGES = 8
 """Views that no step uses, if there are twice as many. The refit stays only if their error shrinks."""
 _RATES = {"means": 0.014, "scales": 0.007, "quats": 0.007, "opacities": 0.035, "features_dc": 0.014}
@@ -57,8 +57,8 @@ def refit(
         A field of as many primitives. It is ``small`` if the refit matches no better.
     """
     device = small["means"].device
-    most, count = by_device(MOST_PIXELS, device), by_device(STEPS, device)
-    views = [view.zoomed(min(1.0, math.sqrt(most / (view.width * view.height)))) for view in views]
+    count = by_device(STEPS, device)
+    views = [view.zoomed(min(1.0, math.sqrt(MOST_PIXELS / (view.width * view.height)))) for view in views]
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(seed)).tolist()
     images: dict[int, Tensor] = {}
     judges = order[:JUDGES] if len(order) >= 2 * JUDGES else order

@@ -28,7 +28,7 @@ FOV = 40.0
 T = TypeVar("T")
 VIEWS = {"cpu": 128, "cuda": 256}
 """Default number of cameras by the device: a GPU has the time to look closer."""
-SIDES = {"cpu": 256, "cuda": 512}
+SIDE = 512
 """Default width and height of their images, pixels."""
 FIRST, ROUNDS, MOVED = 4, 4, 3
 """Cameras that are drawn for each one that is kept; then rounds, and the moved ones of a round."""
@@ -79,7 +79,7 @@ def virtual_views(scene: Scene, n: int | None = None, *, seed: int = 0, size: in
         scene: its finite primitives count.
         n: number of cameras; by default 128 for a scene on a CPU and 256 for one on a GPU.
         seed: of the random draws, which are the same on every device up to rounding.
-        size: width and height of the images, pixels; by default 256 on a CPU and 512 on a GPU.
+        size: width and height of the images, pixels; by default 512.
 
     Raises:
         ConfigError: ``n`` or ``size`` is less than 1.
@@ -91,7 +91,7 @@ def virtual_views(scene: Scene, n: int | None = None, *, seed: int = 0, size: in
     8
     """
     n = by_device(VIEWS, scene.device) if n is None else n
-    size = by_device(SIDES, scene.device) if size is None else size
+    size = SIDE if size is None else size
     if n < 1 or size < 1:
         raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
     field = _usable(scene)

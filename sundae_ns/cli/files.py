@@ -231,7 +231,7 @@ def prune_file(
     from sundae_ns.api import opening, pruning, saving
     from sundae_ns.api.cleaning import kept, within
     from sundae_ns.api.cost import prune_cost, require_memory, state
-    from sundae_ns.api.virtual import SIDES, VIEWS, virtual_views
+    from sundae_ns.api.virtual import SIDE, VIEWS, virtual_views
     from sundae_ns.errors import ConfigError
     from sundae_ns.gpu.memory import naming_full_memory
     from sundae_ns.pruning import PruneRule
@@ -255,7 +255,7 @@ def prune_file(
         n, numbers = stated_size(source)
         share = keep if keep is not None else (count or 0) / max(n, 1)
         looks = (VIEWS["cpu"] if views is None else views) if rule.uses_contribution and cameras is None else 0
-        cost = prune_cost(n, numbers, rule, share, looks, looks * SIDES["cpu"] ** 2)
+        cost = prune_cost(n, numbers, rule, share, looks, looks * SIDE**2)
         require_memory(cost, n, loaded=False)
         if cameras is None and target_drop is None:
             stated = True

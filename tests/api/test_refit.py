@@ -63,7 +63,7 @@ def test_a_refit_that_diverges_is_dropped(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(module.MOST_PIXELS, "cpu", 24 * 24)
+    monkeypatch.setattr(module, "MOST_PIXELS", 24 * 24)
     full, sizes = scene(), set()
     images = module._images
 

@@ -7,7 +7,7 @@ import pytest
 STEPS, VIEWS, SIDE = 4, 8, 64
 SHORT = f"""
 from sundae_ns.api import refit, virtual
-refit.STEPS["cpu"], virtual.VIEWS["cpu"], virtual.SIDES["cpu"] = {STEPS}, {VIEWS}, {SIDE}
+refit.STEPS["cpu"], virtual.VIEWS["cpu"], virtual.SIDE = {STEPS}, {VIEWS}, {SIDE}
 """
 """What the fixture does, as lines of a program of its own."""
 
@@ -19,4 +19,4 @@ def short_prunes(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setitem(refit.STEPS, "cpu", STEPS)
     monkeypatch.setitem(virtual.VIEWS, "cpu", VIEWS)
-    monkeypatch.setitem(virtual.SIDES, "cpu", SIDE)
+    monkeypatch.setattr(virtual, "SIDE", SIDE)
