@@ -24,7 +24,7 @@ vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; sp
 case $1 in
 # One lease, nvidia-h100-x4, GPUS=4 SLOTS=4 RESERVED="0 1 2": curves and stock alone on three GPUs, all else on the others
 1) setup; take 2; PRE=03; default garden 44; others garden; others dinosaur; GPU=1; curves garden a; GPU=; gpu_tests; queue ;;
-2) take 1 4; PRE=03; default bonsai 44; others bonsai; others south_building; GPU=0; curves bonsai a; stock south_building b ;;
+2) take 1 4; PRE=03; default bonsai 44; PRE=04; default south_building 42; default south_building 43; others bonsai; others south_building; GPU=0; curves bonsai a; stock south_building b ;;
 3) vulkan; take 3; PRE=04; default dinosaur 42; default dinosaur 43; default stone_horse 42; default stone_horse 44; others fox; others stone_horse; GPU=2; stock stone_horse a; curves fox b; GPU=1; stock fox b ;;
 4) SECONDS=0; wait_for_all "${2:-400}"; cat $O/formats-*.csv | cut -c1-150 ;;
 esac
