@@ -43,7 +43,7 @@ COLUMNS = (
 PLACE = ("capture", "tool", "rule", "training", "share", "device", "seed", "steps")
 """Columns that name a row."""
 OURS, OTHER = "sundae_ns", "splat-transform"
-RULES = {"pairs": sn.PruneRule(selection="pairs")}
+RULE = sn.PruneRule(selection="pairs")
 OTHER_RULES = ("decimate", "decimate-adaptive")
 TRAININGS = ("none", "distill", "distill-no-head")
 HELD_OUT = 32
@@ -79,12 +79,11 @@ def device_of(scene: sn.Scene) -> str:
 def jobs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The rows to make, without their figures."""
     for share in options.shares:
-        for rule in RULES:
-            yield {"tool": OURS, "rule": rule, "training": "none", "share": share, "steps": 0}
+        yield {"tool": OURS, "rule": RULE.selection, "training": "none", "share": share, "steps": 0}
         for training in options.training:
             if training != "none":
                 yield {
-                    **{"tool": OURS, "rule": "pairs", "training": training, "share": share},
+                    **{"tool": OURS, "rule": RULE.selection, "training": training, "share": share},
                     "steps": options.steps,
                 }
         if options.splat_transform:
@@ -107,9 +106,8 @@ def made(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: P
         found = sn.load(out, device=scene.device)
         return dataclasses.replace(scene, field=found.field), seconds
     if job["training"] == "none":
-        rule = dataclasses.replace(RULES[job["rule"]], seed=options.seed)
-        views = sn.virtual_views(scene, seed=options.seed) if rule.uses_contribution else None
-        small = sn.prune(scene, keep=share, views=views, rule=rule)
+        rule = dataclasses.replace(RULE, seed=options.seed)
+        small = sn.prune(scene, keep=share, views=sn.virtual_views(scene, seed=options.seed), rule=rule)
     else:
         head = job["training"] == "distill"
         small = sn.distill(scene, keep=share, steps=options.steps, seed=options.seed, head=head)

@@ -253,8 +253,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
         Args:
             indices: the views.
-            late: others, which come so often before step ``until`` that about half of the images are theirs.
-            until: that step.
+            late: other views. Before step ``until`` about half of the images are theirs.
+            until: a step.
         """
         held_back = frozenset(indices)
         self._served = [index for index in self.train_indices if index not in held_back]
@@ -262,16 +262,17 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         times = round((len(self._served) - len(behind)) / max(len(behind), 1))
         self._catching_up = self._served + behind * (times - 1)
         self._caught_up_at = until
-        self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])  # pass over so many views, and its order
+        self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])  # number and length of a pass, and its views
 
     def view_of_step(self, step: int) -> int:
         """Index of the training view of ``step``: each pass over the views is a new permutation."""
         served = self._catching_up if step < self._caught_up_at else self._served
         epoch, position = divmod(step, len(served))
-        if self._order[0] != (epoch, len(served)):
+        named = epoch, len(served)
+        if self._order[0] != named:
             indices = list(served)
             random.Random(f"{self.config.train_cameras_sampling_seed}-{epoch}").shuffle(indices)
-            self._order = ((epoch, len(served)), indices)
+            self._order = (named, indices)
         return self._order[1][position]
 
     def training_views(self) -> Iterator[tuple[Cameras, torch.Tensor | None]]:

@@ -109,8 +109,8 @@ def steps_of(captures: Sequence[Path], out: Path, *, others: bool, films: bool) 
             small = with_head / "tuned.sundae"
             add(f"{capture.name}-films", "harness.films", small, full, capture, table="films.jsonl")
         add(f"{capture.name}-seconds", "bench_training.py", capture, "--arms", *TIMED, table="training_time.jsonl")
-    for name in ("default", "others"):
-        add(f"tables-{name}", "tables.py", "--suite", out / name / "results.jsonl")
+    for name in ("default", "others", *(f"curve/{capture.name}" for capture in captures)):
+        add(f"tables-{name.replace('/', '-')}", "tables.py", "--suite", out / name / "results.jsonl")
     return steps
 
 

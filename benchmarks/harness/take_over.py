@@ -76,18 +76,17 @@ def _write(name: str, columns: Sequence[str], rows: Iterable[dict[str, Any]]) ->
 def _curve(old: list[dict[str, Any]], found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows of curve.csv with those of packed results, capture by capture: what the default chose, and fixed shares."""
     new = [_curve_line(result) for result in found if result["packed"] and result["job"]["arm"] in CURVE]
-    chosen = {kind: [row for row in new if row["chosen"] == kind] for kind in ("yes", "no")}
-    rows = merged(
-        [{"variant": "sundae-auto", **row} for row in old if row["chosen"] == "yes"],
-        chosen["yes"],
-        ("capture", "seed"),
-    )
-    # What trials keep differs from seed to seed.
-    places = ("capture", "method", "prune_at", "share", "seed")
-    rows += merged([row for row in old if row["chosen"] == "no"], chosen["no"], places)
+
+    def placed(row: dict[str, Any]) -> dict[str, Any]:
+        # What trials keep differs from seed to seed.
+        if row["chosen"] == "yes":
+            return {"variant": "sundae-auto", "place": "chosen", **row}
+        return {"place": tuple(row[name] for name in ("method", "prune_at", "share")), **row}
+
+    rows = merged(map(placed, old), list(map(placed, new)), ("capture", "place", "seed"))
     captures = list(dict.fromkeys(row["capture"] for row in [*old, *new]))
-    rows.sort(key=lambda row: captures.index(row["capture"]))
-    return [{name: value for name, value in row.items() if name != "variant"} for row in rows]
+    rows.sort(key=lambda row: (captures.index(row["capture"]), row["chosen"] == "no"))
+    return [{name: value for name, value in row.items() if name not in ("variant", "place")} for row in rows]
 
 
 def _curve_line(result: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 from torch import Tensor
 
+from sundae_ns.api.virtual import by_device
 from sundae_ns.gaussians.surgery import replace_parameter
 from sundae_ns.pruning.selection import neighbor_order, select_systematic
 from sundae_ns.training.extension import Extension, TrainingRun
@@ -24,7 +25,7 @@ from sundae_ns.training.options import ModelOptions
 from sundae_ns.training.plane_sweep import Sweep
 
 SIDES = {"cuda": 640, "cpu": 160}
-"""Longest side of the swept images, pixels, by device: a CPU takes a second a view, a GPU 34 ms (H100)."""
+"""Longest side of the swept images, pixels, by device: a CPU takes a second a view, a GPU a fraction."""
 MOST_ON_CPU = 24
 """Most views that a CPU sweeps."""
 FILLED = {"cuda": 100_000, "cpu": 20_000}
@@ -70,7 +71,8 @@ class DenseStart(Extension):
         self._done = True
         assert self._points is not None
         state, (sparse, colours) = run.state, self._points
-        if len(sparse) >= _of(FILLED, run) or (state.device.type == "cpu" and len(run.view_indices()) > MOST_ON_CPU):
+        too_many = state.device.type == "cpu" and len(run.view_indices()) > MOST_ON_CPU
+        if too_many or len(sparse) >= by_device(FILLED, state.device):
             return
         xyz, rgb = self.found(lambda: self._swept(run, sparse.to(state.device)))
         colours = colours.float()
@@ -86,8 +88,8 @@ class DenseStart(Extension):
     @torch.no_grad()
     def _swept(self, run: TrainingRun, sparse: Tensor) -> Points:
         """Positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``; evenly spread ones if too many are found."""
-        most = _of(FILLED, run) - len(sparse)
-        sweep = Sweep(run.photos(), sparse[sparse.isfinite().all(dim=1)], _of(SIDES, run))
+        most = by_device(FILLED, run.state.device) - len(sparse)
+        sweep = Sweep(run.photos(), sparse[sparse.isfinite().all(dim=1)], by_device(SIDES, run.state.device))
         for i in track(range(len(sweep.photos)), "Plane sweep", transient=True, console=CONSOLE):
             sweep.add(i)
         xyz, rgb = sweep.points(most)
@@ -95,10 +97,6 @@ class DenseStart(Extension):
             even = select_systematic(torch.ones(len(xyz)), most, neighbor_order(xyz), self._options.pruning.seed)
             xyz, rgb = xyz[even.to(xyz.device)], rgb[even.to(rgb.device)]
         return xyz.cpu(), rgb.cpu()
-
-
-def _of(limits: Mapping[str, int], run: TrainingRun) -> int:
-    return limits.get(run.state.device.type, limits["cpu"])
 
 
 def put(state: FieldState, params: Mapping[str, Tensor]) -> None:

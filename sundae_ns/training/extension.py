@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -27,9 +27,12 @@ class Photo(NamedTuple):
 class LateViews(NamedTuple):
     """Training views that catch up, because they were held out before."""
 
-    indices: list[int]
-    until: int
+    indices: Sequence[int] = ()
+    until: int = 0
     """Step before which half of the images are theirs."""
+
+
+NONE_LATE = LateViews()
 
 
 class TrainingRun(Protocol):
@@ -72,7 +75,7 @@ class TrainingRun(Protocol):
     def view_indices(self) -> list[int]:
         """Indices of these views."""
 
-    def hold_out(self, indices: Iterable[int], late: LateViews | None = None) -> None:
+    def hold_out(self, indices: Iterable[int], late: LateViews = NONE_LATE) -> None:
         """Hold out these training views too, from the next step on, until the next call. Late views catch up."""
 
     def heldout_views(self) -> Iterator[Photo]:

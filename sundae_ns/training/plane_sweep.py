@@ -47,7 +47,7 @@ _TILT = 0.766, 0.643
 _BATCH = 16
 """Planes at a time."""
 _LOOKED_AT = 16
-"""Pixels that are looked at for each point that is asked for: not all agree, and the even ones are chosen of these."""
+"""Pixels examined for each wanted point: views do not agree on all of them, and even ones are chosen afterwards."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class Sweep:
         """Points on which two or more views agree: positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``.
 
         Args:
-            wanted: about how many are of use. Hundreds of images have millions, of which an even part is looked at.
+            wanted: number of points that the caller needs. If there are many more, pixels are skipped evenly.
         """
         empty = self._sparse.new_zeros(0, 3)
         every = max(1, sum(int((depth > 0).sum()) for depth in self._depths) // max(1, _LOOKED_AT * wanted))
@@ -146,7 +146,12 @@ class Sweep:
         return NEARER * ends[0], FARTHER * ends[1]
 
     def _agreeing(self, index: int, every: int) -> tuple[Tensor, Tensor]:
-        """Points of each so many pixels of a view that others confirm: means with those of the others, and colours."""
+        """Points of a view that others confirm: means with those of the others, and colours.
+
+        Args:
+            index: of the view.
+            every: examine one of this many pixels.
+        """
         photo, depth = self.photos[index], self._depths[index]
         rows, columns = (depth > 0).nonzero()[::every].T
         points = _to_world(photo, photo.rays(rows, columns) * depth[rows, columns][:, None])

@@ -58,17 +58,15 @@ class TrialEngine:
         """Steps after which the field went back to before them."""
         self._held: dict[str, list[int]] = {}
         self._since: dict[str, int] = {}
-        """Counted steps before the views of a policy were held out."""
-        self._late = LateViews([], 0)
-        self._left = 0
-        """Steps in which late views still catch up after the present trial."""
+        """Counted steps after which a policy began to hold views out."""
+        self._late = LateViews([])
         self._head_starts_at = head_starts_at
         self._mean = RunningMean()
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values and tensors for a checkpoint."""
         trial = None if self.trial is None else asdict(self.trial)
-        views = {"held": self._held, "since": self._since, "late": self._late._asdict(), "left": self._left}
+        views = {"held": self._held, "since": self._since, "late": self._late._asdict()}
         return {"trial": trial, "kept": self.kept, "taken_back": self.taken_back, **views, **self._mean.state_dict()}
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
@@ -77,8 +75,7 @@ class TrialEngine:
         self.trial = None if trial is None else Trial(**trial)
         self.kept, self.taken_back = dict(saved.get("kept", {})), int(saved.get("taken_back", 0))
         self._held, self._since = dict(saved.get("held", {})), dict(saved.get("since", {}))
-        self._left = int(saved.get("left", 0))
-        self._late = LateViews(**saved["late"]) if "late" in saved else self._late
+        self._late = LateViews(**saved.get("late", {"indices": []}))
         self._mean = RunningMean.of(saved, state.device)
         self._count_steps(state)
 
@@ -94,8 +91,7 @@ class TrialEngine:
     def start(self, run: TrainingRun, trial: Trial) -> None:
         """Start a trial from the present field."""
         state = run.state
-        if self.trial is None:
-            self._left = max(self._late.until - state.step - 1, 0)
+        self._postpone(state)
         self.trial, self._mean = replace(trial, began=state.schedule_step), RunningMean()
         self.resume(run)
         if trial.num_features is not None:
@@ -129,14 +125,20 @@ class TrialEngine:
         return {view for views in self._held.values() for view in views}
 
     def _release(self, run: TrainingRun, views: Sequence[int], missed: int) -> None:
-        """Let views catch up that were held out for so many counted steps, until all were seen equally often."""
+        """Let views that have missed ``missed`` counted steps catch up until all have been seen equally often."""
         coming, now = self._coming(), run.state.step + 1
-        left = self._left if self.trial is not None else max(self._late.until - now, 0)
-        late = sorted({*views, *(self._late.indices if left else [])} - coming)
+        left = max(self._late.until - now, 0)
+        late = sorted({*views, *(self._late.indices if left else ())} - coming)
         others = len(run.view_indices()) - len(coming) - len(late)
         if others > len(late):
             left += round(2 * missed * len(late) / (others - len(late)))
-        self._late, self._left = LateViews(late, now + left), left
+        self._late = LateViews(late, now + left)
+
+    def _postpone(self, state: FieldState) -> None:
+        """Make up for the steps of the present trial, in which no view catches up."""
+        if self.trial is not None:
+            trained = state.schedule_step - self.trial.began
+            self._late = self._late._replace(until=self._late.until + trained)
 
     def after_step(self, run: TrainingRun) -> bool:
         """Average the weights if it is due; returns whether the current trial has been trained."""
@@ -182,8 +184,7 @@ class TrialEngine:
 
     def end(self, run: TrainingRun, policy: str) -> None:
         """End the trials of a policy: forget the kept copies, and serve its views from the next step on."""
-        if self.trial is not None:
-            self._late = self._late._replace(until=run.state.step + 1 + self._left)
+        self._postpone(run.state)
         self.trial, self.kept, self._mean = None, {}, RunningMean()
         self.hold(run, policy, [])
         self._count_steps(run.state)
