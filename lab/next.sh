@@ -4,27 +4,31 @@ set -u
 export PYTHONPATH=/opt/site PATH=/tmp/node:/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 SLOTS=${SLOTS:-4} GPUS=${GPUS:-4} ROOT=$PWD
 R=/tmp/repo; J=/tmp/jobs; O=/tmp/out; Q=$R/benchmarks/quality.py; P=$R/benchmarks/prune_without_photos.py; F=$R/benchmarks/bench_formats.py
 job() { { [ -z "${AFTER:-}" ] || printf "# after %s\n" $AFTER; [ -z "${GPU:-}" ] || echo "# gpu $GPU"; echo "$2"; } > $J/$1.sh.new; mv $J/$1.sh.new $J/$1.sh; }
-# stock CAPTURE ORDER: splatfacto (480 s on an H100), then its packs, splat-transform's too where Vulkan is
-stock() { job 00-alone-$2-$1-stock "python3 $Q /tmp/scenes/$1 -o /tmp/stock/$1 --arms splatfacto --seeds 42; cp /tmp/stock/$1/done/*.json $O/"
-  GPU= AFTER="$1-stock" job 01-$1-formats "RUN=\$(dirname \$(find /tmp/stock/$1/jobs -name config.yml | head -1)); sundae pack \$RUN -o /tmp/packs/stock-$1.sundae; python3 $F \$RUN -o $O/formats-$1.csv"; }
+# formats CAPTURE: packs of the stock run that curves has left, splatfacto's .sog by splat-transform too where Vulkan is
+formats() { AFTER="$1-curves" job 01-$1-formats "until [ -d /tmp/node ]; do sleep 2; done; python3 $F \$(dirname \$(find /tmp/stock/$1 -name config.yml | head -1)) -o $O/formats-$1.csv"; }
 export XDG_RUNTIME_DIR=/tmp VK_DRIVER_FILES=/usr/local/nvidia/share/vulkan/icd.d/nvidia_icd.json
-take() { mkdir -p /tmp/scenes /tmp/full /tmp/packs; for s in $*; do [ ! -d "$ROOT/.gpu/s$s" ] || cp -r "$ROOT"/.gpu/s$s/* /tmp/scenes/; done; ls /tmp/scenes; }
+take() { mkdir -p /tmp/scenes /tmp/default /tmp/others; for s in $*; do cp -r "$ROOT"/.gpu/s$s/* /tmp/scenes/; done; ls /tmp/scenes; }
 setup() { bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; python3 lab/console_scripts.py
   mkdir -p $R /tmp/logs $O $J; cp -r benchmarks tests lab docs examples web *.md pyproject.toml Makefile mkdocs.yml method_configs $R/; }
 queue() { cd /tmp || exit; setsid nohup python3 $R/lab/slots.py > /tmp/logs/q.out 2>&1 & sleep 1; }
+# Brings home what is done, also of jobs that have not ended
+gather() { for f in /tmp/default/*/done/*.json; do cp $f $O/default/; done; for f in /tmp/others/*/done/*.json; do cp $f $O/others/; done
+  for d in /tmp/default/*; do for f in $(find $d/jobs -name curve.json); do cp $f $O/curves/$(basename $d).json; done; done; cp $(find /tmp/default/bonsai-42 -name 'tuned.sundae') $O/bonsai.sundae; }
 wait_for_all() { touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$1" ]; do sleep 1; done
-  tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log; nvidia-smi --query-gpu=name --format=csv,noheader | sort | uniq -c; }
+  mkdir -p $O/default $O/others $O/curves; gather 2> /dev/null; tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log; nvidia-smi --query-gpu=name --format=csv,noheader | sort | uniq -c; }
 node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C /tmp/node.part; mv /tmp/node.part /tmp/node; }
-default() { job ${PRE:-02}-$2-$1 "python3 $Q /tmp/scenes/$1 -o /tmp/default/$1-$2 --arms sundae-auto --seeds $2; mkdir -p $O/$1-$2; cp /tmp/default/$1-$2/done/*.json $O/$1-$2/; cp \$(find /tmp/default/$1-$2/jobs -name curve.json) $O/$1-$2/"; }
-# curves CAPTURE ORDER: seconds with PSNR and SSIM on the way, alone (530 s); others CAPTURE: the further rows of a suite
-curves() { job 00-alone-$2-$1-curves "python3 $R/benchmarks/bench_training.py /tmp/scenes/$1 --arms sundae sundae-fast splatfacto --curve 1000 2000 3000 4500 6000 8000 10000 12000 15000 18000 21000 25000 30000 -o $O/time-$1.jsonl"; }
-others() { job 05-$1-others "python3 $Q /tmp/scenes/$1 -o /tmp/others/$1 --arms sundae sundae-no-head sundae-fast mcmc --keep-ratios 0.1 --seeds 42; mkdir -p $O/$1-others; cp /tmp/others/$1/done/*.json $O/$1-others/"; }
+default() { for s in 42 43 44; do job 0$2-$s-$1 "python3 $Q /tmp/scenes/$1 -o /tmp/default/$1-$s --arms sundae-auto --seeds $s"; done; }
+# curves CAPTURE ORDER ARM...: seconds with PSNR and SSIM on the way, alone (530 s); others CAPTURE: the further rows of a suite
+curves() { c=$1 o=$2; shift 2; job 00-alone-$o-$c-curves "python3 $R/lab/stock_curve.py /tmp/scenes/$c --arms $* --curve 1000 2000 3000 4500 6000 8000 10000 12000 15000 18000 21000 25000 30000 -o $O/time-$c.jsonl"; }
+row() { job $1-$2-$3 "python3 $Q /tmp/scenes/$2 -o /tmp/others/$2-$3 --arms ${*:4} --seeds 42"; }
+others() { row 05 $1 tenth sundae sundae-no-head --keep-ratios 0.1; row 06 $1 fast sundae-fast --keep-ratios 0.1; row 06 $1 mcmc mcmc --keep-ratios 0.1
+  AFTER="$1-tenth" job 07-$1-shares "python3 $Q /tmp/scenes/$1 -o /tmp/others/$1-tenth --arms sundae --seeds 42 --keep-ratios 0.2 0.05"; }
 gpu_tests() { job 025-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests)"; }
 vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; splat-transform --list-gpus; }
 case $1 in
-# One lease, nvidia-h100-x4, GPUS=4 SLOTS=4 RESERVED="0 1 2": curves and stock alone on three GPUs, all else on the others
-1) setup; take 2; PRE=03; default garden 44; others garden; others dinosaur; GPU=1; curves garden a; GPU=; gpu_tests; queue ;;
-2) take 1 4; PRE=03; default bonsai 44; PRE=04; default south_building 42; default south_building 43; others bonsai; others south_building; GPU=0; curves bonsai a; stock south_building b ;;
-3) vulkan; take 3; PRE=04; default dinosaur 42; default dinosaur 43; default stone_horse 42; default stone_horse 44; others fox; others stone_horse; GPU=2; stock stone_horse a; curves fox b; GPU=1; stock fox b ;;
+# One lease, nvidia-h100-x4, GPUS=4 SLOTS=4 RESERVED="0 1 2": curves alone on three GPUs, all else on the fourth and after them
+1) setup; take 3; default fox 2; default stone_horse 2; GPU=0; curves fox a sundae sundae-fast splatfacto; GPU=1; curves stone_horse a sundae sundae-fast splatfacto; GPU=; gpu_tests; queue ;;
+2) take 1 4; GPU=2; curves bonsai a sundae sundae-fast splatfacto; curves south_building b splatfacto; GPU=; default south_building 3; default bonsai 3; for c in fox stone_horse bonsai south_building; do others $c; done ;;
+3) take 2; default garden 4; default dinosaur 4; others garden; others dinosaur; vulkan; for c in fox stone_horse south_building; do formats $c; done ;;
 4) SECONDS=0; wait_for_all "${2:-400}"; cat $O/formats-*.csv | cut -c1-150 ;;
 esac
