@@ -33,7 +33,6 @@ from nerfstudio.scripts.train import _set_random_seed
 from harness.job import configure, without_lpips
 from harness.plan import Job, parser_of
 from sundae_ns.evaluation import psnr, ssim
-from sundae_ns.scenes.opening import views_to_test
 from sundae_ns.storage.runs.fingerprint import fingerprint
 
 ARMS: dict[str, list[str]] = {
@@ -82,13 +81,14 @@ def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:
 
 
 def quality(trainer: Any) -> tuple[float, float]:
-    """Mean PSNR and SSIM of the test views."""
-    model = trainer.pipeline.model
+    """Mean PSNR and SSIM of the test views, of stock models too."""
+    model, figures = trainer.pipeline.model, []
     model.eval()
     with torch.no_grad():
-        cameras, truths = views_to_test(model, trainer.pipeline.datamanager)
-        images = [model.get_outputs_for_camera(camera)["rgb"] for camera in cameras]
-        figures = [[float(psnr(*pair)), float(ssim(*pair))] for pair in zip(images, truths, strict=True)]
+        for camera, batch in trainer.pipeline.datamanager.fixed_indices_eval_dataloader:
+            outputs = model.get_outputs_for_camera(camera.to(model.device))
+            truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
+            figures.append([float(psnr(outputs["rgb"], truth)), float(ssim(outputs["rgb"], truth))])
     model.train()
     return tuple(torch.tensor(figures).mean(dim=0).tolist())
 

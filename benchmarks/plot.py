@@ -1,6 +1,6 @@
 """Draw the plots of docs/results.md from benchmarks/results, into docs/figures.
 
-python benchmarks/plot.py            # curve.png, heads.png, rules.png
+python benchmarks/plot.py            # curve.png, heads.png, rules.png, time.png
 python benchmarks/plot.py curve      # one of them
 """
 
@@ -21,6 +21,8 @@ from harness.stored import MB, lines_of
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 MARKERS = {"bonsai": "o", "fox": "s"}
+ARMS = {"splatfacto": "gray", "sundae": "tab:red", "sundae-fast": "tab:blue"}
+"""Methods whose trainings are timed, and their colours."""
 KEPT_RULES = {
     "detail-merge": "detail, merged (default)",
     "detail": "detail",
@@ -131,16 +133,42 @@ def plot_rules() -> Any:
     return figure
 
 
+def plot_time() -> Any:
+    """PSNR of the test views against the seconds of a training, a panel for each capture that has curves, if any."""
+    rows = [row for row in lines_of("training_time.jsonl") if row.get("curve")]
+    if not rows:
+        return None
+    captures = list(dict.fromkeys(row["scene"] for row in rows))
+    size = (3.2 * len(captures), 2.9)
+    figure, (panels,) = plt.subplots(1, len(captures), figsize=size, layout="constrained", squeeze=False)
+    for panel, capture in zip(panels, captures, strict=True):
+        for row in (row for row in rows if row["scene"] == capture):
+            points = [*(point[:2] for point in row["curve"]), [row["train_s"], row["psnr"]]]
+            panel.plot(*zip(*points, strict=True), color=ARMS[row["arm"]], label=row["arm"])
+            panel.plot(*points[-1], "o", color=ARMS[row["arm"]])
+        panel.set_title(capture, fontsize=10)
+        panel.set_xscale("log")
+        panel.set_xticks([3, 10, 30, 100, 300])
+        panel.xaxis.set_major_formatter("{x:g}")
+        panel.xaxis.set_minor_formatter(NullFormatter())
+        panel.set_xlabel("seconds of training")
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("test PSNR, dB")
+    figure.legend(*panels[0].get_legend_handles_labels(), fontsize=9, loc="outside lower center", ncols=3)
+    return figure
+
+
 PLOTS: dict[str, Callable[[], Any]] = {
     "curve": plot_curve,
     "heads": plot_heads,
     "rules": plot_rules,
+    "time": plot_time,
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("plots", nargs="*", default=list(PLOTS), help="curve, heads, rules; by default all")
+    parser.add_argument("plots", nargs="*", default=list(PLOTS), help=f"{', '.join(PLOTS)}; by default all")
     parser.add_argument("-o", "--out", type=Path, default=FIGURES, help="folder")
     options = parser.parse_args()
     odd = [name for name in options.plots if name not in PLOTS]
@@ -148,8 +176,10 @@ def main() -> None:
         parser.error(f"no plot {odd[0]}; give some of {', '.join(PLOTS)}")
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.plots:
-        PLOTS[name]().savefig(options.out / f"{name}.png", dpi=110)
-        print(f"wrote {name}.png")
+        figure = PLOTS[name]()
+        if figure is not None:
+            figure.savefig(options.out / f"{name}.png", dpi=110)
+        print(f"{name}.png has no rows yet" if figure is None else f"wrote {name}.png")
 
 
 if __name__ == "__main__":

@@ -17,18 +17,21 @@ gather() { for f in /tmp/default/*/done/*.json; do cp $f $O/default/; done; for 
 wait_for_all() { touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$1" ]; do sleep 1; done
   mkdir -p $O/default $O/others $O/curves; gather 2> /dev/null; tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log; nvidia-smi --query-gpu=name --format=csv,noheader | sort | uniq -c; }
 node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C /tmp/node.part; mv /tmp/node.part /tmp/node; }
-default() { for s in 42 43 44; do job 0$2-$s-$1 "python3 $Q /tmp/scenes/$1 -o /tmp/default/$1-$s --arms sundae-auto --seeds $s"; done; }
+# default CAPTURE ORDER SEED...
+default() { c=$1 o=$2; for s in ${*:3}; do job 0$o-$s-$c "python3 $Q /tmp/scenes/$c -o /tmp/default/$c-$s --arms sundae-auto --seeds $s"; done; }
 # curves CAPTURE ORDER ARM...: seconds with PSNR and SSIM on the way, alone (530 s); others CAPTURE: the further rows of a suite
 curves() { c=$1 o=$2; shift 2; job 00-alone-$o-$c-curves "python3 $R/lab/stock_curve.py /tmp/scenes/$c --arms $* --curve 1000 2000 3000 4500 6000 8000 10000 12000 15000 18000 21000 25000 30000 -o $O/time-$c.jsonl"; }
 row() { job $1-$2-$3 "python3 $Q /tmp/scenes/$2 -o /tmp/others/$2-$3 --arms ${*:4} --seeds 42"; }
 others() { row 05 $1 tenth sundae sundae-no-head --keep-ratios 0.1; row 06 $1 fast sundae-fast --keep-ratios 0.1; row 06 $1 mcmc mcmc --keep-ratios 0.1
-  AFTER="$1-tenth" job 07-$1-shares "python3 $Q /tmp/scenes/$1 -o /tmp/others/$1-tenth --arms sundae --seeds 42 --keep-ratios 0.2 0.05"; }
+  AFTER="$1-tenth" job 07-$1-shares "python3 $Q /tmp/scenes/$1 -o /tmp/others/$1-tenth --arms sundae --seeds 42 --keep-ratios 0.2 0.05 0.4"; }
 gpu_tests() { job 025-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests)"; }
 vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; splat-transform --list-gpus; }
+# ways CAPTURE: what trials cost a capture that keeps all: no trials, with 30,000 steps and with as many as trials leave
+ways() { for n in 30000 26400; do job 035-$1-$n "python3 $R/benchmarks/bench_training.py /tmp/scenes/$1 --arms sundae --steps $n --option=--pipeline.model.pruning.keep-ratio --option=1.0 --option=--pipeline.model.head.mode --option=off -o $O/ways-$1-$n.jsonl"; done; }
 case $1 in
 # One lease, nvidia-h100-x4, GPUS=4 SLOTS=4 RESERVED="0 1 2": curves alone on three GPUs, all else on the fourth and after them
-1) setup; take 3; default fox 2; default stone_horse 2; GPU=0; curves fox a sundae sundae-fast splatfacto; GPU=1; curves stone_horse a sundae sundae-fast splatfacto; GPU=; gpu_tests; queue ;;
-2) take 1 4; GPU=2; curves bonsai a sundae sundae-fast splatfacto; curves south_building b splatfacto; GPU=; default south_building 3; default bonsai 3; for c in fox stone_horse bonsai south_building; do others $c; done ;;
-3) take 2; default garden 4; default dinosaur 4; others garden; others dinosaur; vulkan; for c in fox stone_horse south_building; do formats $c; done ;;
-4) SECONDS=0; wait_for_all "${2:-400}"; cat $O/formats-*.csv | cut -c1-150 ;;
+1) setup; take 3; GPU=0; curves fox a sundae sundae-fast splatfacto; GPU=1; curves stone_horse a sundae sundae-fast splatfacto; GPU=; others fox; others stone_horse; queue ;;
+2) take 1 4; GPU=2; curves bonsai a sundae sundae-fast splatfacto; curves south_building b splatfacto; GPU=; default bonsai 3 44; ways south_building; others bonsai; others south_building ;;
+3) take 2; default garden 3 44; others garden; others dinosaur; vulkan; for c in fox stone_horse south_building; do formats $c; done ;;
+9) [ -f /tmp/logs/queue.log ] || { echo "no queue: another machine; give it back"; exit 3; }; SECONDS=0; wait_for_all "${2:-400}"; cat $O/formats-*.csv | cut -c1-150 ;;
 esac

@@ -18,7 +18,7 @@ from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.rendering import FieldSource, RenderSettings, TrainingView
 from sundae_ns.storage.accounting import BYTES_PER_FLOAT, bytes_of_module, megabytes
 from sundae_ns.storage.runs.folder import find_config, take_records
-from sundae_ns.training.extension import NONE_LATE, Extension, LateViews, Photo
+from sundae_ns.training.extension import Extension, Photo
 from sundae_ns.training.field_state import FieldState
 
 
@@ -83,9 +83,9 @@ class NerfstudioRun:
         """Indices of the training views."""
         return self._datamanager.train_indices
 
-    def hold_out(self, indices: Iterable[int], late: LateViews = NONE_LATE) -> None:
-        """Hold out these training views from the next step on, and let late ones catch up."""
-        self._datamanager.hold_back(indices, late.indices, late.until)
+    def hold_out(self, indices: Iterable[int]) -> None:
+        """Hold out these training views from the next step on."""
+        self._datamanager.hold_back(indices)
 
     def heldout_views(self) -> Iterator[Photo]:
         """The held-out training views, loaded one at a time."""

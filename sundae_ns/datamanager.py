@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -248,31 +248,19 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         every = self.config.holdout_every
         return [i for i in range(len(self.train_dataset)) if not every or (i + 1) % every]
 
-    def hold_back(self, indices: Iterable[int], late: Collection[int] = (), until: int = 0) -> None:
-        """Hold out these of :attr:`train_indices` too, from the next step on, until the next call.
-
-        Args:
-            indices: the views.
-            late: other views. Before step ``until`` about half of the images are theirs.
-            until: a step.
-        """
+    def hold_back(self, indices: Iterable[int]) -> None:
+        """Hold out these of :attr:`train_indices` too, from the next step on, until the next call."""
         held_back = frozenset(indices)
         self._served = [index for index in self.train_indices if index not in held_back]
-        behind = [index for index in self._served if index in late]
-        times = round((len(self._served) - len(behind)) / max(len(behind), 1))
-        self._catching_up = self._served + behind * (times - 1)
-        self._caught_up_at = until
-        self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])  # number and length of a pass, and its views
+        self._order: tuple[int, list[int]] = (-1, [])  # pass over the views, and its order
 
     def view_of_step(self, step: int) -> int:
         """Index of the training view of ``step``: each pass over the views is a new permutation."""
-        served = self._catching_up if step < self._caught_up_at else self._served
-        epoch, position = divmod(step, len(served))
-        named = epoch, len(served)
-        if self._order[0] != named:
-            indices = list(served)
+        epoch, position = divmod(step, len(self._served))
+        if self._order[0] != epoch:
+            indices = list(self._served)
             random.Random(f"{self.config.train_cameras_sampling_seed}-{epoch}").shuffle(indices)
-            self._order = (named, indices)
+            self._order = (epoch, indices)
         return self._order[1][position]
 
     def training_views(self) -> Iterator[tuple[Cameras, torch.Tensor | None]]:

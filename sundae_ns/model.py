@@ -324,7 +324,7 @@ class SundaeModel(SplatfactoModel):
         parts = state.head_enabled and not state.densifying
         pixels = config.head.max_train_pixels if parts else 0
         # Mirrored images help in the long run only.
-        mirror = parts and state.head_images > 0 and config.head.mode != "features"
+        mirror = parts and not state.provisional and config.head.mode != "features"
         return StepResolution(step, int(2 ** max(rising, 0)), pixels, mirror)
 
     def get_training_callbacks(

@@ -93,17 +93,6 @@ def test_held_out_views_are_never_trained_on(capture: Path) -> None:
     assert batch["image"].shape == (16, 20, 3)
 
 
-def test_late_views_are_half_of_all_images_until_they_have_caught_up(capture: Path) -> None:
-    made, usual = manager(capture), manager(capture)
-    made.hold_back([5], late=[2], until=60)
-    order = [made.view_of_step(step) for step in range(120)]
-    assert order[:60].count(2) == 30
-    assert {order[:60].count(view) for view in (0, 1, 3, 4, 6)} == {6}
-    usual.hold_back([5])
-    assert order[60:] == [usual.view_of_step(step) for step in range(60, 120)]
-    assert [made.view_of_step(step) for step in (59, 60, 3)] == [order[59], order[60], order[3]]
-
-
 def test_a_held_back_view_goes_to_the_device_when_its_turn_comes(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

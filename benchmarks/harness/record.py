@@ -41,6 +41,8 @@ SHARES = ("1", "0.4", "0.2", "0.1", "0.05", "0.025")
 """Fixed shares beside the default's choice: the curve of what a scene needs."""
 OTHERS = ("splatfacto", "sundae", "sundae-with-head", "sundae-no-head", "sundae-fast", "mcmc", "band")
 TIMED = ("splatfacto", "sundae", "sundae-fast")
+LOOKED = (1000, 2000, 3000, 4500, 6000, 8000, 10000, 12000, 15000, 18000, 21000, 25000)
+"""Steps of a timed training after which the test views are measured, with the clock stopped."""
 
 
 class Step(NamedTuple):
@@ -108,7 +110,8 @@ def steps_of(captures: Sequence[Path], out: Path, *, others: bool, films: bool) 
             steps.append(Step(f"{capture.name}-full", words))
             small = with_head / "tuned.sundae"
             add(f"{capture.name}-films", "harness.films", small, full, capture, table="films.jsonl")
-        add(f"{capture.name}-seconds", "bench_training.py", capture, "--arms", *TIMED, table="training_time.jsonl")
+        timed = ("--arms", *TIMED, "--curve", *LOOKED)
+        add(f"{capture.name}-seconds", "bench_training.py", capture, *timed, table="training_time.jsonl")
     for name in ("default", "others", *(f"curve/{capture.name}" for capture in captures)):
         add(f"tables-{name.replace('/', '-')}", "tables.py", "--suite", out / name / "results.jsonl")
     return steps

@@ -105,7 +105,6 @@ class Team:
         if not self.collective:
             return source, extensions
         shards = self.shards = Shards(state.device)
-        state.images_per_step = shards.ranks
         take_shard(state, shards)
         random.seed(seed)
         cameras = datamanager.train_dataset.cameras

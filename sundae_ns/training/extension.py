@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -22,17 +22,6 @@ class Photo(NamedTuple):
     """The image over the background of :attr:`TrainingRun.background`, in [0, 1] ``[H, W, 3]``."""
     mask: Tensor | None
     """Pixels that count, bool ``[H, W]``; None for all."""
-
-
-class LateViews(NamedTuple):
-    """Training views that catch up, because they were held out before."""
-
-    indices: Sequence[int] = ()
-    until: int = 0
-    """Step before which half of the images are theirs."""
-
-
-NONE_LATE = LateViews()
 
 
 class TrainingRun(Protocol):
@@ -75,8 +64,8 @@ class TrainingRun(Protocol):
     def view_indices(self) -> list[int]:
         """Indices of these views."""
 
-    def hold_out(self, indices: Iterable[int], late: LateViews = NONE_LATE) -> None:
-        """Hold out these training views too, from the next step on, until the next call. Late views catch up."""
+    def hold_out(self, indices: Iterable[int]) -> None:
+        """Hold out these training views too, from the next step on, until the next call."""
 
     def heldout_views(self) -> Iterator[Photo]:
         """The held-out training views, loaded one at a time."""

@@ -55,11 +55,8 @@ class FieldState:
     """Step of the schedule at which densification ends."""
     head_starts_at: float = math.inf
     """Step of the schedule after which the head is enabled."""
-    uncounted: float = 0
-    """Images trained on since the head was enabled that do not count: the field went back to before them. Infinite in
-    a trial whose field may be dropped."""
-    images_per_step: int = 1
-    """Number of images in the batch of a step."""
+    provisional: bool = False
+    """Whether a trial is trained whose field may be dropped."""
     restored: int = 0
     """Number of times in this process that other weights took the place of the trained ones."""
     sh_degree_interval: int | None = None
@@ -100,11 +97,6 @@ class FieldState:
     def head_enabled(self) -> bool:
         """Whether images get the head's correction at this step."""
         return self.head is not None and self.schedule_step > self.head_starts_at
-
-    @property
-    def head_images(self) -> float:
-        """Number of images that the head was trained on, as far as they count; none before it is enabled."""
-        return (self.schedule_step - self.head_starts_at) * self.images_per_step - self.uncounted
 
     def remove_head(self) -> None:
         """Do without head and features from now on. Parameters stay the same objects, as optimizers need them."""

@@ -11,6 +11,7 @@ import shutil
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ import tyro
 from bench_jobs import measured
 from csv_rows import read_rows
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.models.splatfacto import SplatfactoModel
 
 from harness import stored, today
 from harness.plan import Job
@@ -274,13 +276,46 @@ def test_packed_formats_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 def test_plots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    results, out = tmp_path / "results", tmp_path / "out"
+    shutil.copytree(RESULTS, results)
+    row = {"scene": "lion", "train_s": 80.0, "psnr": 31.5, "ssim": 0.93, "curve": [[2.0, 20.0, 0.6], [9.0, 25.0, 0.8]]}
+    rows = [json.dumps({**row, "arm": arm}) + "\n" for arm in ("sundae", "splatfacto")]
+    (results / "training_time.jsonl").write_text("".join(rows))
+    monkeypatch.setattr(stored, "RESULTS", results)
     plots = loaded(monkeypatch, "plot.py")
-    monkeypatch.setattr(sys, "argv", ["plot.py", "-o", str(tmp_path)])
+    monkeypatch.setattr(sys, "argv", ["plot.py", "-o", str(out)])
     plots["main"]()
-    assert {path.stem for path in tmp_path.iterdir()} == set(plots["PLOTS"])
+    assert {path.stem for path in out.iterdir()} == set(plots["PLOTS"])
+    (panel,) = plots["plot_time"]().axes
+    assert [line.get_label() for line in panel.lines[::2]] == ["sundae", "splatfacto"]
+    assert panel.lines[0].get_ydata().tolist() == [20.0, 25.0, 31.5]
 
 
 # ---------------------------------------------------------------------------------------------------------------- parts
+
+
+class Stock(torch.nn.Module):
+    """What a finished model of stock splatfacto offers, without its kernels: grey images."""
+
+    get_gt_img = SplatfactoModel.get_gt_img
+    composite_with_background = SplatfactoModel.composite_with_background
+    _downscale_if_required = SplatfactoModel._downscale_if_required
+    _get_downscale_factor = SplatfactoModel._get_downscale_factor
+    device = torch.device("cpu")
+
+    def get_outputs_for_camera(self, camera: Any) -> dict[str, torch.Tensor]:
+        return {"rgb": torch.full((16, 16, 3), 0.5), "background": torch.ones(16, 16, 3)}
+
+
+def test_a_training_of_stock_splatfacto_is_measured_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    grey, clear = torch.full((16, 16, 3), 0.6), torch.zeros(16, 16, 4)
+    views = [(torch.zeros(1), {"image": image}) for image in (grey, clear)]  # a clear image is its background
+    manager = SimpleNamespace(fixed_indices_eval_dataloader=views)
+    trainer = SimpleNamespace(pipeline=SimpleNamespace(model=Stock(), datamanager=manager))
+    decibels, similarity = loaded(monkeypatch, "bench_training.py")["quality"](trainer)
+    assert decibels == pytest.approx((20 - 20 * np.log10(0.5)) / 2, abs=1e-4)
+    assert 0.5 < similarity < 1
+    assert trainer.pipeline.model.training
 
 
 def test_parts_are_timed_beside_their_errors(

@@ -172,7 +172,6 @@ class CountTrials(Extension):
         """Hold views out, or take the usual share where trials cannot decide."""
         progress, state, views = self.progress, run.state, len(run.view_indices())
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
-        self._engine.resume(run)
         if progress.phase == "done" or state.pruning["num_prunes"] and progress.phase != "trials":
             progress.phase = "done"
         elif run.images_per_step > 1:
@@ -185,6 +184,7 @@ class CountTrials(Extension):
             self._take_usual(run, "the steps after the prune are too few to compare counts")
         elif progress.phase == "trials":
             self._engine.enable_head(state, len(progress.head) == 1)
+            self._engine.resume(run)
         else:
             progress.phase = "holding"
             self._engine.hold(run, self.name, self._views(run))

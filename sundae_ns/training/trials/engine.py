@@ -18,7 +18,7 @@ from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.gaussians.surgery import replace_parameter
 from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, weights_of
-from sundae_ns.training.extension import LateViews, TrainingRun
+from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, measure_heldout
 from sundae_ns.training.schedulers import notify_pruned, put_restarts, restarts
@@ -37,7 +37,7 @@ class Trial:
     num_features: int | None = None
     """Width of the features: 0 disables the head, another width begins with a fresh one. None changes nothing."""
     counts: bool = True
-    """Whether its steps count at once, or only when the trials have ended (:attr:`FieldState.uncounted`)."""
+    """Whether its field goes on in any case; that of others is :attr:`FieldState.provisional`."""
     began: int = 0
     """Step of the schedule at which it began; the engine sets it."""
 
@@ -57,27 +57,21 @@ class TrialEngine:
         self.taken_back = 0
         """Steps after which the field went back to before them."""
         self._held: dict[str, list[int]] = {}
-        self._since: dict[str, int] = {}
-        """Counted steps after which a policy began to hold views out."""
-        self._late = LateViews([])
         self._head_starts_at = head_starts_at
         self._mean = RunningMean()
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values and tensors for a checkpoint."""
         trial = None if self.trial is None else asdict(self.trial)
-        views = {"held": self._held, "since": self._since, "late": self._late._asdict()}
-        return {"trial": trial, "kept": self.kept, "taken_back": self.taken_back, **views, **self._mean.state_dict()}
+        return {"trial": trial, "kept": self.kept, "taken_back": self.taken_back, **self._mean.state_dict()}
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Take over a :meth:`state_dict`. Missing entries stand for no trial."""
         trial = saved.get("trial")
         self.trial = None if trial is None else Trial(**trial)
         self.kept, self.taken_back = dict(saved.get("kept", {})), int(saved.get("taken_back", 0))
-        self._held, self._since = dict(saved.get("held", {})), dict(saved.get("since", {}))
-        self._late = LateViews(**saved.get("late", {"indices": []}))
         self._mean = RunningMean.of(saved, state.device)
-        self._count_steps(state)
+        self._mark(state)
 
     def require(self, *names: str, trial: bool = True) -> None:
         """Check after loading that copies of the field are kept under these names, and that there is a trial.
@@ -91,7 +85,6 @@ class TrialEngine:
     def start(self, run: TrainingRun, trial: Trial) -> None:
         """Start a trial from the present field."""
         state = run.state
-        self._postpone(state)
         self.trial, self._mean = replace(trial, began=state.schedule_step), RunningMean()
         self.resume(run)
         if trial.num_features is not None:
@@ -100,45 +93,20 @@ class TrialEngine:
             _widen(state, trial.num_features)
             # Now: the extension that prunes acts before this one, so it would be a step later.
             notify_pruned(state.schedulers, state.step, run.source.total)
-        self._count_steps(state)
+        self._mark(state)
 
     def hold(self, run: TrainingRun, policy: str, views: Sequence[int]) -> None:
         """Hold out views for the trials to come of a policy, in place of those before; none ends it.
 
-        While a trial is trained, its own views are held out and no others. Views that are no longer held out catch up.
+        While a trial is trained, its own views are held out and no others.
         """
-        released, self._held[policy] = self._held.get(policy, []), list(views)
-        if views:
-            self._since.setdefault(policy, self._counted(run.state))
-        elif policy in self._since:
-            self._release(run, released, self._counted(run.state) - self._since.pop(policy))
+        self._held[policy] = list(views)
         self.resume(run)
 
     def resume(self, run: TrainingRun) -> None:
         """Hold out the views of the current trial, or else those of the trials to come."""
-        if self.trial is None:
-            run.hold_out(sorted(self._coming()), self._late)
-        else:
-            run.hold_out(self.trial.held_out)
-
-    def _coming(self) -> set[int]:
-        return {view for views in self._held.values() for view in views}
-
-    def _release(self, run: TrainingRun, views: Sequence[int], missed: int) -> None:
-        """Let views that have missed ``missed`` counted steps catch up until all have been seen equally often."""
-        coming, now = self._coming(), run.state.step + 1
-        left = max(self._late.until - now, 0)
-        late = sorted({*views, *(self._late.indices if left else ())} - coming)
-        others = len(run.view_indices()) - len(coming) - len(late)
-        if others > len(late):
-            left += round(2 * missed * len(late) / (others - len(late)))
-        self._late = LateViews(late, now + left)
-
-    def _postpone(self, state: FieldState) -> None:
-        """Make up for the steps of the present trial, in which no view catches up."""
-        if self.trial is not None:
-            trained = state.schedule_step - self.trial.began
-            self._late = self._late._replace(until=self._late.until + trained)
+        coming = {view for views in self._held.values() for view in views}
+        run.hold_out(sorted(coming) if self.trial is None else self.trial.held_out)
 
     def after_step(self, run: TrainingRun) -> bool:
         """Average the weights if it is due; returns whether the current trial has been trained."""
@@ -165,7 +133,7 @@ class TrialEngine:
     def keep(self, name: str, state: FieldState, *, head: bool) -> None:
         """Keep a copy of the field, and of the head if asked for, until the trials end."""
         self.kept[name] = {
-            "counted": self._counted(state),
+            "counted": state.schedule_step - self.taken_back,
             "taken_back": self.taken_back,
             "pruning": dict(state.pruning),
             "restarts": restarts(state.schedulers),
@@ -180,26 +148,20 @@ class TrialEngine:
         state.pruning.update({**kept["pruning"], **peak})
         self.taken_back = state.schedule_step - kept["counted"]
         put_restarts(state.schedulers, kept["restarts"], self.taken_back - kept["taken_back"])
-        self._count_steps(state)
 
     def end(self, run: TrainingRun, policy: str) -> None:
         """End the trials of a policy: forget the kept copies, and serve its views from the next step on."""
-        self._postpone(run.state)
         self.trial, self.kept, self._mean = None, {}, RunningMean()
         self.hold(run, policy, [])
-        self._count_steps(run.state)
+        self._mark(run.state)
 
     def enable_head(self, state: FieldState, enabled: bool) -> None:
         """Enable or disable the head."""
         # Not from this step on: a run that is resumed on several GPUs counts other steps.
         state.head_starts_at = self._head_starts_at if enabled else math.inf
 
-    def _counted(self, state: FieldState) -> int:
-        return state.schedule_step - self.taken_back
-
-    def _count_steps(self, state: FieldState) -> None:
-        pending = self.trial is not None and not self.trial.counts
-        state.uncounted = math.inf if pending else self.taken_back
+    def _mark(self, state: FieldState) -> None:
+        state.provisional = self.trial is not None and not self.trial.counts
 
 
 def _widen(state: FieldState, num_features: int) -> None:

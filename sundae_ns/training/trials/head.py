@@ -237,7 +237,6 @@ class HeadTrials(Extension):
         views, progress = len(run.view_indices()), self.progress
         # A warm start skips the steps of the warm-up.
         progress.steps = progress.steps or (run.schedule_length or 0) + run.state.offset
-        self._engine.resume(run)
         if progress.phase == "done":
             return
         if run.images_per_step > 1:  # also if one GPU has begun them: its copies are of the whole field
@@ -247,7 +246,9 @@ class HeadTrials(Extension):
             self._settle(run, "plain", f"{views} training views are too few to tell whether a head helps")
         elif progress.phase == "holding":
             self._engine.hold(run, self.name, self._planned(run).views)
-        elif progress.phase == "before" and run.last_step is not None and not self._fits(run):
+        elif progress.phase == "trials":
+            self._engine.resume(run)
+        elif run.last_step is not None and not self._fits(run):
             warn(f"training ends before the head can be tried, {_DISABLED}")
 
     def after_step(self, run: TrainingRun) -> None:

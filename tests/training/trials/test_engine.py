@@ -14,7 +14,6 @@ from torch.optim import SGD, Adam
 from torch.optim.lr_scheduler import LambdaLR
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.training.extension import LateViews
 from sundae_ns.training.heldout import HeldOutQuality
 from sundae_ns.training.schedulers import Decay
 from sundae_ns.training.trials import engine
@@ -29,14 +28,10 @@ class FakeRun:
     def __init__(self, state: Any) -> None:
         self.state = state
         self.held_out: list[int] = []
-        self.late: LateViews | None = None
         self.source = SimpleNamespace(total=20)
 
-    def hold_out(self, indices: Any, late: LateViews | None = None) -> None:
-        self.held_out, self.late = list(indices), late
-
-    def view_indices(self) -> list[int]:
-        return list(range(10))
+    def hold_out(self, indices: Any) -> None:
+        self.held_out = list(indices)
 
     def train(self, trials: TrialEngine, most: int = 100) -> int:
         """Train to the end of the trial, or ``most`` steps; returns their number."""
@@ -81,13 +76,13 @@ def test_trials_of_several_lengths_go_back_to_any_kept_field(run: FakeRun) -> No
     trials.start(run, Trial(3, held_out=[4]))  # type: ignore[arg-type]
     assert (run.train(trials), run.held_out, height(run)) == (3, [4], 8.0)
     trials.go_back("second", state)
-    assert (height(run), state.uncounted, age()) == (5.0, 3, 5)
+    assert (height(run), trials.taken_back, age()) == (5.0, 3, 5)
     trials.start(run, Trial(4))  # type: ignore[arg-type]
     run.train(trials, most=2)
     trials.go_back("first", state)
-    assert (height(run), state.uncounted, age()) == (0.0, 3 + 2 + 5, 0)
+    assert (height(run), trials.taken_back, age()) == (0.0, 3 + 2 + 5, 0)
     trials.go_back("second", state)  # its five steps count again
-    assert (height(run), state.uncounted, age()) == (5.0, 5, 5)
+    assert (height(run), trials.taken_back, age()) == (5.0, 5, 5)
     trials.end(run, "count")  # type: ignore[arg-type]
     assert (run.held_out, trials.trial, trials.kept) == ([], None, {})
 
@@ -110,14 +105,14 @@ def test_the_mean_of_the_last_weights_is_measured(
     assert (seen, height(run)) == ([shown], own)
 
 
-def test_steps_that_do_not_count_yet_count_when_the_trials_end(run: FakeRun) -> None:
+def test_a_field_is_provisional_until_the_trials_end(run: FakeRun) -> None:
     state, trials = run.state, TrialEngine(head_starts_at=2)
     trials.start(run, Trial(5, num_features=5, counts=False))  # type: ignore[arg-type]
     run.train(trials)
     assert state.head_enabled
-    assert state.head_images == -math.inf
+    assert state.provisional
     trials.end(run, "count")  # type: ignore[arg-type]
-    assert state.head_images == 3
+    assert not state.provisional
 
 
 def test_another_width_begins_with_a_fresh_head_and_a_kept_one_comes_back(run: FakeRun) -> None:
@@ -139,10 +134,10 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun) -> None:
     trials.start(run, Trial(6, held_out=[1, 3], averaged=5, counts=False))  # type: ignore[arg-type]
     run.train(trials, most=4)
     saved = copy.deepcopy(trials.state_dict())
-    state.uncounted = 0
+    state.provisional = False
     other.load_state_dict(state, saved)
     other.require("first")
-    assert state.uncounted == math.inf
+    assert state.provisional
     run.held_out = []
     other.resume(run)  # type: ignore[arg-type]
     assert run.held_out == [1, 3]
@@ -151,43 +146,6 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun) -> None:
     assert height(run) == 4.0  # of the steps 2 to 6
     other.go_back("first", state)
     assert (height(run), other.taken_back) == (0.0, 6)
-
-
-def test_views_that_were_held_out_catch_up(run: FakeRun) -> None:
-    """Of ten views two are held out for 40 steps, in which the others are seen five times. In 27 steps, half of which
-    are theirs, both sorts come to seven."""
-    trials, state = TrialEngine(), run.state
-    trials.hold(run, "count", [3, 6])  # type: ignore[arg-type]
-    state.step = 40
-    assert (run.held_out, run.late) == ([3, 6], LateViews([], 0))
-    trials.hold(run, "count", [])  # type: ignore[arg-type]
-    assert (run.held_out, run.late) == ([], LateViews([3, 6], 40 + 1 + 27))
-    trials.hold(run, "count", [])  # type: ignore[arg-type]
-    assert run.late == LateViews([3, 6], 68)
-
-
-def test_a_trial_postpones_the_catching_up_and_adds_to_it(run: FakeRun) -> None:
-    trials, state = TrialEngine(), run.state
-    trials.hold(run, "count", [3, 6])  # type: ignore[arg-type]
-    trials.hold(run, "trials", [6])  # type: ignore[arg-type]
-    state.step = 40
-    trials.keep("first", state, head=False)
-    trials.start(run, Trial(9, held_out=[3, 6]))  # type: ignore[arg-type]
-    assert (run.held_out, run.late) == ([3, 6], None)
-    run.train(trials)
-    trials.go_back("first", state)
-    trials.end(run, "count")  # type: ignore[arg-type]
-    # Nine of the 49 steps do not count; the other policy still holds one view.
-    assert (run.held_out, run.late) == ([6], LateViews([3], 49 + 1 + round(2 * 40 / (8 - 1))))
-    other = TrialEngine()
-    other.load_state_dict(state, copy.deepcopy(trials.state_dict()))
-    for one in (trials, other):
-        state.step = 54
-        one.start(run, Trial(3, held_out=[6]))  # type: ignore[arg-type]
-        run.train(one)
-        one.end(run, "trials")  # type: ignore[arg-type]
-        # 6 of its 11 steps were left before the trial; the second view has missed 48.
-        assert (run.held_out, run.late) == ([], LateViews([3, 6], 57 + 1 + 6 + round(2 * 48 * 2 / (8 - 2))))
 
 
 @pytest.mark.parametrize("saved", [{}, {"kept": {"first": {}}}, {"trial": {"length": 3}}])
