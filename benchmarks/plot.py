@@ -7,7 +7,7 @@ python benchmarks/plot.py curve      # one of them
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import matplotlib.pyplot as plt
 from matplotlib.ticker import NullFormatter
 
 from harness.stored import MB, lines_of
+from harness.today import is_of_today
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 MARKERS = {"bonsai": "o", "fox": "s"}
@@ -35,6 +36,16 @@ KEPT_RULES = {
 """Rules of the plot, by the names that readers see."""
 
 
+def fixed_shares(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of a capture at fixed shares, the smallest first: today's, or else those that pruned at 15,000 steps."""
+    found: dict[float, dict[str, Any]] = {}
+    for row in (row for row in rows if row["chosen"] == "no" and row["method"] == "sundae"):
+        of_today = is_of_today({"variant": "sundae", "keep_ratio": row["share"], **row})
+        if of_today or row["prune_at"] == "15000" and float(row["share"]) not in found:
+            found[float(row["share"])] = row
+    return [found[share] for share in sorted(found)]
+
+
 def plot_curve() -> Any:
     """PSNR and SSIM of packed scenes against their size: fixed shares as a line, what the default has chosen, and its
     fine-tuned pack."""
@@ -47,8 +58,7 @@ def plot_curve() -> Any:
     )
     for column, capture in zip(panels.T, captures, strict=True):
         own = [row for row in rows if row["capture"] == capture]
-        fixed = [row for row in own if row["chosen"] == "no" and row["prune_at"] == "15000"]
-        fixed.sort(key=lambda row: float(row["share"]))
+        fixed = fixed_shares(own)
         for panel, metric in zip(column, ("psnr", "ssim"), strict=True):
             sizes = [int(row["packed_bytes"]) / MB for row in fixed]
             values = [float(row[f"packed_{metric}"]) for row in fixed]

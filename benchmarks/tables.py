@@ -98,27 +98,6 @@ def quality() -> list[str]:
     return table(heads, first_of_each(rows))
 
 
-def shares() -> list[str]:
-    """PSNR of each method at the shares of the primitives that it keeps, with MB."""
-    rows = [row for row in runs() if 0 < (row["keep_ratio"] or 0) < 1 and row["variant"] != "sundae-auto"]
-    columns = sorted({row["keep_ratio"] for row in rows if row["variant"] == "sundae"})
-    cells = {(row["scene"], row["variant"], row["keep_ratio"]): row for row in rows}
-
-    def cell(scene: str, variant: str, share: float) -> str:
-        row = cells.get((scene, variant, share))
-        return (
-            ""
-            if row is None
-            else named(f"{row['psnr_cell']} ({number(row['bytes_total'] / MB, 1)} MB)", row["of_today"])
-        )
-
-    made = [
-        [scene, METHODS[variant], *(cell(scene, variant, share) for share in columns)]
-        for scene, variant in dict.fromkeys((row["scene"], row["variant"]) for row in rows)
-    ]
-    return table(["capture", "method", *(f"{share:.0%}, dB" for share in columns)], first_of_each(made))
-
-
 def cells_of(row: dict[str, Any]) -> list[str]:
     """Capture, method, number of primitives, metrics and size of a row of runs.csv."""
     return [
@@ -144,19 +123,6 @@ def speed() -> list[str]:
         for line in lines_of("frames.jsonl")
     ]
     return table(heads, first_of_each(rows))
-
-
-def flicker() -> list[str]:
-    """Squared errors of warped frames without the least of head and base colours, and their quotients."""
-    apart = (1, 7)
-    rows: dict[str, dict[int, list[str]]] = {}
-    for line in lines_of("flicker.jsonl"):
-        cells = rows.setdefault(named(line["config"], is_of_today(line)), {})
-        cells[line["frames_apart"]] = [
-            *(number(1e6 * line["excess"], 1), number(1e6 * line["excess_base"], 1), number(line["ratio"], 1))
-        ]
-    heads = [f"{name}, {frames} apart" for frames in apart for name in ("head", "base", "head / base")]
-    return table(["field", *heads], [[name, *(c for at in apart for c in cells[at])] for name, cells in rows.items()])
 
 
 def training_time() -> list[str]:
@@ -283,27 +249,6 @@ def multi_gpu() -> list[str]:
     return table(heads, first_of_each(rows))
 
 
-def rules() -> list[str]:
-    """Rules of pruning on two captures at three shares, 15,000 steps after the prune, without a head."""
-    lines = lines_of("rules.csv")
-    columns = list(dict.fromkeys((line["scene"], float(line["keep"])) for line in lines))
-    cells = {(line["rule"], line["scene"], float(line["keep"])): line for line in lines}
-
-    def cell(rule: str, column: tuple[str, float]) -> str:
-        line = cells.get((rule, *column))
-        if line is None:
-            return "-"
-        spread = f" ± {float(line['psnr_range']) / 2:.2f}" if int(line["seeds"]) > 1 else ""
-        return f"{float(line['psnr']):.2f}{spread}"
-
-    def total(rule: str) -> float:
-        return -sum(float(cells[(rule, *column)]["psnr"]) for column in columns if (rule, *column) in cells)
-
-    heads = ["rule", *(f"{name}, {keep:.0%}" for name, keep in columns)]
-    names = sorted({line["rule"] for line in lines}, key=total)
-    return table(heads, [[name, *(cell(name, column) for column in columns)] for name in names], words=1)
-
-
 def trials() -> list[str]:
     """What held-out training views say of the head and of more features, and the finished run on test views."""
     heads = ["capture", "training views", "held out", "head: dB", "SSIM", "29 features: dB", "SSIM", "chosen"]
@@ -354,15 +299,12 @@ def prune() -> list[str]:
 
 TABLES: dict[str, Callable[[], list[str]]] = {
     "quality": quality,
-    "shares": shares,
     "speed": speed,
-    "flicker": flicker,
     "training-time": training_time,
     "packing": packing,
     "formats": formats,
     "packed-headline": packed_headline,
     "multi-gpu": multi_gpu,
-    "rules": rules,
     "prune": prune,
     "trials": trials,
 }

@@ -19,28 +19,40 @@ from sundae_ns.storage.packing import FINETUNE_STEPS
 
 CURVE = {"sundae": "sundae", "sundae-auto": "sundae", "sundae-no-head": "sundae-no-head"}
 """Arms of curve.csv by the method in its rows."""
+CHOSEN = "sundae-auto"
+"""The arm whose share is chosen by trials, and differs from run to run."""
 
 
 def take_over(results: Path) -> None:
     """Replace rows of runs.csv, curve.csv, frames, training times and packs by those of ``suite.py``.
 
-    Other rows stay, but for earlier defaults at other seeds of what was measured.
+    Other rows stay, but for earlier defaults at other seeds of what was measured. What curve.csv holds, packs and fixed
+    shares, is in no other file.
 
     Args:
         results: ``results.jsonl`` of the suite.
     """
     found = [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]
-    measured = [_rounded({**result["measured"], "command": _public(result["measured"]["command"])}) for result in found]
+    measured = [
+        _rounded({**result["measured"], "command": _public(result["measured"]["command"])})
+        for result in found
+        if not _on_curve(result) or (result["job"]["keep_ratio"] or SHARE) == SHARE
+    ]
     rows = list(csv.DictReader(csv_text(measured).splitlines()))
-    kept = merged(lines_of("runs.csv"), rows, ("scene", "variant", "keep_ratio", "seed"))
-    _write("runs.csv", COLUMNS, kept)
+
+    def placed(row: dict[str, Any]) -> dict[str, Any]:
+        return {**row, "place": "chosen" if row["variant"] == CHOSEN else row["keep_ratio"]}
+
+    old, new = (list(map(placed, lines)) for lines in (lines_of("runs.csv"), rows))
+    _write("runs.csv", COLUMNS, merged(old, new, ("scene", "variant", "place", "seed")))
     _write("curve.csv", list(lines_of("curve.csv")[0]), _curve(lines_of("curve.csv"), list(map(_rounded, found))))
     seed = found[0]["job"]["seed"]
     own = [r for r in map(_rounded, found) if r["job"]["seed"] == seed and (r["job"]["keep_ratio"] or SHARE) == SHARE]
+    packs = [line for r in own if not _on_curve(r) for line in _pack_lines(r)]
     for name, lines, places in (
         ("frames.jsonl", [_frame_line(r) for r in own if r["measured"]["ms_head"] is not None], ("config",)),
         ("training_time.jsonl", [_training_line(r) for r in own if _is_timed(r)], ("scene", "arm")),
-        ("pack.jsonl", [line for r in own for line in _pack_lines(r)], ("run", "variant", "finetune_steps")),
+        ("pack.jsonl", packs, ("run", "variant", "finetune_steps")),
     ):
         kept = merged(lines_of(name), lines, places)
         (stored.RESULTS / name).write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
@@ -68,25 +80,28 @@ def merged(old: Iterable[dict[str, Any]], new: Sequence[dict[str, Any]], places:
 
 def _write(name: str, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
     with (stored.RESULTS / name).open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer = csv.DictWriter(file, columns, lineterminator="\n", extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
 
 
 def _curve(old: list[dict[str, Any]], found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows of curve.csv with those of packed results, capture by capture: what the default chose, and fixed shares."""
-    new = [_curve_line(result) for result in found if result["packed"] and result["job"]["arm"] in CURVE]
+    new = [_curve_line(result) for result in found if _on_curve(result)]
 
     def placed(row: dict[str, Any]) -> dict[str, Any]:
-        # What trials keep differs from seed to seed.
         if row["chosen"] == "yes":
-            return {"variant": "sundae-auto", "place": "chosen", **row}
+            return {"variant": CHOSEN, "place": "chosen", **row}
         return {"place": tuple(row[name] for name in ("method", "prune_at", "share")), **row}
 
     rows = merged(map(placed, old), list(map(placed, new)), ("capture", "place", "seed"))
     captures = list(dict.fromkeys(row["capture"] for row in [*old, *new]))
     rows.sort(key=lambda row: (captures.index(row["capture"]), row["chosen"] == "no"))
     return [{name: value for name, value in row.items() if name not in ("variant", "place")} for row in rows]
+
+
+def _on_curve(result: dict[str, Any]) -> bool:
+    return bool(result["packed"]) and result["job"]["arm"] in CURVE
 
 
 def _curve_line(result: dict[str, Any]) -> dict[str, Any]:
@@ -100,7 +115,7 @@ def _curve_line(result: dict[str, Any]) -> dict[str, Any]:
         **{"packed_psnr": packed["psnr"], "packed_ssim": packed["ssim"]},
         **{f"tuned_{name}": tuned.get(name, "") for name in ("bytes", "psnr", "ssim")},
         **{"head": "yes" if run["bytes_head"] else "no", "seed": str(run["seed"])},
-        **{"chosen": "yes" if job["arm"] == "sundae-auto" else "no", "seconds": run["train_s"] or ""},
+        **{"chosen": "yes" if job["arm"] == CHOSEN else "no", "seconds": run["train_s"] or ""},
     }
     return {**row, "fingerprint": run["fingerprint"]}
 
