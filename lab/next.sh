@@ -23,7 +23,7 @@ default() { c=$1 o=$2; for s in ${*:3}; do job 0$o-$s-$c "python3 $Q /tmp/scenes
 curves() { c=$1 o=$2; shift 2; job 00-alone-$o-$c-curves "python3 $R/lab/stock_curve.py /tmp/scenes/$c --arms $* --curve 1000 2000 3000 4500 6000 8000 10000 12000 15000 18000 21000 25000 30000 -o $O/time-$c.jsonl"; }
 row() { job $1-$2-$3 "python3 $Q /tmp/scenes/$2 -o /tmp/others/$2-$3 --arms ${*:4} --seeds 42"; }
 others() { row 05 $1 tenth sundae sundae-no-head --keep-ratios 0.1; row 06 $1 fast sundae-fast --keep-ratios 0.1; row 06 $1 mcmc mcmc --keep-ratios 0.1
-  AFTER="$1-tenth" job 07-$1-shares "python3 $Q /tmp/scenes/$1 -o /tmp/others/$1-tenth --arms sundae --seeds 42 --keep-ratios 0.2 0.05 0.4"; }
+  AFTER="$1-tenth" job 07-$1-shares "python3 $Q /tmp/scenes/$1 -o /tmp/others/$1-tenth --arms sundae --seeds 42 --keep-ratios 0.2 0.05 0.4 1"; }
 gpu_tests() { job 025-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests)"; }
 vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; splat-transform --list-gpus; }
 # ways CAPTURE: what trials cost a capture that keeps all: no trials, with 30,000 steps and with as many as trials leave
