@@ -24,18 +24,15 @@ curves() { c=$1 o=$2; shift 2; job 00-alone-$o-$c-curves "python3 $R/lab/stock_c
 row() { job $1-$2-$3 "python3 $Q /tmp/scenes/$2 -o /tmp/others/$2-$3 --arms ${*:4} --seeds 42"; }
 others() { row 05 $1 tenth sundae sundae-no-head --keep-ratios 0.1; row 06 $1 fast sundae-fast --keep-ratios 0.1; row 06 $1 mcmc mcmc --keep-ratios 0.1
   AFTER="$1-mcmc" job 061-$1-pack "python3 $R/lab/pack_loss.py \$(dirname \$(find /tmp/others/$1-mcmc -name config.yml | head -1))"
-  AFTER="$1-tenth" job 07-$1-shares "python3 $Q /tmp/scenes/$1 -o /tmp/others/$1-tenth --arms sundae --seeds 42 --keep-ratios 0.2 0.05 0.4"; }
+  AFTER="$1-tenth" job 07-$1-shares "python3 $Q /tmp/scenes/$1 -o /tmp/others/$1-tenth --arms sundae --seeds 42 --keep-ratios 0.2 0.05 0.4 1"; }
 gpu_tests() { job 025-pytest "cd /tmp/repo; PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o 'addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload' \$(grep -rlE --include='*.py' 'mark.gpu|pytestmark.*gpu' tests)"; }
 vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; splat-transform --list-gpus; }
 # ways CAPTURE: what trials cost a capture that keeps all: no trials, with 30,000 steps and with as many as trials leave
 ways() { for n in 30000 26400; do job 035-$1-$n "python3 $R/benchmarks/bench_training.py /tmp/scenes/$1 --arms sundae --steps $n --option=--pipeline.model.pruning.keep-ratio --option=1.0 --option=--pipeline.model.head.mode --option=off -o $O/ways-$1-$n.jsonl"; done; }
-# few CAPTURE: 16 views at full size, whole and with primitives left out; .gpu/few has the sparse models and names
-few() { mkdir -p /tmp/few/$1/images; cp -r "$ROOT"/.gpu/few/$1/sparse /tmp/few/$1/; for i in $(cat "$ROOT"/.gpu/few/$1/images.txt); do cp /tmp/scenes/$1/images/${i#*_} /tmp/few/$1/images/$i; done
-  for w in 0 0.1; do D=/tmp/few-out/$w; job 065-$1-few-$w "python3 $R/lab/dropping.py $w -- sundae --data /tmp/few/$1 --output-dir $D --experiment-name $1 --timestamp run --vis tensorboard --record-steps False colmap --colmap-path sparse/0 --eval-mode filename --downscale-factor 1; ns-eval --load-config $D/$1/sundae/run/config.yml --output-path $O/few-$1-$w.json"; done; }
 case $1 in
 # One lease, nvidia-h100-x4, GPUS=4 SLOTS=4 RESERVED="0 1 2": curves alone on three GPUs, all else on the fourth and after them
 1) setup; take 3; GPU=0; curves fox a sundae sundae-fast splatfacto; GPU=1; curves stone_horse a sundae sundae-fast splatfacto; GPU=; others fox; others stone_horse; queue ;;
-2) take 1 4; GPU=2; curves bonsai a sundae sundae-fast splatfacto; curves south_building b splatfacto; GPU=; default bonsai 3 44; ways south_building; others bonsai; others south_building; few bonsai; few south_building ;;
-3) take 2; default garden 3 44; others garden; others dinosaur; vulkan; for c in fox stone_horse south_building; do formats $c; done; few garden; few stone_horse ;;
+2) take 1 4; GPU=2; curves bonsai a sundae sundae-fast splatfacto; curves south_building b splatfacto; GPU=; default bonsai 3 44; ways south_building; others bonsai; others south_building; ;;
+3) take 2; default garden 3 44; others garden; others dinosaur; vulkan; for c in fox stone_horse south_building; do formats $c; done ;;
 9) [ -f /tmp/logs/queue.log ] || { echo "no queue: another machine; give it back"; exit 3; }; SECONDS=0; wait_for_all "${2:-400}"; cat $O/formats-*.csv | cut -c1-150 ;;
 esac
