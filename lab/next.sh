@@ -2,7 +2,7 @@
 # bash lab/next.sh PART [LIMIT] on one GPU or more (GPUS); lab/README.md says what lies in .gpu.
 set -u
 export PYTHONPATH=/opt/site PATH=/tmp/node:/opt/site/bin:$PATH OMP_NUM_THREADS=4 NUMBA_NUM_THREADS=4 SLOTS=${SLOTS:-4} GPUS=${GPUS:-4} ROOT=$PWD
-R=/tmp/repo; J=/tmp/jobs; O=/tmp/out; Q=$R/benchmarks/quality.py; P=$R/benchmarks/prune_without_photos.py; F=$R/benchmarks/bench_formats.py
+R=/tmp/repo; J=/tmp/jobs; O=/tmp/out; Q=$R/benchmarks/quality.py; F=$R/benchmarks/bench_formats.py
 job() { { [ -z "${AFTER:-}" ] || printf "# after %s\n" $AFTER; [ -z "${GPU:-}" ] || echo "# gpu $GPU"; echo "$2"; } > $J/$1.sh.new; mv $J/$1.sh.new $J/$1.sh; }
 # formats CAPTURE: packs of the stock run that curves has left, splatfacto's .sog by splat-transform too where Vulkan is
 formats() { AFTER="$1-curves" job 01-$1-formats "until [ -d /tmp/node ]; do sleep 2; done; python3 $F \$(dirname \$(find /tmp/stock/$1 -name config.yml | head -1)) -o $O/formats-$1.csv"; }
@@ -13,7 +13,7 @@ setup() { bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; py
 queue() { cd /tmp || exit; setsid nohup python3 $R/lab/slots.py > /tmp/logs/q.out 2>&1 & sleep 1; }
 # Brings home what is done, also of jobs that have not ended
 gather() { for f in /tmp/default/*/done/*.json; do cp $f $O/default/; done; for f in /tmp/others/*/done/*.json; do cp $f $O/others/; done
-  for d in /tmp/default/*; do for f in $(find $d/jobs -name curve.json); do cp $f $O/curves/$(basename $d).json; done; done; cp $(find /tmp/default/bonsai-42 -name 'tuned.sundae') $O/bonsai.sundae; }
+  for d in /tmp/default/*; do for f in $(find $d/jobs -name curve.json); do cp $f $O/curves/$(basename $d).json; done; done; }
 wait_for_all() { touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$1" ]; do sleep 1; done
   mkdir -p $O/default $O/others $O/curves; gather 2> /dev/null; tar -czf "$OUT/out.tgz" -C /tmp out logs; tail -n 60 /tmp/logs/queue.log; nvidia-smi --query-gpu=name --format=csv,noheader | sort | uniq -c; }
 node() { mkdir -p /tmp/node.part; tar -xJf "$ROOT"/.gpu/node/nodepack.tar.xz -C /tmp/node.part; mv /tmp/node.part /tmp/node; }
@@ -31,8 +31,8 @@ vulkan() { for f in "$ROOT"/.gl/*.deb; do dpkg -x $f /; done; ldconfig; node; sp
 ways() { for n in 30000 26400; do job 035-$1-$n "python3 $R/benchmarks/bench_training.py /tmp/scenes/$1 --arms sundae --steps $n --option=--pipeline.model.pruning.keep-ratio --option=1.0 --option=--pipeline.model.head.mode --option=off -o $O/ways-$1-$n.jsonl"; done; }
 case $1 in
 # One lease, nvidia-h100-x4, GPUS=4 SLOTS=4 RESERVED="0 1 2": curves alone on three GPUs, all else on the fourth and after them
-1) setup; take 3; GPU=0; curves fox a sundae sundae-fast splatfacto; GPU=1; curves stone_horse a sundae sundae-fast splatfacto; GPU=; others fox; others stone_horse; queue ;;
-2) take 1 4; GPU=2; curves bonsai a sundae sundae-fast splatfacto; curves south_building b splatfacto; GPU=; default bonsai 3 44; ways south_building; others bonsai; others south_building; ;;
+1) setup; take 3; GPU=0; curves fox a sundae sundae-fast splatfacto; GPU=1; curves stone_horse a sundae sundae-fast splatfacto; GPU=; others fox; others stone_horse; gpu_tests; queue ;;
+2) take 1 4; GPU=2; curves bonsai a sundae sundae-fast splatfacto; curves south_building b splatfacto; GPU=; default bonsai 3 44; ways south_building; others bonsai; others south_building ;;
 3) take 2; default garden 3 44; others garden; others dinosaur; vulkan; for c in fox stone_horse south_building; do formats $c; done ;;
 9) [ -f /tmp/logs/queue.log ] || { echo "no queue: another machine; give it back"; exit 3; }; SECONDS=0; wait_for_all "${2:-400}"; cat $O/formats-*.csv | cut -c1-150 ;;
 esac

@@ -32,9 +32,9 @@ def take_over(results: Path) -> None:
     Args:
         results: ``results.jsonl`` of the suite.
     """
-    found = [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]
+    found = [_rounded(json.loads(line)) for line in results.read_text(encoding="utf-8").splitlines()]
     measured = [
-        _rounded({**result["measured"], "command": _public(result["measured"]["command"])})
+        {**result["measured"], "command": _public(result["measured"]["command"])}
         for result in found
         if not _on_curve(result) or (result["job"]["keep_ratio"] or SHARE) == SHARE
     ]
@@ -44,10 +44,10 @@ def take_over(results: Path) -> None:
         return {**row, "place": "chosen" if row["variant"] == CHOSEN else row["keep_ratio"]}
 
     old, new = (list(map(placed, lines)) for lines in (lines_of("runs.csv"), rows))
-    _write("runs.csv", COLUMNS, merged(old, new, ("scene", "variant", "place", "seed")))
-    _write("curve.csv", list(lines_of("curve.csv")[0]), _curve(lines_of("curve.csv"), list(map(_rounded, found))))
+    _write("runs.csv", COLUMNS, _without(merged(old, new, ("scene", "variant", "place", "seed")), "place"))
+    _write("curve.csv", list(lines_of("curve.csv")[0]), _curve(lines_of("curve.csv"), found))
     seed = found[0]["job"]["seed"]
-    own = [r for r in map(_rounded, found) if r["job"]["seed"] == seed and (r["job"]["keep_ratio"] or SHARE) == SHARE]
+    own = [r for r in found if r["job"]["seed"] == seed and (r["job"]["keep_ratio"] or SHARE) == SHARE]
     packs = [line for r in own if not _on_curve(r) for line in _pack_lines(r)]
     for name, lines, places in (
         ("frames.jsonl", [_frame_line(r) for r in own if r["measured"]["ms_head"] is not None], ("config",)),
@@ -80,7 +80,7 @@ def merged(old: Iterable[dict[str, Any]], new: Sequence[dict[str, Any]], places:
 
 def _write(name: str, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
     with (stored.RESULTS / name).open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n", extrasaction="ignore")
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
@@ -97,7 +97,11 @@ def _curve(old: list[dict[str, Any]], found: Iterable[dict[str, Any]]) -> list[d
     rows = merged(map(placed, old), list(map(placed, new)), ("capture", "place", "seed"))
     captures = list(dict.fromkeys(row["capture"] for row in [*old, *new]))
     rows.sort(key=lambda row: (captures.index(row["capture"]), row["chosen"] == "no"))
-    return [{name: value for name, value in row.items() if name not in ("variant", "place")} for row in rows]
+    return _without(rows, "variant", "place")
+
+
+def _without(rows: Iterable[dict[str, Any]], *names: str) -> list[dict[str, Any]]:
+    return [{name: value for name, value in row.items() if name not in names} for row in rows]
 
 
 def _on_curve(result: dict[str, Any]) -> bool:

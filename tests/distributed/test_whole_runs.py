@@ -137,6 +137,7 @@ def check_training(shards: Shards, folder: Path) -> None:
     assert team.shards.numbers(model.num_points) == [[count] for count in team.shards.counts]
     assert model.source.total == sum(team.shards.counts)
     assert max(team.shards.counts) <= DRIFT * model.source.total / RANKS
+    assert trainer.pipeline.datamanager.place[1] == RANKS
     group = trainer.optimizers.optimizers["opacities"].param_groups[0]
     assert group["lr"] == pytest.approx(0.05 * RANKS**0.5)
     assert group["betas"] == pytest.approx((0.9**RANKS, 0.999**RANKS))

@@ -83,6 +83,12 @@ def record_of(trainer: Trainer) -> dict[str, Any]:
     return dict(json.loads((trainer.base_dir / "curve.json").read_text()))
 
 
+def head_steps(model: Any) -> float:
+    """Steps in which the head was trained, without those that were taken back."""
+    (engine,) = (saved["engine"] for one in model.extensions if "engine" in (saved := one.state_dict()))
+    return float(model.state.schedule_step - model.state.head_starts_at - engine["taken_back"])
+
+
 def watch(trainer: Trainer) -> tuple[list[int], dict[str, torch.Tensor]]:
     """Collects the views that are served by step, and the field before the trials and before the prune."""
     manager, served, fields = trainer.pipeline.datamanager, [], {}
@@ -162,6 +168,7 @@ def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make: Make, judge: Any, 
     assert all(torch.equal(fresh[name], found[name]) for name in fresh)
     if decision == "head":
         assert any(not torch.equal(fresh[name], value) for name, value in model.state.head.state_dict().items())
+        assert head_steps(model) == STEPS - 1 - record["step"]
         assert not model.state.provisional
 
 
@@ -204,7 +211,7 @@ def test_a_resumed_run_takes_the_same_decision_bit_for_bit(
         assert record_of(whole)["step"] == DECIDED + 2 * HEAD_TRIAL
 
 
-def test_a_head_in_any_case_rests_during_the_trials(make: Make, judge: Any) -> None:
+def test_a_head_in_any_case_rests_during_the_trials_and_counts_its_own_steps(make: Make, judge: Any) -> None:
     judge(LEVEL)
     trainer = make(head="residual")
     enabled: dict[int, bool] = {}
@@ -220,6 +227,7 @@ def test_a_head_in_any_case_rests_during_the_trials(make: Make, judge: Any) -> N
     decided = record_of(trainer)["step"]
     assert not any(enabled[step] for step in range(decided))
     assert all(enabled[step] for step in range(decided + 1, STEPS))
+    assert head_steps(model) == STEPS - 1 - decided
     assert not model.state.provisional
 
 

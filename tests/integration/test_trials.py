@@ -72,10 +72,15 @@ def _record(trainer: Trainer) -> dict[str, Any]:
     return dict(json.loads((trainer.base_dir / "trials.json").read_text()))
 
 
+def _trials(model: Any) -> Any:
+    """The extension that decides about the head."""
+    (trials,) = (extension for extension in model.extensions if extension.name == "trials")
+    return trials
+
+
 def _taken_back(model: Any) -> int:
     """Steps of trials whose field was dropped."""
-    (trials,) = (extension for extension in model.extensions if extension.name == "trials")
-    return int(trials.state_dict()["engine"]["taken_back"])
+    return int(_trials(model).state_dict()["engine"]["taken_back"])
 
 
 def _served(trainer: Trainer) -> list[int]:
@@ -146,7 +151,7 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     judge(head=(head, 0.01), features=(features, 0.02))
     trainer = make()
     model: Any = trainer.pipeline.model
-    (trial,) = (extension for extension in model.extensions if extension.name == "trials")
+    trial = _trials(model)
     seen: dict[int, tuple[torch.Tensor, float]] = {}
     head_rates: dict[int, list[float]] = {}
     real = trial.after_step
@@ -193,7 +198,7 @@ def test_the_verdict_is_on_the_mean_of_the_weights(make: Make, judge: Any, monke
     judge(head=(0.5, 0.01))
     trainer = make()
     model: Any = trainer.pipeline.model
-    (trial,) = (extension for extension in model.extensions if extension.name == "trials")
+    trial = _trials(model)
     own: dict[int, torch.Tensor] = {}
     after: dict[int, torch.Tensor] = {}
     judged: dict[int, torch.Tensor] = {}
@@ -332,7 +337,7 @@ def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, tria
     whole.train()
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=3)
     model: Any = resumed.pipeline.model
-    (trials_of_run,) = (extension for extension in model.extensions if extension.name == "trials")
+    trials_of_run = _trials(model)
     assert "start" in trials_of_run.state_dict()["engine"]["kept"]
     resumed.pipeline.datamanager.place = (0, 2)
     attributes = TrainingCallbackAttributes(resumed.optimizers, resumed.grad_scaler, resumed.pipeline, resumed)

@@ -113,6 +113,7 @@ def test_a_field_is_provisional_until_the_trials_end(run: FakeRun) -> None:
     assert state.provisional
     trials.end(run, "count")  # type: ignore[arg-type]
     assert not state.provisional
+    assert state.schedule_step - state.head_starts_at - trials.taken_back == 3
 
 
 def test_another_width_begins_with_a_fresh_head_and_a_kept_one_comes_back(run: FakeRun) -> None:
