@@ -1,4 +1,4 @@
-"""bench_training.py, whose run of splatfacto stays under /tmp/stock/CAPTURE, for bench_formats.py."""
+"""bench_training.py, whose runs stay under /tmp/stock/CAPTURE or /tmp/ours/CAPTURE-ARM, for bench_formats.py and frames."""
 import sys
 from pathlib import Path
 
@@ -9,17 +9,16 @@ trainer_of, timed, kept = bench.trainer_of, bench.timed, []
 
 
 def opened(options, arm, out):
-    trainer = trainer_of(options, arm, f"/tmp/stock/{options.capture.name}" if arm == "splatfacto" else out)
-    if arm == "splatfacto":
-        trainer.config.save_config()
+    name = options.capture.name
+    trainer = trainer_of(options, arm, f"/tmp/stock/{name}" if arm == "splatfacto" else f"/tmp/ours/{name}-{arm}")
+    trainer.config.save_config()
     kept.append(trainer)
     return trainer
 
 
 def saved(options, arm, out):
     row = timed(options, arm, out)
-    if arm == "splatfacto":
-        type(kept[-1]).save_checkpoint(kept[-1], kept[-1].step)
+    type(kept[-1]).save_checkpoint(kept[-1], kept[-1].step)
     return row
 
 
