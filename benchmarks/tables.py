@@ -27,8 +27,10 @@ from sundae_ns.evaluation.document import number, table
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
-LEFT_OUT = ("splatfacto-7k", "sundae-with-head", "sundae-no-head-bytes", "band")
+LEFT_OUT = ("splatfacto-7k", "sundae-warm-up", "sundae-with-head", "sundae-no-head-bytes", "band")
 """Methods of runs.csv that the table of quality leaves out; the text gives what they show."""
+TIMED = {"sundae": "sundae-auto"}
+"""Arms of runs.csv that bench_training.py calls by another name, the method's."""
 FORMATS = {".spz": ".spz", ".sog": ".sog", ".sog theirs": ".sog by splat-transform", ".sundae": ".sundae"}
 """Packed formats in the order of a table, by the heads that readers see."""
 
@@ -89,8 +91,10 @@ def quality() -> list[str]:
     heads = ["capture", "method", "keep", "primitives", "PSNR, dB", "SSIM", "PSNR, head off", "MB"]
     rows, found = [], default_runs()
     compared = {row["scene"] for row in found if row["variant"] in ("sundae", "sundae-auto")}
+    headless = {row["scene"] for row in found if row["variant"] == "sundae" and not row["bytes_head"]}
     for row in found:
-        if row["variant"] in LEFT_OUT or row["scene"] not in compared:
+        again = row["variant"] == "sundae-no-head" and row["scene"] in headless  # the same run but for chance
+        if row["variant"] in LEFT_OUT or row["scene"] not in compared or again:
             continue
         capture, method, *others = cells_of(row)
         keep = "" if row["keep_ratio"] is None else f"{row['keep_ratio']:.0%}"
@@ -130,7 +134,7 @@ def training_time() -> list[str]:
     heads = ["capture", "method", "steps", "seconds", "ms a step", "primitives", "PSNR, dB", "SSIM", "GPU"]
     rows = [
         [
-            *(line["scene"], named(line["arm"], is_of_today({"variant": line["arm"], **line}))),
+            *(line["scene"], named(line["arm"], is_of_today({"variant": TIMED.get(line["arm"], line["arm"]), **line}))),
             *(number(line["steps"], 0), number(line["train_s"], 0)),
             number(1000 * line["train_s"] / line["steps"], 2),
             number(line["primitives"], 0),
@@ -176,40 +180,11 @@ def _quality(rows: Sequence[dict[str, Any]], kind: str) -> str:
     return f"{decibels}, {_mean(rows, f'{kind}ssim'):.3f}"
 
 
-def format_rows() -> list[dict[str, Any]]:
-    """Rows of formats.csv by capture, method and format, a row for all seeds; numbers are means over the seeds."""
-    methods, kinds = [*METHODS], ["fp32", ".ply", *FORMATS]
-    groups: dict[tuple[str, int, int], list[dict[str, Any]]] = {}
-    for line in lines_of("formats.csv"):
-        theirs = " theirs" if line["program"].startswith("splat-transform") else ""
-        place = methods.index(line["method"]), kinds.index(line["format"] + theirs)
-        groups.setdefault((line["capture"], *place), []).append(line)
-    return [
-        {
-            **{"capture": capture, "kind": kinds[kind], "format": lines[0]["format"], "program": lines[0]["program"]},
-            "method": named(
-                METHODS[methods[method]], all(is_of_today({"variant": methods[method], **line}) for line in lines)
-            ),
-            **{name: fmean(float(line[name]) for line in lines) for name in ("bytes", "psnr", "ssim", "primitives")},
-        }
-        for (capture, method, kind), lines in sorted(groups.items())
-    ]
-
-
 def formats() -> list[str]:
-    """Stock runs in each packed format, and in fp32: bytes of the whole file, and quality on the test views."""
-    heads = ["capture, method", "format", "program", "primitives", "MB", "PSNR, dB", "SSIM"]
-    rows = [
-        [
-            f"{row['capture']}, {row['method']}",
-            *(row["format"] if row["format"] == "fp32" else f"`{row['format']}`", row["program"]),
-            *(number(row["primitives"], 0), number(row["bytes"] / MB, 2)),
-            *(number(row["psnr"], 2), number(row["ssim"], 4)),
-        ]
-        for row in format_rows()
-        if row["method"] == METHODS["splatfacto"] and row["kind"] != ".ply"
-    ]
-    return table(heads, first_of_each(rows), words=3)
+    """Stock runs in fp32 and in each packed format: MB of the whole file, PSNR in dB, and SSIM of the test views."""
+    stock = _stock(lambda row: f"{number(row['bytes'] / MB, 1)}, {number(row['psnr'], 2)}, {row['ssim']:.3f}")
+    rows = [[capture, *(cells.get(kind, "") for kind in ("fp32", *FORMATS))] for capture, cells in stock.items()]
+    return table(["capture", "fp32", *FORMATS.values()], rows, words=1)
 
 
 def packed_headline() -> list[str]:
@@ -218,9 +193,7 @@ def packed_headline() -> list[str]:
     def cell(size: float, psnr: float) -> str:
         return f"{number(size / MB, 1)}, {number(psnr, 1)}"
 
-    stock: dict[str, dict[str, str]] = {}
-    for row in (row for row in format_rows() if row["method"] == METHODS["splatfacto"]):
-        stock.setdefault(row["capture"], {})[row["kind"]] = cell(row["bytes"], row["psnr"])
+    stock = _stock(lambda row: cell(row["bytes"], row["psnr"]))
     rows = [
         [
             name,
@@ -231,6 +204,22 @@ def packed_headline() -> list[str]:
     ]
     kinds = list(FORMATS.values())
     return table(["capture", f"splatfacto, {kinds[0]}", *kinds[1:], "sundae", "fine-tuned"], rows, words=1)
+
+
+def _stock(cell: Callable[[dict[str, float]], str]) -> dict[str, dict[str, str]]:
+    """A cell of stock splatfacto for each format, by capture, from means over the seeds."""
+    groups: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    for line in sorted(lines_of("formats.csv"), key=lambda line: str(line["capture"])):
+        if line["method"] == "splatfacto" and is_of_today({"variant": "splatfacto", **line}):
+            theirs = " theirs" if line["program"].startswith("splat-transform") else ""
+            groups.setdefault(line["capture"], {}).setdefault(line["format"] + theirs, []).append(line)
+    return {
+        capture: {
+            kind: cell({name: _mean(lines, name) for name in ("bytes", "psnr", "ssim")})
+            for kind, lines in found.items()
+        }
+        for capture, found in groups.items()
+    }
 
 
 def multi_gpu() -> list[str]:
@@ -250,19 +239,20 @@ def multi_gpu() -> list[str]:
 
 
 def trials() -> list[str]:
-    """What held-out training views say of the head and of more features, and the finished run on test views."""
-    heads = ["capture", "training views", "held out", "head: dB", "SSIM", "29 features: dB", "SSIM", "chosen"]
-    heads += ["dB, test", "SSIM, test"]
-    rows = []
-    for line in lines_of("trials.csv"):
-        row = [line["capture"], line["training_views"], line["held_out"]]
-        for arm, before in (("head", "plain"), ("features", "head")):
-            for name, digits in (("psnr", 2), ("ssim", 4)):
-                tried = line[f"{name}_{arm}"]
-                row.append(f"{float(tried) - float(line[f'{name}_{before}']):+.{digits}f}" if tried else "")
-        found = ((line[f"{name}_test"], digits) for name, digits in (("psnr", 2), ("ssim", 4)))
-        test = [number(float(value), digits) if value else "-" for value, digits in found]
-        rows.append([*row, line["chosen"], *test])
+    """What held-out training views say of the head."""
+    heads = ["capture", "training views", "held out", "without a head: dB", "SSIM", "with one: dB", "SSIM", "chosen"]
+    rows = [
+        [
+            *(line["capture"], line["training_views"], line["held_out"]),
+            *(
+                number(float(line[f"{name}_{arm}"]), digits)
+                for arm in ("plain", "head")
+                for name, digits in (("psnr", 2), ("ssim", 3))
+            ),
+            line["chosen"],
+        ]
+        for line in lines_of("trials.csv")
+    ]
     return table(heads, rows)
 
 

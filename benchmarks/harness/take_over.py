@@ -119,7 +119,7 @@ def _curve_line(result: dict[str, Any]) -> dict[str, Any]:
         **{"packed_psnr": packed["psnr"], "packed_ssim": packed["ssim"]},
         **{f"tuned_{name}": tuned.get(name, "") for name in ("bytes", "psnr", "ssim")},
         **{"head": "yes" if run["bytes_head"] else "no", "seed": str(run["seed"])},
-        **{"chosen": "yes" if job["arm"] == CHOSEN else "no", "seconds": run["train_s"] or ""},
+        **{"chosen": "yes" if job["arm"] == CHOSEN else "no", "seconds": run["train_s"] if _is_timed(result) else ""},
     }
     return {**row, "fingerprint": run["fingerprint"]}
 

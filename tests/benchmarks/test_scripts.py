@@ -136,7 +136,15 @@ def test_rows_of_earlier_defaults_say_so(monkeypatch: pytest.MonkeyPatch) -> Non
         if shown_method and (row["keep_ratio"] in ("0.1", "0.13", "1.0") or row["variant"] == "sundae-auto"):
             seeds.setdefault((row["scene"], row["variant"]), []).append(row)
     compared = {scene for scene, variant in seeds if variant in ("sundae", "sundae-auto")}
-    runs = {place: all(today_of(row, "") for row in rows) for place, rows in seeds.items() if place[0] in compared}
+    headless = {
+        scene for (scene, variant), (row, *_) in seeds.items() if variant == "sundae" and row["bytes_head"] == "0"
+    }
+    again = {(scene, "sundae-no-head") for scene in headless}
+    runs = {
+        place: all(today_of(row, "") for row in rows)
+        for place, rows in seeds.items()
+        if place[0] in compared and place not in again
+    }
     lines = {
         name: [json.loads(line) for line in (RESULTS / f"{name}.jsonl").read_text().splitlines()]
         for name in ("frames", "training_time")
@@ -146,7 +154,9 @@ def test_rows_of_earlier_defaults_say_so(monkeypatch: pytest.MonkeyPatch) -> Non
     shown = {
         "quality": list(runs.values()),
         "speed": [today_of(line, "") for line in lines["frames"]],
-        "training-time": [today_of(line, line["arm"]) for line in lines["training_time"]],
+        "training-time": [
+            today_of(line, tables["TIMED"].get(line["arm"], line["arm"])) for line in lines["training_time"]
+        ],
     }
     chosen: dict[str, list[bool]] = {}
     for row in csv.DictReader((RESULTS / "curve.csv").open(newline="")):
@@ -268,24 +278,22 @@ def test_packed_formats_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, tmp_
         ["| fox", "", "", "9.0, 29.5", "7.0, 29.2", "2.5, 31.2", "1.4, 30.6 |"],
         ["| lion, earlier default", "", "", "", "", "2.0, 31.0", "1.0, 30.0 |"],
     ]
-    assert tables["formats"]()[-2:] == [
-        "| fox, splatfacto, 30,000 steps | `.sog` | splat-transform 3.7.0 | 900 | 9.00 | 29.50 | 0.7000 |",
-        "|  | `.sundae` | sundae_ns | 900 | 7.00 | 29.20 | 0.6500 |",
-    ]
+    assert tables["formats"]()[-1] == "| fox |  |  |  | 9.0, 29.50, 0.700 | 7.0, 29.20, 0.650 |"
 
 
-def test_the_curve_shows_todays_shares_and_earlier_ones_in_their_place(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_curve_shows_todays_shares_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     today_at = {share: sorted(fingerprints("sundae", share))[0] for share in (0.1, 0.2)}
     rows = [
-        {"method": method, "chosen": chosen, "prune_at": at, "share": str(share), "fingerprint": fingerprint}
-        for method, chosen, at, share, fingerprint in (
-            *(("sundae", "no", "12000", 0.2, today_at[0.2]), ("sundae", "no", "15000", 0.2, "older")),
-            *(("sundae", "no", "15000", 0.4, "older"), ("sundae", "no", "12000", 0.1, "older")),
-            *(("sundae", "yes", "12000", 0.3, "older"), ("sundae-no-head", "no", "12000", 1.0, "older")),
+        {"method": method, "chosen": chosen, "share": str(share), "fingerprint": fingerprint}
+        for method, chosen, share, fingerprint in (
+            *(("sundae", "no", 0.2, today_at[0.2]), ("sundae", "no", 0.2, "older")),
+            *(("sundae", "no", 0.4, "older"), ("sundae", "no", 0.1, today_at[0.1])),
+            *(("sundae", "yes", 0.1, today_at[0.1]), ("sundae-no-head", "no", 0.1, today_at[0.1])),
         )
     ]
     shown = loaded(monkeypatch, "plot.py")["fixed_shares"](rows)
-    assert [(row["share"], row["prune_at"]) for row in shown] == [("0.2", "12000"), ("0.4", "15000")]
+    assert [row["share"] for row in shown] == ["0.1", "0.2"]
+    assert all(row["method"] == "sundae" and row["chosen"] == "no" for row in shown)
 
 
 def test_plots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
