@@ -5,8 +5,8 @@
 
 Every arm trains in a process of its own, on images of full size on the GPU, with every 8th image for the test and the
 head as the method decides. Nothing is evaluated or saved while the clock runs; the clock waits for the GPU.
-``gpu_busy_share`` is the share of 100 steps in which a kernel runs, before and after the prune, and ``kernels`` has the
-microseconds of a step in each of them (``--profile``: in a further training, because the profiler takes time).
+``gpu_busy_share`` is the share of 100 steps in which a kernel runs, after each of the steps of ``--profile``, and
+``kernels`` has the microseconds of a step in each of them (in a further training, because the profiler takes time).
 ``curve`` lists seconds, PSNR and SSIM of the test views on the way, measured with the clock stopped.
 """
 
@@ -20,6 +20,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -134,8 +135,11 @@ def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
 
 
 def busy(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
-    """Shares of time in which a kernel runs, and the time of each: a quarter into the training, and at its end."""
+    """Shares of time in which a kernel runs, and the time of each: by default, a quarter into the training and at its
+    end.
+    """
     trainer, steps = trainer_of(options, arm, out), steps_of(options, arm)
+    starts = options.profile or [steps // 4, steps - PROFILED - 1]
     shares: list[float] = []
     kernels: list[dict[str, float]] = []
     profile: Any = None
@@ -143,12 +147,12 @@ def busy(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
 
     def look(step: int) -> None:
         nonlocal profile, began
-        if step + 1 in (steps // 4 + 1, steps - PROFILED - 1):
+        if step + 1 in starts:
             torch.cuda.synchronize()
             profile = torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA])
             profile.__enter__()
             began = time.perf_counter()
-        elif profile is not None and step + 1 in (steps // 4 + 1 + PROFILED, steps - 1):
+        elif profile is not None and step + 1 - PROFILED in starts:
             torch.cuda.synchronize()
             span = time.perf_counter() - began
             profile.__exit__(None, None, None)
@@ -158,7 +162,7 @@ def busy(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
 
     after_step(trainer, look)
     trainer.train()
-    return {"gpu_busy_share": shares, "kernels": kernels}
+    return {"profiled_after": starts, "gpu_busy_share": shares, "kernels": kernels}
 
 
 def by_kernel(profile: Any) -> dict[str, float]:
@@ -196,11 +200,15 @@ def main() -> None:
     parser.add_argument(
         "--curve", type=int, nargs="*", default=[], help="steps after which the test views are measured"
     )
-    parser.add_argument("--profile", action="store_true", help="also train each arm under a profiler")
+    parser.add_argument(
+        "--profile", type=int, nargs="*", metavar="STEP", help="also train under a profiler, for 100 steps after each"
+    )
     parser.add_argument("--option", action="append", default=[], help="a further word of ns-train")
     parser.add_argument("-o", "--output", type=Path, help="file to append the lines to")
     parser.add_argument("--child", choices=("timed", "busy"), help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if any(abs(a - b) <= PROFILED for a, b in combinations(options.profile or (), 2)):
+        parser.error(f"steps of --profile must be more than {PROFILED} apart")
     if options.child is not None:
         with TemporaryDirectory() as out:
             print("ROW " + json.dumps({"timed": timed, "busy": busy}[options.child](options, options.arms[0], out)))
@@ -208,9 +216,10 @@ def main() -> None:
     for arm in options.arms:
         steps = steps_of(options, arm)
         row: dict[str, Any] = {"arm": arm, "scene": options.capture.name, "steps": steps, "seed": options.seed}
-        for child in ("timed", "busy") if options.profile else ("timed",):
+        for child in ("timed",) if options.profile is None else ("timed", "busy"):
             words = [sys.executable, __file__, str(options.capture), "--arms", arm, "--steps", str(steps)]
             words += ["--seed", str(options.seed), "--child", child, "--curve", *map(str, options.curve)]
+            words += ["--profile", *map(str, options.profile or ())]
             words += [f"--option={word}" for word in options.option]
             done = subprocess.run(words, check=False, capture_output=True, text=True)
             lines = [line for line in done.stdout.splitlines() if line.startswith("ROW ")]

@@ -1,11 +1,12 @@
-"""How visible a head is, in JOD: films of a packed scene, head on and off, beside films of its full field.
+"""How visible a head is, in JOD and FLIP: films of a packed scene, head on and off, beside films of its full field.
 
-    pip install cvvdp
+    pip install cvvdp flip-evaluator
     cd benchmarks; python -m harness.films SMALL.sundae FULL.sundae CAPTURE -o results/films.jsonl
 
 ``film`` is the JOD of whole films, in which flicker counts, ``still`` the mean of their frames, each by itself; what a
 film has less than its stills is motion. ``photo`` is the mean JOD of test photos, every eighth of a COLMAP capture, of
-which ``--photos`` are looked at. 10 is the reference itself (``sundae_ns.evaluation.jod``).
+which ``--photos`` are looked at. 10 is the reference itself (``sundae_ns.evaluation.jod``). ``flip`` is the mean FLIP
+of the frames, 0 for equal ones, if its package is installed.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.data.camera_axes import world_to_camera
+from sundae_ns.evaluation import flip, flip_available
 from sundae_ns.evaluation.jod import INSTALL_JOD, jod, jod_available, jod_metric
 
 FRAMES, FPS, BETWEEN = 20, 30, 30
@@ -54,7 +56,10 @@ def rows(small: sn.Scene, full: sn.Scene, capture: Path, places: int, photos: in
             shown = film(small, views, pair, head=head)
             found, _ = metric.predict(shown, reference, dim_order="FHWC", frames_per_second=FPS)
             row[f"film_{name}"] = float(found)
-            row[f"still_{name}"] = fmean(_jod(image, truth) for image, truth in zip(shown, reference, strict=True))
+            pairs = list(zip(shown, reference, strict=True))
+            row[f"still_{name}"] = fmean(_value(jod(*pair)) for pair in pairs)
+            if flip_available():
+                row[f"flip_{name}"] = fmean(_value(flip(*pair)) for pair in pairs)
         yield row
     names = sorted(path.name for path in (capture / "images").iterdir())[::8]
     row = {"photos": min(photos, len(names))}
@@ -67,12 +72,11 @@ def rows(small: sn.Scene, full: sn.Scene, capture: Path, places: int, photos: in
 def _of_photo(scene: sn.Scene, view: sn.View, path: Path, head: bool) -> float:
     with Image.open(path) as photo:
         truth = torch.from_numpy(np.asarray(photo.convert("RGB"), np.float32) / 255).to(scene.device)
-    return _jod(sn.render(scene, view, head=head).rgb, truth[: view.height, : view.width])
+    return _value(jod(sn.render(scene, view, head=head).rgb, truth[: view.height, : view.width]))
 
 
-def _jod(image: Tensor, truth: Tensor) -> float:
-    found = jod(image, truth)
-    assert found is not None
+def _value(found: Tensor | None) -> float:
+    assert found is not None, "its package is installed"
     return float(found)
 
 

@@ -19,7 +19,7 @@ from sundae_ns.cli.outputs import check_folder
 from sundae_ns.cli.poses import FRAMES, Matching, check_poses, too_few
 from sundae_ns.cli.process import run_in_group, word
 from sundae_ns.cli.results import is_evaluation, is_packed, is_page, is_report
-from sundae_ns.cli.train import check, command
+from sundae_ns.cli.train import check, command, has_gpu, pack_command
 from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 
 SETTINGS = "run.json"
@@ -167,11 +167,9 @@ class Project:
 
     def pack(self, packed: Path, *, plain: bool = False) -> list[str]:
         """Command that packs, with a fine-tune where that takes seconds and nobody asked for a draft."""
-        from sundae_ns.storage.packing import FINETUNE_STEPS
-
-        words = ["sundae", "pack", word(self.run), "-o", word(packed), "--data", word(self.capture)]
-        words += [] if self.max_bytes is None else ["--target-bytes", str(self.max_bytes)]
-        return [*words, "--finetune", str(FINETUNE_STEPS)] if self.tunes and not plain else words
+        more = ["--data", word(self.capture)]
+        more += [] if self.max_bytes is None else ["--target-bytes", str(self.max_bytes)]
+        return pack_command(self.run, packed, *more, finetune=self.tunes and not plain)
 
     @property
     def tunes(self) -> bool:
@@ -360,13 +358,6 @@ def run(
     print(f"# to look at the scene: open {out / 'scene.html'} in a browser, or")
     print(shlex.join(["sundae", "view", word(out / "scene.sundae")]))
     return 0
-
-
-def has_gpu() -> bool:
-    """Whether a GPU trains; imports torch, which takes a second, so ask only where it matters."""
-    import torch
-
-    return torch.cuda.is_available()
 
 
 def _check_input(photos: Path) -> None:

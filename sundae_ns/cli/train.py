@@ -1,20 +1,21 @@
-"""``sundae train``: the options of ``ns-train`` that everyone sets, under short names."""
+"""``sundae train``: the options of ``ns-train`` that everyone sets, under short names, and then a packed scene."""
 
 from __future__ import annotations
 
-import os
 import shlex
-import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.guard import GROUPS
-from sundae_ns.cli.process import console_script, run_in_group, word
-from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.cli.process import run_in_group, word
+from sundae_ns.errors import STOPPED, ConfigError, DataError
+
+PACKED = "scene.sundae"
+"""Name of the packed scene in the folder of its run."""
 
 
 def methods() -> list[str]:
@@ -32,7 +33,7 @@ def train(
     steps: int | None = None,
     resume: bool = False,
 ) -> int:
-    """Print a command of ns-train and run it.
+    """Print a command of ns-train and run it; then pack the scene into scene.sundae in the run's folder.
 
     Args:
         capture: folder of the capture: a transforms.json, a COLMAP model (sparse/0, dense/sparse) beside its images, or
@@ -45,6 +46,7 @@ def train(
         steps: number of training steps; by default that of the method.
         resume: train the remaining steps of the newest unfinished run of this method on this capture.
     """
+    from sundae_ns.storage.runs.folder import new_name
     from sundae_ns.storage.runs.unfinished import unfinished_run
 
     if further and not (further[0].startswith("-") or _is_parser(further[0])):
@@ -55,10 +57,14 @@ def train(
     unfinished, more = unfinished_run(out, method, capture), list(further)
     if resume and unfinished is None:
         raise ConfigError(f"{out} has no unfinished run of {method} on {capture}; leave out --resume")
+    name = _value_of("--timestamp", more) or new_name()
     if unfinished is not None and resume:
         folder = unfinished[0]
-        more[:0] = [f"--experiment-name={folder.parent.parent.name}", "--timestamp", folder.name]
+        name = folder.name
+        more[:0] = [f"--experiment-name={folder.parent.parent.name}", "--timestamp", name]
         more[:0] = ["--load-dir", word(folder / "nerfstudio_models")]
+    elif _value_of("--timestamp", more) is None:
+        more[:0] = ["--timestamp", name]
     words = command(capture, out, method, keep, steps, more)  # refuses a damaged capture before it speaks of runs
     if unfinished is not None and not resume:
         folder, done, length = unfinished
@@ -68,10 +74,47 @@ def train(
         print(f"# {folder} ended after {done:,} of {length:,} steps; this is a new run. To resume the other:")
         print(f"#     {shlex.join(again)}")
     print(shlex.join(words), flush=True)
-    if not GROUPS:  # Windows, where a process that is replaced ends, and the shell does not wait for the other
-        sys.exit(run_in_group(words))
-    # The same process: an interrupt reaches the training, and its exit code is ours.
-    os.execvp(console_script(words[0]), words)
+    code = run_in_group(words)
+    # Options of ns-train may have put the run elsewhere; then its last line names the command that packs it.
+    run = next((path.parent for path in out.glob(f"*/{method}/{name}/config.yml")), None)
+    return code if code or run is None else _pack(run)
+
+
+def _pack(run: Path) -> int:
+    """Pack a finished run; the exit code."""
+    tuned = has_gpu()
+    for finetune in (True, False) if tuned else (False,):
+        words = pack_command(run, run / PACKED, finetune=finetune)
+        print(shlex.join(words), flush=True)
+        code = run_in_group(words, saves=False)
+        if not code or code in STOPPED:
+            break
+    return code
+
+
+def pack_command(run: Path, out: Path, *more: str, finetune: bool) -> list[str]:
+    """The words of the command that packs a run, with further words, and with a fine-tune if asked for."""
+    from sundae_ns.storage.packing import FINETUNE_STEPS
+
+    words = ["sundae", "pack", word(run), "-o", word(out), *more]
+    return [*words, "--finetune", str(FINETUNE_STEPS)] if finetune else words
+
+
+def has_gpu() -> bool:
+    """Whether a GPU trains; imports torch, which takes a second, so ask only where it matters."""
+    import torch
+
+    return torch.cuda.is_available()
+
+
+def _value_of(option: str, words: Sequence[str]) -> str | None:
+    """What follows an option of ns-train, after a space or ``=``; None without it."""
+    for given, following in pairwise([*words, None]):
+        if given == option:
+            return following
+        if given is not None and given.startswith(f"{option}="):
+            return given.partition("=")[2]
+    return None
 
 
 def check(capture: Path, method: str, keep: float | None, steps: int | None) -> None:

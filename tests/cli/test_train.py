@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
+import re
 import shlex
 import zipfile
 from pathlib import Path
@@ -24,19 +24,20 @@ from sundae_ns.storage.runs.unfinished import unfinished_run
 
 
 class Replaced(Exception):
-    """In place of the process that would be replaced."""
+    """In place of the command that would run."""
 
 
 @pytest.fixture
 def ran(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     found: list[list[str]] = []
 
-    def replace(program: str, words: list[str]) -> None:
-        assert Path(program).name == "ns-train"
+    def replace(words: list[str], *, saves: bool = True) -> int:
+        assert saves, "an interrupt lets it save itself"
+        assert words[0] == "ns-train"
         found.append(words)
         raise Replaced
 
-    monkeypatch.setattr(os, "execvp", replace)
+    monkeypatch.setattr("sundae_ns.cli.train.run_in_group", replace)
     return found
 
 
@@ -59,7 +60,9 @@ def test_the_printed_command_runs(
 def test_what_is_not_given_is_the_method_s_own(tmp_path: Path, ran: list[list[str]]) -> None:
     with pytest.raises(Replaced):
         main(["train", str(tmp_path)])
-    assert ran == [["ns-train", "sundae", "--data", str(tmp_path), "--output-dir", "outputs"]]
+    (*words, option, name) = ran[0]
+    assert [*words, option] == ["ns-train", "sundae", "--data", str(tmp_path), "--output-dir", "outputs", "--timestamp"]
+    assert re.fullmatch(r"[\d_-]+", name), "its run is found by this name"
 
 
 @pytest.mark.parametrize(
@@ -206,3 +209,84 @@ def test_a_resumed_run_has_its_length(tmp_path: Path, ran: list[list[str]], caps
     with pytest.raises(SystemExit):
         main(["train", str(tmp_path), "--resume", "--steps", "5"])
     assert "leave out --steps or --resume" in capsys.readouterr().err
+
+
+class Trained:
+    """Stands for the commands of ``sundae train``: a training leaves its run; each ends with the code it is told."""
+
+    def __init__(self) -> None:
+        self.ran: list[tuple[list[str], bool]] = []
+        self.codes: dict[str, int] = {}
+        self.elsewhere = False
+
+    def __call__(self, words: list[str], *, saves: bool = True) -> int:
+        self.ran.append((words, saves))
+        if words[0] == "ns-train" and not self.elsewhere:
+            run_of(self.run, Path(words[3]), 29999)
+        return self.codes.get("--finetune" if "--finetune" in words else words[0], 0)
+
+    @property
+    def run(self) -> Path:
+        words = self.ran[0][0]
+        return Path(words[5]) / "scene" / words[1] / words[words.index("--timestamp") + 1]
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Trained:
+    made = Trained()
+    (tmp_path / "scene").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sundae_ns.cli.train.run_in_group", made)
+    monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: False)
+    return made
+
+
+def exit_code(*words: str) -> int:
+    with pytest.raises(SystemExit) as caught:
+        main(["train", "scene", *words])
+    return int(caught.value.code or 0)
+
+
+def test_a_finished_training_is_packed(trained: Trained, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code() == 0
+    (_, saves), (pack, packing_saves) = trained.ran
+    assert (saves, packing_saves) == (True, False), "an interrupt lets the training save itself"
+    assert pack == ["sundae", "pack", str(trained.run), "-o", str(trained.run / "scene.sundae")]
+    assert capsys.readouterr().out.splitlines()[-1] == shlex.join(pack), "the command is printed"
+
+
+@pytest.mark.parametrize("given", [["--timestamp", "mine"], ["--timestamp=mine"]])
+def test_a_run_of_the_user_s_own_name_is_packed(trained: Trained, given: list[str]) -> None:
+    run_of(Path("outputs/scene/sundae/other"), Path("scene"), 29999)
+    trained.elsewhere = True
+    run_of(Path("outputs/scene/sundae/mine"), Path("scene"), 29999)
+    assert exit_code("--", *given) == 0
+    assert [words[2] for words, _ in trained.ran[1:]] == ["outputs/scene/sundae/mine"]
+    assert sum("--timestamp" in word for word in trained.ran[0][0]) == 1
+
+
+@pytest.mark.parametrize(("failed", "last"), [(False, "--finetune"), (True, "scene.sundae")])
+def test_a_gpu_fine_tunes_the_pack_or_leaves_it(
+    trained: Trained, monkeypatch: pytest.MonkeyPatch, failed: bool, last: str
+) -> None:
+    monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: True)
+    trained.codes = {"--finetune": int(failed)}
+    assert exit_code() == 0
+    packs = [words for words, _ in trained.ran[1:]]
+    assert packs[0][-2:] == ["--finetune", "1500"]
+    assert len(packs) == 1 + failed
+    assert any(last in word for word in packs[-1][-2:])
+
+
+@pytest.mark.parametrize("stage", ["ns-train", "--finetune", "sundae"])
+def test_what_ends_early_ends_the_command(trained: Trained, monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
+    monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: stage == "--finetune")
+    trained.codes = {stage: 130}
+    assert exit_code() == 130
+    assert len(trained.ran) == (1 if stage == "ns-train" else 2)
+
+
+def test_a_run_that_is_not_found_is_not_packed(trained: Trained) -> None:
+    trained.elsewhere = True
+    assert exit_code("--", "--output-dir", "own") == 0
+    assert len(trained.ran) == 1

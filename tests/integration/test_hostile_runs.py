@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import runpy
 import shutil
 import sys
@@ -132,7 +131,7 @@ def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("sundae_ns.cli.run.measured_step", lambda *_: None)
     monkeypatch.setattr("sundae_ns.cli.demo.run_logged", start)
     monkeypatch.setattr("sundae_ns.scenes.distill.CAMERAS", 8)
-    monkeypatch.setattr(os, "execvp", lambda program, words: start(words))
+    monkeypatch.setattr("sundae_ns.cli.train.run_in_group", start)
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", stop)
     with pytest.raises(SystemExit):
         main([command, *WORDS[command]])
