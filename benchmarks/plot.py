@@ -1,6 +1,6 @@
 """Draw the plots of docs/results.md from benchmarks/results, into docs/figures.
 
-python benchmarks/plot.py            # curve.png, heads.png, rules.png, time.png
+python benchmarks/plot.py            # curve.png, rules.png, time.png
 python benchmarks/plot.py curve      # one of them
 """
 
@@ -91,29 +91,6 @@ def plot_curve() -> Any:
     return figure
 
 
-def plot_heads() -> Any:
-    """Gain of each head over the same primitives trained without one, against its time."""
-    figure, panel = plt.subplots(figsize=(6, 4), layout="constrained")
-    for scene, marker in MARKERS.items():
-        own = [line for line in lines_of("heads.csv") if line["scene"] == scene and line["rate"] == "cosine"]
-        ms, gains = [float(line["ms_824x1240"]) for line in own], [float(line["gain"]) for line in own]
-        panel.plot(ms, gains, marker + "-", label=scene)
-        for line, x, y in zip(own, ms, gains, strict=True) if scene == "bonsai" else ():
-            name = line["size"] + (" (default)" if line["size"] == "wide" else "")
-            panel.annotate(name, (x, y), (6, 6), textcoords="offset points", fontsize=8)
-    panel.set_xscale("log")
-    panel.set_xlim(0.5, 5)
-    panel.set_xticks([0.5, 1, 2, 5])
-    panel.xaxis.set_major_formatter("{x:g}")
-    panel.xaxis.set_minor_formatter(NullFormatter())
-    panel.set_ylim(0, 2.4)
-    panel.set_xlabel("head, ms at 824 x 1240 in fp16 (H200; regular: H100)")
-    panel.set_ylabel("gain in test PSNR, dB")
-    panel.legend()
-    panel.grid(alpha=0.3, which="both")
-    return figure
-
-
 def plot_rules() -> Any:
     """PSNR of pruning rules against the share they keep, over random primitives, a panel for each capture."""
     figure, panels = plt.subplots(1, len(MARKERS), figsize=(5.5 * len(MARKERS), 4), layout="constrained")
@@ -168,7 +145,6 @@ def plot_time() -> Any:
 
 PLOTS: dict[str, Callable[[], Any]] = {
     "curve": plot_curve,
-    "heads": plot_heads,
     "rules": plot_rules,
     "time": plot_time,
 }

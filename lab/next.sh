@@ -9,7 +9,7 @@ setup() { bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log; py
   mkdir -p $R /tmp/logs $O $J; cp -r benchmarks tests lab docs examples web *.md pyproject.toml Makefile mkdocs.yml method_configs $R/; }
 queue() { cd /tmp || exit; setsid nohup python3 $R/lab/slots.py > /tmp/logs/q.out 2>&1 & sleep 1; }
 wait_for_all() { touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$1" ]; do sleep 1; done
-  for d in shorter others mip; do mkdir -p $O/$d; for r in /tmp/$d/*; do cp $r/done/*.json $O/$d/$(basename $r).json; done; done 2> /dev/null; tar -czf "$OUT/out.tgz" -C /tmp out logs
+  for d in shorter others mip; do mkdir -p $O/$d; cp /tmp/$d/*/done/*.json $O/$d/; done 2> /dev/null; tar -czf "$OUT/out.tgz" -C /tmp out logs
   tail -n 60 /tmp/logs/queue.log; nvidia-smi --query-gpu=name --format=csv,noheader | sort | uniq -c; }
 # profile CAPTURE STEP...: kinds of step, alone
 profile() { job 00-alone-$1-profile "python3 $R/benchmarks/bench_training.py /tmp/scenes/$1 --arms sundae --profile ${*:2} -o $O/profile-$1.jsonl"; }
