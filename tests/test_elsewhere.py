@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sundae_ns.cli import guard, process, train
+from sundae_ns.cli import guard, process
 from sundae_ns.errors import StorageError, SundaeError
 from sundae_ns.storage import atomic, locks
 from sundae_ns.storage.runs import folder
@@ -222,13 +222,3 @@ def test_an_interrupted_command_ends_without_groups(tmp_path: Path) -> None:
         process.run_logged(words, tmp_path / "log", interrupt)
     with pytest.raises(ProcessLookupError):  # the guard has waited for it
         os.kill(found[0], 0)
-
-
-def test_train_waits_where_a_process_cannot_be_replaced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    started: list[list[str]] = []
-    monkeypatch.setattr(train, "GROUPS", False)
-    monkeypatch.setattr(train, "run_in_group", lambda words: started.append(words) or 130)
-    monkeypatch.setattr(train, "command", lambda *_: ["ns-train", "sundae"])
-    with pytest.raises(SystemExit) as caught:
-        train.train(tmp_path)
-    assert (caught.value.code, started) == (130, [["ns-train", "sundae"]])
