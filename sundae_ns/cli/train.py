@@ -57,13 +57,14 @@ def train(
     unfinished, more = unfinished_run(out, method, capture), list(further)
     if resume and unfinished is None:
         raise ConfigError(f"{out} has no unfinished run of {method} on {capture}; leave out --resume")
-    name = _value_of("--timestamp", more) or new_name()
+    given = _value_of("--timestamp", more)
+    name = given or new_name()
     if unfinished is not None and resume:
         folder = unfinished[0]
         name = folder.name
         more[:0] = [f"--experiment-name={folder.parent.parent.name}", "--timestamp", name]
         more[:0] = ["--load-dir", word(folder / "nerfstudio_models")]
-    elif _value_of("--timestamp", more) is None:
+    elif given is None:
         more[:0] = ["--timestamp", name]
     words = command(capture, out, method, keep, steps, more)  # refuses a damaged capture before it speaks of runs
     if unfinished is not None and not resume:
