@@ -135,11 +135,9 @@ def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
 
 
 def busy(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
-    """Shares of time in which a kernel runs, and the time of each: by default, a quarter into the training and at its
-    end.
-    """
+    """Shares of time in which a kernel runs, and the time of each; by default after a quarter, and at the end."""
     trainer, steps = trainer_of(options, arm, out), steps_of(options, arm)
-    starts = options.profile or [steps // 4, steps - PROFILED - 1]
+    starts = sorted(options.profile) if options.profile else [steps // 4, steps - PROFILED - 1]
     shares: list[float] = []
     kernels: list[dict[str, float]] = []
     profile: Any = None

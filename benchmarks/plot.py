@@ -21,7 +21,8 @@ from harness.stored import MB, lines_of
 from harness.today import is_of_today
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
-MARKERS = {"bonsai": "o", "fox": "s"}
+PRUNED = ("bonsai", "fox")
+"""Captures whose pruning rules are compared."""
 ARMS = {"splatfacto": "gray", "sundae": "tab:red", "sundae-fast": "tab:blue"}
 """Methods whose trainings are timed, and their colours."""
 KEPT_RULES = {
@@ -93,8 +94,8 @@ def plot_curve() -> Any:
 
 def plot_rules() -> Any:
     """PSNR of pruning rules against the share they keep, over random primitives, a panel for each capture."""
-    figure, panels = plt.subplots(1, len(MARKERS), figsize=(5.5 * len(MARKERS), 4), layout="constrained")
-    for panel, scene in zip(panels, MARKERS, strict=True):
+    figure, panels = plt.subplots(1, len(PRUNED), figsize=(5.5 * len(PRUNED), 4), layout="constrained")
+    for panel, scene in zip(panels, PRUNED, strict=True):
         psnr = {
             (line["rule"], float(line["keep"])): float(line["psnr"])
             for line in lines_of("rules.csv")
