@@ -11,18 +11,11 @@ queue() { cd /tmp || exit; setsid nohup python3 $R/lab/slots.py > /tmp/logs/q.ou
 wait_for_all() { touch $J/END; until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "$1" ]; do sleep 1; done
   for d in shorter others; do mkdir -p $O/$d; cp /tmp/$d/*/done/*.json $O/$d/; done 2> /dev/null; tar -czf "$OUT/out.tgz" -C /tmp out logs
   tail -n 60 /tmp/logs/queue.log; nvidia-smi --query-gpu=name --format=csv,noheader | sort | uniq -c; }
-# profile CAPTURE STEP...: kinds of step, alone
-profile() { job 00-alone-$1-profile "python3 $R/benchmarks/bench_training.py /tmp/scenes/$1 --arms sundae --profile ${*:2} -o $O/profile-$1.jsonl"; }
-# without CAPTURE: a trick of the head left out, three seeds of the default; the suite has them with it
-without() { for s in 42 43 44; do for t in decay mirror; do job 03-$s-$1-$t "TRICK=$t python3 $R/lab/without.py /tmp/scenes/$1 --arms sundae --seed $s -o $O/without-$t-$1-$s.jsonl"; done; done; }
-# shorter CAPTURE SEED...: the fine-tune as the last 1,500 of 30,000 steps
-shorter() { for s in ${*:2}; do job 04-$s-$1-shorter "python3 $Q /tmp/scenes/$1 -o /tmp/shorter/$1-$s --arms sundae-auto --seeds $s --steps-scale 0.95"; done; }
-# tuned CAPTURE: seconds of a fine-tune of a shorter run, alone
-tuned() { job 05-$1-tuned "until [ -f /tmp/shorter/$1-42/done/*.json ]; do sleep 1; done; python3 $R/benchmarks/bench_pack.py --run \$(dirname \$(find /tmp/shorter/$1-42 -name config.yml | head -1)) --finetune 1500 --views 8 > $O/tuned-$1.jsonl"; }
+# arm NAME CAPTURE SEED...: the arm of lab/NAME.yaml
+arm() { for s in ${*:3}; do job 04-$s-$2-$1 "python3 $Q /tmp/scenes/$2 -o /tmp/others/$2-$1-$s --arms $R/lab/$1.yaml --seeds $s"; done; }
 case $1 in
-# One lease, nvidia-h100-x4, GPUS=4 SLOTS=4 RESERVED="0 1": profiles alone on two GPUs, all else on the others and after them
-1) setup; take 3; GPU=0; profile fox 20000; GPU=; shorter fox 42 43; shorter stone_horse 42 43; job 06-fox-all "python3 $Q /tmp/scenes/fox -o /tmp/others/fox --arms sundae --seeds 42 --keep-ratios 1"; queue ;;
-2) take 1 4; GPU=1; profile bonsai 1000 4000 8000 11000 20000; GPU=; without bonsai; shorter bonsai 42 43; shorter south_building 42 43; tuned bonsai ;;
-3) take 2; without garden; shorter garden 42 43; shorter dinosaur 42 43 ;;
-9) [ -f /tmp/logs/queue.log ] || { echo "no queue: another machine; give it back"; exit 3; }; SECONDS=0; wait_for_all "${2:-400}"; cat $O/*.jsonl | cut -c1-250 ;;
+1) setup; take 3; arm last fox 42 43 44; queue ;;
+2) [ -d $J ] || exit 3; take 1 4; arm no-decay bonsai 42 43 44; arm last bonsai 42 43 44; arm last south_building 42 43 44 ;;
+3) [ -d $J ] || exit 3; take 2; arm no-decay garden 42 43 44; arm last garden 42 ;;
+9) [ -f /tmp/logs/queue.log ] || { echo "no queue: another machine; give it back"; exit 3; }; SECONDS=0; wait_for_all "${2:-400}" ;;
 esac

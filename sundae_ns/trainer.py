@@ -54,6 +54,9 @@ class SundaeTrainerConfig(TrainerConfig):
     schedule_length: int | None = None
     """Steps over which prune, densification, resolution and learning rates are spread, unless you set their options: by
     default max_num_iterations, and the length of the run that is resumed. A larger number trains the first part."""
+    finetune_steps: int | None = None
+    """Steps of the fine-tune with which the run will be packed (sundae pack RUN --finetune): training leaves it as many
+    at the end of the schedule, if they are at most a twentieth of it."""
 
     def print_to_terminal(self) -> None:
         """Check the capture, make the schedule and log it; the other options are in ``config.yml``.

@@ -316,6 +316,29 @@ def test_the_number_of_steps_alone_sets_the_schedule(tmp_path: Path) -> None:
             configured(tmp_path, option, "0")
 
 
+def test_a_fine_tune_takes_the_place_of_the_last_steps(tmp_path: Path) -> None:
+    tuned = ("--finetune-steps", "1500")
+    config = configured(tmp_path, *tuned)
+    assert (config.max_num_iterations, config.schedule_length) == (28500, 30000)
+    assert config.pipeline.model.pruning.prune_at == 12000, "the schedule is that of the whole run"
+    for length, steps in ((29999, 29999), (60000, 58500)):  # at most a twentieth
+        assert configured(tmp_path, *tuned, "--max-num-iterations", str(length)).max_num_iterations == steps
+    first = configured(tmp_path, *tuned, "--max-num-iterations", "10000", "--schedule-length", "30000")
+    assert first.max_num_iterations == 10000
+    config.save_config()
+    checkpoints = config.get_base_dir() / "nerfstudio_models"
+    checkpoints.mkdir()
+    saved(checkpoints, 19999)
+    words = ("--load-dir", str(checkpoints))
+    assert configured(tmp_path, *words, *tuned).max_num_iterations == 8500
+    assert configured(tmp_path, *words).max_num_iterations == 10000
+    assert configured(tmp_path, *words, *tuned, "--max-num-iterations", "9000").max_num_iterations == 9000
+    saved(checkpoints, 28499)
+    assert configured(tmp_path, *words, *tuned).max_num_iterations == 1500, "all others are done"
+    with pytest.raises(ConfigError, match="finetune-steps is 0; give 1500, or leave it out"):
+        configured(tmp_path, "--finetune-steps", "0")
+
+
 def test_a_resumed_run_has_the_schedule_of_its_config(tmp_path: Path) -> None:
     run = configured(tmp_path, "--max-num-iterations", "3000", "--pipeline.model.pruning.prune-at", "1000")
     run.save_config()

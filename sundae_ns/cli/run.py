@@ -19,7 +19,7 @@ from sundae_ns.cli.outputs import check_folder
 from sundae_ns.cli.poses import FRAMES, Matching, check_poses, too_few
 from sundae_ns.cli.process import run_in_group, word
 from sundae_ns.cli.results import is_evaluation, is_packed, is_page, is_report
-from sundae_ns.cli.train import check, command, has_gpu, pack_command
+from sundae_ns.cli.train import check, command, finetune_words, has_gpu, pack_command
 from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 
 SETTINGS = "run.json"
@@ -159,6 +159,7 @@ class Project:
         # Curves of the report come from tensorboard's files. The name may begin with a dash.
         more = [f"--experiment-name={self.name}", "--timestamp", self.run.name, "--vis", "viewer+tensorboard"]
         more += ["--load-dir", word(saved)] if resumes else []
+        more += finetune_words() if self.tunes else []
         if not resumes:
             more += self.options
         # Without a number of steps, a resumed run trains those that are left.
@@ -236,9 +237,14 @@ class Project:
         print(f"# warning: {told}; faster are {', '.join([*faster, 'smaller photos and a GPU'])}", flush=True)
 
     def trained(self) -> bool:
-        """Whether the last step of the schedule is saved."""
+        """Whether the last step is saved, of those before the pack's fine-tune."""
         left = self._steps_left()
-        return left is not None and left <= 0
+        if left is None or left <= 0:
+            return left is not None
+        from sundae_ns.storage.packing import tuned_steps
+        from sundae_ns.storage.runs.config_file import schedule_length
+
+        return self.tunes and left <= tuned_steps(schedule_length(self.run / "config.yml"))
 
     def _steps_left(self) -> int | None:
         from sundae_ns.storage.runs.unfinished import steps_left

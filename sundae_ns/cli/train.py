@@ -16,6 +16,8 @@ from sundae_ns.errors import STOPPED, ConfigError, DataError
 
 PACKED = "scene.sundae"
 """Name of the packed scene in the folder of its run."""
+LENGTHS = ("--max-num-iterations", "--schedule-length", "--finetune-steps")
+"""Options of ns-train that say when a training ends."""
 
 
 def methods() -> list[str]:
@@ -34,6 +36,8 @@ def train(
     resume: bool = False,
 ) -> int:
     """Print a command of ns-train and run it; then pack the scene into scene.sundae in the run's folder.
+
+    On a GPU the pack is fine-tuned, in place of the last steps of a long run.
 
     Args:
         capture: folder of the capture: a transforms.json, a COLMAP model (sparse/0, dense/sparse) beside its images, or
@@ -66,8 +70,11 @@ def train(
         more[:0] = ["--load-dir", word(folder / "nerfstudio_models")]
     elif given is None:
         more[:0] = ["--timestamp", name]
+    tunes = has_gpu()
+    if tunes and not any(_value_of(option, further) for option in LENGTHS):
+        more[:0] = finetune_words()
     words = command(capture, out, method, keep, steps, more)  # refuses a damaged capture before it speaks of runs
-    if unfinished is not None and not resume:
+    if unfinished is not None and not resume and not (unfinished.folder / PACKED).exists():
         folder, done, length = unfinished
         again = ["sundae", "train", word(capture), "--resume"]
         again += ["-o", word(out)] if out != Path("outputs") else []
@@ -78,13 +85,12 @@ def train(
     code = run_in_group(words)
     # Options of ns-train may have put the run elsewhere; then its last line names the command that packs it.
     run = next((path.parent for path in out.glob(f"*/{method}/{name}/config.yml")), None)
-    return code if code or run is None else _pack(run)
+    return code if code or run is None else _pack(run, tunes=tunes)
 
 
-def _pack(run: Path) -> int:
-    """Pack a finished run; the exit code."""
-    tuned = has_gpu()
-    for finetune in (True, False) if tuned else (False,):
+def _pack(run: Path, *, tunes: bool) -> int:
+    """Pack a finished run, without a fine-tune where that fails; the exit code."""
+    for finetune in (True, False) if tunes else (False,):
         words = pack_command(run, run / PACKED, finetune=finetune)
         print(shlex.join(words), flush=True)
         code = run_in_group(words, saves=False)
@@ -99,6 +105,13 @@ def pack_command(run: Path, out: Path, *more: str, finetune: bool) -> list[str]:
 
     words = ["sundae", "pack", word(run), "-o", word(out), *more]
     return [*words, "--finetune", str(FINETUNE_STEPS)] if finetune else words
+
+
+def finetune_words() -> list[str]:
+    """Words of ns-train that leave the last steps to the fine-tune of :func:`pack_command`."""
+    from sundae_ns.storage.packing import FINETUNE_STEPS
+
+    return ["--finetune-steps", str(FINETUNE_STEPS)]
 
 
 def has_gpu() -> bool:

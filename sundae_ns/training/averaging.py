@@ -91,7 +91,7 @@ def weights_of(state: FieldState) -> dict[str, Tensor]:
 
 
 class Averaging(Extension):
-    """Ends a training with the mean of field and head.
+    """Ends a training with the mean of field and head, a first part of one too if it ends within the share.
 
     Args:
         share: of the schedule, at its end, over which weights are averaged.
@@ -132,9 +132,10 @@ class Averaging(Extension):
     def after_step(self, run: TrainingRun) -> None:
         """Count the weights if their turn has come; after the last step, put the mean in their place."""
         state, length, last = run.state, run.schedule_length, run.last_step
-        if length is None or last is None or last + 1 < length:  # the first part of a run ends with its own weights
+        if length is None or last is None:
             return
-        if state.schedule_step < self.settled_at or state.step < last - self.share * length:
+        end = max(last, length - 1)  # a part that ends earlier ends with its own weights
+        if state.schedule_step < self.settled_at or state.step < end - self.share * length:
             self._mean = RunningMean()  # a run that was stopped in its last part may be resumed for a longer one
             return
         if state.restored != self._restored:
@@ -145,4 +146,6 @@ class Averaging(Extension):
         if state.step == last and self._mean.fits(weights):
             CONSOLE.log(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
             replaced = self._mean.replace(weights)
-            self._replaced, self._mean = replaced if self._alone else {}, RunningMean()
+            self._replaced = replaced if self._alone else {}
+            if last == end:  # after a part, the mean goes on with the rest of the run
+                self._mean = RunningMean()

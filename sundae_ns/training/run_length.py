@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sundae_ns.errors import CheckpointError, ConfigError
+from sundae_ns.storage.packing import FINETUNE_STEPS, tuned_steps
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import find_config
@@ -64,6 +65,8 @@ def set_schedule(config: Any, words: Iterable[str]) -> None:
                 config.max_num_iterations = _steps_left(config, place)
         # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
         config.schedule_length = config.schedule_length or config.max_num_iterations
+        if run is not None and "max_num_iterations" not in given:
+            _leave_finetune(config, config.schedule_length - config.max_num_iterations)
         return
     if config.schedule_length is None:
         config.schedule_length = config.max_num_iterations
@@ -71,8 +74,21 @@ def set_schedule(config: Any, words: Iterable[str]) -> None:
         raise ConfigError(
             f"the length of the run is {config.schedule_length}; give --max-num-iterations 30000, or fewer"
         )
+    _leave_finetune(config, done=0)
     if usual is not None:
         fit_to_length(config, usual, given)
+
+
+def _leave_finetune(config: Any, done: int) -> None:
+    """End the training before the steps that a fine-tune takes the place of, unless all others are done."""
+    steps = config.finetune_steps
+    if steps is None:
+        return
+    if steps < 1:
+        raise ConfigError(f"finetune-steps is {steps}; give {FINETUNE_STEPS}, or leave it out")
+    left = config.schedule_length - tuned_steps(config.schedule_length, steps) - done
+    if left > 0:
+        config.max_num_iterations = min(config.max_num_iterations, left)
 
 
 def _steps_left(config: Any, place: Path) -> int:

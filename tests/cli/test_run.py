@@ -113,7 +113,7 @@ def test_a_size_and_a_quality(commands: Commands) -> None:
 def test_a_gpu_packs_with_a_fine_tune(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
     commands.gpu = True
     assert run("photos", "-o", "out", "--max-mb", "2") == 0
-    assert commands.option("--finetune", 3) == "1500"
+    assert commands.option("--finetune", 3) == commands.option("--finetune-steps", 1) == "1500"
     assert commands.option("--target-bytes", 3) == "2000000"
     # Trials count the bytes of a pack without one.
     assert commands.option("--pipeline.model.pruning.max-bytes", 1) == "3333333"

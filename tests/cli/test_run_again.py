@@ -112,6 +112,19 @@ def test_an_interrupted_training_resumes(commands: Commands, capsys: pytest.Capt
     ]
 
 
+def test_a_fine_tune_ends_the_training_where_there_is_a_gpu(commands: Commands) -> None:
+    commands.gpu, commands.length, commands.saved_at[0] = True, 30000, 28499
+    assert run("photos", "-o", "out") == 0
+    commands.ran.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.ran == [], "the fine-tune took the place of the other steps"
+    commands.gpu, commands.saved_at[0] = False, 29999
+    assert run("photos", "-o", "out") == 0
+    assert commands.names[0] == "ns-train", "without one they are trained"
+    assert "--finetune-steps" not in commands.ran[0]
+    assert commands.option("--load-dir", 0) == f"{RUN}/nerfstudio_models"
+
+
 def test_a_training_without_a_checkpoint_starts_anew(commands: Commands) -> None:
     commands.codes["ns-train"] = 137
     assert run("photos", "-o", "out", "--steps", "100") == 137

@@ -29,6 +29,7 @@ class Replaced(Exception):
 
 @pytest.fixture
 def ran(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: False)
     found: list[list[str]] = []
 
     def replace(words: list[str], *, saves: bool = True) -> int:
@@ -272,10 +273,36 @@ def test_a_gpu_fine_tunes_the_pack_or_leaves_it(
     monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: True)
     trained.codes = {"--finetune": int(failed)}
     assert exit_code() == 0
-    packs = [words for words, _ in trained.ran[1:]]
+    (training, _), *packing = trained.ran
+    assert option_of(training, "--finetune-steps") == "1500", "in place of the last steps"
+    packs = [words for words, _ in packing]
     assert packs[0][-2:] == ["--finetune", "1500"]
     assert len(packs) == 1 + failed
     assert any(last in word for word in packs[-1][-2:])
+
+
+def option_of(words: list[str], name: str) -> str:
+    return words[words.index(name) + 1]
+
+
+@pytest.mark.parametrize("length", ["--max-num-iterations", "--schedule-length", "--finetune-steps"])
+def test_a_length_of_ns_train_is_the_user_s(trained: Trained, monkeypatch: pytest.MonkeyPatch, length: str) -> None:
+    monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: True)
+    assert exit_code("--", length, "40000") == 0
+    assert sum(word.startswith("--finetune-steps") for word in trained.ran[0][0]) == (length == "--finetune-steps")
+
+
+def test_a_run_that_its_fine_tune_has_finished_is_no_interrupted_one(
+    trained: Trained, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = run_of(Path("outputs/scene/sundae/tuned"), Path("scene"), 28499)
+    (run / "scene.sundae").touch()
+    assert exit_code() == 0
+    assert "# " not in capsys.readouterr().out
+    trained.ran.clear()
+    trained.elsewhere = True
+    assert exit_code("--resume") == 0
+    assert option_of(trained.ran[0][0], "--load-dir") == str(run / "nerfstudio_models")
 
 
 @pytest.mark.parametrize("stage", ["ns-train", "--finetune", "sundae"])

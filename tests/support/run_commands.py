@@ -38,6 +38,8 @@ class Commands:
         self.out_of_memory = False
         """Whether a fine-tune ends with an error."""
         self.forecast: Forecast | None = None
+        self.length = 100
+        """Of a training, in steps."""
         self.asked: list[tuple[str, int, int]] = []
 
     def measured(self, *asked: Any) -> Forecast | None:
@@ -69,7 +71,7 @@ class Commands:
             folder = Path(root, experiment, words[1], stamp)
             (folder / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
             (folder / "config.yml").write_text(
-                "!!python/object:sundae_ns.trainer.SundaeTrainerConfig\nschedule_length: 100\n"
+                f"!!python/object:sundae_ns.trainer.SundaeTrainerConfig\nschedule_length: {self.length}\n"
             )
             if code in self.saved_at:
                 checkpoint = folder / "nerfstudio_models" / f"step-{self.saved_at[code]:09d}.ckpt"

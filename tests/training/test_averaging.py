@@ -18,9 +18,9 @@ from sundae_ns.training.extension import TrainingRun
 LAST = 99
 
 
-def run_of(state: Any, *, images: int = 1) -> TrainingRun:
+def run_of(state: Any, *, images: int = 1, last: int = LAST) -> TrainingRun:
     return cast(
-        TrainingRun, SimpleNamespace(state=state, last_step=LAST, schedule_length=LAST + 1, images_per_step=images)
+        TrainingRun, SimpleNamespace(state=state, last_step=last, schedule_length=LAST + 1, images_per_step=images)
     )
 
 
@@ -29,7 +29,9 @@ def state(build: Callable[..., Any]) -> Any:
     return build(n=20).state
 
 
-def train(state: Any, mean: Averaging, steps: range, *, seen: list[torch.Tensor] | None = None) -> None:
+def train(
+    state: Any, mean: Averaging, steps: range, *, seen: list[torch.Tensor] | None = None, last: int = LAST
+) -> None:
     """Steps that change the weights at random."""
     for step in steps:
         state.step = step
@@ -38,7 +40,7 @@ def train(state: Any, mean: Averaging, steps: range, *, seen: list[torch.Tensor]
             value.data += torch.randn_like(value)
         if seen is not None and step >= 90 and step % averaging.AVERAGED_EVERY == 0:
             seen.append(state.field["means"].detach().clone())
-        mean.after_step(run_of(state))
+        mean.after_step(run_of(state, last=last))
 
 
 def test_the_last_weights_become_the_mean(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,14 +81,15 @@ def test_no_mean_of_fields_that_differ(state: Any, monkeypatch: pytest.MonkeyPat
 
 
 def test_unfinished_schedules_and_growing_fields_keep_their_weights(state: Any) -> None:
-    for mean, length in ((Averaging(0.1, settled_at=1000), LAST + 1), (Averaging(0.1, settled_at=0), LAST + 2)):
+    for mean, length in ((Averaging(0.1, settled_at=1000), LAST + 1), (Averaging(0.1, settled_at=0), 2 * LAST)):
         state.step = LAST
         before = state.field["means"].detach().clone()
         mean.after_step(cast(TrainingRun, SimpleNamespace(state=state, last_step=LAST, schedule_length=length)))
         assert torch.equal(state.field["means"], before)
 
 
-def test_a_resumed_training_ends_with_the_same_mean(state: Any) -> None:
+@pytest.mark.parametrize("planned", [False, True], ids=["interrupted", "a part"])
+def test_a_resumed_training_ends_with_the_same_mean(state: Any, planned: bool) -> None:
     start = {name: value.detach().clone() for name, value in state.field.items()}
     whole = Averaging(0.5, settled_at=0)
     train(state, whole, range(LAST + 1))
@@ -94,8 +97,9 @@ def test_a_resumed_training_ends_with_the_same_mean(state: Any) -> None:
     for name, value in state.field.items():
         value.data.copy_(start[name])
     first, second = Averaging(0.5, settled_at=0), Averaging(0.5, settled_at=0)
-    train(state, first, range(75))
+    train(state, first, range(75), last=74 if planned else LAST)
     second.load_state_dict(state, first.state_dict())
+    second.before_training(run_of(state))
     train(state, second, range(75, LAST + 1))
     assert torch.equal(state.field["means"], expected)
     assert not second.state_dict()["mean"]  # the mean is in the field: a checkpoint needs it no more
@@ -115,6 +119,17 @@ def test_a_longer_training_goes_on_from_the_last_weights(state: Any) -> None:
     again.before_training(run_of(state))
     assert all(torch.equal(value, last[name]) for name, value in state.field.items())
     assert not again.state_dict()["replaced"]
+
+
+def test_a_first_part_ends_with_the_mean_of_its_last_steps(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As far as it reaches into the share: what is packed from there on begins at the mean."""
+    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 2)
+    seen: list[torch.Tensor] = []
+    mean = Averaging(0.09, settled_at=0)
+    train(state, mean, range(96), seen=seen, last=95)
+    assert len(seen) == 3
+    torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+    assert mean.state_dict()["replaced"]
 
 
 def test_a_rank_without_primitives(state: Any) -> None:

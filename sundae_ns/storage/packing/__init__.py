@@ -1,7 +1,7 @@
 """Packed scenes: a field, its head and its cameras in one small, checksummed file without executable content."""
 
 from sundae_ns.storage.packing.codecs import Codecs, Sensitivity
-from sundae_ns.storage.packing.config import FINETUNE_STEPS, FINETUNED, FINETUNED_SIZE, PackConfig
+from sundae_ns.storage.packing.config import FINETUNE_STEPS, FINETUNED, FINETUNED_SIZE, PackConfig, tuned_steps
 from sundae_ns.storage.packing.container import read_header
 from sundae_ns.storage.packing.scene import (
     PackedScene,
@@ -26,6 +26,7 @@ __all__ = [
     "pack_bytes",
     "read_header",
     "read_scene",
+    "tuned_steps",
     "write_fitted",
     "write_scene",
 ]

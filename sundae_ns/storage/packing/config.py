@@ -58,5 +58,15 @@ FINETUNED: dict[str, int | float] = {
 """Coarser options for scenes that were fine-tuned with them (``sundae_ns.scenes.finetune``)."""
 FINETUNE_STEPS = 1500
 """Steps of a fine-tune that make up for them: packs lose at most about 0.1 dB more (``curve.csv``)."""
+LEAST_LENGTHS = 20
+"""A run whose last steps are a fine-tune has at least this many times its steps: measured with a twentieth."""
 FINETUNED_SIZE = 0.6
 """Bytes of such a pack as a share of one without: 0.58 to 0.61 on six captures."""
+
+
+def tuned_steps(length: int, steps: int = FINETUNE_STEPS) -> int:
+    """Number of steps at the end of a schedule of ``length`` steps that a fine-tune takes the place of.
+
+    0 for shorter schedules, whose fine-tune comes after the last step.
+    """
+    return steps if length >= LEAST_LENGTHS * steps else 0
