@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -222,6 +223,44 @@ def _stock(cell: Callable[[dict[str, float]], str]) -> dict[str, dict[str, str]]
     }
 
 
+def equal_quality() -> list[str]:
+    """Bytes of our smallest fine-tuned packs as a share of stock's .sog by splat-transform, at its PSNR and its SSIM.
+
+    Between measured fixed shares that enclose its quality, the bytes lie on a line, in their logarithm.
+    """
+    packs: dict[str, list[dict[str, float]]] = {}
+    for row in lines_of("curve.csv"):
+        if row["tuned_bytes"]:
+            fixed = row["method"] == "sundae" and row["chosen"] == "no"
+            cells = {name: float(row[f"tuned_{name}"]) for name in ("bytes", "psnr", "ssim")}
+            packs.setdefault(row["capture"], []).append({**cells, "fixed": fixed})
+    for line in lines_of("pack.jsonl"):
+        if line.get("variant") == "sundae-fast" and line["finetune_steps"]:
+            cells = {"bytes": line["bytes"], "psnr": line["psnr_packed"], "ssim": line["ssim_packed"]}
+            packs[line["run"]].append({**cells, "fixed": False})
+    theirs = {
+        row["capture"]: {name: float(row[name]) for name in ("bytes", "psnr", "ssim")}
+        for row in sorted(lines_of("formats.csv"), key=lambda row: str(row["capture"]))
+        if row["format"] == ".sog" and row["program"].startswith("splat-transform")
+    }
+    rows = []
+    for name in ("psnr", "ssim"):
+        shares = [_least_bytes(packs[capture], name, sog[name]) / sog["bytes"] for capture, sog in theirs.items()]
+        rows.append([f"at its {name.upper()}", *(f"1/{1 / share:.0f}" for share in [*shares, fmean(shares)])])
+    return table([".sundae / .sog", *theirs, "mean"], rows, words=1)
+
+
+def _least_bytes(packs: Sequence[dict[str, float]], metric: str, aim: float) -> float:
+    """Bytes of the smallest pack that reaches a metric, measured or on a line between neighbouring fixed shares."""
+    sizes = [pack["bytes"] for pack in packs if pack[metric] >= aim]
+    fixed = sorted((pack for pack in packs if pack["fixed"]), key=lambda pack: pack["bytes"])
+    for less, more in pairwise(fixed):
+        if less[metric] < aim <= more[metric]:
+            part = (aim - less[metric]) / (more[metric] - less[metric])
+            sizes.append(less["bytes"] ** (1 - part) * more["bytes"] ** part)
+    return min(sizes)
+
+
 def multi_gpu() -> list[str]:
     """Training on one and several GPUs."""
     heads = ["field", "GPUs", "primitives", "images a second", "PSNR, dB", "MiB of a GPU, at most"]
@@ -294,6 +333,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "packing": packing,
     "formats": formats,
     "packed-headline": packed_headline,
+    "equal-quality": equal_quality,
     "multi-gpu": multi_gpu,
     "prune": prune,
     "trials": trials,

@@ -55,8 +55,7 @@ class SundaeTrainerConfig(TrainerConfig):
     """Steps over which prune, densification, resolution and learning rates are spread, unless you set their options: by
     default max_num_iterations, and the length of the run that is resumed. A larger number trains the first part."""
     finetune_steps: int | None = None
-    """Steps of the fine-tune with which the run will be packed (sundae pack RUN --finetune): training leaves it as many
-    at the end of the schedule, if they are at most a twentieth of it."""
+    """Steps at the end of the schedule, at most a twentieth of it, that are left to sundae pack RUN --finetune."""
 
     def print_to_terminal(self) -> None:
         """Check the capture, make the schedule and log it; the other options are in ``config.yml``.
@@ -75,9 +74,8 @@ class SundaeTrainerConfig(TrainerConfig):
             datamanager.check()
         set_schedule(self, sys.argv[1:])
         scaled = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
-        table = Table(
-            "part of training", "steps", title=f"{self.max_num_iterations:,}{scaled} steps", title_justify="left"
-        )
+        title = f"{self.max_num_iterations:,}{scaled} steps"
+        table = Table("part of training", "steps", title=title, title_justify="left")
         for row in schedule_table(self):
             table.add_row(*row)
         CONSOLE.print(table)
