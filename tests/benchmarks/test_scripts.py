@@ -281,6 +281,20 @@ def test_packed_formats_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, tmp_
     assert tables["formats"]()[-1] == "| fox |  |  |  | 9.0, 29.50, 0.700 | 7.0, 29.20, 0.650 |"
 
 
+def test_bytes_at_equal_quality_are_measured_or_between_fixed_shares(monkeypatch: pytest.MonkeyPatch) -> None:
+    least = loaded(monkeypatch, "tables.py")["_least_bytes"]
+    packs = [
+        {"bytes": 4e6, "psnr": 22.0, "fixed": True},
+        {"bytes": 1e6, "psnr": 20.0, "fixed": True},
+        {"bytes": 3e6, "psnr": 21.9, "fixed": False},
+    ]
+    assert least(packs, "psnr", 21.0) == pytest.approx(2e6)  # halfway in the logarithm
+    assert least(packs, "psnr", 21.8) == 3e6
+    assert least(packs, "psnr", 20.0) == 1e6
+    with pytest.raises(ValueError, match="empty"):
+        least(packs, "psnr", 22.1)
+
+
 def test_the_curve_shows_todays_shares_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     today_at = {share: sorted(fingerprints("sundae", share))[0] for share in (0.1, 0.2)}
     rows = [
