@@ -71,6 +71,11 @@ def _make_value(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
     module, _, name = suffix.rpartition(".")
     if module.partition(".")[0] == "pathlib" and name in _PATHS and all(isinstance(a, str) for a in arguments):
         return Path(*arguments)
+    if suffix == "builtins.getattr":  # as Python before 3.11.4 saves a member of an enumeration
+        kind, name = arguments if len(arguments) == 2 else (None, "")
+        if isinstance(kind, type) and issubclass(kind, Enum) and isinstance(name, str) and name in kind.__members__:
+            return kind[name]
+        raise ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
     kind = _named(suffix, node)
     if not isinstance(kind, type) or not issubclass(kind, Enum) or len(arguments) != 1:
         raise ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)

@@ -9,6 +9,7 @@ import pytest
 import yaml
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.utils.writer import EventName
 
 from harness.cameras import training_cameras
 from sundae_ns.errors import CheckpointError, DataError
@@ -53,7 +54,23 @@ def test_the_class_paths_of_earlier_runs_still_open(tmp_path: Path) -> None:
         assert yaml.dump(found) == text
 
 
+def test_a_run_of_an_early_python_3_11_opens(tmp_path: Path) -> None:
+    """Before 3.11.4 a member of an enumeration was saved as an attribute of its class."""
+    path = tmp_path / "config.yml"
+    call = "!!python/object/apply:builtins.getattr [!!python/name:nerfstudio.utils.writer.EventName '', {}]"
+    path.write_text(f"!!python/object:nerfstudio.engine.trainer.TrainerConfig {{data: {call.format('ETA')}}}")
+    assert load_config(path).data is EventName.ETA
+    for attribute in ("__class__", "__members__", "3", "[ETA]"):
+        path.write_text(f"!!python/object:nerfstudio.engine.trainer.TrainerConfig {{data: {call.format(attribute)}}}")
+        with pytest.raises(CheckpointError):
+            load_config(path)
+
+
 HOSTILE = {
+    "an attribute": (
+        "!!python/object/apply:builtins.getattr [!!python/name:nerfstudio.engine.trainer.Trainer '', setup]"
+    ),
+    "an attribute of nothing": "!!python/object/apply:builtins.getattr []",
     "a call": "!!python/object/apply:os.mkdir ['{}']",
     "a new object": "!!python/object/new:os.mkdir\nargs: ['{}']",
     "a call of nerfstudio's": "!!python/object/apply:nerfstudio.utils.scripts.run_command ['mkdir {}']",
