@@ -17,6 +17,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import tempfile
 import tomllib
 import venv
@@ -87,7 +88,10 @@ def build(folder: Path) -> tuple[Path, Path]:
         (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, folder / "source" / name, follow_symlinks=False)
     sdist = folder / run(sys.executable, "-c", BUILD, "sdist", folder, cwd=folder / "source").splitlines()[-1]
-    shutil.unpack_archive(sdist, folder / "unpacked", filter="data")
+    with tarfile.open(sdist) as archive:
+        if hasattr(tarfile, "data_filter"):  # not before Python 3.11.4
+            archive.extraction_filter = tarfile.data_filter
+        archive.extractall(folder / "unpacked")
     (unpacked,) = (folder / "unpacked").iterdir()
     wheel = folder / run(sys.executable, "-c", BUILD, "wheel", folder, cwd=unpacked).splitlines()[-1]
     return sdist, wheel
