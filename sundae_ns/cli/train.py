@@ -90,8 +90,9 @@ def train(
 
 def _pack(run: Path, *, tunes: bool) -> int:
     """Pack a finished run, without a fine-tune where that fails; the exit code."""
+    more = ["--overwrite"] if (run / PACKED).exists() else []  # of the steps before a resume
     for finetune in (True, False) if tunes else (False,):
-        words = pack_command(run, run / PACKED, finetune=finetune)
+        words = pack_command(run, run / PACKED, *more, finetune=finetune)
         print(shlex.join(words), flush=True)
         code = run_in_group(words, saves=False)
         if not code or code in STOPPED:

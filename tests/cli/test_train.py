@@ -299,10 +299,13 @@ def test_a_run_that_its_fine_tune_has_finished_is_no_interrupted_one(
     (run / "scene.sundae").touch()
     assert exit_code() == 0
     assert "# " not in capsys.readouterr().out
+    assert "--overwrite" not in trained.ran[-1][0]
     trained.ran.clear()
     trained.elsewhere = True
     assert exit_code("--resume") == 0
-    assert option_of(trained.ran[0][0], "--load-dir") == str(run / "nerfstudio_models")
+    (resumed, _), (pack, _) = trained.ran
+    assert option_of(resumed, "--load-dir") == str(run / "nerfstudio_models")
+    assert (pack[2], pack[-1]) == (str(run), "--overwrite"), "the new steps take the place of their pack"
 
 
 @pytest.mark.parametrize("stage", ["ns-train", "--finetune", "sundae"])
