@@ -207,7 +207,7 @@ def packed_headline() -> list[str]:
     return table(["capture", f"splatfacto, {kinds[0]}", *kinds[1:], "sundae", "fine-tuned"], rows, words=1)
 
 
-def _stock(cell: Callable[[dict[str, float]], str]) -> dict[str, dict[str, str]]:
+def _stock(cell: Callable[[dict[str, float]], Any]) -> dict[str, dict[str, Any]]:
     """A cell of stock splatfacto for each format, by capture, from means over the seeds."""
     groups: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for line in sorted(lines_of("formats.csv"), key=lambda line: str(line["capture"])):
@@ -238,11 +238,7 @@ def equal_quality() -> list[str]:
         if line.get("variant") == "sundae-fast" and line["finetune_steps"]:
             cells = {"bytes": line["bytes"], "psnr": line["psnr_packed"], "ssim": line["ssim_packed"]}
             packs[line["run"]].append({**cells, "fixed": False})
-    theirs = {
-        row["capture"]: {name: float(row[name]) for name in ("bytes", "psnr", "ssim")}
-        for row in sorted(lines_of("formats.csv"), key=lambda row: str(row["capture"]))
-        if row["format"] == ".sog" and row["program"].startswith("splat-transform")
-    }
+    theirs = {capture: kinds[".sog theirs"] for capture, kinds in _stock(dict).items() if ".sog theirs" in kinds}
     rows = []
     for name in ("psnr", "ssim"):
         shares = [_least_bytes(packs[capture], name, sog[name]) / sog["bytes"] for capture, sog in theirs.items()]
