@@ -7,7 +7,7 @@ into every run's ``config.yml``, so moving them breaks saved runs.
 from __future__ import annotations
 
 from collections.abc import Mapping, MutableMapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -24,7 +24,7 @@ from torch import Tensor
 from sundae_ns.callbacks import NerfstudioRun, training_views
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window
 from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, no_images_error, view_index
-from sundae_ns.evaluation import Lpips, fitted_psnr, psnr, ssim
+from sundae_ns.evaluation import Lpips, psnr, quality_of
 from sundae_ns.evaluation.count_curve import CurvePoint
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.parsing import check_projection
@@ -41,6 +41,7 @@ from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.initial_field import Start
 from sundae_ns.training.losses import StepLosses
+from sundae_ns.training.photo_gains import PhotoGains
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.step import StepInputs, TrainingStep, training_part
 from sundae_ns.training.trials.count import CountTrials
@@ -66,6 +67,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Weight of opacities and scales in the loss of the pruned field, over the number of training images."""
     average_share: float = 0.1
     """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
+    photo_gains: bool = False
+    """For photos whose exposure or white balance changes: even each out with those of neighbouring cameras."""
     dense_start_views: int = 300
     """With at most this many training images, a plane sweep fills a sparse cloud to start from; 0 turns it off."""
     warm_start: Path | None = None
@@ -113,6 +116,7 @@ class SundaeModel(SplatfactoModel):
         self.state, self.extensions, self._start = build(config, self.num_train_data, self.seed_points, frame)
         self.gauss_params, self.networks = cast(Any, self.state.field.data), self.state.networks
         self.source = LocalField(self.state.field)
+        self.photo_gains = next(one for one in self.extensions if isinstance(one, PhotoGains))
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self.losses = StepLosses(config, self.ssim, self.num_train_data)
@@ -122,8 +126,7 @@ class SundaeModel(SplatfactoModel):
         self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution, self.count_curve)
         self.compensated = True
         """Whether images outside of a viewer get the head's correction."""
-        self._response = ShownResponse()
-        self._replay = FrameReplay()
+        self._response, self._replay = ShownResponse(), FrameReplay()
         self._views: dict[tuple[int | None, int], View] = {}
         """Views of training cameras that do not move, by index and divisor of their sides."""
 
@@ -229,9 +232,7 @@ class SundaeModel(SplatfactoModel):
         )
 
     @torch.no_grad()
-    def get_outputs_for_camera(  # type: ignore[override]
-        self, camera: Cameras, obb_box: OrientedBox | None = None
-    ) -> MutableMapping[str, Any]:
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]
         """Render a camera, or the primitives in a box; unlike splatfacto's, this leaves the camera on its device."""
         if not in_viewer():  # an error would end the viewer
             check_projection(camera)
@@ -310,7 +311,7 @@ class SundaeModel(SplatfactoModel):
     def step_inputs(self, camera: Cameras, batch: dict[str, Any]) -> StepInputs:
         """What a step outside of nerfstudio's loop trains on, from a camera of shape ``(1,)`` and its batch."""
         background, (view, window) = self._get_background_color(), self._training_view(camera)
-        target = self.truth(batch, {"background": background, "window": window})
+        target = self.target(batch, {"background": background, "window": window})
         return StepInputs(view, target, self.mask(batch, window), background, window)
 
     def _get_downscale_factor(self) -> int:
@@ -354,26 +355,24 @@ class SundaeModel(SplatfactoModel):
         truth = crop_image(self.get_gt_img(batch["image"], downscale), outputs.get("window"))
         return self.composite_with_background(truth, outputs["background"])
 
+    def target(self, batch: dict[str, Any], outputs: Mapping[str, Any]) -> Tensor:
+        """What outputs are compared with: the truth, in training divided by the gain of its photo ``[H, W, 3]``."""
+        truth = self.truth(batch, outputs)
+        return self.photo_gains.balanced(truth, batch) if self.training else truth
+
     def mask(self, batch: dict[str, Any], window: Window | None) -> Tensor | None:
         """Pixels of a batch that count, at the resolution of this step ``[H, W, 1]``; None for all."""
-        if "mask" not in batch:
-            return None
-        return crop_image(self._downscale_if_required(batch["mask"]).to(self.device), window).float()
+        mask = None if "mask" not in batch else self._downscale_if_required(batch["mask"]).to(self.device)
+        return None if mask is None else crop_image(mask, window).float()
 
-    def get_metrics_dict(  # type: ignore[override]
-        self, outputs: dict[str, Any], batch: dict[str, Any]
-    ) -> LazyOutputs:
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> LazyOutputs:  # type: ignore[override]
         """PSNR with and without the head, and the number of primitives; computed on access, which few steps need."""
         # They may be read during the next step. Bind the resolution now, and do not keep the autograd graph alive.
         rgb, base, downscale = outputs["rgb"].detach(), outputs["base_rgb"].detach(), self._get_downscale_factor()
         target = partial(self.truth, batch, {name: outputs.get(name) for name in ("window", "background")}, downscale)
-        metrics = LazyOutputs(
-            {
-                "psnr": Later(lambda: psnr(rgb.clamp(0, 1), target())),
-                "psnr_base": Later(lambda: psnr(base, target())),
-                "gaussian_count": self.source.total,
-            }
-        )
+        metrics = LazyOutputs({"gaussian_count": self.source.total})
+        metrics["psnr"] = Later(lambda: psnr(rgb.clamp(0, 1), target()))
+        metrics["psnr_base"] = Later(lambda: psnr(base, target()))
         self.camera_optimizer.get_metrics_dict(metrics)  # type: ignore[arg-type]
         return metrics
 
@@ -381,10 +380,11 @@ class SundaeModel(SplatfactoModel):
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
         """Loss of the image and, while the head is enabled, an L1 loss of the base colours."""
-        target, mask = self.truth(batch, outputs), self.mask(batch, outputs.get("window"))
+        target, mask = self.target(batch, outputs), self.mask(batch, outputs.get("window"))
         losses = self.training_step.terms(outputs, target, mask)
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
+            self.photo_gains.observe(outputs["rgb"], target, mask, batch)
         return losses
 
     def get_image_metrics_and_images(
@@ -394,7 +394,6 @@ class SundaeModel(SplatfactoModel):
         target = self.truth(batch, outputs)
         metrics = {"gaussian_count": float(self.source.total)}
         for suffix, image in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
-            found = {"psnr": psnr(image, target), "psnr_fitted": fitted_psnr(image, target)}
-            found |= {"ssim": ssim(image, target), "lpips": self.lpips(image, target)}
-            metrics |= {name + suffix: float(value) for name, value in found.items() if value is not None}
+            found = asdict(quality_of(image, target, self.lpips, visible=False))
+            metrics |= {name + suffix: value for name, value in found.items() if value is not None}
         return metrics, {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}

@@ -264,11 +264,11 @@ class SundaeTrainer(Trainer):
             inputs = model.step_inputs(camera, batch)
             result = self._recorded(model.state, inputs, model.render_settings(training=True))
         except (BackendError, torch.cuda.OutOfMemoryError) as error:
-            reason = str(error).splitlines()[0]
-            warn(f"training continues without recordings, slower: {reason}")
+            warn(f"training continues without recordings, slower: {str(error).splitlines()[0]}")
             self._recorded = None
             torch.cuda.empty_cache()
             return None
+        model.photo_gains.observe(result.images["rgb"], inputs.target, inputs.mask, batch)
         # Not nerfstudio's method, which also writes every rate at every step; that takes longer than to launch one.
         for scheduler in self.optimizers.schedulers.values():
             scheduler.step()

@@ -28,6 +28,7 @@ from sundae_ns.training.densification import CappedStrategy, Densification
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.floaters import FloaterRemoval
+from sundae_ns.training.photo_gains import PhotoGains
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.warning import warn
 
@@ -122,6 +123,8 @@ class Team:
             return ShardedDensification(strategy, self.shards)
         if isinstance(extension, (ScheduledPruning, FloaterRemoval)):
             extension.pruner = partial(RankPruner, shards=self.shards)
+        if isinstance(extension, PhotoGains):
+            extension.total = summed
         if isinstance(extension, DenseStart):
             extension.found, extension.put = self.shards.by_first, partial(_put_block, shards=self.shards)
         return extension
@@ -180,6 +183,12 @@ def _take_block(state: FieldState, shards: Shards) -> None:
     for value in state.field.values():
         value.data = value.data[start:end].clone()
     shards.recount(state.field)
+
+
+def summed(values: Tensor) -> Tensor:
+    """The sum of the tensors of all ranks, in place. Collective."""
+    dist.all_reduce(values)
+    return values
 
 
 def _put_block(state: FieldState, params: Mapping[str, Tensor], *, shards: Shards) -> None:

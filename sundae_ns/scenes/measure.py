@@ -25,14 +25,10 @@ from sundae_ns.evaluation import (
     Lpips,
     Measured,
     ViewQuality,
-    fitted_psnr,
-    flip,
     median_ms,
-    psnr,
-    ssim,
+    quality_of,
     without_nan,
 )
-from sundae_ns.evaluation.jod import jod
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import compensate, draw, scale_plan, zoomed
@@ -184,7 +180,7 @@ def measure_scene(
         for name, on in ways.items():
             with compensation(model, on):
                 image = model.get_outputs_for_camera(camera)["rgb"]
-            views[name].append(quality(image, truth, lpips, visible=visible))
+            views[name].append(quality_of(image, truth, lpips, visible=visible))
         if repeats:
             found = frame_times(model, [camera], warmup=warmup, repeats=repeats)
             for name, on in ways.items():
@@ -254,15 +250,6 @@ def evaluation(run: Path, *, data: Path | None = None) -> dict[str, Any]:
         }
     )
     return plain
-
-
-def quality(image: Tensor, truth: Tensor, lpips: Lpips | None = None, *, visible: bool = True) -> ViewQuality:
-    """Every metric of one image ``[H, W, 3]`` against its truth; ``visible`` is that of :func:`measure_scene`."""
-    found: dict[str, Any] = {"psnr": psnr(image, truth), "psnr_fitted": fitted_psnr(image, truth)}
-    found |= {"ssim": ssim(image, truth), "lpips": None if lpips is None else lpips(image, truth)}
-    if visible:
-        found |= {"flip": flip(image, truth), "jod": jod(image, truth)}
-    return ViewQuality(**{name: float(value) for name, value in found.items() if value is not None})
 
 
 def comparison_of(model: SundaeModel, camera: Cameras, truth: Tensor, title: str) -> ComparisonRow:

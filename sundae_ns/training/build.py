@@ -17,6 +17,7 @@ from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.floaters import FloaterRemoval
 from sundae_ns.training.initial_field import Frame, Points, Start, initial_field
 from sundae_ns.training.options import ModelOptions
+from sundae_ns.training.photo_gains import PhotoGains
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.schedules import PruningSchedule
 from sundae_ns.training.trials.count import CountTrials
@@ -64,8 +65,8 @@ def build(
 
     Returns:
         State of field and head; extensions in their order (dense start, densification, removal of floaters, trials of
-        counts, scheduled pruning, trials of the head and stopping, averaging; trials and averaging optional); what to
-        announce when training starts.
+        counts, scheduled pruning, trials of the head and stopping, gains of the photos, averaging; trials and
+        averaging optional); what to announce when training starts.
 
     Raises:
         ConfigError: an option cannot work.
@@ -98,6 +99,7 @@ def build(
     if options.head.mode == "auto":
         decision = HeadTrials(begins_at, state, engine, None if counts is None else counts.head_pays)
         extensions += [decision, EarlyStopping(decision, options.ssim_lambda, engine)]
+    extensions.append(PhotoGains(num_images if options.photo_gains else 0))
     if options.average_share > 0:
         extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
     return state, extensions, start

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import torch
 import torch.distributed as dist
+from photographed import COUNT, batch_of, begin, image_of, update
 from shared_fields import (
     COLORS,
     Passed,
@@ -36,7 +37,7 @@ from sundae_ns.distributed import Shards
 from sundae_ns.distributed.batches import average_gradients
 from sundae_ns.distributed.densification import ShardedDensification
 from sundae_ns.distributed.pruning import RankPruner
-from sundae_ns.distributed.team import _put_block, take_shard
+from sundae_ns.distributed.team import _put_block, summed, take_shard
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning.cutting import FieldPruner
@@ -89,6 +90,20 @@ def check_an_empty_shard(shards: Shards) -> None:
             torch.testing.assert_close(value.grad, alone[name].grad, rtol=1e-10, atol=1e-14)
         optimizers[name].step()
         assert len(value) == shards.counts[shards.rank]
+
+
+def check_gains_of_photos(shards: Shards) -> None:
+    """All ranks divide photos by the same gains, from what both have measured."""
+    gains, run = begin()
+    gains.total = summed
+    for index in range(shards.rank, COUNT, 2):
+        gains.observe(image_of(index), image_of(index) * (1.3 if index % 3 else 1.0), None, batch_of(index))
+    update(gains, run)
+    state = gains.state_dict()
+    assert state["counts"].tolist() == [1] * COUNT
+    expected = torch.tensor([1.3 if index % 3 else 1.0 for index in range(COUNT)]).log()
+    torch.testing.assert_close(state["measured"].mean(dim=1).float(), expected, rtol=1e-4, atol=1e-4)
+    assert state["gains"].std() > 0.05
 
 
 class Tripling:
@@ -269,6 +284,7 @@ def checks(_: Path) -> dict[str, Callable[[Shards], None]]:
     """The checks of each rank, in this order."""
     plain = (
         check_levelling,
+        check_gains_of_photos,
         check_an_empty_shard,
         check_drift,
         check_pruning,

@@ -12,6 +12,7 @@ import torch
 from sundae_ns.distributed import Team
 from sundae_ns.distributed.densification import ShardedDensification
 from sundae_ns.distributed.pruning import RankPruner
+from sundae_ns.distributed.team import summed
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.method_configs import sundae_tiny
@@ -20,6 +21,7 @@ from sundae_ns.training.dense_start import DenseStart
 from sundae_ns.training.densification import CappedStrategy, ChainStrategy, Densification
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.photo_gains import PhotoGains
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedules import PruningSchedule
@@ -90,5 +92,8 @@ def test_ranks_densify_and_prune_as_one() -> None:
     dense = DenseStart(sundae_tiny.config.pipeline.model, None, 7, num_features=0, cap=None)  # type: ignore[attr-defined]
     assert team._sharded(dense, 7) is dense
     assert dense.found is shards.by_first
+    gains = PhotoGains(7)
+    assert team._sharded(gains, 7) is gains
+    assert gains.total is summed
     other = Extension()
     assert team._sharded(other, 7) is other

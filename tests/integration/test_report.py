@@ -21,10 +21,10 @@ from nerfstudio.configs.method_configs import method_configs
 from PIL import Image
 
 from sundae_ns.cli import main
-from sundae_ns.evaluation import COLUMNS, flip_available
+from sundae_ns.evaluation import COLUMNS, flip_available, quality_of
 from sundae_ns.evaluation.jod import jod_available
 from sundae_ns.rendering import render_view
-from sundae_ns.scenes.measure import quality, walk
+from sundae_ns.scenes.measure import walk
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage.packing import write_scene
@@ -132,7 +132,7 @@ def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any
             images, _ = render_view(
                 model.source, model.view_of(opened.cameras[1]), model._get_background_color(), settings
             )
-        expected = quality(images["rgb"], opened.truths[1])
+        expected = quality_of(images["rgb"], opened.truths[1])
         found = way["views"][1]
         assert (found["psnr"], found["ssim"]) == (pytest.approx(expected.psnr), pytest.approx(expected.ssim))
         assert (found["flip"] is not None) == flip_available()

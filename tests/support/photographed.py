@@ -1,0 +1,62 @@
+"""A field that is right, photos of it by cameras on a ring, and the measurement of their gains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from sundae_ns.rendering.views import View
+from sundae_ns.training.extension import TrainingRun
+from sundae_ns.training.photo_gains import REFRESHED_EVERY, PhotoGains
+
+COUNT = 48
+ANGLES = torch.arange(COUNT) * 2 * math.pi / COUNT
+
+
+def ring(count: int = COUNT) -> list[View]:
+    """Cameras on a circle that look at its middle."""
+    angles = torch.arange(count) * 2 * math.pi / count
+    return [View.look_at((3 * math.cos(a), 3 * math.sin(a), 1.0), (0, 0, 0), width=64, height=48) for a in angles]
+
+
+def run_of(views: list[View], *, ranks: int = 1) -> TrainingRun:
+    indices = list(range(len(views)))
+    shown = [SimpleNamespace(view=view, mask=None) for view in views]
+    members = {"view_indices": lambda: indices, "training_views": lambda: shown, "images_per_step": ranks}
+    return cast(TrainingRun, SimpleNamespace(state=SimpleNamespace(step=0), **members))
+
+
+def begin(count: int = COUNT) -> tuple[PhotoGains, TrainingRun]:
+    gains, run = PhotoGains(count), run_of(ring(count))
+    gains.before_training(run)
+    return gains, run
+
+
+def image_of(index: int) -> Tensor:
+    """What the field shows of a view, dark enough that no photo is clipped."""
+    return 0.1 + 0.4 * torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(index))
+
+
+def batch_of(index: int, channels: int = 3) -> dict[str, Any]:
+    return {"image_idx": index, "image": torch.zeros(48, 64, channels, dtype=torch.uint8)}
+
+
+def measure(gains: PhotoGains, run: TrainingRun, photos: Callable[[int], Tensor], rounds: int = 12) -> None:
+    """Steps that see each photo once between two updates. The field is right, and does not change."""
+    for _ in range(rounds):
+        run.state.step = 0
+        for index in range(COUNT):
+            batch = batch_of(index)
+            gains.observe(image_of(index), gains.balanced(photos(index), batch), None, batch)
+        update(gains, run)
+
+
+def update(gains: PhotoGains, run: TrainingRun) -> None:
+    run.state.step = REFRESHED_EVERY - 1
+    gains.after_step(run)
+    run.state.step = 0
