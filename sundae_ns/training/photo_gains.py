@@ -26,6 +26,7 @@ from sundae_ns.rasterization.projection import camera_center
 from sundae_ns.rendering.views import View
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.warning import warn
 
 NEIGHBORS = 8
 """Cameras with which one is compared."""
@@ -87,9 +88,14 @@ class PhotoGains(Extension):
 
     def before_training(self, run: TrainingRun) -> None:
         """Build the graph of the cameras."""
-        if len(self._gains) == 0 or len(run.view_indices()) < LEAST_PHOTOS:
+        if len(self._gains) == 0:
             return
         indices, views = run.view_indices(), [own.view for own in run.training_views()]
+        if len(indices) < LEAST_PHOTOS:
+            warn(
+                f"photo-gains is off: {len(indices)} training photos are too few to be compared with those beside them"
+            )
+            return
         self._state, self._rows = run.state, np.asarray(indices)
         self._smoother = Smoother(build_graph(places(views).cpu(), num_neighbors=NEIGHBORS), SMOOTHING)
         if run.images_per_step > 1:  # of the first rank alone
@@ -133,7 +139,7 @@ class PhotoGains(Extension):
 
     def finish(self, run: TrainingRun) -> None:
         """Say how much the photos differ."""
-        if len(self._gains) == 0:
+        if self._smoother is None:
             return
         exposure = self._gains.double().cpu().log().mean(dim=1)
         most = float(exposure.abs().max().exp()) - 1

@@ -95,7 +95,9 @@ def test_gains_are_bounded() -> None:
     assert gains.state_dict()["measured"][7].tolist() == pytest.approx([-math.log(photo_gains.MOST)] * 3)
 
 
-def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alone() -> None:
+def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alone(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     photo = image_of(0)
     gains, run = begin()
     measure(gains, run, lambda index: image_of(index) * (1 + index % 2))
@@ -110,6 +112,9 @@ def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alo
         few.observe(photo, few.balanced(photo * 2, batch_of(0)), None, batch_of(0))
         update(few, run)
         assert torch.equal(few.balanced(photo, batch_of(0)), photo)
+        few.finish(run)
+    # Once: nobody has asked for gains of no photos.
+    assert " ".join(capsys.readouterr().out.split()).count("31 training photos are too few") == 1
 
 
 def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
