@@ -157,3 +157,8 @@ class Shards:
         dist.all_reduce(ends, dist.ReduceOp.MIN)
         low, high = ends.tolist()
         return None if math.isinf(low) else (low, -high)
+
+    def summed(self, values: Tensor) -> Tensor:
+        """The sum of the tensors of all ranks, in place. Collective."""
+        dist.all_reduce(values)
+        return values

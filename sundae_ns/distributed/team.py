@@ -124,7 +124,7 @@ class Team:
         if isinstance(extension, (ScheduledPruning, FloaterRemoval)):
             extension.pruner = partial(RankPruner, shards=self.shards)
         if isinstance(extension, PhotoGains):
-            extension.total = summed
+            extension.total = self.shards.summed
         if isinstance(extension, DenseStart):
             extension.found, extension.put = self.shards.by_first, partial(_put_block, shards=self.shards)
         return extension
@@ -183,12 +183,6 @@ def _take_block(state: FieldState, shards: Shards) -> None:
     for value in state.field.values():
         value.data = value.data[start:end].clone()
     shards.recount(state.field)
-
-
-def summed(values: Tensor) -> Tensor:
-    """The sum of the tensors of all ranks, in place. Collective."""
-    dist.all_reduce(values)
-    return values
 
 
 def _put_block(state: FieldState, params: Mapping[str, Tensor], *, shards: Shards) -> None:

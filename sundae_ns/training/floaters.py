@@ -11,7 +11,6 @@ from torch import Tensor
 
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.pruning.floaters import MOST, near_cameras
-from sundae_ns.rasterization.projection import camera_center
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 
@@ -50,7 +49,7 @@ class FloaterRemoval(Extension):
         views = [own.view for own in run.training_views()]
         if not views:
             return
-        eyes = torch.stack([camera_center(view.viewmat) for view in views])
+        eyes = torch.stack([view.center for view in views])
         pruner = self.pruner(state.field, state.optimizers, [state.densification])
         removed = pruner.drop(near_cameras(state.field["means"], eyes, self._points), at_most=MOST)
         if removed:

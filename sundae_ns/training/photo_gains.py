@@ -1,12 +1,11 @@
-"""Gains of the photos in training: exposure and white balance in which a photo differs from those beside it.
+"""Gains of the training photos: differences in exposure and white balance between neighbouring photos.
 
-A camera that adjusts itself photographs one wall brighter and darker. A field that has to agree with all of the photos
-becomes an average of them, with a haze where they disagree. So each photo is divided by its gain, three numbers, before
-it is compared. Test views and finished scenes have no gains.
+A camera with automatic exposure photographs one wall in different brightness. A field that fits all of these photos
+shows their average, and haze where they disagree. So the loss compares each photo after a division by its gain, one
+number a channel. Test views and finished scenes have no gains.
 
-What neighbouring photos share may come from the place, such as light from a window, and a field can show that by
-itself. Left in the gains it would be lost for every other view. So a gain is a high-pass response on the graph of the
-cameras: what its neighbours do not have.
+Light that neighbouring photos share may belong to the place, as beside a window. A field can show it, and a gain would
+remove it from every other view. So a gain is a high-pass response on the graph of the cameras.
 """
 
 from __future__ import annotations
@@ -22,32 +21,31 @@ from torch import Tensor
 
 from sundae_ns.filters import Smoother
 from sundae_ns.graphs import build_graph
-from sundae_ns.rasterization.projection import camera_center
 from sundae_ns.rendering.views import View
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.warning import warn
 
 NEIGHBORS = 8
-"""Cameras with which one is compared."""
+"""Neighbours of a camera in the graph."""
 SMOOTHING = 8.0
-"""Strength of the filter that finds what neighbours have in common."""
+"""Strength of the filter that computes the smooth part of the gains."""
 NOISE = 0.03
-"""Relative differences between neighbours that a field's own errors make: 1 to 3% where the light does not change."""
+"""Relative differences between neighbours by errors of the field. They are 1 to 3% where the light is constant."""
 LEAST_PHOTOS = 32
-"""With fewer photos, neighbours are too far apart to be compared."""
+"""Least number of photos. The neighbours of fewer photos are too far apart."""
 MEASURED_EVERY = 2
-"""Steps between two measurements, which take some small kernels each."""
+"""Steps between two measurements. A measurement launches some ten small kernels."""
 REFRESHED_EVERY = 200
-"""Steps between two updates, each of which waits for the GPU."""
+"""Steps between two updates. An update waits for the GPU."""
 NEWEST_WEIGHT = 0.3
-"""Weight of a new measurement of a photo beside its earlier ones; the field changes while they are taken."""
+"""Weight of a new measurement in the mean of a photo. Older ones are of an earlier field."""
 MOST = 4.0
-"""Largest factor between a photo and its image that counts as a gain."""
+"""Largest measured factor between a photo and its image."""
 CLIPPED = 0.98
-"""From this value on a pixel of a photo may be clipped, and says nothing of its gain."""
+"""Pixels of a photo from this value on may be clipped, and are not measured."""
 SAMPLE = 1 << 14
-"""About as many pixels of an image are measured."""
+"""Approximate number of measured pixels of an image."""
 
 
 class PhotoGains(Extension):
@@ -62,15 +60,15 @@ class PhotoGains(Extension):
     def __init__(self, num_photos: int) -> None:
         self._gains = torch.ones(num_photos, 3)
         self._sums = torch.zeros(num_photos, 2, 3)
-        """Of photo times image and of squares of the image, by channel, since the last update."""
+        """Sums since the last update: photo times image, and squares of the image, by channel."""
         self._measured = np.zeros((num_photos, 3))
-        """Logarithms of how much brighter a photo is than its image."""
+        """Logarithms of the brightness of a photo over that of its image."""
         self._counts = np.zeros(num_photos, np.int64)
         """Updates of each photo."""
         self._rows = np.zeros(0, np.int64)
-        """Photos that training sees."""
+        """Indices of the training photos."""
         self._smoother: Smoother | None = None
-        """On their cameras; None without gains."""
+        """Filter on the graph of their cameras; None without gains."""
         self.total: Callable[[Tensor], Tensor] = lambda sums: sums
         """Adds up the sums of several ranks."""
 
@@ -138,7 +136,7 @@ class PhotoGains(Extension):
             self._sums.zero_()
 
     def finish(self, run: TrainingRun) -> None:
-        """Say how much the photos differ."""
+        """Log the largest difference."""
         if self._smoother is None:
             return
         exposure = self._gains.double().cpu().log().mean(dim=1)
@@ -150,7 +148,7 @@ class PhotoGains(Extension):
         )
 
     def _update(self, sums: NDArray[np.float64]) -> None:
-        """Count measurements in, and take their smooth part away."""
+        """Add measurements to the means, and compute the gains from them."""
         assert self._smoother is not None
         products, squares = sums[:, 0], sums[:, 1]
         seen = np.isfinite(sums).all(axis=(1, 2)) & (products > 0).all(axis=1) & (squares > 0).all(axis=1)
@@ -160,7 +158,7 @@ class PhotoGains(Extension):
         self._counts[seen] += 1
         rows, known = self._rows, self._counts[self._rows] > 0
         response = (self._measured[rows] - self._smoother(self._measured[rows], known))[known]
-        # The positive-part estimator of James and Stein: differences no larger than those of the noise are none.
+        # The positive-part estimator of James and Stein; it is 0 up to the size of the noise.
         response *= max(1 - NOISE**2 / max(float(np.square(response).mean()), NOISE**2), 0.0) if len(response) else 0.0
         self._gains[rows[known]] = torch.from_numpy(np.exp(response)).to(self._gains)
 
@@ -172,11 +170,11 @@ def _index(batch: Mapping[str, Any]) -> int | None:
 
 
 def places(views: Sequence[View]) -> Tensor:
-    """A point for each camera that is near to those of cameras which see the same, ``[N, 3]``.
+    """One point for each camera ``[N, 3]``; cameras with similar views have points close together.
 
-    It lies behind the camera, as far as the cameras are from their middle: so those at one place that look elsewhere
-    are apart, and so are those around an object.
+    The point lies behind the camera, at the root mean square distance of the cameras to their middle. So two cameras at
+    one place with different directions have different points, and so do cameras around an object.
     """
-    centers = torch.stack([camera_center(view.viewmat) for view in views])
+    centers = torch.stack([view.center for view in views])
     forward = torch.stack([view.viewmat[2, :3] for view in views])
     return centers - (centers - centers.mean(dim=0)).square().sum(dim=1).mean().sqrt() * forward

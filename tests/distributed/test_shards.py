@@ -37,7 +37,7 @@ from sundae_ns.distributed import Shards
 from sundae_ns.distributed.batches import average_gradients
 from sundae_ns.distributed.densification import ShardedDensification
 from sundae_ns.distributed.pruning import RankPruner
-from sundae_ns.distributed.team import _put_block, summed, take_shard
+from sundae_ns.distributed.team import _put_block, take_shard
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning.cutting import FieldPruner
@@ -95,7 +95,7 @@ def check_an_empty_shard(shards: Shards) -> None:
 def check_gains_of_photos(shards: Shards) -> None:
     """All ranks divide photos by the same gains, from what both have measured."""
     gains, run = begin()
-    gains.total = summed
+    gains.total = shards.summed
     for index in range(shards.rank, COUNT, 2):
         gains.observe(image_of(index), image_of(index) * (1.3 if index % 3 else 1.0), None, batch_of(index))
     update(gains, run)

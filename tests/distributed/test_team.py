@@ -12,7 +12,6 @@ import torch
 from sundae_ns.distributed import Team
 from sundae_ns.distributed.densification import ShardedDensification
 from sundae_ns.distributed.pruning import RankPruner
-from sundae_ns.distributed.team import summed
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.method_configs import sundae_tiny
@@ -76,7 +75,7 @@ def test_a_chain_that_goes_on_is_refused_and_one_that_has_ended_is_not() -> None
 
 
 def test_ranks_densify_and_prune_as_one() -> None:
-    team, shards = Team(0, 2), SimpleNamespace(by_first=lambda compute: compute())
+    team, shards = Team(0, 2), SimpleNamespace(by_first=lambda compute: compute(), summed=lambda values: values)
     team.shards = shards  # type: ignore[assignment]
     strategy = CappedStrategy(refine_every=6)
     densification = team._sharded(Densification(strategy), 7)
@@ -94,6 +93,6 @@ def test_ranks_densify_and_prune_as_one() -> None:
     assert dense.found is shards.by_first
     gains = PhotoGains(7)
     assert team._sharded(gains, 7) is gains
-    assert gains.total is summed
+    assert gains.total is shards.summed
     other = Extension()
     assert team._sharded(other, 7) is other
