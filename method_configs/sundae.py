@@ -181,6 +181,7 @@ sundae_paper = method(
     average_share=0.0,
     loss_after_prune="l1",
     prior_after_prune=0.0,
+    photo_gains="off",
     dense_start_views=0,
     ssim_lambda=0.25,
 )

@@ -67,8 +67,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Weight of opacities and scales in the loss of the pruned field, over the number of training images."""
     average_share: float = 0.1
     """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
-    photo_gains: bool = False
-    """For photos whose exposure or white balance changes: even each out with those of neighbouring cameras."""
+    photo_gains: Literal["auto", "on", "off"] = "auto"
+    """Even out photos of changing exposure or white balance with their neighbours; auto does if half of them differ."""
     dense_start_views: int = 300
     """With at most this many training images, a plane sweep fills a sparse cloud to start from; 0 turns it off."""
     warm_start: Path | None = None

@@ -47,6 +47,7 @@ class Views:
 
     eval_dataset = None
     place = (0, 1)
+    train_indices = (0, 1)
     holdout_indices: tuple[int, ...] = ()
     asked = 0
 

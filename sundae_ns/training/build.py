@@ -99,7 +99,7 @@ def build(
     if options.head.mode == "auto":
         decision = HeadTrials(begins_at, state, engine, None if counts is None else counts.head_pays)
         extensions += [decision, EarlyStopping(decision, options.ssim_lambda, engine)]
-    extensions.append(PhotoGains(num_images if options.photo_gains else 0))
+    extensions.append(PhotoGains(num_images, options.photo_gains))
     if options.average_share > 0:
         extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
     return state, extensions, start

@@ -24,7 +24,7 @@ class ModelOptions(Protocol):
     loss_after_prune: Literal["l1", "rms"]
     prior_after_prune: float
     average_share: float
-    photo_gains: bool
+    photo_gains: Literal["auto", "on", "off"]
 
     # Options of splatfacto.
     sh_degree: int

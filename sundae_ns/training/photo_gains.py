@@ -2,7 +2,7 @@
 
 A camera with automatic exposure photographs one wall in different brightness. A field that fits all of these photos
 shows their average, and haze where they disagree. So the loss compares each photo after a division by its gain, one
-number a channel. Test views and finished scenes have no gains.
+number a channel. Test views and finished scenes have no gains. Where neighbouring photos agree, there are none either.
 
 Light that neighbouring photos share may belong to the place, as beside a window. A field can show it, and a gain would
 remove it from every other view. So a gain is a high-pass response on the graph of the cameras.
@@ -11,7 +11,7 @@ remove it from every other view. So a gain is a high-pass response on the graph 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -32,6 +32,12 @@ SMOOTHING = 8.0
 """Strength of the filter that computes the smooth part of the gains."""
 NOISE = 0.03
 """Relative differences between neighbours by errors of the field. They are 1 to 3% where the light is constant."""
+NOTICED = 0.035
+"""``auto`` divides photos if half of them differ by more from their neighbours."""
+FIRST_STEPS = 1500
+"""Steps before that decision. A younger field errs more than the photos differ."""
+FIRST_MEASUREMENTS = 2
+"""Measurements of a photo before that decision, in the mean."""
 LEAST_PHOTOS = 32
 """Least number of photos. The neighbours of fewer photos are too far apart."""
 MEASURED_EVERY = 2
@@ -53,11 +59,15 @@ class PhotoGains(Extension):
 
     Args:
         num_photos: number of training photos.
+        mode: divide photos, do not, or decide once they are measured.
     """
 
     name = "photo-gains"
 
-    def __init__(self, num_photos: int) -> None:
+    def __init__(self, num_photos: int, mode: Literal["auto", "on", "off"]) -> None:
+        self._mode = mode
+        self._divides = None if mode == "auto" else mode == "on"
+        """Whether photos are divided by their gains; None before that is decided."""
         self._gains = torch.ones(num_photos, 3)
         self._sums = torch.zeros(num_photos, 2, 3)
         """Sums since the last update: photo times image, and squares of the image, by channel."""
@@ -73,36 +83,41 @@ class PhotoGains(Extension):
         """Adds up the sums of several ranks."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Gains and measurements."""
+        """Decision, gains and measurements."""
         measured, counts = torch.from_numpy(self._measured.copy()), torch.from_numpy(self._counts.copy())
-        return {"gains": self._gains.clone(), "sums": self._sums.clone(), "measured": measured, "counts": counts}
+        values = {"gains": self._gains.clone(), "sums": self._sums.clone(), "measured": measured, "counts": counts}
+        return {"divides": self._divides, **values}
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`; other photos, or none as in an earlier version, begin anew."""
-        if "gains" not in saved or len(saved["gains"]) != len(self._gains):
+        if "divides" not in saved or len(saved["gains"]) != len(self._gains):
             return
+        if self._mode == "auto":
+            self._divides = saved["divides"]
         self._gains, self._sums = (saved[name].to(state.device, copy=True) for name in ("gains", "sums"))
         self._measured, self._counts = (saved[name].cpu().numpy().copy() for name in ("measured", "counts"))
 
     def before_training(self, run: TrainingRun) -> None:
         """Build the graph of the cameras."""
-        if len(self._gains) == 0:
+        if self._divides is False:
             return
-        indices, views = run.view_indices(), [own.view for own in run.training_views()]
+        indices = run.view_indices()
         if len(indices) < LEAST_PHOTOS:
-            warn(
-                f"photo-gains is off: {len(indices)} training photos are too few to be compared with those beside them"
-            )
+            self._divides = False
+            if self._mode == "on":
+                few = f"{len(indices)} training photos are too few to be compared with those beside them"
+                warn(f"photo-gains is off: {few}")
             return
         self._state, self._rows = run.state, np.asarray(indices)
-        self._smoother = Smoother(build_graph(places(views).cpu(), num_neighbors=NEIGHBORS), SMOOTHING)
+        positions = places([own.view for own in run.training_views()]).cpu()
+        self._smoother = Smoother(build_graph(positions, num_neighbors=NEIGHBORS), SMOOTHING)
         if run.images_per_step > 1:  # of the first rank alone
             self._sums.zero_()
 
     def balanced(self, photo: Tensor, batch: Mapping[str, Any]) -> Tensor:
-        """A training photo ``[H, W, 3]`` divided by its gain; those with an alpha channel have none."""
+        """A training photo ``[H, W, 3]``, divided if its gain counts; those with an alpha channel have none."""
         index = _index(batch)
-        if index is None or len(self._gains) == 0:
+        if index is None or not self._divides:
             return photo
         self._gains = self._gains.to(photo.device)
         return photo / self._gains[index]
@@ -118,9 +133,9 @@ class PhotoGains(Extension):
             batch: of the photo.
         """
         index = _index(batch)
-        if index is None or self._smoother is None or self._state.step % MEASURED_EVERY:
+        if index is None or not self._measures or self._state.step % MEASURED_EVERY:
             return
-        self._sums = self._sums.to(photo.device)
+        self._sums, self._gains = self._sums.to(photo.device), self._gains.to(photo.device)
         apart = max(int((photo.shape[0] * photo.shape[1] / SAMPLE) ** 0.5), 1)
         shown, taken = image[::apart, ::apart].detach(), photo[::apart, ::apart] * self._gains[index]
         counts = taken.amax(dim=2, keepdim=True) < CLIPPED
@@ -131,13 +146,13 @@ class PhotoGains(Extension):
 
     def after_step(self, run: TrainingRun) -> None:
         """Update the gains if it is due."""
-        if self._smoother is not None and run.state.step % REFRESHED_EVERY == REFRESHED_EVERY - 1:
+        if self._measures and run.state.step % REFRESHED_EVERY == REFRESHED_EVERY - 1:
             self._update(self.total(self._sums).double().cpu().numpy())
             self._sums.zero_()
 
     def finish(self, run: TrainingRun) -> None:
         """Log the largest difference."""
-        if self._smoother is None:
+        if not self._measures or not self._divides:
             return
         exposure = self._gains.double().cpu().log().mean(dim=1)
         most = float(exposure.abs().max().exp()) - 1
@@ -146,6 +161,10 @@ class PhotoGains(Extension):
             if most > 0
             else "photos are as bright as those beside them; none was changed"
         )
+
+    @property
+    def _measures(self) -> bool:
+        return self._smoother is not None and self._divides is not False
 
     def _update(self, sums: NDArray[np.float64]) -> None:
         """Add measurements to the means, and compute the gains from them."""
@@ -158,6 +177,12 @@ class PhotoGains(Extension):
         self._counts[seen] += 1
         rows, known = self._rows, self._counts[self._rows] > 0
         response = (self._measured[rows] - self._smoother(self._measured[rows], known))[known]
+        if self._divides is None:
+            ready = self._state.step + 1 >= FIRST_STEPS and self._counts[rows].mean() >= FIRST_MEASUREMENTS
+            apart = np.sqrt(np.square(response).mean(axis=1))
+            self._divides = bool(np.median(apart) > NOTICED) if ready else None
+        if not self._divides:
+            return
         # The positive-part estimator of James and Stein; it is 0 up to the size of the noise.
         response *= max(1 - NOISE**2 / max(float(np.square(response).mean()), NOISE**2), 0.0) if len(response) else 0.0
         self._gains[rows[known]] = torch.from_numpy(np.exp(response)).to(self._gains)

@@ -91,7 +91,7 @@ def test_ranks_densify_and_prune_as_one() -> None:
     dense = DenseStart(sundae_tiny.config.pipeline.model, None, 7, num_features=0, cap=None)  # type: ignore[attr-defined]
     assert team._sharded(dense, 7) is dense
     assert dense.found is shards.by_first
-    gains = PhotoGains(7)
+    gains = PhotoGains(7, "on")
     assert team._sharded(gains, 7) is gains
     assert gains.total is shards.summed
     other = Extension()

@@ -86,6 +86,11 @@ def test_the_head_is_undecided_unless_a_method_says_otherwise(name: str) -> None
     assert ours()[name].config.pipeline.model.head.mode == modes.get(name, HeadConfig().mode)
 
 
+@pytest.mark.parametrize("name", METHODS)
+def test_photos_are_evened_out_where_they_differ_but_not_in_the_papers_method(name: str) -> None:
+    assert ours()[name].config.pipeline.model.photo_gains == ("off" if name == "sundae-paper" else "auto")
+
+
 def test_methods_share_no_objects() -> None:
     def parts(value: Any, seen: set[int]) -> set[int]:
         if hasattr(value, "__dataclass_fields__") and not isinstance(value, type) and id(value) not in seen:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
 
 from sundae_ns.rendering.views import View
 from sundae_ns.training.extension import TrainingRun
-from sundae_ns.training.photo_gains import REFRESHED_EVERY, PhotoGains
+from sundae_ns.training.photo_gains import FIRST_STEPS, REFRESHED_EVERY, PhotoGains
 
 COUNT = 48
 ANGLES = torch.arange(COUNT) * 2 * math.pi / COUNT
@@ -31,8 +31,8 @@ def run_of(views: list[View], *, ranks: int = 1) -> TrainingRun:
     return cast(TrainingRun, SimpleNamespace(state=SimpleNamespace(step=0), **members))
 
 
-def begin(count: int = COUNT) -> tuple[PhotoGains, TrainingRun]:
-    gains, run = PhotoGains(count), run_of(ring(count))
+def begin(mode: Literal["auto", "on", "off"] = "on") -> tuple[PhotoGains, TrainingRun]:
+    gains, run = PhotoGains(COUNT, mode), run_of(ring())
     gains.before_training(run)
     return gains, run
 
@@ -46,17 +46,22 @@ def batch_of(index: int, channels: int = 3) -> dict[str, Any]:
     return {"image_idx": index, "image": torch.zeros(48, 64, channels, dtype=torch.uint8)}
 
 
-def measure(gains: PhotoGains, run: TrainingRun, photos: Callable[[int], Tensor], rounds: int = 12) -> None:
-    """Steps that see each photo once between two updates. The field is right, and does not change."""
+def measure(
+    gains: PhotoGains, run: TrainingRun, photos: Callable[[int], Tensor], rounds: int = 12, *, late: bool = True
+) -> None:
+    """Steps that see each photo once between two updates. The field is right, and does not change.
+
+    Late ones are at the step from which ``auto`` decides.
+    """
     for _ in range(rounds):
         run.state.step = 0
         for index in range(COUNT):
             batch = batch_of(index)
             gains.observe(image_of(index), gains.balanced(photos(index), batch), None, batch)
-        update(gains, run)
+        update(gains, run, late=late)
 
 
-def update(gains: PhotoGains, run: TrainingRun) -> None:
-    run.state.step = REFRESHED_EVERY - 1
+def update(gains: PhotoGains, run: TrainingRun, *, late: bool = True) -> None:
+    run.state.step = -(-(FIRST_STEPS if late else 1) // REFRESHED_EVERY) * REFRESHED_EVERY - 1
     gains.after_step(run)
     run.state.step = 0

@@ -107,13 +107,13 @@ def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alo
     before = gains.state_dict()
     gains.observe(photo, photo, None, batch_of(0, channels=4))
     assert torch.equal(gains.state_dict()["sums"], before["sums"])
-    for few in (PhotoGains(LEAST_PHOTOS - 1), PhotoGains(0)):
+    for few in (PhotoGains(LEAST_PHOTOS - 1, "on"), PhotoGains(LEAST_PHOTOS - 1, "auto"), PhotoGains(9, "off")):
         few.before_training(run_of(ring(LEAST_PHOTOS - 1)))
         few.observe(photo, few.balanced(photo * 2, batch_of(0)), None, batch_of(0))
         update(few, run)
-        assert torch.equal(few.balanced(photo, batch_of(0)), photo)
+        assert few.balanced(photo, batch_of(0)) is photo
         few.finish(run)
-    # Once: nobody has asked for gains of no photos.
+    # Once: nobody has asked for the others.
     assert " ".join(capsys.readouterr().out.split()).count("31 training photos are too few") == 1
 
 
@@ -130,7 +130,7 @@ def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
     gains, run = begin()
     half(gains, run)
     saved = gains.state_dict()
-    resumed = PhotoGains(COUNT)
+    resumed = PhotoGains(COUNT, "on")
     resumed.load_state_dict(cast(Any, SimpleNamespace(device=torch.device("cpu"))), saved)
     assert torch.equal(found(resumed), found(gains)), "a fine-tune has no run"
     resumed.before_training(run)
@@ -138,8 +138,8 @@ def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
     half(resumed, run)
     assert torch.equal(found(resumed), found(gains))
     assert saved["counts"].max() < gains.state_dict()["counts"].max(), "a saved state does not change"
-    for other in ({}, PhotoGains(COUNT + 1).state_dict()):
-        fresh = PhotoGains(COUNT)
+    for other in ({}, PhotoGains(COUNT + 1, "on").state_dict()):
+        fresh = PhotoGains(COUNT, "on")
         fresh.load_state_dict(cast(Any, SimpleNamespace(device=torch.device("cpu"))), other)
         assert torch.equal(found(fresh), torch.ones(COUNT, 3))
 
@@ -167,7 +167,7 @@ def test_cameras_at_one_place_are_apart_by_what_they_see() -> None:
 def test_training_compares_with_the_balanced_photo_and_evaluation_with_the_true_one(
     build: Build, batch: Callable[..., dict[str, Any]], camera: Callable[..., Any]
 ) -> None:
-    model, photo = build(photo_gains=True), {**batch(), "image_idx": 2}
+    model, photo = build(photo_gains="on"), {**batch(), "image_idx": 2}
     gains = model.photo_gains.state_dict()
     gains["gains"][2] = torch.tensor([0.5, 1.0, 2.0])
     model.photo_gains.load_state_dict(model.state, gains)
@@ -181,10 +181,67 @@ def test_training_compares_with_the_balanced_photo_and_evaluation_with_the_true_
     torch.testing.assert_close(model.target(photo, background), true)
 
 
-def test_it_is_an_option(build: Build, training_of: Callable[..., Any]) -> None:
-    training = training_of(build())
-    training.step(0)
-    assert len(training.model.photo_gains.state_dict()["gains"]) == 0
+def test_auto_divides_photos_of_changing_light_from_the_decision_on() -> None:
+    true = torch.exp(0.15 * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(3)))
+
+    def photos(index: int) -> Tensor:
+        return image_of(index) * true[index]
+
+    gains, run = begin("auto")
+    photo = photos(5)
+    measure(gains, run, photos, late=False)
+    assert gains.balanced(photo, batch_of(5)) is photo, "a young field errs more than photos differ"
+    assert gains.state_dict()["divides"] is None
+    measure(gains, run, photos, rounds=1)
+    assert gains.state_dict()["divides"] is True
+    asked, run = begin("on")
+    measure(asked, run, photos, rounds=13)
+    torch.testing.assert_close(found(gains), found(asked), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("differences", ["even light", "three photos", "the place"])
+def test_auto_leaves_a_capture_of_even_light_alone_and_measures_no_more(differences: str) -> None:
+    """So it is trained as without gains, to the bit. A few photos in other light are no change of exposure."""
+    noise = 0.8 * photo_gains.NOISE * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0))
+    true = {
+        "even light": torch.exp(noise),
+        "three photos": torch.where(torch.arange(COUNT) < 3, 2.5, 1.0)[:, None].expand(-1, 3),
+        "the place": torch.exp(0.2 * torch.sin(ANGLES))[:, None].expand(-1, 3),
+    }[differences]
+    gains, run = begin("auto")
+    measure(gains, run, lambda index: 0.3 * image_of(index) * true[index])
+    photo, before = image_of(0), gains.state_dict()
+    assert before["divides"] is False
+    assert gains.balanced(photo, batch_of(0)) is photo
+    gains.observe(photo, photo * 2, None, batch_of(0))
+    update(gains, run)
+    assert all(torch.equal(gains.state_dict()[name], before[name]) for name in ("sums", "counts", "gains"))
+
+
+def test_auto_waits_until_photos_were_measured_often_enough() -> None:
+    gains, run = begin("auto")
+    measure(gains, run, lambda index: image_of(index) * (1 + index % 2), rounds=1)
+    assert gains.state_dict()["divides"] is None
+    measure(gains, run, lambda index: image_of(index) * (1 + index % 2), rounds=1)
+    assert gains.state_dict()["divides"] is True
+
+
+def test_a_decision_is_resumed_and_an_option_replaces_it() -> None:
+    gains, run = begin("auto")
+    measure(gains, run, lambda index: image_of(index) * (1 + index % 2))
+    saved = gains.state_dict()
+    for mode, divides in (("auto", True), ("on", True), ("off", False)):
+        other, _ = begin(mode)  # type: ignore[arg-type]
+        other.load_state_dict(cast(Any, SimpleNamespace(device=torch.device("cpu"))), saved)
+        assert other.state_dict()["divides"] is divides
+        photo = image_of(1)
+        assert (other.balanced(photo, batch_of(1)) is not photo) is divides
+
+
+def test_a_model_trains_with_the_mode_of_its_options(build: Build) -> None:
+    modes = {"auto": None, "on": True, "off": False}
+    assert {mode: build(photo_gains=mode).photo_gains.state_dict()["divides"] for mode in modes} == modes
+    assert build().photo_gains.state_dict()["divides"] is None
 
 
 def test_the_end_says_what_was_taken_out(capsys: pytest.CaptureFixture[str]) -> None:
@@ -194,5 +251,7 @@ def test_the_end_says_what_was_taken_out(capsys: pytest.CaptureFixture[str]) -> 
     measure(gains, run, lambda index: image_of(index) * (1.3 if index % 2 else 1.0))
     gains.finish(run)
     assert "up to 12% brighter or darker" in " ".join(capsys.readouterr().out.split())
-    PhotoGains(0).finish(run)
+    quiet, run = begin("auto")
+    measure(quiet, run, image_of)
+    quiet.finish(run)
     assert capsys.readouterr().out == ""

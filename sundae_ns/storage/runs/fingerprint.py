@@ -32,6 +32,9 @@ LEFT_OUT = frozenset(
 GONE = {"pipeline.model.pruning": {"search_every": 250, "patience": 4}}
 """Options that have gone, by the configuration that had them. They decided nothing in the runs that have today's
 options, so these still count them with the value that all had."""
+DECIDED = {"pipeline.model.photo_gains": "auto"}
+"""Options that came later, by the value that counts as absent: it decides by the capture, and where it decides against
+the option, a run is as before there was one, to the bit."""
 LENGTH = 8
 _LETTERS = str.maketrans("0123456789abcdef", "abcdefghijklmnop")
 
@@ -70,7 +73,8 @@ def _entries(values: Mapping[str, Any], name: str) -> dict[str, Any]:
     found = {}
     for key, value in values.items():
         inner = f"{name}.{key}".lstrip(".")
-        plain = None if inner in LEFT_OUT or key == "_target" else _plain(value, inner)
+        left_out = inner in LEFT_OUT or key == "_target" or DECIDED.get(inner) == value
+        plain = None if left_out else _plain(value, inner)
         if plain is not None:
             found[str(key)] = plain
     return found

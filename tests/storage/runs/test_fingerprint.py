@@ -70,6 +70,15 @@ def test_a_new_option_that_is_off_changes_nothing() -> None:
         LaterOptions.__name__ = name
 
 
+def test_a_decision_by_the_capture_counts_as_the_option_before_it() -> None:
+    """Rows of captures on which it decides against the option stay those of today."""
+    before: Any = parse(SUNDAE)
+    before.pipeline.model.photo_gains = None
+    auto, on, off = (of("--pipeline.model.photo-gains", mode) for mode in ("auto", "on", "off"))
+    assert fingerprint(before) == auto
+    assert len({auto, on, off}) == 3
+
+
 @pytest.mark.parametrize(
     "other",
     [
