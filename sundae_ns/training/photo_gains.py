@@ -33,7 +33,7 @@ SMOOTHING = 8.0
 NOISE = 0.03
 """Relative differences between neighbours by errors of the field. They are 1 to 3% where the light is constant."""
 NOTICED = 0.035
-"""``auto`` divides photos if half of them differ by more from their neighbours."""
+"""``auto`` divides photos if half of them differ by more from their neighbours (root mean square of the channels)."""
 FIRST_STEPS = 1500
 """Steps before that decision. A younger field errs more than the photos differ."""
 FIRST_MEASUREMENTS = 2
@@ -115,7 +115,7 @@ class PhotoGains(Extension):
             self._sums.zero_()
 
     def balanced(self, photo: Tensor, batch: Mapping[str, Any]) -> Tensor:
-        """A training photo ``[H, W, 3]``, divided if its gain counts; those with an alpha channel have none."""
+        """A training photo ``[H, W, 3]``, once gains are in use divided by its own; not one with an alpha channel."""
         index = _index(batch)
         if index is None or not self._divides:
             return photo
