@@ -78,7 +78,7 @@ class PhotoGains(Extension):
         self._rows = np.zeros(0, np.int64)
         """Indices of the training photos."""
         self._smoother: Smoother | None = None
-        """Filter on the graph of their cameras; None without gains."""
+        """Filter on the graph of their cameras; None if nothing is measured."""
         self.total: Callable[[Tensor], Tensor] = lambda sums: sums
         """Adds up the sums of several ranks."""
 
@@ -133,7 +133,7 @@ class PhotoGains(Extension):
             batch: of the photo.
         """
         index = _index(batch)
-        if index is None or not self._measures or self._state.step % MEASURED_EVERY:
+        if index is None or self._smoother is None or self._state.step % MEASURED_EVERY:
             return
         self._sums, self._gains = self._sums.to(photo.device), self._gains.to(photo.device)
         apart = max(int((photo.shape[0] * photo.shape[1] / SAMPLE) ** 0.5), 1)
@@ -146,13 +146,13 @@ class PhotoGains(Extension):
 
     def after_step(self, run: TrainingRun) -> None:
         """Update the gains if it is due."""
-        if self._measures and run.state.step % REFRESHED_EVERY == REFRESHED_EVERY - 1:
+        if self._smoother is not None and run.state.step % REFRESHED_EVERY == REFRESHED_EVERY - 1:
             self._update(self.total(self._sums).double().cpu().numpy())
             self._sums.zero_()
 
     def finish(self, run: TrainingRun) -> None:
         """Log the largest difference."""
-        if not self._measures or not self._divides:
+        if self._smoother is None or not self._divides:
             return
         exposure = self._gains.double().cpu().log().mean(dim=1)
         most = float(exposure.abs().max().exp()) - 1
@@ -161,10 +161,6 @@ class PhotoGains(Extension):
             if most > 0
             else "photos are as bright as those beside them; none was changed"
         )
-
-    @property
-    def _measures(self) -> bool:
-        return self._smoother is not None and self._divides is not False
 
     def _update(self, sums: NDArray[np.float64]) -> None:
         """Add measurements to the means, and compute the gains from them."""
@@ -177,10 +173,11 @@ class PhotoGains(Extension):
         self._counts[seen] += 1
         rows, known = self._rows, self._counts[self._rows] > 0
         response = (self._measured[rows] - self._smoother(self._measured[rows], known))[known]
-        if self._divides is None:
-            ready = self._state.step + 1 >= FIRST_STEPS and self._counts[rows].mean() >= FIRST_MEASUREMENTS
-            apart = np.sqrt(np.square(response).mean(axis=1))
-            self._divides = bool(np.median(apart) > NOTICED) if ready else None
+        ready = self._state.step + 1 >= FIRST_STEPS and self._counts[rows].mean() >= FIRST_MEASUREMENTS
+        if self._divides is None and ready:
+            self._divides = bool(np.median(np.sqrt(np.square(response).mean(axis=1))) > NOTICED)
+            if not self._divides:
+                self._smoother = None
         if not self._divides:
             return
         # The positive-part estimator of James and Stein; it is 0 up to the size of the noise.

@@ -17,9 +17,11 @@ from sundae_ns.model import SundaeModel
 from sundae_ns.rendering.views import View
 from sundae_ns.training import photo_gains
 from sundae_ns.training.extension import TrainingRun
+from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.photo_gains import LEAST_PHOTOS, PhotoGains, places
 
 Build = Callable[..., SundaeModel]
+ON_CPU = cast(FieldState, SimpleNamespace(device=torch.device("cpu")))
 
 
 def found(gains: PhotoGains) -> Tensor:
@@ -131,7 +133,7 @@ def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
     half(gains, run)
     saved = gains.state_dict()
     resumed = PhotoGains(COUNT, "on")
-    resumed.load_state_dict(cast(Any, SimpleNamespace(device=torch.device("cpu"))), saved)
+    resumed.load_state_dict(ON_CPU, saved)
     assert torch.equal(found(resumed), found(gains)), "a fine-tune has no run"
     resumed.before_training(run)
     half(gains, run)
@@ -140,7 +142,7 @@ def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
     assert saved["counts"].max() < gains.state_dict()["counts"].max(), "a saved state does not change"
     for other in ({}, PhotoGains(COUNT + 1, "on").state_dict()):
         fresh = PhotoGains(COUNT, "on")
-        fresh.load_state_dict(cast(Any, SimpleNamespace(device=torch.device("cpu"))), other)
+        fresh.load_state_dict(ON_CPU, other)
         assert torch.equal(found(fresh), torch.ones(COUNT, 3))
 
 
@@ -232,7 +234,7 @@ def test_a_decision_is_resumed_and_an_option_replaces_it() -> None:
     saved = gains.state_dict()
     for mode, divides in (("auto", True), ("on", True), ("off", False)):
         other, _ = begin(mode)  # type: ignore[arg-type]
-        other.load_state_dict(cast(Any, SimpleNamespace(device=torch.device("cpu"))), saved)
+        other.load_state_dict(ON_CPU, saved)
         assert other.state_dict()["divides"] is divides
         photo = image_of(1)
         assert (other.balanced(photo, batch_of(1)) is not photo) is divides
