@@ -171,8 +171,8 @@ def compile_for_cpu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., c
 def load_on_cpu(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKernels:
     """As ``nvrtc.load_kernels``, but for the CPU."""
 
-    def compile_them(source: str, names: Sequence[str], options: Sequence[str], *_: object) -> dict[str, Launch]:
-        loaded = compile_for_cpu(source, options)
+    def compile_them(file: str, names: Sequence[str], options: Sequence[str], *_: object) -> dict[str, Launch]:
+        loaded = compile_for_cpu(nvrtc.read_source(file), options)
 
         def launch_of(name: str) -> Launch:
             def launch(threads: int, arguments: Sequence[Argument]) -> None:

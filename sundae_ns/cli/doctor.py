@@ -147,7 +147,7 @@ def own_kernels() -> Finding:
     device = torch.device("cuda", 0)
     options = (*traversal.OPTIONS, *traversal.definitions(torch.float32, 16))
     try:
-        nvrtc.Kernel(traversal.SOURCE, traversal.KERNEL, device, options, traversal.BLOCK)
+        nvrtc.Kernel(traversal.FILE, traversal.KERNEL, device, options, traversal.BLOCK)
         fused_loss.loss_kernels(device)
         net = CompensationHead(HeadConfig()).net
         kernels.head_kernels(device, torch.bfloat16, kernels.head_options(net, True))

@@ -8,8 +8,10 @@ from __future__ import annotations
 import ctypes
 import functools
 import logging
+import re
 from collections.abc import Callable, Sequence
 from ctypes import byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_void_p
+from importlib import resources
 
 import torch
 from torch import Tensor
@@ -23,11 +25,18 @@ Launch = Callable[[int, Sequence[Argument]], None]
 _log = logging.getLogger(__name__)
 
 
-def compile_cubin(source: str, architecture: str, options: Sequence[str] = ()) -> bytes:
-    """Compile CUDA C++ to machine code. Needs no device.
+@functools.cache
+def read_source(file: str) -> str:
+    """A file of ``sundae_ns/csrc``, with the files that it includes."""
+    source = (resources.files("sundae_ns") / "csrc" / file).read_text(encoding="utf-8")
+    return re.sub(r'^#include "(.+)"$', lambda include: read_source(include[1]), source, flags=re.MULTILINE)
+
+
+def compile_cubin(file: str, architecture: str, options: Sequence[str] = ()) -> bytes:
+    """Compile a file of ``sundae_ns/csrc`` to machine code. Needs no device.
 
     Args:
-        source: CUDA C++; kernels are ``extern "C"``.
+        file: its name; kernels are ``extern "C"``.
         architecture: such as ``sm_90`` for compute capability 9.0.
         options: further compiler options.
 
@@ -35,8 +44,8 @@ def compile_cubin(source: str, architecture: str, options: Sequence[str] = ()) -
         BackendError: NVRTC is missing, or the source does not compile.
     """
     nvrtc = _library("nvrtc")
-    program = c_void_p()
-    _check_nvrtc(nvrtc, nvrtc.nvrtcCreateProgram(byref(program), source.encode(), b"sundae.cu", 0, None, None))
+    program, source = c_void_p(), read_source(file).encode()
+    _check_nvrtc(nvrtc, nvrtc.nvrtcCreateProgram(byref(program), source, file.encode(), 0, None, None))
     try:
         flags = [f"--gpu-architecture={architecture}".encode(), *(option.encode() for option in options)]
         result = nvrtc.nvrtcCompileProgram(program, len(flags), (c_char_p * len(flags))(*flags))
@@ -57,7 +66,7 @@ def compile_cubin(source: str, architecture: str, options: Sequence[str] = ()) -
 
 
 class Kernel:
-    """The ``extern "C"`` kernel ``name`` of a CUDA C++ source on one device, callable with tensors and numbers.
+    """The kernel ``name`` of a file of ``sundae_ns/csrc`` on one device, callable with tensors and numbers.
 
     ``options`` are further compiler options, ``block`` is the number of threads per block.
 
@@ -65,12 +74,12 @@ class Kernel:
         BackendError: the kernel cannot be compiled or loaded.
     """
 
-    def __init__(self, source: str, name: str, device: torch.device, options: Sequence[str] = (), block: int = 128):
+    def __init__(self, file: str, name: str, device: torch.device, options: Sequence[str] = (), block: int = 128):
         self._driver = _library("cuda")
         self._device = device
         self._block = block
         self._function, self._context = c_void_p(), c_void_p()
-        module = _module(source, tuple(options), device)
+        module = _module(file, tuple(options), device)
         with torch.cuda.device(device):
             _check(self._driver, self._driver.cuCtxGetCurrent(byref(self._context)))
             _check(self._driver, self._driver.cuModuleGetFunction(byref(self._function), module, name.encode()))
@@ -100,14 +109,14 @@ class Kernel:
 
 @functools.cache
 def load_kernels(
-    source: str, names: tuple[str, ...], options: tuple[str, ...], device: torch.device, block: int = 128
+    file: str, names: tuple[str, ...], options: tuple[str, ...], device: torch.device, block: int = 128
 ) -> dict[str, Launch]:
-    """Kernels of one source by name, compiled on the first call; arguments are those of :class:`Kernel`.
+    """Kernels of one file by name, compiled on the first call; arguments are those of :class:`Kernel`.
 
     Raises:
         BackendError: the kernels cannot be compiled or loaded.
     """
-    return {name: Kernel(source, name, device, options, block) for name in names}
+    return {name: Kernel(file, name, device, options, block) for name in names}
 
 
 @functools.cache
@@ -129,10 +138,10 @@ def kernels_where_possible(
 
 
 @functools.cache
-def _module(source: str, options: tuple[str, ...], device: torch.device) -> c_void_p:
-    """A compiled source, loaded once for all of its kernels: compiling takes up to a second."""
+def _module(file: str, options: tuple[str, ...], device: torch.device) -> c_void_p:
+    """A compiled file, loaded once for all of its kernels: compiling takes up to a second."""
     major, minor = torch.cuda.get_device_capability(device)
-    code = compile_cubin(source, f"sm_{major}{minor}", options)
+    code = compile_cubin(file, f"sm_{major}{minor}", options)
     driver, module = _library("cuda"), c_void_p()
     with torch.cuda.device(device):
         # The driver's calls need torch's context on this thread; work on the device creates it.

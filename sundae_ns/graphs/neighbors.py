@@ -82,7 +82,7 @@ def _kernel(device: torch.device, dtype: torch.dtype, k: int) -> Kernel | None:
     else:
         options = (*traversal.OPTIONS, *traversal.definitions(dtype, k))
         try:
-            return Kernel(traversal.SOURCE, traversal.KERNEL, device, options, traversal.BLOCK)
+            return Kernel(traversal.FILE, traversal.KERNEL, device, options, traversal.BLOCK)
         except BackendError as error:
             reason = str(error)
     _log.warning("neighbour search runs on the CPU, not on %s: %s", device, reason)

@@ -17,24 +17,18 @@ from sundae_ns.compensation.fused_training import FusedTraining, _Graphs, _Pass,
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, RECORD_AT
 
-FLOAT_IMAGES = """
-typedef float T;
-inline float load(T v) { return v; }
-inline T store(float v) { return v; }
-"""
-
 
 @pytest.fixture(autouse=True, scope="module")
 def on_cpu(load_on_cpu: Callable[..., kernels.Launches]) -> Iterator[None]:
     """Float32 images, which only these tests use, are those of the CPU."""
     on_gpu = kernels.load_kernels
 
-    def load(source: str, names: tuple[str, ...], options: tuple[str, ...], device: torch.device) -> kernels.Launches:
-        return (load_on_cpu if device.type == "cpu" else on_gpu)(source, names, options, device)
+    def load(file: str, names: tuple[str, ...], options: tuple[str, ...], device: torch.device) -> kernels.Launches:
+        return (load_on_cpu if device.type == "cpu" else on_gpu)(file, names, options, device)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "load_kernels", load)
-        patch.setitem(kernels._CONVERSIONS, torch.float32, FLOAT_IMAGES)
+        patch.setitem(kernels._TYPES, torch.float32, "-DFP32")
         yield
 
 
@@ -278,7 +272,7 @@ def test_kernels_compile_for_gpus_that_have_the_types(compile_for_gpu: Callable[
         ("sm_90", torch.float16, make()),
     ):
         options = kernels.head_options(head.net, head.config.mode == "residual")
-        code = compile_for_gpu(kernels.head_source(dtype), architecture, options)
+        code = compile_for_gpu("head.cu", architecture, (kernels._TYPES[dtype], *options))
         assert all(name.encode() in code for name in kernels.KERNELS)
 
 

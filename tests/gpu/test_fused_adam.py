@@ -52,4 +52,4 @@ def test_a_skipped_step_changes_nothing() -> None:
 
 
 def test_it_compiles_for_gpus(compile_for_gpu: Callable[..., bytes]) -> None:
-    assert compile_for_gpu(fused_adam.SOURCE, "sm_75", fused_adam.OPTIONS)
+    assert compile_for_gpu("adam.cu", "sm_75", fused_adam.OPTIONS)

@@ -148,7 +148,7 @@ def test_nan_propagates() -> None:
 
 
 def test_it_compiles_for_a_gpu(compile_for_gpu: Callable[..., bytes]) -> None:
-    assert compile_for_gpu(fused.SOURCE, "sm_90", fused.OPTIONS)
+    assert compile_for_gpu("loss.cu", "sm_90", fused.OPTIONS)
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def test_it_moves_centres_as_pytorch_does(load_on_cpu: Any, monkeypatch: pytest.
     noise = torch.randn(777, 3)
     monkeypatch.setattr(torch, "randn_like", lambda value: noise.to(value.dtype))
     relocation.jitter(expected, 0.7)
-    kernels = load_on_cpu(fused_noise.SOURCE, ("add_noise",), (), torch.device("cpu"), fused_noise.THREADS)
+    kernels = load_on_cpu("noise.cu", ("add_noise",), (), torch.device("cpu"), fused_noise.THREADS)
     shape = (params["scales"], params["quats"], params["opacities"])
     fused_noise.add_noise(kernels, params["means"], *shape, noise, 0.7, relocation.GATE)
     moved, exact = params["means"].double() - before, expected["means"] - before
@@ -40,7 +40,7 @@ def test_it_moves_centres_as_pytorch_does(load_on_cpu: Any, monkeypatch: pytest.
 
 
 def test_it_compiles_for_gpus(compile_for_gpu: Callable[..., bytes]) -> None:
-    assert compile_for_gpu(fused_noise.SOURCE, "sm_75", ())
+    assert compile_for_gpu("noise.cu", "sm_75", ())
 
 
 @pytest.mark.gpu

@@ -46,7 +46,7 @@ def apart(found: torch.Tensor, expected: torch.Tensor) -> float:
 
 def test_it_correlates_as_pytorch_does(load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = scores()
-    loaded = load_on_cpu(fused_sweep.SOURCE, ("correlate",), fused_sweep.OPTIONS, torch.device("cpu"), 1)
+    loaded = load_on_cpu("sweep.cu", ("correlate",), fused_sweep.OPTIONS, torch.device("cpu"), 1)
     monkeypatch.setattr(plane_sweep, "_kernels", lambda image: loaded)
     assert apart(scores(), expected) < 1e-3
     assert (expected == -1).any()
@@ -54,7 +54,7 @@ def test_it_correlates_as_pytorch_does(load_on_cpu: Any, monkeypatch: pytest.Mon
 
 
 def test_it_compiles_for_gpus(compile_for_gpu: Callable[..., bytes]) -> None:
-    assert compile_for_gpu(fused_sweep.SOURCE, "sm_75", fused_sweep.OPTIONS)
+    assert compile_for_gpu("sweep.cu", "sm_75", fused_sweep.OPTIONS)
 
 
 @pytest.mark.gpu

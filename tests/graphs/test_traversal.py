@@ -14,7 +14,7 @@ from sundae_ns.errors import BackendError
 from sundae_ns.gpu import nvrtc
 from sundae_ns.gpu.nvrtc import Argument, Launch
 from sundae_ns.graphs import knn
-from sundae_ns.graphs.traversal import KERNEL, MAX_NEIGHBORS, OPTIONS, SOURCE, definitions, search_tree
+from sundae_ns.graphs.traversal import FILE, KERNEL, MAX_NEIGHBORS, OPTIONS, definitions, search_tree
 from sundae_ns.graphs.tree import LEAF, build_tree
 
 # The kernel's source with a counter of visited points, and a loop over the threads.
@@ -42,8 +42,9 @@ class Compile(Protocol):
 @pytest.fixture(scope="module")
 def compiled(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Compile:
     visit = "const double dx = points"
-    assert SOURCE.count(visit) == 1
-    source = SHIM % SOURCE.replace(visit, "++visited; " + visit)
+    source = nvrtc.read_source(FILE)
+    assert source.count(visit) == 1
+    source = SHIM % source.replace(visit, "++visited; " + visit)
 
     def compile_for(dtype: torch.dtype, k: int, visited: list[int] | None = None) -> Launch:
         kernel = compile_for_cpu(source, ["-ffp-contract=off", *definitions(dtype, k)])
@@ -121,8 +122,8 @@ def test_kernel_compiles_for_gpus_from_turing_to_hopper() -> None:
         pytest.skip(f"no NVRTC here: {error}")
     cases = [("sm_75", torch.float32, 16), ("sm_90", torch.float64, 1), ("sm_90", torch.float32, MAX_NEIGHBORS)]
     for architecture, dtype, k in cases:
-        code = nvrtc.compile_cubin(SOURCE, architecture, [*OPTIONS, *definitions(dtype, k)])
+        code = nvrtc.compile_cubin(FILE, architecture, [*OPTIONS, *definitions(dtype, k)])
         assert code.startswith(b"\x7fELF")
         assert KERNEL.encode() in code
     with pytest.raises(BackendError, match="does not compile for sm_90.*REAL"):
-        nvrtc.compile_cubin(SOURCE, "sm_90")
+        nvrtc.compile_cubin(FILE, "sm_90")

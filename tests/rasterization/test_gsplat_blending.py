@@ -143,4 +143,4 @@ def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes], monkeyp
     monkeypatch.setattr(gsplat_blending, "LANES", 32)
     for architecture, channels, absgrad in (("sm_75", 3, True), ("sm_90", 16, False), ("sm_90", 32, False)):
         options = gsplat_blending.blending_options(channels, absgrad=absgrad)
-        compile_for_gpu(gsplat_blending.SOURCE, architecture, options)
+        compile_for_gpu("blending.cu", architecture, options)

@@ -227,8 +227,8 @@ def test_second_derivatives_of_colors_are_refused() -> None:
 
 def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes]) -> None:
     for dtype in (torch.int16, torch.int32):
-        compile_for_gpu(gsplat_tiles.SOURCE, "sm_75", gsplat_tiles.listing_options(dtype))
-    compile_for_gpu(gsplat_colors.SOURCE, "sm_90", gsplat_colors.OPTIONS)
+        compile_for_gpu("tiles.cu", "sm_75", gsplat_tiles.listing_options(dtype))
+    compile_for_gpu("colors.cu", "sm_90", gsplat_colors.OPTIONS)
 
 
 def test_harmonics_that_are_not_recorded_are_gsplats(monkeypatch: pytest.MonkeyPatch) -> None:
