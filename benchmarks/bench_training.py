@@ -41,7 +41,6 @@ ARMS: dict[str, list[str]] = {
     "sundae": ["sundae"],
     "sundae-fast": ["sundae-fast"],
     "sundae-unrecorded": ["sundae", "--record-steps", "False"],
-    "sundae-mcmc": ["sundae", "--pipeline.model.warmup", "mcmc"],
     "sundae-with-head": ["sundae", "--pipeline.model.head.mode", "residual"],
 }
 PROFILED = 100

@@ -4,7 +4,7 @@
     python benchmarks/quality.py CAPTURE -o DIR --arms MINE.yaml sundae --keep-ratios 0.1 --seeds 42
 
 MINE.yaml has arms of your own, as benchmarks/harness/arms.yaml has the default ones: a list of names, each with a
-method of ns-train (of this package, splatfacto, or mcmc for 3DGS-MCMC) and options of ns-train, if it needs them.
+method of ns-train (of this package, or splatfacto) and options of ns-train, if it needs them.
 
 Methods that prune once share a warm-up of each seed, and prune at every share of --keep-ratios. Other methods train
 from scratch. Methods and options are checked before anything is trained.

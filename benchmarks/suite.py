@@ -30,7 +30,7 @@ from sundae_ns.storage.packing import FINETUNE_STEPS
 
 ARMS = (
     *("splatfacto", "sundae", "sundae-with-head", "sundae-no-head", "sundae-no-head-bytes"),
-    *("mcmc", "band", "sundae-fast", "sundae-auto"),
+    *("band", "sundae-fast", "sundae-auto"),
 )
 
 
@@ -140,7 +140,7 @@ def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping
         lines += ["## Left out", ""]
         # The output of a training that failed ends with the cause.
         lines += [*(f"- {name}: {reason.splitlines()[-1]}" for name, reason in left_out.items()), ""]
-    trained = [r for r in results if r["job"]["kind"] in ("whole", "mcmc") and r["measured"]["train_s"] is not None]
+    trained = [r for r in results if r["job"]["kind"] == "whole" and r["measured"]["train_s"] is not None]
     packed, tuned = ([result for result in results if result.get(name)] for name in ("packed", "tuned"))
     lines += [
         "## Training",

@@ -75,12 +75,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Start from a finished field without a warm-up: a splatfacto or sundae .ckpt (or its folder), or a 3DGS .ply."""
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"
     """Coordinates of the warm start: nerfstudio's model, or the capture (COLMAP). auto decides by the kind of file."""
-    warmup: Literal["densify", "mcmc"] = "densify"
-    """Growth of the field: by gradients (3DGS), or as a Markov chain with an exact cap (3DGS-MCMC)."""
     stop_split_at: int = 12000
     """Step at which densification ends, that of the prune; longer growth gains nothing that the prune keeps."""
-    mcmc_cap: int = 500_000
-    """Highest number of primitives in a warm-up by mcmc: about as many as densification makes of most captures."""
     evaluate_prune: bool = True
     """Evaluate all test views right before and right after the prune, and at the end."""
 
@@ -228,7 +224,7 @@ class SundaeModel(SplatfactoModel):
             self.backend,
             antialiased=self.config.rasterize_mode == "antialiased",
             training=training,
-            absgrad=self.config.use_absgrad and self.config.warmup == "densify",
+            absgrad=self.config.use_absgrad,
         )
 
     @torch.no_grad()

@@ -20,8 +20,6 @@ from sundae_ns.errors import ConfigError
 
 DEFAULT_FILE = Path(__file__).with_name("arms.yaml")
 """The default arms; also an example of a file of arms."""
-MCMC = "mcmc"
-"""In place of a method: 3DGS-MCMC from scratch, with as many primitives as a branch keeps."""
 
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
 _KEEP_RATIO, _STEPS = "pipeline.model.pruning.keep-ratio", "max-num-iterations"
@@ -143,7 +141,7 @@ def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Ar
 
     from sundae_ns.model import SundaeModelConfig
 
-    method = default if entry.method in (None, MCMC) else entry.method
+    method = entry.method or default
     config, model = _config_of(entry, method), _methods()[method].pipeline.model
     if not isinstance(model, SplatfactoModelConfig):
         raise ConfigError(f"arm {entry.name}: {method} has no Gaussians; use splatfacto or a method of this package")
@@ -151,13 +149,11 @@ def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Ar
     if method == default and mode != "one-shot":
         raise ConfigError(f"{method!r} is no method of ours that prunes once; use sundae, or sundae-tiny for a trial")
     kind: Kind = "whole"
-    if entry.method == MCMC:
-        kind = "mcmc"
     # To a share of the plan; an arm of a named method that decides about the number trains whole, at its own.
     pruning = None if mode is None else config.pipeline.model.pruning
     decides = pruning is not None and pruning.decides and entry.method is not None
     prunes_once = pruning is not None and pruning.mode == "one-shot" and not decides
-    if prunes_once and kind != "mcmc" and (entry.options or not from_scratch):
+    if prunes_once and (entry.options or not from_scratch):
         kind = "branch"
     options, ratio = dict(entry.options), None
     own_steps = _scaled(config.max_num_iterations, scale)
@@ -167,7 +163,7 @@ def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Ar
         prune_at = whole.pipeline.model.pruning.prune_at
         warmup, finetune = _scaled(prune_at, scale), _scaled(whole.max_num_iterations - prune_at, scale)
         total = warmup + finetune
-        steps = finetune if kind == "branch" else total
+        steps = finetune
         if options.pop(_KEEP_RATIO, None) is not None:
             ratio = config.pipeline.model.pruning.keep_ratio
     elif mode is not None:

@@ -216,8 +216,6 @@ def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
     start: Words = ()
     if job.kind == "branch":
         start = ("--pipeline.model.warm-start", str(_run_folder(out, job.needs) / "nerfstudio_models"))
-    if job.kind == "mcmc":
-        start = ("--pipeline.model.mcmc-cap", str(_cap(job, out)))
     arguments = _arguments(job, start)
     config = parse(arguments)
     config.output_dir = job_folder(out, job.key)
@@ -258,14 +256,6 @@ def _arguments(job: Job, start: Words) -> Words:
     """Words after ``ns-train``, with those of the place that the job starts from."""
     fixed = ("--data", job.data, "--machine.seed", str(job.seed), "--max-num-iterations", str(job.steps))
     return (job.method, *fixed, *job.options, *start, *job.parser)
-
-
-def _cap(job: Job, out: Path) -> int:
-    """Number of primitives that a branch of the same share keeps."""
-    result = read_result(done_file(out, str(job.needs)))
-    if result is None:
-        raise CheckpointError(f"{job.key} needs the count of {job.needs}, which is not done; run the whole plan")
-    return max(1, round((job.keep_ratio or 1.0) * int(result["measured"]["primitives"])))
 
 
 def _run_folder(out: Path, key: str | None) -> Path:

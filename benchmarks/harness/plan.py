@@ -10,8 +10,8 @@ from typing import Literal, TypeAlias
 from sundae_ns.data.advice import how_to_make_one
 from sundae_ns.errors import ConfigError, DataError
 
-Kind = Literal["branch", "mcmc", "whole"]
-"""How an arm trains: from a warm-up that others share, as MCMC with a branch's count, or by itself from scratch."""
+Kind = Literal["branch", "whole"]
+"""How an arm trains: from a warm-up that others share, or by itself from scratch."""
 
 Words: TypeAlias = tuple[str, ...]
 """Words of a command line."""
@@ -47,7 +47,7 @@ class Job:
 
     key: str
     """Name, unique in a plan; also of its folder."""
-    kind: Literal["warm-up", "branch", "mcmc", "whole"]
+    kind: Literal["warm-up", "branch", "whole"]
     scene: str
     arm: str
     data: str
@@ -59,7 +59,7 @@ class Job:
     keep_ratio: float | None = None
     """Share of the primitives to keep; None for an arm that has no share, or decides it."""
     needs: str | None = None
-    """Key of the warm-up that it starts from, or whose count it takes."""
+    """Key of the warm-up that it starts from."""
     options: Words = ()
     """Options of ``ns-train``."""
     parser: Words = ()
@@ -162,18 +162,7 @@ def _job(base: Job, arm: Arm, ratio: float | None) -> Job:
     """The training of an arm at one share, or at its own."""
     steps, share = str(arm.steps), "" if ratio is None else f"{ratio:g}"
     options: dict[str, Words]
-    if arm.kind == "mcmc":
-        options = {
-            "pipeline.model.warmup": ("mcmc",),
-            "pipeline.model.pruning.mode": ("off",),
-            "pipeline.model.head.mode": ("off",),
-            # As its authors start.
-            "pipeline.model.dense-start-views": ("0",),
-            # The share of its authors: 25,000 of 30,000.
-            "pipeline.model.stop-split-at": (str(max(arm.steps * 5 // 6, 1)),),
-            "optimizers.means.scheduler.max-steps": (steps,),
-        }
-    elif arm.kind == "branch":
+    if arm.kind == "branch":
         options = {
             "pipeline.model.pruning.keep-ratio": (share,),
             "pipeline.model.pruning.seed": (str(base.seed),),

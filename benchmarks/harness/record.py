@@ -39,7 +39,7 @@ FOLDER = Path(__file__).parents[1]
 SEEDS = ("42", "43", "44")
 SHARES = ("1", "0.4", "0.2", "0.1", "0.05", "0.025")
 """Fixed shares beside the default's choice: the curve of what a scene needs."""
-OTHERS = ("splatfacto", "sundae", "sundae-with-head", "sundae-no-head", "sundae-fast", "mcmc", "band")
+OTHERS = ("splatfacto", "sundae", "sundae-with-head", "sundae-no-head", "sundae-fast", "band")
 TIMED = ("splatfacto", "sundae", "sundae-fast")
 LOOKED = (1000, 2000, 3000, 4500, 6000, 8000, 10000, 12000, 15000, 18000, 21000, 25000)
 """Steps of a timed training after which the test views are measured, with the clock stopped."""

@@ -129,7 +129,6 @@ def _described(arms: Sequence[Arm]) -> list[str]:
     """A line for each arm: its method, how it starts, and its options."""
     starts = {
         "branch": "from the warm-up",
-        "mcmc": "as 3DGS-MCMC from scratch, with as many primitives as a branch keeps",
         "whole": "from scratch",
     }
     lines = []

@@ -51,7 +51,7 @@ class Options:
     """folder for jobs, results and tables; its finished jobs are not run again."""
     arms: tuple[str, ...] = ()
     """files of arms (.yaml), and names of default arms: sundae, band (the paper's rule), contribution, random, each
-    also with -no-head; sundae-with-head, sundae-no-head-bytes; mcmc (from scratch to the same count), sundae-fast,
+    also with -no-head; sundae-with-head, sundae-no-head-bytes; sundae-fast,
     sundae-auto, splatfacto, splatfacto-7k."""
     keep_ratios: tuple[float, ...] = (0.1,)
     """shares of the warm-up's primitives to keep."""

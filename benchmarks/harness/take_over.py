@@ -139,7 +139,7 @@ def _rounded(value: Any) -> Any:
 
 
 def _is_timed(result: dict[str, Any]) -> bool:
-    return result["job"]["kind"] in ("whole", "mcmc") and result["measured"]["train_s"] is not None
+    return result["job"]["kind"] == "whole" and result["measured"]["train_s"] is not None
 
 
 def _common(result: dict[str, Any]) -> dict[str, Any]:

@@ -4,34 +4,23 @@ from __future__ import annotations
 
 from sundae_ns.distributed.shards import DRIFT, Shards
 from sundae_ns.distributed.source import send_statistics, statistics_of
-from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.parameters import num_primitives
-from sundae_ns.training.densification import CappedStrategy, ChainStrategy, Densification
+from sundae_ns.training.densification import CappedStrategy, Densification
 from sundae_ns.training.field_state import FieldState
 
 
 class ShardedDensification(Densification):
     """Densification with statistics of all ranks. Collective."""
 
-    def __init__(self, strategy: CappedStrategy | ChainStrategy, shards: Shards) -> None:
+    def __init__(self, strategy: CappedStrategy, shards: Shards) -> None:
         super().__init__(strategy)
         self.shards = shards
 
     def before_backward(self, state: FieldState) -> None:
-        """Keep the gradients that densification reads, and let its statistics travel back with them.
-
-        Raises:
-            ConfigError: the field, of a resumed run, still grows as a Markov chain.
-        """
+        """Keep the gradients that densification reads, and let its statistics travel back with them."""
         super().before_backward(state)
-        if not state.densifying:
-            return
-        if isinstance(self.strategy, ChainStrategy):
-            raise ConfigError(
-                "this run still grows as a Markov chain, which does not work on several GPUs yet; resume it with "
-                f"--machine.num-devices 1 up to step {state.densify_until:,}"
-            )
-        send_statistics(state.info, absgrad=self.strategy.absgrad)
+        if state.densifying:
+            send_statistics(state.info, absgrad=self.strategy.absgrad)
 
     def densify(self, state: FieldState) -> None:
         """Densify every shard, and balance the ranks if the largest shard exceeds the mean by :data:`DRIFT`."""

@@ -26,11 +26,8 @@ def check_options(config: Any) -> None:
     """
     model = config.pipeline.model
     pruning = model.pruning
-    # A chain that has ended changes nothing; one that goes on is refused once the checkpoint is read.
-    resumed = config.load_dir is not None or config.load_checkpoint is not None
     counted = pruning.max_primitives is not None or pruning.target_primitives is not None
     refused = {
-        "--pipeline.model.warmup mcmc": model.warmup == "mcmc" and not resumed,
         "continuous pruning to a count or under a cap": pruning.mode == "continuous" and counted,
         "a camera optimizer": model.camera_optimizer.mode != "off",
         "--mixed-precision": config.mixed_precision or config.use_grad_scaler,

@@ -1,4 +1,4 @@
-"""Gaussian fields: parameters and their activations, initialisation, surgery, merging and relocation."""
+"""Gaussian fields: parameters and their activations, initialisation, surgery, merging and growth."""
 
 from sundae_ns.gaussians.initialization import from_points, initial_features, random_points
 from sundae_ns.gaussians.mending import mend

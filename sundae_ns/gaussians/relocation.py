@@ -1,4 +1,4 @@
-"""Updates of "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al., 2024): relocation, growth, noise.
+"""Growth of a field by copies, as in "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al., 2024).
 
 N copies of a primitive at its place must render like the primitive. Opacities ``o' = 1 - (1 - o)^(1/N)`` preserve the
 opacity at the centre; equation 9 of the paper gives the scale that preserves the integral along a ray. Its double sum
@@ -17,15 +17,10 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.gaussians.surgery import change_parameter, moments_of
-from sundae_ns.gpu.fused_noise import add_noise, noise_kernels
-from sundae_ns.gpu.nvrtc import kernels_where_possible
 
 MAX_COPIES = 51
 """Larger numbers of copies are clamped to this: the terms of the alternating sum grow with N."""
-GATE = (100.0, 0.005)
-"""Sharpness and threshold: noise is times ``sigmoid(sharpness * (threshold - opacity))``, as in the paper."""
 
 
 def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
@@ -64,33 +59,6 @@ def draw_sources(weights: Tensor, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def relocate(
-    params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], dead: Tensor, min_opacity: float
-) -> int:
-    """Move dead primitives onto living ones, drawn by opacity; the rendered image stays the same.
-
-    Args:
-        optimizers: by parameter name; the moments of the moved primitives and of their targets become 0.
-        dead: True for primitives to move, bool ``[N]``.
-        min_opacity: lower limit of the new opacities.
-
-    Returns:
-        Number of primitives moved; 0 if no primitive is alive.
-    """
-    targets, alive = dead.nonzero().squeeze(1), (~dead).nonzero().squeeze(1)
-    if len(targets) == 0 or len(alive) == 0:
-        return 0
-    sources = alive[draw_sources(params["opacities"][alive].sigmoid().flatten(), len(targets))]
-    _split_sources(params, sources, min_opacity)
-    for name, value in params.items():
-        value.data[targets] = value.data[sources]
-        for moment in moments_of(optimizers, name, value).values():
-            moment[sources] = 0
-            moment[targets] = 0
-    return len(targets)
-
-
-@torch.no_grad()
 def grow(
     params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], count: int, min_opacity: float
 ) -> None:
@@ -110,32 +78,6 @@ def grow(
         change_parameter(params, optimizers, name, lambda value: torch.cat([value, value[sources]]))
         for moment in moments_of(optimizers, name, params[name]).values():
             moment[-count:] = 0
-
-
-@torch.no_grad()
-def jitter(params: Mapping[str, Tensor], strength: float) -> None:
-    """Add noise to the centres, shaped by each primitive's covariance and much weaker for opaque primitives.
-
-    Args:
-        strength: factor of the noise; in the paper 5e5 times the learning rate of the centres.
-    """
-    means = params["means"]
-    noise = torch.randn_like(means)
-    kernels = None
-    if means.is_cuda and means.dtype == torch.float32:
-        kernels = kernels_where_possible(noise_kernels, means.device, "noise on centres takes forty kernels, not one")
-    if kernels is not None:
-        scales, quats, opacities = (params[name].detach().contiguous() for name in ("scales", "quats", "opacities"))
-        add_noise(kernels, means.data, scales, quats, opacities, noise, strength, GATE)
-        return
-    sharpness, threshold = GATE
-    scales = params["scales"].exp()
-    gate = torch.sigmoid(sharpness * (threshold - params["opacities"].sigmoid()))
-    rotation = rotation_matrices(params["quats"])
-    noise = noise * gate * strength
-    # R S^2 R^T e, without building the covariance.
-    local = torch.einsum("nji,nj->ni", rotation, noise) * scales.square()
-    means.data.add_(torch.einsum("nij,nj->ni", rotation, local))
 
 
 def _split_sources(params: Mapping[str, Tensor], sources: Tensor, min_opacity: float) -> None:

@@ -35,8 +35,6 @@ def check(options: ModelOptions) -> None:
     options.pruning.validate()
     if options.head.mode != "off":
         options.head.validate()
-    if options.mcmc_cap < 1:
-        raise ConfigError(f"mcmc-cap is {options.mcmc_cap}; give the highest number of primitives, at least 1")
     for name in ("base_loss_weight", "prior_after_prune"):
         if getattr(options, name) < 0:
             raise ConfigError(f"{name.replace('_', '-')} is {getattr(options, name)}; give 0 or more")

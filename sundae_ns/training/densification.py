@@ -1,12 +1,10 @@
-"""Growth of a field during the warm-up: gsplat's densification under a cap, or Markov chain Monte Carlo.
+"""Growth of a field: gsplat's densification under a cap.
 
-Both have the verbs of gsplat's strategies. Their running state holds ``peak``, the number of primitives right after
-growing and before culling.
+Its running state holds ``peak``, the number of primitives right after growing and before culling.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -14,10 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from gsplat.strategy import DefaultStrategy
 from torch import Tensor
-from torch.nn import Parameter
-from torch.optim import Optimizer
 
-from sundae_ns.gaussians.relocation import grow, jitter, relocate
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.options import ModelOptions
@@ -69,7 +64,7 @@ def start_counting(state: MutableMapping[str, Any], means: Tensor) -> None:
     """Make the tensors that are missing in the running state of gsplat's strategy.
 
     Args:
-        state: the running state; that of a chain has none.
+        state: the running state.
         means: centres ``[N, 3]``.
     """
     for name in STATISTICS:
@@ -148,68 +143,6 @@ class CappedStrategy(DefaultStrategy):
         return grown
 
 
-def start_of_chain(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Start of the chain: opacity one half and a tenth of the width, as in the paper of 3DGS-MCMC.
-
-    Args:
-        params: the field from points ``[N, ...]``; it does not change.
-    """
-    scales = params["scales"] + math.log(0.1)
-    return {**params, "opacities": torch.zeros_like(params["opacities"]), "scales": scales}
-
-
-@dataclass
-class ChainStrategy:
-    """3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al., 2024), in PyTorch on any device.
-
-    It moves transparent primitives onto visible ones, adds a twentieth at a time up to the cap, and adds noise to the
-    centres. Numbers are the paper's.
-    """
-
-    cap: int
-    """Highest number of primitives."""
-    refine_start_iter: int = 500
-    """First step after which primitives are moved and added."""
-    refine_stop_iter: int = 25000
-    """Step at which all of this ends."""
-    refine_every: int = 100
-    """Steps between rounds."""
-    min_opacity: float = 0.005
-    """Opacity below which a primitive is moved."""
-    growth: float = 0.05
-    """Share of the primitives that a round adds."""
-    noise: float = 5e5
-    """Noise of the centres, in units of their learning rate."""
-
-    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """The peak; the chain needs no other state."""
-        return {"peak": 0}
-
-    def step_pre_backward(self, *_: Any, **__: Any) -> None:
-        """Nothing to keep: the chain reads no gradients."""
-
-    @torch.no_grad()
-    def step_post_backward(
-        self,
-        params: MutableMapping[str, Parameter],
-        optimizers: Mapping[str, Optimizer],
-        state: MutableMapping[str, Any],
-        step: int,
-        info: Mapping[str, Any] | None = None,
-        packed: bool = False,
-    ) -> None:
-        """Move, add and jitter primitives; call it after the optimizer's step."""
-        if step >= self.refine_stop_iter:
-            return
-        if step > self.refine_start_iter and step % self.refine_every == 0:
-            dead: Tensor = params["opacities"].detach().sigmoid().flatten() <= self.min_opacity
-            relocate(params, optimizers, dead, self.min_opacity)
-            n = len(params["means"])
-            grow(params, optimizers, min(self.cap, int((1 + self.growth) * n)) - n, self.min_opacity)
-            state["peak"] = max(state.get("peak", 0), len(params["means"]))
-        jitter(params, self.noise * optimizers["means"].param_groups[0]["lr"])
-
-
 class Densification(Extension):
     """Grows the field until the schedule's prune would undo it.
 
@@ -219,7 +152,7 @@ class Densification(Extension):
 
     name = "densification"
 
-    def __init__(self, strategy: CappedStrategy | ChainStrategy) -> None:
+    def __init__(self, strategy: CappedStrategy) -> None:
         self.strategy = strategy
 
     def initialize(self, state: FieldState) -> None:
@@ -246,7 +179,7 @@ class Densification(Extension):
         self.strategy.step_post_backward(params, state.optimizers, running, state.schedule_step, state.info)
 
 
-def make_strategy(options: ModelOptions, num_images: int) -> CappedStrategy | ChainStrategy:
+def make_strategy(options: ModelOptions, num_images: int) -> CappedStrategy:
     """Strategy of the warm-up. It ends before the prune that would undo it.
 
     Args:
@@ -258,13 +191,6 @@ def make_strategy(options: ModelOptions, num_images: int) -> CappedStrategy | Ch
         stop, cap = min(stop, pruning.stop), pruning.max_primitives
     elif pruning.ends_growth_at is not None:
         stop = min(stop, pruning.ends_growth_at)
-    if options.warmup == "mcmc":
-        return ChainStrategy(
-            cap=min(options.mcmc_cap, cap or options.mcmc_cap),
-            refine_start_iter=options.warmup_length,
-            refine_stop_iter=stop,
-            refine_every=options.refine_every,
-        )
     strategy = CappedStrategy(
         cap=cap,
         prune_opa=options.cull_alpha_thresh,

@@ -16,7 +16,6 @@ from sundae_ns.pruning import select_random
 from sundae_ns.storage.kinds import kind_of
 from sundae_ns.storage.runs.checkpoint import read_field
 from sundae_ns.storage.transform import similarity
-from sundae_ns.training.densification import start_of_chain
 from sundae_ns.training.options import ModelOptions
 from sundae_ns.training.warning import warn
 
@@ -73,8 +72,6 @@ def initial_field(
             params = _warm_field(options, options.warm_start, frame, num_features)
     except CheckpointError as error:
         params, start = _sparse_field(options, points, num_features, cap)[0], Start(failure=error)
-    if options.warmup == "mcmc" and options.warm_start is None:
-        params = start_of_chain(params)
     if options.sh_degree == 0:
         # splatfacto and nerfstudio's exporter store logits of colours at SH degree 0.
         params["features_dc"] = rgb_to_logit(sh_to_rgb(params["features_dc"]))

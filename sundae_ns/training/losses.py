@@ -15,9 +15,6 @@ from sundae_ns.rasterization.select import numba_problem
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.options import ModelOptions
 
-CHAIN_PRIOR = 0.01
-"""Weights of opacities and scales in the loss of a chain (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
-
 LEAST_SQUARE = 1e-8
 """Added to the mean square, so that its root has a gradient for equal images."""
 
@@ -65,8 +62,8 @@ class StepLosses:
             losses["base_loss"] = options.base_loss_weight * base_loss
         weight = self.prior_weight(state)
         if weight > 0:
-            # Unused primitives become transparent and small (equation 10 of 3DGS-MCMC). A chain moves such primitives;
-            # in a pruned field they would fit what differs between the training images.
+            # Unused primitives become transparent and small (equation 10 of 3DGS-MCMC). In a pruned field they would
+            # fit what differs between the training images.
             for name, values in (("opacity", params["opacities"].sigmoid()), ("scale", params["scales"].exp())):
                 mean = values.mean() if count is None else values.sum() / (values.shape[1] * count)
                 losses[f"{name}_loss"] = weight * mean
@@ -74,8 +71,6 @@ class StepLosses:
 
     def prior_weight(self, state: FieldState) -> float:
         """Weight of opacities and scales at this step."""
-        if self.options.warmup == "mcmc" and state.densifying:
-            return CHAIN_PRIOR
         # A prior counts once, and the loss is of one image: its weight falls with their number.
         return self.options.prior_after_prune / max(self.num_images, 1) if state.pruned else 0.0
 

@@ -14,8 +14,6 @@ class ModelOptions(Protocol):
 
     pruning: PruningConfig
     head: HeadConfig
-    warmup: Literal["densify", "mcmc"]
-    mcmc_cap: int
     dense_start_views: int
     warm_start: Path | None
     warm_start_frame: Literal["auto", "model", "capture"]

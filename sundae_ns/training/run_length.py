@@ -156,7 +156,7 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
             scaled = min(value, config.schedule_length // LONGEST_RISE)
         else:
             scaled = max(round(value * (share if name.startswith("optimizers.") else steps_share)), 1)
-        if name == "pipeline.model.refine_every" and model.warmup == "densify":
+        if name == "pipeline.model.refine_every":
             scaled = max(scaled, min(value, LEAST_IMAGES))
         set_option(config, name, scaled)
     if RESETS in free:
@@ -227,8 +227,6 @@ def _growth(model: Any) -> str:
     ends = model.pruning.stop if model.pruning.mode == "continuous" else model.pruning.ends_growth_at
     last = model.stop_split_at if ends is None else min(model.stop_split_at, ends)
     text = f"{model.warmup_length:,} to {last:,}, every {model.refine_every:,}"
-    if model.warmup == "mcmc":
-        return f"{text} (MCMC)"
     resets = model.reset_alpha_every * model.refine_every
     return text + (f"; opacities reset every {resets:,}" if resets < last else "; opacities never reset")
 

@@ -14,7 +14,7 @@ from sundae_ns.errors import ConfigError
 DEFAULTS = [
     *("sundae", "sundae-with-head", "band", "contribution", "random"),
     *("sundae-no-head", "sundae-no-head-bytes", "band-no-head", "contribution-no-head", "random-no-head"),
-    *("mcmc", "sundae-fast", "sundae-auto", "splatfacto", "splatfacto-7k"),
+    *("sundae-fast", "sundae-auto", "splatfacto", "splatfacto-7k"),
 ]
 MINE = """
 - name: gentle  # a comment
@@ -115,11 +115,8 @@ def test_the_default_arms_are_a_file_like_any_other() -> None:
     arms = choose_arms([], "sundae")
     assert [arm.name for arm in arms] == DEFAULTS
     assert {arm.method for arm in arms} == {"sundae", "sundae-fast", "sundae-auto", "splatfacto"}
-    tiny = choose_arms(["random", "mcmc"], "sundae-tiny")
-    assert [(arm.name, arm.kind, arm.method) for arm in tiny] == [
-        ("random", "branch", "sundae-tiny"),
-        ("mcmc", "mcmc", "sundae-tiny"),
-    ]
+    tiny = choose_arms(["random"], "sundae-tiny")
+    assert [(arm.name, arm.kind, arm.method) for arm in tiny] == [("random", "branch", "sundae-tiny")]
 
 
 def test_default_arms_and_those_of_a_file_together(tmp_path: Path) -> None:
@@ -176,8 +173,6 @@ def test_lengths_come_from_the_method_times_a_factor(tmp_path: Path) -> None:
     }
     half = {name: (arm.warmup, arm.steps) for name, arm in chosen(path, 0.5).items()}
     assert half == {"gentle": (6000, 9000), "listed": (6000, 9000), "stock": (0, 500), "steady": (0, 15_000)}
-    (mcmc,) = choose_arms(["mcmc"], "sundae", 0.001)
-    assert (mcmc.warmup, mcmc.steps) == (12, 30)
     for method, scale in (("nerfacto", 1.0), ("sundae-continuous", 1.0), ("sundae", 0.0)):
         with pytest.raises(ConfigError):
             choose_arms(["sundae"], method, scale)

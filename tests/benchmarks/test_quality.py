@@ -36,7 +36,7 @@ def capture(tmp_path: Path) -> Path:
 
 def quality(capture: Path, out: Path, runner: Runner, **changed: Any) -> tuple[int, str]:
     text = StringIO()
-    options: dict[str, Any] = {"arms": ("sundae", "random-no-head", "mcmc", "splatfacto"), **changed}
+    options: dict[str, Any] = {"arms": ("sundae", "random-no-head", "splatfacto"), **changed}
     console = Console(file=text, width=200, force_terminal=False)
     code = run_quality(QualityOptions(folder=capture, out=out, **options), runner=runner, console=console)
     return code, text.getvalue()
@@ -105,8 +105,8 @@ def test_every_arm_of_a_seed_starts_from_its_warm_up_and_trains_as_long(arms: li
             assert place[warm_up.key] < place[job.key]
             assert (warm_up.kind, warm_up.seed) == ("warm-up", job.seed)
             total, steps = (18_000, 12_000) if job.arm == "sundae-fast" else (30_000, 18_000)
-            assert job.steps == (total if job.kind == "mcmc" else steps)
-            assert (job.steps if job.kind == "mcmc" else warm_up.steps + job.steps) == total
+            assert job.steps == steps
+            assert warm_up.steps + job.steps == total
 
 
 def test_arms_differ_in_their_rule_alone(arms: list[Arm]) -> None:
@@ -212,8 +212,8 @@ def test_a_branch_needs_the_warm_up_and_not_its_result_alone(capture: Path, tmp_
     quality(capture, out, Runner(), arms=("sundae",), seeds=(42,))
     (out / "done" / "fox-sundae-warm-up-s42.json").unlink()
     runner = Runner()
-    quality(capture, out, runner, arms=("sundae", "mcmc"), keep_ratios=(0.1,), seeds=(42,))
-    assert runner.ran == ["fox-sundae-warm-up-s42", "fox-mcmc-10pct-s42"]
+    quality(capture, out, runner, arms=("sundae", "sundae-no-head"), keep_ratios=(0.1,), seeds=(42,))
+    assert runner.ran == ["fox-sundae-warm-up-s42", "fox-sundae-no-head-10pct-s42"]
 
 
 def test_a_job_that_fails_stops_only_what_needs_it(capture: Path, tmp_path: Path) -> None:

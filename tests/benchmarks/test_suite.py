@@ -32,7 +32,7 @@ FRAME: dict[str, Any] = {
     "w": 16,
     "h": 16,
 }
-ARMS = ("splatfacto", "sundae", "sundae-no-head", "mcmc")
+ARMS = ("splatfacto", "sundae", "sundae-no-head")
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_the_default_plan(captures: Path) -> None:
     assert {arm: job.kind for arm, job in own.items()} == {
         **{arm: "branch" for arm in SUITE},
         **{arm: "whole" for arm in ("splatfacto", "sundae", "sundae-fast", "sundae-auto")},
-        **{"sundae-warm-up": "warm-up", "mcmc": "mcmc"},
+        "sundae-warm-up": "warm-up",
     }
     assert [job.key for job in jobs if job.scene == "bonsai"][0] == "bonsai-sundae-warm-up-s42"
     # A method without options trains as its command does, so that its time is that of the command.
@@ -94,9 +94,7 @@ def test_the_default_plan(captures: Path) -> None:
 
 
 def test_a_method_trains_whole_at_every_share_and_repeated_seed(captures: Path, tmp_path: Path) -> None:
-    jobs = plan(
-        captures, scenes=("fox",), keep_ratios=(0.01, 0.1), seeds=(42, 43), arms=("sundae", "splatfacto", "mcmc")
-    )
+    jobs = plan(captures, scenes=("fox",), keep_ratios=(0.01, 0.1), seeds=(42, 43), arms=("sundae", "splatfacto"))
     wholes = [(job.arm, job.keep_ratio, job.seed) for job in jobs if job.kind == "whole"]
     assert sorted(wholes, key=str) == sorted(
         [
@@ -112,12 +110,12 @@ def test_a_method_trains_whole_at_every_share_and_repeated_seed(captures: Path, 
 
 
 def test_a_job_has_the_fingerprint_of_its_arm_and_share(captures: Path) -> None:
-    jobs = plan(captures, keep_ratios=(0.01, 0.1), seeds=(42, 43), arms=("sundae", "sundae-no-head", "mcmc"))
+    jobs = plan(captures, keep_ratios=(0.01, 0.1), seeds=(42, 43), arms=("sundae", "sundae-no-head"))
     found: dict[Any, set[str]] = {}
     for job in jobs:
-        found.setdefault((job.arm, None if job.kind == "mcmc" else job.keep_ratio), set()).add(fingerprint_of(job))
+        found.setdefault((job.arm, job.keep_ratio), set()).add(fingerprint_of(job))
     assert all(len(own) == 1 for own in found.values()), found
-    assert len(found) == len(set.union(*found.values())) == 6
+    assert len(found) == len(set.union(*found.values())) == 5
 
 
 def test_folders_that_hold_no_captures(captures: Path, tmp_path: Path) -> None:
@@ -154,7 +152,7 @@ def test_several_commands_share_a_folder(captures: Path) -> None:
     suite(captures, Runner())
     again = Runner()
     assert suite(captures, again, scenes=("fox",), keep_ratios=(0.1, 0.3))[0] == 0
-    assert again.ran == ["fox-sundae-no-head-30pct-s42", "fox-mcmc-30pct-s42", "fox-sundae-30pct-s42"]
+    assert again.ran == ["fox-sundae-no-head-30pct-s42", "fox-sundae-30pct-s42"]
     page = (captures.parent / "out" / "table.md").read_text()
     assert {(line[0], line[2]) for line in lines_of(page, "Packing")} == {
         *[("bonsai", "10%"), ("fox", "10%"), ("fox", "30%")]
@@ -236,11 +234,11 @@ def test_times_stand_beside_errors_and_are_of_trainings_from_scratch(captures: P
     suite(captures, Runner(), scenes=("fox",))
     page = (captures.parent / "out" / "table.md").read_text()
     training = lines_of(page, "Training")
-    assert {line[1] for line in training} == {"splatfacto", "sundae", "mcmc"}
+    assert {line[1] for line in training} == {"splatfacto", "sundae"}
     sundae = next(line for line in training if line[1] == "sundae")
     assert sundae == ["fox", "sundae", "10%", "1", "30,000", "10", "26.00", "0.8000", "1,000", "-", "CPU"]
     packing = {line[1]: line for line in lines_of(page, "Packing")}
-    assert set(packing) == {"sundae", "sundae-no-head", "mcmc"}
+    assert set(packing) == {"sundae", "sundae-no-head"}
     assert packing["sundae"] == ["fox", "sundae", "10%", "1", "1,000", "0.05", "26.00", "24.90", "0.8000", "0.7500"]
     assert "`sundae`: `sundae` from scratch, 30,000 steps" in page
     assert "--finetune" not in page
@@ -268,7 +266,7 @@ def test_a_job_that_shared_its_gpu_has_no_times(captures: Path) -> None:
     path.write_text(json.dumps(result) + "\n")
     suite(captures, Runner(), scenes=("fox",))
     page = (out / "table.md").read_text()
-    assert {line[1] for line in lines_of(page, "Training")} == {"splatfacto", "mcmc"}
+    assert {line[1] for line in lines_of(page, "Training")} == {"splatfacto"}
     (row,) = [row for row in read_rows(out / "results.csv") if row.variant == "sundae"]
     assert (row.ms_frame, row.ms_splat, row.ms_head, row.train_s, row.prune_s) == (None,) * 5
     assert row.psnr is not None

@@ -56,7 +56,7 @@ raise ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -
     assert line.startswith("sundae: rank 1 ended (killed by SIGKILL)")
 
 
-@pytest.mark.parametrize(("option", "value"), [("warmup", "mcmc"), ("camera_optimizer.mode", "SO3xR3")])
+@pytest.mark.parametrize(("option", "value"), [("camera_optimizer.mode", "SO3xR3")])
 def test_options_that_several_ranks_cannot_use_are_refused(config: Any, option: str, value: str) -> None:
     *owners, name = option.split(".")
     owner: Any = config.pipeline.model
@@ -65,11 +65,6 @@ def test_options_that_several_ranks_cannot_use_are_refused(config: Any, option: 
     setattr(owner, name, value)
     with pytest.raises(ConfigError, match="several GPUs"):
         distributed.check_options(config)
-
-
-def test_a_resumed_chain_may_have_ended(config: Any) -> None:
-    config.pipeline.model.warmup, config.load_dir = "mcmc", Path("models")
-    distributed.check_options(config)
 
 
 def test_more_ranks_than_gpus_are_refused_before_anything_is_written(

@@ -143,12 +143,6 @@ def test_a_cpu_sweeps_few_views(
     assert model.num_points == 60 + swept * FOUND
 
 
-def test_the_cap_holds(build: Build, training_of: TrainingOf) -> None:
-    model = few(build, warmup="mcmc", mcmc_cap=70)
-    training_of(model)
-    assert model.num_points == 70
-
-
 def test_ranks_take_what_the_first_finds(build: Build, training_of: TrainingOf) -> None:
     model = few(build)
     (dense,) = (one for one in model.extensions if isinstance(one, DenseStart))

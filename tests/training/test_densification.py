@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from torch.nn import Parameter
@@ -12,11 +10,9 @@ from torch.optim import Adam
 from sundae_ns.rasterization.reference import _radii_per_axis, strategy_info
 from sundae_ns.training.densification import (
     CappedStrategy,
-    ChainStrategy,
     count_view,
     limit_growth,
     start_counting,
-    start_of_chain,
 )
 
 FIELD = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
@@ -76,47 +72,6 @@ def test_densification_stops_at_the_cap(cap: int | None, expected: int, wide: bo
     # One place may be left over, where the next in line takes two.
     assert expected - (wide and cap == N + 7) <= len(params["means"]) <= expected
     assert state["peak"] == len(params["means"])
-
-
-def test_a_chain_starts_half_opaque_and_thin() -> None:
-    params, _ = field()
-    start = start_of_chain(params)
-    torch.testing.assert_close(start["opacities"].sigmoid(), torch.full((N, 1), 0.5))
-    torch.testing.assert_close(start["scales"].exp(), params["scales"].exp() / 10)
-    assert start["means"] is params["means"]
-
-
-def test_a_chain_grows_to_its_cap_and_no_further() -> None:
-    params, optimizers = field()
-    strategy = ChainStrategy(cap=60, refine_start_iter=0, refine_stop_iter=30, refine_every=2)
-    state, counts = strategy.initialize_state(), []
-    for step in range(40):
-        strategy.step_pre_backward()
-        if step == 20:
-            params["opacities"].data[:5] = -9.0
-        strategy.step_post_backward(params, optimizers, state, step)
-        counts.append(len(params["means"]))
-        assert all(len(value) == counts[-1] for value in params.values())
-        if step == 20:
-            assert (params["opacities"].sigmoid() > 0.005).all(), "dead primitives have moved"
-    assert counts[2] == int(1.05 * N)
-    assert counts == sorted(counts)
-    assert counts[-1] == max(counts) == state["peak"] == 60
-    assert not any(math.isnan(value) for value in params["means"].flatten().tolist())
-
-
-@pytest.mark.parametrize(
-    ("reset_every", "images", "pause"),
-    [
-        (300, 50, 60),  # each image once, and one round
-        (300, 290, 150),  # more images than steps between resets: gsplat alone would never grow
-        (1000, 290, 0),  # never reset: gsplat alone would grow from step 300 on
-    ],
-)
-def test_a_field_grows_however_many_images_there_are(reset_every: int, images: int, pause: int) -> None:
-    strategy = CappedStrategy(refine_every=10, refine_start_iter=0, refine_stop_iter=1000, reset_every=reset_every)
-    strategy.see_each_image_after_resets(images)
-    assert strategy.pause_refine_after_reset == pause
 
 
 @pytest.mark.parametrize("absgrad", [False, True])

@@ -70,12 +70,10 @@ GROWTH = {
     [
         GROWTH,
         {**GROWTH, "use_absgrad": True},
-        # With one image the whole prior would leave features gradients of the size of rounding.
-        {**GROWTH, "warmup": "mcmc", "mcmc_cap": 90, "prior_after_prune": 0.05},
         {"pruning": {"mode": "off"}, "head": {"mode": "off"}},
         {"sh_degree": 0, "head": {"mode": "features"}},
     ],
-    ids=["densify", "absgrad", "mcmc", "no-head", "logits"],
+    ids=["densify", "absgrad", "no-head", "logits"],
 )
 def test_both_train_the_same_field(both: Callable[..., tuple[Any, Recorded]], options: dict[str, Any]) -> None:
     """Through growth, resets of opacities, the prune and the head."""

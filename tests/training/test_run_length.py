@@ -107,14 +107,6 @@ def test_options_set_by_hand_keep_their_value() -> None:
     assert config.pipeline.model.stop_split_at == 8000
 
 
-def test_a_chain_keeps_its_number_of_rounds() -> None:
-    model = fitted("sundae", 3000, warmup="mcmc").pipeline.model
-    assert (model.refine_every, model.stop_split_at) == (10, 1200)
-    assert (
-        dict(schedule_table(fitted("sundae", 3000, warmup="mcmc")))["densification"] == "50 to 1,200, every 10 (MCMC)"
-    )
-
-
 @pytest.mark.parametrize("length", [300, 1500, 7000, 50000])
 def test_continuous_pruning_keeps_its_number_of_prunes(length: int) -> None:
     def prunes(config: Any) -> int:

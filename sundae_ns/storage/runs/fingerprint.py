@@ -24,9 +24,7 @@ LEFT_OUT = frozenset(
     "steps_per_save steps_per_eval_batch steps_per_eval_image steps_per_eval_all_images "
     "load_dir load_step load_config load_checkpoint load_scheduler pipeline.datamanager.eval_image_indices "
     "pipeline.datamanager.eval_num_images_to_sample_from pipeline.datamanager.eval_num_times_to_repeat_images "
-    "pipeline.model.evaluate_prune "
-    # A count that comparisons take from the capture; it stands beside the row as its number of primitives.
-    "pipeline.model.mcmc_cap".split()
+    "pipeline.model.evaluate_prune".split()
 )
 """Options of a trainer that decide neither quality nor time of what is trained, by their dotted names."""
 GONE = {"pipeline.model.pruning": {"search_every": 250, "patience": 4}}
