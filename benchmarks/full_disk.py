@@ -163,26 +163,6 @@ def tried(disk: Disk, words: list[object], exact: bool) -> Counter[str]:
     return tally
 
 
-def tried_unpack(disk: Disk, packed: Path) -> Counter[str]:
-    """As :func:`tried`, for the run that ``sundae unpack`` makes, which replaces nothing."""
-    tally: Counter[str] = Counter()
-    words = ["unpack", packed, "-o", disk.place / "out"]
-    disk.empty()
-    before = disk.free
-    succeeds("sundae", *words)
-    size = before - disk.free
-    for level in LEVELS:
-        disk.empty()
-        with disk.leaving(int(level * size)):
-            code, output = call("sundae", *words)
-            found = disk.files()
-        tally["tried"] += 1
-        tally["one line"] += says_so(code, output)
-        tally["older results whole"] += not any(path.endswith(("config.yml", ".ckpt")) for path in found)
-        tally["succeeds with room"] += call("sundae", *words)[0] == 0
-    return tally
-
-
 def tried_training(disk: Disk, scene: Path, whole: dict[str, Any], size: int, exact: bool) -> Counter[str]:
     """Trainings whose disk gets full: at their start, before the first save, and at a later one."""
     from sundae_ns.errors import CheckpointError
@@ -217,7 +197,7 @@ def tried_training(disk: Disk, scene: Path, whole: dict[str, Any], size: int, ex
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    names = ["train", "unpack", *commands(*[Path()] * 4)]
+    names = ["train", *commands(*[Path()] * 4)]
     parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="COMMAND", help=", ".join(names))
     options = parser.parse_args()
     inside()
@@ -242,8 +222,6 @@ def main() -> None:
             for name in options.only:
                 if name == "train":
                     found[name] = tried_training(disk, scene, loaded["pipeline"], path.stat().st_size, exact)
-                elif name == "unpack":
-                    found[name] = tried_unpack(disk, packed)
                 else:
                     found[name] = tried(disk, commands(run, ply, packed, disk.place)[name], exact)
                 print(name, dict(found[name]), file=sys.stderr, flush=True)

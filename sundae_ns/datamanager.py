@@ -42,17 +42,6 @@ __all__ = ["LightNerfstudioParser", "SundaeDatamanager", "SundaeDatamanagerConfi
 DATASET_FRAME = "sundae_dataset_frame"
 """Metadata key of the training set: transform ``[3, 4]`` and scale from the capture's coordinates to the model's."""
 
-NO_IMAGES = "sundae_no_images"
-"""Key of a dataset's metadata and of a batch: cameras without images, which are grey."""
-
-
-def no_images_error(run: object = "this run") -> DataError:
-    """The error for training or evaluating on the grey images of a run that was unpacked without its capture."""
-    return DataError(
-        f"{run} was unpacked without its capture, so its cameras have no images to train or evaluate on; "
-        "give the capture to sundae unpack with --data"
-    )
-
 
 def view_index(camera: Cameras) -> int | None:
     """Index of the training view that :meth:`SundaeDatamanager.next_train` gave; None for other cameras."""
@@ -78,7 +67,7 @@ def _fits(cameras: Cameras, device: torch.device) -> bool:
 
 
 class CheckedDataset(InputDataset):
-    """nerfstudio's dataset; it names an image that cannot be decoded, and gives grey images if there is no capture.
+    """nerfstudio's dataset; it names an image that cannot be decoded.
 
     Its cameras are perspective ones, as their images are once they are loaded.
     """
@@ -111,11 +100,6 @@ class CheckedDataset(InputDataset):
         Raises:
             DataError: a file of this view is damaged.
         """
-        if self.metadata.get(NO_IMAGES):
-            camera = self.cameras[image_idx]
-            grey = torch.tensor(128, dtype=torch.uint8) if image_type == "uint8" else torch.tensor(0.5)
-            image = grey.expand(int(camera.height.item()), int(camera.width.item()), 3)
-            return {"image_idx": image_idx, "image": image, NO_IMAGES: True}
         try:
             return super().get_data(image_idx, image_type)
         except Exception as error:  # decoders raise many kinds with one meaning for the user
@@ -132,8 +116,6 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
     robust_frame: bool = False
     """Centre and scale the scene by the cameras that stand near each other, and shift survey coordinates in float64.
     False takes all cameras, as nerfstudio does."""
-    images: bool = True
-    """False for cameras without images, as sundae unpack writes them without a capture: for the viewer only."""
 
     @property
     def capture(self) -> Path:
@@ -142,7 +124,7 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
 
     def check(self) -> None:
         """Check the capture before anything else of a training; see :func:`check_capture`."""
-        check_capture(self.dataparser, self.capture, ("train", "val"), images=self.images)
+        check_capture(self.dataparser, self.capture, ("train", "val"))
 
 
 class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
@@ -175,7 +157,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             config.dataparser,
             data,
             ("train", "val" if test_mode == "val" else "test"),
-            images=config.images and test_mode != "inference",
+            images=test_mode != "inference",
         )
         try:
             super().__init__(config, device, test_mode, **kwargs)
@@ -210,7 +192,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         # nerfstudio states the translation after the scale that a capture has been given.
         transform[:, 3] /= getattr(self.dataparser, "applied_scale", 1.0)
         outputs.metadata[DATASET_FRAME] = (transform, float(outputs.dataparser_scale))
-        return self._marked(super().create_train_dataset())
+        return super().create_train_dataset()
 
     def _remark(self, outputs: DataparserOutputs) -> None:
         """Name what lies in the capture and is not used."""
@@ -225,16 +207,11 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     def create_eval_dataset(self) -> CheckedDataset:
         """Test set."""
-        dataset = self._marked(super().create_eval_dataset())
+        dataset = super().create_eval_dataset()
         names = dataset.image_filenames
         warning = stray_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names) if names else None
         if warning is not None:
             warn(warning)
-        return dataset
-
-    def _marked(self, dataset: CheckedDataset) -> CheckedDataset:
-        if not self.config.images:
-            dataset.metadata[NO_IMAGES] = True
         return dataset
 
     @property
@@ -271,7 +248,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         outputs = self.train_dataparser_outputs
         # Undistortion masks what a fisheye lens has not seen.
         round_lens = (outputs.cameras.camera_type != CameraType.PERSPECTIVE.value).any()
-        masked = self.config.images and (outputs.mask_filenames is not None or bool(round_lens))
+        masked = outputs.mask_filenames is not None or bool(round_lens)
         for index in self.train_indices:
             # Read the mask first: undistortion changes the camera.
             mask = self.cached_train[index].get("mask") if masked else None
@@ -303,9 +280,6 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> list[dict[str, torch.Tensor]]:
         dataset = self.train_dataset if split == "train" else self.eval_dataset
-        if not self.config.images:
-            # The viewer loads all of them before its first frame.
-            return super()._load_images(split, "gpu")
         self._check_images(dataset)
         if split == "train" and self.eval_dataset:
             # Report a damaged test view now, not at the prune.

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from sundae_ns.callbacks import NerfstudioRun, training_views
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window
-from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, no_images_error, view_index
+from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager, view_index
 from sundae_ns.evaluation import Lpips, psnr, quality_of
 from sundae_ns.evaluation.count_curve import CurvePoint
 from sundae_ns.gpu.memory import naming_full_memory
@@ -72,7 +72,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     dense_start_views: int = 300
     """With at most this many training images, a plane sweep fills a sparse cloud to start from; 0 turns it off."""
     warm_start: Path | None = None
-    """Start from a finished field without a warm-up: a splatfacto or sundae .ckpt (or its folder), or a 3DGS .ply."""
+    """Start from a finished field, without a warm-up: a splatfacto or sundae .ckpt, its folder, a .sundae or .ply."""
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"
     """Coordinates of the warm start: nerfstudio's model, or the capture (COLMAP). auto decides by the kind of file."""
     stop_split_at: int = 12000
@@ -346,8 +346,6 @@ class SundaeModel(SplatfactoModel):
 
     def truth(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
         """The true image of outputs, over their background ``[H, W, 3]``; by default at the resolution of this step."""
-        if NO_IMAGES in batch:
-            raise no_images_error()
         truth = crop_image(self.get_gt_img(batch["image"], downscale), outputs.get("window"))
         return self.composite_with_background(truth, outputs["background"])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import torch
 from torch import Tensor
 
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.start import Direction
 from sundae_ns.api.views import is_frame
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.compensation.head import SIZES
@@ -19,7 +17,6 @@ from sundae_ns.data.capture import read_json
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rendering.source import degree_in_use
-from sundae_ns.rendering.views import View
 from sundae_ns.storage.kinds import kind_of, kind_of_primitives, unread
 from sundae_ns.storage.primitives import read_primitives
 from sundae_ns.storage.runs import checkpoint
@@ -29,8 +26,6 @@ from sundae_ns.storage.runs.folder import find_config
 _HEAD = "networks.head."
 FRAME_FILE = "dataparser_transforms.json"
 """Transform from the capture's coordinates to the model's, which nerfstudio writes into the folder of a run."""
-START_FILE = "start.json"
-"""Start view and up axis of an unpacked run, as in the header of a packed file."""
 
 
 def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
@@ -108,15 +103,15 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
     field["features_rest"] = field["features_rest"][:, : (degree + 1) ** 2 - 1]
     field = checkpoint.usable_of(field, source)
     frame = _frame_of(config.parent)
-    up, start = _start_of(config)
+    # nerfstudio turns captures so that z is upwards, unless the options forbid it.
+    upright = parser_options(config).get("orientation_method") in ("up", "vertical")
     return Scene(
         field,
         head,
         background_color=options.get("background_color", "random"),
         antialiased=options.get("rasterize_mode") == "antialiased",
         trained_focal=(float(focal[0]), float(focal[1])) if head is not None and focal else None,
-        up=up,
-        start=start,
+        up=(0.0, 0.0, 1.0) if upright else None,
         in_model_frame=True,
         meta={"source": {"step": int(loaded["step"])}, **({} if frame is None else {"frame": frame})},
     )
@@ -141,19 +136,6 @@ def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path)
         if head is not None:
             return head
     raise CheckpointError(f"{source} has a head that does not fit its own config.yml; give another run")
-
-
-def _start_of(config: Path) -> tuple[Direction | None, View | None]:
-    """Up axis and start view of a run. nerfstudio turns captures so that z is upwards, unless the options forbid it."""
-    up, start = None, None
-    if (config.parent / START_FILE).is_file():
-        from sundae_ns.api.packing import start_of  # needs a compiler, as above
-
-        with suppress(DataError):
-            up, start = start_of(read_json(config.parent / START_FILE))
-    if up is None and parser_options(config).get("orientation_method") in ("up", "vertical"):
-        up = (0.0, 0.0, 1.0)
-    return up, start
 
 
 def _frame_of(run: Path) -> dict[str, Any] | None:

@@ -19,7 +19,7 @@ from sundae_ns.cli.demo import demo
 from sundae_ns.cli.distill import distill_file
 from sundae_ns.cli.evaluate import evaluate
 from sundae_ns.cli.files import export, prune_file
-from sundae_ns.cli.packing import pack, unpack
+from sundae_ns.cli.packing import pack
 from sundae_ns.cli.poses import poses
 from sundae_ns.cli.process import loading
 from sundae_ns.cli.render import render_file
@@ -59,7 +59,6 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "prune": (prune_file, "make any splat scene smaller, without its photos"),
     "distill": (distill_file, "prune, then train on the full scene's own images, without photos"),
     "pack": (pack, "pack a scene into one file; says what that costs"),
-    "unpack": (unpack, "unpack a scene into a run, for the commands of nerfstudio"),
     "export": (export, "write a scene as a web page, .ply, .spz, .sog or .glb"),
     "view": (view, "show a scene with its head in the browser"),
     "render": (render_file, "render a scene to an image, or to a film along a smooth path"),

@@ -1,4 +1,4 @@
-"""``sundae pack`` and ``sundae unpack``: convert a finished run into one small file, and back."""
+"""``sundae pack``: convert a scene into one small file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ import tyro
 
 from sundae_ns.cli.cleaning import Cleaning
 from sundae_ns.cli.outputs import Overwrite, check_file
-from sundae_ns.cli.process import quoted
 
 if TYPE_CHECKING:
     from sundae_ns.scenes.targets import Judge
@@ -81,6 +80,7 @@ def pack(
         overwrite: replace an existing file, once the new one is complete.
         block: number of primitives per block of positions; smaller blocks are more exact and larger on disk.
     """
+    import torch
     from rich.console import Console
     from rich.progress import Progress
 
@@ -178,7 +178,7 @@ def pack(
     print(f"{'all':14}{report.bytes:12,}{8 * report.bytes / report.primitives:20.2f}")
     if quality:
         print(quality)
-    if quality and not tuned and not cleaning.chosen and _can_tune(run):
+    if quality and not tuned and not cleaning.chosen and torch.cuda.is_available():
         print(f"--finetune {FINETUNE_STEPS} makes it about 40% smaller")
     return 0
 
@@ -195,15 +195,6 @@ def _has_photos(source: Path, options: Mapping[str, object]) -> bool:
         if value:
             raise ConfigError(f"{source} is a {PRIMITIVES[kind]} without photos; leave out {name}, or give a run")
     return False
-
-
-def _can_tune(run: Path) -> bool:
-    """Whether a fine-tune takes seconds here: on a GPU, of a run that was trained."""
-    import torch
-
-    from sundae_ns.storage.runs.folder import UNPACKED, config_of
-
-    return torch.cuda.is_available() and config_of(run).parent.name != UNPACKED
 
 
 def _judge_of(run: Path, data: Path | None) -> Callable[[], Judge]:
@@ -247,44 +238,3 @@ def _measured(
                 "or leave out --finetune"
             )
     return f"{shown}, before and after, on {opened.views} of {opened.all_views} test views", figures
-
-
-def unpack(
-    scene: Annotated[Path, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs"),
-    name: str | None = None,
-    data: Path | None = None,
-    overwrite: Overwrite = False,
-) -> int:
-    """Unpack a scene into a run for ns-viewer, ns-render and ns-eval. No code in the file is executed.
-
-    Args:
-        scene: file written by sundae pack.
-        out: folder of runs, like ns-train's --output-dir.
-        name: name of the experiment; by default the file's name.
-        data: folder of the capture on which the scene was trained; ns-eval needs its images.
-        overwrite: replace a run that was unpacked under this name.
-    """
-    from rich.progress import Progress
-
-    from sundae_ns.errors import writing
-    from sundae_ns.storage.packing import read_scene
-    from sundae_ns.storage.runs.folder import unpacked_folder
-
-    name = name or scene.stem
-    with writing(f"cannot write to {out}"):
-        unpacked_folder(out, name, overwrite=overwrite)
-    with Progress(transient=True) as progress:
-        task = progress.add_task("Unpacking", total=2)
-        found = read_scene(scene)
-        # Takes seconds, which a damaged file or an existing run should not cost.
-        from sundae_ns.scenes.packed import write_run
-
-        progress.update(task, advance=1, description="Writing the run")
-        with writing(f"cannot write to {out}"):
-            path = write_run(found, out, name, data=data, overwrite=overwrite)
-    print(f"{len(found.field['means']):,} primitives, {'with' if found.head else 'without'} a head")
-    print(f"View: ns-viewer --load-config {quoted(path)}")
-    if data is not None:
-        print(f"Evaluate: ns-eval --load-config {quoted(path)}")
-    return 0

@@ -26,8 +26,7 @@ from sundae_ns.scenes.opening import open_pipeline
 from sundae_ns.scenes.packed import place
 from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene
 from sundae_ns.storage.packing.rate import estimated_bits
-from sundae_ns.storage.runs.config_file import load_config
-from sundae_ns.storage.runs.folder import UNPACKED, config_of
+from sundae_ns.storage.runs.folder import config_of
 from sundae_ns.training.optimizers import NetworkAdamConfig
 from sundae_ns.training.recordings import StepRecordings
 from sundae_ns.training.step import StepInputs, StepResult
@@ -85,17 +84,13 @@ def finetune(
 
     Raises:
         ConfigError: an option cannot work.
-        CheckpointError: the run still densifies, was unpacked from a scene, or cannot be opened.
+        CheckpointError: the run still densifies, or cannot be opened.
         DataError: its capture is missing, or cannot be used.
         MemoryExhaustedError: the GPU's memory is full.
     """
     if steps < 1:
         raise ConfigError(f"a fine-tune of {steps} steps changes nothing; give 1 or more")
     path = config_of(run)
-    if load_config(path).timestamp == UNPACKED:
-        raise CheckpointError(
-            f"{run} was unpacked from a packed scene and cannot be fine-tuned; fine-tune the run that was packed"
-        )
     scene, codecs = fit_scene(scene, config)
     opened = open_pipeline(path, data=data, test_mode="val")
     pipeline, model = opened.pipeline, opened.model

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sundae_ns.api.opening import scene_of_checkpoint
 from sundae_ns.api.packing import scene_of
-from sundae_ns.datamanager import SundaeDatamanager, no_images_error
+from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.scenes import stock
@@ -161,12 +161,10 @@ def open_pipeline(
 
     Raises:
         CheckpointError: the run is of another method, or has no whole checkpoint.
-        DataError: its capture is missing, or cannot be used, or it was unpacked without one.
+        DataError: its capture is missing, or cannot be used.
     """
     config, model_config = stock.config_with_field(path)
     pipeline_config = config.pipeline
-    if not getattr(pipeline_config.datamanager, "images", True):
-        raise no_images_error(path.parent)  # a capture given now would not be parsed as in training
     options = fingerprint(config)  # before a run of splatfacto becomes one of ours
     folder = path.parent / config.relative_model_dir
     newest, loaded = checkpoint.read_newest(folder)

@@ -1,4 +1,4 @@
-"""Finished runs as packed scenes, and packed scenes as runs that nerfstudio's commands open.
+"""Finished runs as packed scenes, and packed scenes as models with the views of their captures.
 
 A ``config.yml`` can run code in nerfstudio, so no part of it is packed. A packed scene states plain values; each one is
 checked, and a new configuration is made from them.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 import re
 from collections.abc import Mapping
 from contextlib import suppress
@@ -17,32 +16,28 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
-import yaml
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
-from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from sundae_ns.api.opening import FRAME_FILE, START_FILE, load
-from sundae_ns.api.packing import contents_of, refusal, scene_of, stated_start, stored_cameras
+from sundae_ns.api.opening import load
+from sundae_ns.api.packing import contents_of, refusal, scene_of
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.start import unit
-from sundae_ns.api.views import is_frame, is_number
+from sundae_ns.api.views import is_number
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.datamanager import SundaeDatamanagerConfig, no_images_error
+from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.parsing import check_capture
 from sundae_ns.scenes import stock
-from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
-from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import check_run
-from sundae_ns.storage.runs.folder import config_of, unpacked_folder
+from sundae_ns.storage.runs.folder import config_of
 
 _PARSERS: dict[str, type[DataParserConfig]] = {
     "blender-data": BlenderDataParserConfig,
@@ -54,9 +49,6 @@ _ALPHA_COLORS = ("white", "black", None)
 _FOLDER = re.compile(r"(?!.*\.\.)[\w.-]+(/[\w.-]+)*")
 """Paths that a packed scene may name: below the capture, and without special characters of a shell, because nerfstudio
 passes paths of images to ffmpeg through one."""
-
-
-# -------------------------------------------------------------------------------------------------------------- packing
 
 
 def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> PackedScene:
@@ -78,8 +70,6 @@ def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = No
     config, _ = stock.config_with_field(path)
     scene = load(path)
     manager = stock.datamanager_config(copy.deepcopy(config.pipeline.datamanager))
-    if data is not None and not manager.images:
-        raise no_images_error(path.parent)
     manager.data = data or manager.data or config.data
     source = {"method": config.method_name, **scene.meta["source"]}
     meta = {**scene.meta, "source": source, "capture": _describe(manager)}
@@ -108,13 +98,10 @@ def _cameras(manager: SundaeDatamanagerConfig, most: int) -> dict[str, Tensor]:
 
 
 def _describe(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
-    """Plain values to parse, split and scale the same capture again.
-
-    None for another parser, and for a run without its capture, whose cameras have other coordinates.
-    """
+    """Plain values to parse, split and scale the same capture again; None for another parser."""
     parser = manager.dataparser
     kind = next((name for name, known in _PARSERS.items() if type(parser) is known), None)
-    if kind is None or not manager.images:
+    if kind is None:
         return None
     options: dict[str, Any] = {}
     for name, default in _options(_PARSERS[kind]).items():
@@ -134,75 +121,6 @@ def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
     """Options of a parser that a finished run needs, with their defaults."""
     left_out = {"_target", "data", "masks_path", "depths_path", "mask_color", "load_3D_points", "ply_path"}
     return {field.name: getattr(kind(), field.name) for field in fields(kind) if field.name not in left_out}
-
-
-# ------------------------------------------------------------------------------------------------------------ unpacking
-
-
-def write_run(
-    packed: PackedScene, output_dir: Path, name: str, *, data: Path | None = None, overwrite: bool = False
-) -> Path:
-    """Write a packed scene as a run for ``ns-viewer``, ``ns-render``, ``ns-export`` and, with its capture, ``ns-eval``.
-
-    Args:
-        packed: from ``read_scene``; its values are checked.
-        output_dir: folder of runs; the run is ``output_dir/name/sundae/unpacked``.
-        name: of the experiment: letters, digits, ``_``, ``.``, ``-``.
-        data: the capture; without it the run has cameras without images.
-        overwrite: replace a run that was unpacked there; files of other names in its folder stay.
-
-    Returns:
-        The run's ``config.yml``, which is written last.
-
-    Raises:
-        DataError: the capture is missing, or cannot be used.
-        PackError: the scene has impossible values, or a run of that name exists.
-        StorageError: no space or no right to write.
-    """
-    from nerfstudio.configs.method_configs import all_methods
-
-    config: TrainerConfig = copy.deepcopy(all_methods["sundae"])  # type: ignore[assignment]
-    folder = unpacked_folder(output_dir, name, overwrite=overwrite)
-    config.output_dir, (config.experiment_name, _, config.timestamp) = output_dir.resolve(), folder.parts[-3:]
-    scene = scene_of(packed)
-    model = model_of(scene)
-    config.pipeline.model = model.config
-    cameras = folder / "cameras"
-    manager = _without_images(cameras) if data is None else datamanager_of(packed, data)
-    config.pipeline.datamanager, config.data = manager, manager.data
-    with writing(f"cannot write to {folder}"):
-        folder.mkdir(parents=True, exist_ok=True)
-        if data is None:
-            cameras.mkdir(exist_ok=True)
-            write_text(cameras / "transforms.json", json.dumps(_transforms(packed), indent=1))
-        if is_frame(frame := packed.meta.get("frame")):
-            write_text(folder / FRAME_FILE, json.dumps(frame, indent=4))
-        else:
-            (folder / FRAME_FILE).unlink(missing_ok=True)
-        if stated := stated_start(scene):
-            write_text(folder / START_FILE, json.dumps(stated, indent=4))
-        else:
-            (folder / START_FILE).unlink(missing_ok=True)
-    state = {f"_model.{name}": value for name, value in model.state_dict().items()}
-    path = config.get_checkpoint_dir() / f"step-{model.step:09d}.ckpt"
-    checkpoint.write({"step": model.step, "pipeline": state}, path)
-    write_text(folder / "config.yml", yaml.dump(config))
-    for other in checkpoint.checkpoints(path.parent):  # of a replaced run
-        if other != path:
-            other.unlink()
-    return folder / "config.yml"
-
-
-def _without_images(cameras: Path) -> SundaeDatamanagerConfig:
-    """Configuration that reads cameras without images, whose coordinates are those of the model."""
-    parser = NerfstudioDataParserConfig(
-        downscale_factor=1,
-        orientation_method="none",
-        center_method="none",
-        auto_scale_poses=False,
-        eval_mode="all",
-    )
-    return SundaeDatamanagerConfig(dataparser=parser, images=False, data=cameras, cache_images_type="uint8")
 
 
 def model_of(scene: Scene) -> SundaeModel:
@@ -273,7 +191,7 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
     kind = stated.get("parser") if isinstance(stated, dict) else None
     options = stated.get("options") if isinstance(stated, dict) else None
     if kind not in _PARSERS or not isinstance(options, dict):
-        raise PackError("the packed scene does not say how its capture is read; unpack it without --data")
+        raise PackError("the packed scene does not say how its capture is read; measure the run that was packed")
     scale = stated.get("scale")
     if not is_number(scale) or not 0 < scale <= 1:
         raise refusal("an impossible scale of its images")
@@ -299,18 +217,3 @@ def _is_possible(value: Any, default: Any, hint: Any) -> bool:
     if isinstance(default, str):
         return value in (get_args(hint) if get_origin(hint) is Literal else _ALPHA_COLORS)
     return type(value) is type(default)
-
-
-def _transforms(packed: PackedScene) -> dict[str, Any]:
-    """The cameras as a ``transforms.json`` in the model's coordinates, without distortion, as in rendering."""
-    cameras = stored_cameras(packed)
-    frames = [
-        {
-            "file_path": f"view-{i:05d}",
-            **dict(zip(("fl_x", "fl_y", "cx", "cy"), cameras["intrinsics"][i].tolist(), strict=True)),
-            **dict(zip(("w", "h"), cameras["sizes"][i].long().tolist(), strict=True)),
-            "transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]],
-        }
-        for i, pose in enumerate(cameras["poses"].double().tolist())
-    ]
-    return {"camera_model": "PINHOLE", "frames": frames}

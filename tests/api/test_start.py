@@ -16,16 +16,14 @@ from command_line import run
 from short_prunes import short_prunes  # noqa: F401
 
 import sundae_ns as sn
-from sundae_ns.api.opening import START_FILE
-from sundae_ns.api.packing import scene_of, start_of, stated_start
+from sundae_ns.api.packing import start_of, stated_start
 from sundae_ns.api.page import render_first
 from sundae_ns.api.rendering import image_of
 from sundae_ns.api.start import with_start
 from sundae_ns.api.views import view_in_front
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.scenes.distill import distill
-from sundae_ns.scenes.packed import contents_of_run, write_run
-from sundae_ns.storage.packing import container, read_scene
+from sundae_ns.storage.packing import container
 
 UP = (0.6, 0.0, -0.8)
 
@@ -69,40 +67,6 @@ def test_a_file_without_them_is_read_and_adds_nothing(tmp_path: Path) -> None:
     assert header.meta.keys().isdisjoint({"up", "start"})
     found = sn.load(tmp_path / "a.sundae")
     assert (found.up, found.start) == (None, None)
-
-
-def test_a_run_keeps_them_from_unpacking_to_packing(tmp_path: Path) -> None:
-    for name, truth in (("a", started()), ("b", scene(up=UP))):
-        sn.save(truth, tmp_path / f"{name}.sundae")
-        config = write_run(read_scene(tmp_path / f"{name}.sundae"), tmp_path, "x", overwrite=True)
-        for found in (sn.load(config), scene_of(contents_of_run(config))):
-            assert found.up == pytest.approx(truth.up)
-            assert (found.start is None) == (truth.start is None)
-    # The run that replaces another has none of its own: up is then that of the cameras.
-    sn.save(scene(), tmp_path / "c.sundae")
-    config = write_run(read_scene(tmp_path / "c.sundae"), tmp_path, "x", overwrite=True)
-    assert not (config.parent / START_FILE).exists()
-    assert sn.load(config).up is None
-    assert scene_of(contents_of_run(config)).up == pytest.approx((0, 0, 1))
-
-
-@pytest.mark.parametrize(("method", "up"), [("up", (0, 0, 1)), ("vertical", (0, 0, 1)), ("pca", None), ("none", None)])
-def test_the_up_axis_of_a_run_is_that_of_nerfstudio(method: str, up: Any, tmp_path: Path) -> None:
-    sn.save(scene(), tmp_path / "a.sundae")
-    config = write_run(read_scene(tmp_path / "a.sundae"), tmp_path, "x")
-    text = config.read_text()
-    assert text.count("orientation_method: none") == 1
-    config.write_text(text.replace("orientation_method: none", f"orientation_method: {method}"))
-    assert sn.load(config).up == up
-
-
-def test_a_damaged_file_of_a_run_is_passed_over(tmp_path: Path) -> None:
-    sn.save(started(), tmp_path / "a.sundae")
-    config = write_run(read_scene(tmp_path / "a.sundae"), tmp_path, "x")
-    for text in ("{", "[]", '{"up": [0, 0, 0], "start": 3}', '{"up": null}'):
-        (config.parent / START_FILE).write_text(text)
-        found = sn.load(config)
-        assert (found.up, found.start) == (None, None)
 
 
 def test_the_first_image_is_that_of_the_start_view() -> None:

@@ -136,7 +136,6 @@ def test_only_files_and_folders_are_replaced(here: Path) -> None:
         ["export", "in", "-o", "x.spz"],
         ["export", "run", "-o", "x.spz"],
         ["pack", "in", "-o", "x.sundae"],
-        ["unpack", "in"],
         ["report", "in", "-o", "x"],
         ["report", "run", "-o", "x"],
         ["bench", "frame", "in"],
@@ -157,8 +156,6 @@ def test_what_is_no_file_is_refused_at_once(here: Path, refused: Refused, words:
 @pytest.mark.parametrize(
     "words",
     [
-        ["unpack", "a.sundae", "--name", LONG],
-        ["unpack", "a.sundae", "-o", LONG],
         ["prune", "a.ply", "-o", LONG + ".ply"],
         ["prune", LONG, "-o", "x.ply"],
         ["export", "a.ply", "-o", LONG + ".spz"],

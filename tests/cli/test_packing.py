@@ -8,12 +8,10 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
-import torch
 from command_line import run
 
 from sundae_ns.cli.packing import Precision, pack
-from sundae_ns.gaussians import from_points
-from sundae_ns.storage.packing import FINETUNED, PackConfig, PackedScene, write_scene
+from sundae_ns.storage.packing import FINETUNED, PackConfig
 
 
 def test_options_are_those_of_the_configuration() -> None:
@@ -46,10 +44,6 @@ def test_the_options_of_precision_have_no_prefix(capsys: pytest.CaptureFixture[s
         (["pack", "nothing", "-o", "a.sundae", "--target-bytes", "0"], "target-bytes is 0"),
         (["pack", "nothing", "-o", "a.sundae", "--target-drop", "nan"], "target-drop is nan"),
         (["pack", "nothing", "-o", "a.sundae", "--target-drop", "1", "--target-bytes", "9"], "exclude each other"),
-        (["unpack", "nothing"], "nothing cannot be read"),
-        (["unpack", "cut.sundae"], "not a whole packed scene"),
-        (["unpack", "harmed.sundae"], "the checksum of"),
-        (["unpack", "bare.sundae"], "states no valid model"),
     ],
 )
 def test_refusals_are_one_line(
@@ -60,11 +54,7 @@ def test_refusals_are_one_line(
     message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    points = torch.rand(20, 3)
-    write_scene(Path("bare.sundae"), PackedScene(from_points(points, points, sh_degree=0, num_features=0)))
-    content = Path("bare.sundae").read_bytes()
-    Path("cut.sundae").write_bytes(content[:-5])
-    Path("harmed.sundae").write_bytes(content[:-5] + bytes([content[-5] ^ 64]) + content[-4:])
+    Path("cut.sundae").touch()
     before = sorted(tmp_path.iterdir())
     assert run(*arguments) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()

@@ -20,9 +20,7 @@ from typing import Any
 import pytest
 import torch
 
-from sundae_ns.errors import SundaeError
 from sundae_ns.gaussians import from_points
-from sundae_ns.scenes.packed import write_run
 from sundae_ns.storage import read_ply, write_ply
 from sundae_ns.storage.packing import PackedScene, container, read_scene, write_scene
 from sundae_ns.storage.runs import checkpoint
@@ -131,22 +129,6 @@ def test_nothing_leaves_the_file(tmp_path: Path, name: str, place: str, verdict:
         verdict(lambda: read(path), path.stat().st_size)
     assert found == []
     assert [entry.name for entry in path.parent.iterdir()] == [name]
-
-
-@pytest.mark.parametrize("place", PLACES)
-def test_an_unpacked_run_stays_in_the_given_folder(tmp_path: Path, place: str) -> None:
-    a_pack(tmp_path / "a.sundae", place, section=False)
-    scene = read_scene(tmp_path / "a.sundae")
-    out = tmp_path / "deep" / "er" / "runs"
-    with watched() as found:
-        try:
-            write_run(scene, out, place)
-        except SundaeError:
-            pass
-    assert all(str(tmp_path) in line for line in found), found
-    outside = [path for path in tmp_path.rglob("*") if path.is_file() and not path.is_relative_to(out)]
-    assert outside == [tmp_path / "a.sundae"]
-    assert not Path("/tmp/outside-of-sundae").exists()
 
 
 def test_members_of_an_exported_archive_are_plain_names(tmp_path: Path) -> None:

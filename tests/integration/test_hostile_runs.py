@@ -32,7 +32,6 @@ WORDS: dict[str, list[str]] = {
     "prune": ["RUN", "-o", "out.ply", "--views", "2"],
     "distill": ["RUN", "-o", "out.sundae", "--steps", "2"],
     "pack": ["RUN", "-o", "out.sundae"],
-    "unpack": ["RUN", "-o", "runs"],
     "export": ["RUN", "-o", "out.html"],
     "view": ["RUN", "--no-open-browser"],
     "render": ["RUN", "-o", "out.png"],

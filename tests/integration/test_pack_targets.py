@@ -253,23 +253,6 @@ def test_a_fine_tune_that_loses_less_than_its_bytes_are_worth_says_nothing(
     assert "the fine-tune" not in shown.err
 
 
-def test_a_gpu_makes_it_say_that_a_fine_tune_is_smaller(
-    tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def said(*words: object) -> bool:
-        with pytest.raises(SystemExit, match="0"):
-            main(["pack", str(tiny.folder), "-o", str(tmp_path / "a.sundae"), "--overwrite", *map(str, words)])
-        return "--finetune 1500 makes it about 40% smaller\n" in capsys.readouterr().out
-
-    monkeypatch.setattr("sundae_ns.cli.packing._can_tune", lambda run: True)
-    assert said()
-    assert not said("--finetune", 1)
-    assert not said("--json")
-    monkeypatch.undo()
-    if not torch.cuda.is_available():
-        assert not said()
-
-
 def test_a_pack_without_its_capture_says_that_it_is_not_measured(
     tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

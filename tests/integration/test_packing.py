@@ -1,50 +1,35 @@
-"""``sundae pack`` and ``sundae unpack`` on a finished run, and nerfstudio's own commands on what comes out."""
+"""``sundae pack`` on a finished run, and what reads its file: measurements, and a warm start."""
 
 from __future__ import annotations
 
 import io
-import json
 import re
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stdout
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 import torch
-from nerfstudio.utils.eval_utils import eval_setup
-from nerfstudio.viewer.utils import parse_object
-from nerfstudio.viewer.viewer_elements import ViewerElement
-from PIL import Image
 
 from sundae_ns.api.opening import load
 from sundae_ns.cli import main
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes.opening import open_scene
+from sundae_ns.storage.runs.checkpoint import read_field
 
 
 class Packed(NamedTuple):
     file: Path
     output: str
-    config: Path
-    """Of the run that was unpacked beside its capture."""
-    blind: Path
-    """Of the one that was unpacked without."""
 
 
 @pytest.fixture(scope="module")
 def packed(tiny: Any, tmp_path_factory: pytest.TempPathFactory) -> Packed:
-    folder = tmp_path_factory.mktemp("packed")
-    file = folder / "tiny.sundae"
+    file = tmp_path_factory.mktemp("packed") / "tiny.sundae"
     with redirect_stdout(io.StringIO()) as output, pytest.raises(SystemExit, match="0"):
         main(["pack", str(tiny.folder), "-o", str(file)])
-    with pytest.raises(SystemExit, match="0"):
-        main(["unpack", str(file), "-o", str(folder / "runs"), "--name", "blind"])
-    with redirect_stderr(io.StringIO()) as errors, pytest.raises(SystemExit, match="0"):
-        main(["unpack", str(file), "-o", str(folder / "runs"), "--data", str(tiny.scene)])
-    assert errors.getvalue() == ""
-    config, blind = (folder / "runs" / name / "sundae" / "unpacked" / "config.yml" for name in ("tiny", "blind"))
-    return Packed(file, output.getvalue(), config, blind)
+    return Packed(file, output.getvalue())
 
 
 def test_the_report_counts_every_byte(packed: Packed) -> None:
@@ -65,7 +50,6 @@ def test_the_up_axis_is_that_of_the_capture(packed: Packed) -> None:
     assert found.up == (0, 0, 1)
     ups = torch.stack([view.pose[:, 1] for view in found.views]).mean(dim=0)
     assert torch.nn.functional.cosine_similarity(ups, torch.tensor(found.up), dim=0) > 0.99
-    assert load(packed.blind).up == load(packed.config).up == found.up
 
 
 def test_a_run_is_cut_before_it_is_packed_or_exported(
@@ -96,52 +80,22 @@ def test_a_run_is_cut_before_it_is_packed_or_exported(
         assert load(tmp_path / "a.ply").num_primitives == found.num_primitives
 
 
-@pytest.mark.filterwarnings("error::UserWarning")
-def test_ns_eval_finds_the_same_quality(tiny: Any, packed: Packed, call_here: Any, tmp_path: Path) -> None:
-    said = call_here("ns-eval", "--load-config", packed.config, "--output-path", tmp_path / "out.json")
-    assert "sparse point cloud" not in said, "the field is finished, wherever it started"
-    after = json.loads((tmp_path / "out.json").read_text())["results"]
-    run = open_scene(tiny.config)
-    assert after["gaussian_count"] == run.model.num_points
-    with torch.no_grad():
-        pictures = [run.model.get_outputs_for_camera(camera) for camera in run.cameras]
-    for name, key in (("rgb", "psnr"), ("base_rgb", "psnr_base")):
-        values = [float(psnr(picture[name], truth)) for picture, truth in zip(pictures, run.truths, strict=True)]
-        assert 0 < abs(after[key] - sum(values) / len(values)) < 0.15
+def test_a_packed_scene_is_measured_on_its_capture(tiny: Any, packed: Packed) -> None:
+    before, after = open_scene(tiny.config), open_scene(packed.file, data=tiny.scene)
+    for name in ("rgb", "base_rgb"):
+        values = [
+            fmean(
+                float(psnr(run.model.get_outputs_for_camera(camera)[name], truth))
+                for camera, truth in zip(run.cameras, run.truths, strict=True)
+            )
+            for run in (before, after)
+        ]
+        assert 0 < abs(values[0] - values[1]) < 0.15
+    assert torch.equal(before.cameras[1].camera_to_worlds, after.cameras[1].camera_to_worlds)
 
 
-def test_ns_render_needs_no_capture(packed: Packed, call_here: Any, tmp_path: Path) -> None:
-    call_here(
-        *("ns-render", "interpolate", "--load-config", packed.blind, "--output-path", tmp_path),
-        *("--output-format", "images", "--image-format", "png", "--interpolation-steps", 1, "--pose-source", "train"),
-    )
-    frames = [np.asarray(Image.open(path)) for path in sorted(tmp_path.glob("*.png"))]
-    assert len(frames) > 5
-    assert all(frame.shape == (48, 48, 3) and frame.std() > 5 for frame in frames)
-
-
-@pytest.mark.parametrize("command", ["report", "bench frame"])
-def test_grey_is_no_truth(
-    tiny: Any, packed: Packed, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
-    run, out = packed.blind.parent, str(tmp_path / "out")
-    words = ["report", str(run), "-o", out] if command == "report" else ["bench", "frame", str(run)]
-    # Naming a capture makes no run of it: the cameras of the two do not agree.
-    for more in ([], ["--data", str(tiny.scene)] if command == "report" else []):
-        with pytest.raises(SystemExit, match="2"):
-            main([*words, *more])
-        (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("sundae: ")]
-        assert f"{run} was unpacked without its capture" in line
-
-
-def test_the_viewer_shows_a_run_without_its_capture(packed: Packed) -> None:
-    blind, whole = (eval_setup(config, test_mode="test")[1] for config in (packed.blind, packed.config))
-    # The viewer looks at every attribute of everything, pictures of the test views included.
-    names = [name for name, _ in parse_object(blind, ViewerElement, "Custom Elements")]
-    assert any("compensate" in name for name in names)
-    seen = blind.datamanager.train_dataset
-    assert (seen[0]["image"] * 255).byte().shape == (48, 48, 3)
-    camera = seen.cameras[0:1]
-    assert torch.equal(camera.camera_to_worlds, whole.datamanager.train_dataset.cameras[0:1].camera_to_worlds)
-    pictures = [run.model.get_outputs_for_camera(camera)["rgb"] for run in (blind, whole)]
-    assert torch.equal(*pictures)
+def test_a_warm_start_reads_a_packed_scene(packed: Packed) -> None:
+    found, truth = read_field(packed.file), load(packed.file)
+    assert found.in_model_frame
+    assert "features" not in found.params
+    assert all(torch.equal(value, truth.field[name]) for name, value in found.params.items())

@@ -1,4 +1,4 @@
-"""Runs as packed scenes, and back: what is stored, what is not, and headers with false claims."""
+"""Runs as packed scenes: what is stored, what is not, and headers with false claims."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
-from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
-from sundae_ns.api.opening import FRAME_FILE
+from sundae_ns.api.packing import scene_of
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
-from sundae_ns.errors import CheckpointError, DataError, PackError, StorageError
+from sundae_ns.errors import CheckpointError, DataError, PackError
 from sundae_ns.gaussians import from_points
 from sundae_ns.scenes import packed as packed_run
-from sundae_ns.scenes.packed import contents_of_run, write_run
-from sundae_ns.storage.packing import PackedScene, read_scene, write_scene
+from sundae_ns.scenes.packed import contents_of_run, datamanager_of, model_of
+from sundae_ns.storage.packing import PackedScene
 from sundae_ns.storage.runs import checkpoint
 
 Json = dict[str, Any]
@@ -75,107 +74,22 @@ def scene() -> PackedScene:
     return PackedScene(field(), head(), cameras(), meta())
 
 
-def opened(config: Path) -> Any:
-    return eval_setup(config, test_mode="test")[1]
-
-
-def test_a_scene_becomes_a_run(tmp_path: Path) -> None:
+def test_a_packed_scene_becomes_a_model() -> None:
     truth = scene()
-    config = write_run(truth, tmp_path, "garden")
-    assert config == tmp_path / "garden" / "sundae" / "unpacked" / "config.yml"
-    pipeline = opened(config)
-    model = pipeline.model
+    model = model_of(scene_of(truth))
     found = {name: value.detach() for name, value in model.gauss_params.items()}
-    assert torch.equal(found["features_rest"][:, :3], truth.field["features_rest"])
-    assert found["features_rest"].shape == (60, 3, 3)
-    for name in ("means", "scales", "quats", "features_dc", "opacities", "features"):
-        assert torch.equal(found[name], truth.field[name]), name
-    for name, value in model.head.state_dict().items():
-        assert torch.equal(value, truth.head[name]), name
+    assert torch.equal(found.pop("features_rest")[:, :3], truth.field["features_rest"])
+    assert all(torch.equal(value, truth.field[name]) for name, value in found.items())
+    assert model.head is not None
+    assert all(torch.equal(value, truth.head[name]) for name, value in model.head.state_dict().items())
     assert model.state.head_enabled
     assert model.state.trained_focal == (40.0, 41.0)
     assert (model.config.rasterize_mode, model.config.background_color) == ("antialiased", "white")
-    seen = pipeline.datamanager.train_dataset
-    assert torch.equal(seen.cameras.camera_to_worlds, cameras()["poses"])
-    assert seen.cameras.fx.flatten().tolist() == [40.5] * 3
-    assert seen[1]["image"].shape == (32, 40, 3)
-    outputs = model.get_outputs_for_camera(seen.cameras[0:1])
-    assert outputs["rgb"].shape == (32, 40, 3)
-    assert (outputs["rgb"] - outputs["base_rgb"]).abs().max() > 1e-3
-    # Grey images stand for those of the capture; nothing is measured on them.
-    camera, batch = pipeline.datamanager.fixed_indices_eval_dataloader[0]
-    with pytest.raises(DataError, match="unpacked without its capture"):
-        model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
-
-
-def test_images_of_the_run_are_those_of_the_scene(tmp_path: Path) -> None:
-    """Through the file, and through another run made of that run."""
-    first = opened(write_run(scene(), tmp_path / "a", "x"))
-    write_scene(tmp_path / "x.sundae", contents_of_run(tmp_path / "a" / "x" / "sundae" / "unpacked"))
-    second = opened(write_run(read_scene(tmp_path / "x.sundae"), tmp_path / "b", "x"))
-    camera = first.datamanager.train_dataset.cameras[1:2]
-    images = [run.model.get_outputs_for_camera(camera)["rgb"] for run in (first, second)]
-    assert (images[0] - images[1]).square().mean().sqrt() < 0.004
-    assert (images[0] - 1).abs().max() > 0.2
-
-
-def test_a_run_without_its_capture_names_none(tmp_path: Path) -> None:
-    """Its parser is another one; options of that would move every camera to a wrong place."""
-    blind = write_run(scene(), tmp_path, "x").parent
-    assert contents_of_run(blind).meta["capture"] is None
-    with pytest.raises(DataError, match="unpacked without its capture"):
-        contents_of_run(blind, data=tmp_path)
-
-
-def test_a_scene_without_cameras_gets_one_outside_of_it(tmp_path: Path) -> None:
-    pipeline = opened(write_run(PackedScene(field(), head(), None, meta()), tmp_path, "a"))
-    (camera,) = [pipeline.datamanager.train_dataset.cameras[0:1]]
-    accumulation = pipeline.model.get_outputs_for_camera(camera)["accumulation"]
-    assert accumulation.mean() > 0.02
-    assert accumulation[200:280, 280:360].mean() > 0.1
-
-
-def test_a_scene_without_a_head(tmp_path: Path) -> None:
-    plain = meta()
-    plain["model"] |= {"head": None, "trained_focal": None}
-    model = opened(write_run(PackedScene(field(features=0), {}, cameras(), plain), tmp_path, "a")).model
-    assert model.head is None
-    assert "features" not in model.gauss_params
-
-
-def test_a_run_is_replaced_on_demand(tmp_path: Path) -> None:
-    """Also by a scene of another step, with no transform; other files of its folder stay."""
-    stated = {"frame": {"transform": torch.eye(4)[:3].tolist(), "scale": 0.5}}
-    first = write_run(PackedScene(field(), head(), None, {**meta(), **stated}), tmp_path, "a")
-    stale = first.parent / "nerfstudio_models" / "step-000099999.ckpt"
-    stale.write_bytes(next((first.parent / "nerfstudio_models").glob("*.ckpt")).read_bytes())
-    (first.parent / "thesis.txt").write_text("years of work")
-    assert (first.parent / FRAME_FILE).is_file()
-    smaller = {name: value[:20] for name, value in field(features=0).items()}
-    plain = meta()
-    plain["model"] |= {"head": None, "trained_focal": None}
-    plain.pop("frame", None)
-    again = write_run(PackedScene(smaller, {}, cameras(), plain), tmp_path, "a", overwrite=True)
-    assert again == first
-    assert len(opened(again).model.means) == 20
-    assert not stale.exists()
-    assert not (first.parent / FRAME_FILE).exists()
-    assert (first.parent / "thesis.txt").read_text() == "years of work"
-
-
-def test_a_run_is_never_replaced_unasked(tmp_path: Path) -> None:
-    config = write_run(scene(), tmp_path, "a")
-    before = config.read_bytes()
-    with pytest.raises(PackError, match="is a run already"):
-        write_run(scene(), tmp_path, "a")
-    assert config.read_bytes() == before
 
 
 @pytest.mark.parametrize("parser", ["colmap", "nerfstudio-data"])
 @pytest.mark.parametrize("kind", ["missing", "empty", "images"])
-def test_a_folder_without_a_capture_is_refused_before_anything_is_written(
-    tmp_path: Path, kind: str, parser: str
-) -> None:
+def test_a_folder_without_a_capture_is_refused(tmp_path: Path, kind: str, parser: str) -> None:
     capture = tmp_path / "capture"
     if kind != "missing":
         capture.mkdir()
@@ -184,30 +98,7 @@ def test_a_folder_without_a_capture_is_refused_before_anything_is_written(
     found = scene()
     found.meta["capture"] = {"parser": parser, "options": {}, "scale": 1.0}
     with pytest.raises(DataError, match=str(capture)):
-        write_run(found, tmp_path / "runs", "a", data=capture)
-    assert not (tmp_path / "runs").exists()
-
-
-def test_an_interrupted_unpack_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any) -> None:
-        raise StorageError("the disk is full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "write", full)
-        with pytest.raises(StorageError):
-            write_run(scene(), tmp_path, "a")
-    assert not list(tmp_path.rglob("config.yml"))
-    assert write_run(scene(), tmp_path, "a").exists()
-    (tmp_path / "b").write_text("years of work")
-    with pytest.raises(StorageError, match="a file stands where a folder should be"):
-        write_run(scene(), tmp_path, "b")
-
-
-@pytest.mark.parametrize("name", ["../../up", "/etc/x", "a b;c", "..", ""])
-def test_names_stay_below_the_folder(tmp_path: Path, name: str) -> None:
-    config = write_run(scene(), tmp_path / "runs", name)
-    assert config.resolve().is_relative_to(tmp_path / "runs")
-    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+        datamanager_of(found, capture)
 
 
 LIES: dict[str, Json] = {
@@ -239,11 +130,10 @@ def merged(base: Json, changes: Json) -> Json:
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_headers_that_lie_are_refused(tmp_path: Path, lie: str) -> None:
+def test_headers_that_lie_are_refused(lie: str) -> None:
     stated = merged(meta(), LIES[lie])
     with pytest.raises(PackError):
-        write_run(PackedScene(field(), head(), cameras(), stated), tmp_path, "a")
-    assert not list(tmp_path.iterdir())
+        scene_of(PackedScene(field(), head(), cameras(), stated))
 
 
 @pytest.mark.parametrize(
@@ -272,7 +162,7 @@ def test_captures_that_are_not_described() -> None:
     ):
         assert packed_run._describe(SundaeDatamanagerConfig(dataparser=parser)) is None
     for stated in (None, {}, {"parser": "dnerf-data", "options": {}}, {"parser": "colmap", "options": None}):
-        with pytest.raises(PackError, match="without --data"):
+        with pytest.raises(PackError, match="how its capture is read"):
             packed_run._capture(stated)
     for scale in (0, 2, "1", None, float("nan")):
         with pytest.raises(PackError, match="an impossible scale"):
@@ -367,8 +257,7 @@ def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path: Path) ->
     assert found.head == {}
     assert "features" not in found.field
     assert torch.equal(found.field["features_rest"], truth["features_rest"][:, :3])
-    model = opened(write_run(found, tmp_path / "out", "a")).model
-    assert model.config.sh_degree == 1
+    assert model_of(scene_of(found)).config.sh_degree == 1
 
 
 def test_a_run_of_splatfacto(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from sundae_ns.gaussians.field import Encoding, Field
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes
 from sundae_ns.storage.archive import damage_of, load_tensors
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.kinds import kind_of_primitives, refuse
+from sundae_ns.storage.kinds import kind_of, kind_of_primitives, refuse
 from sundae_ns.storage.primitives import mended_of, read_primitives
 
 EXTRA_STATE = "_extra_state"
@@ -286,10 +286,11 @@ class FinishedField(NamedTuple):
 
 
 def read_field(path: Path) -> FinishedField:
-    """Read a finished field: a splatfacto or SUNDAE checkpoint (file or folder), or a file of primitives.
+    """Read a finished field: a splatfacto or SUNDAE checkpoint (file or folder), a packed scene, or other primitives.
 
     Args:
-        path: ``.ckpt`` file, a folder of them (the newest counts), or a file that ``storage.primitives`` reads.
+        path: ``.ckpt`` file, a folder of them (the newest counts), a packed scene, or a file that
+            ``storage.primitives`` reads.
 
     Raises:
         CheckpointError: there is no such file, it holds no Gaussian field, or has another format.
@@ -302,7 +303,9 @@ def read_field(path: Path) -> FinishedField:
         except DataError as error:
             raise CheckpointError(str(error)) from error
         return FinishedField(dict(found.mended.field), found.in_model_frame, found.mended.dropped)
-    refuse(path, packed="sundae unpack makes a run of it: give that, or its checkpoint")
+    if kind_of(path) == "packed":
+        return _packed_field(path)
+    refuse(path)
     if path.is_dir():
         if not checkpoints(folder_of(path)):
             raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
@@ -312,6 +315,18 @@ def read_field(path: Path) -> FinishedField:
     field = field_of(loaded, path)
     usable = usable_of(field, path).as_harmonics()
     return FinishedField(dict(usable), True, field.num_primitives - usable.num_primitives)
+
+
+def _packed_field(path: Path) -> FinishedField:
+    """The field of a packed scene; its head and features are left out."""
+    from sundae_ns.storage.packing import read_scene  # its decoder needs a compiler, which other files do not
+
+    packed = read_scene(path)
+    model, source = packed.meta.get("model"), packed.meta.get("source")
+    logits = isinstance(model, dict) and model.get("sh_degree") == 0
+    field = Field({name: packed.field[name] for name in SPLAT_NAMES}, "logits" if logits else "harmonics")
+    in_model_frame = not isinstance(source, dict) or source.get("model_frame") is not False
+    return FinishedField(dict(field.as_harmonics()), in_model_frame, 0)
 
 
 def field_of(loaded: Mapping[str, Any], path: Path) -> Field:

@@ -160,7 +160,7 @@ def check_run(run: Path) -> None:
     """
     refuse(
         run,
-        packed="give the run that was packed, or the one that sundae unpack makes of it",
+        packed="give the run that was packed",
         primitives="give the folder of a run; sundae prune and sundae export read such files",
     )
     model_options(config_of(run))

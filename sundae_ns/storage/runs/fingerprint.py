@@ -15,7 +15,7 @@ LEFT_OUT = frozenset(
     "method_name experiment_name project_name timestamp output_dir relative_model_dir data pipeline.datamanager.data "
     "pipeline.datamanager.train_cameras_sampling_seed pipeline.model.pruning.seed "
     # How the capture is read belongs to the capture.
-    "pipeline.datamanager.dataparser pipeline.datamanager.images pipeline.datamanager.robust_frame "
+    "pipeline.datamanager.dataparser pipeline.datamanager.robust_frame "
     # The machine, and where it keeps images.
     "machine pipeline.datamanager.cache_images pipeline.datamanager.max_thread_workers "
     "pipeline.datamanager.masks_on_gpu pipeline.datamanager.images_on_gpu "

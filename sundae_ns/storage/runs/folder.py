@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import socket
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TextIO
 
-from sundae_ns.errors import PackError, StorageError, regular, writing
+from sundae_ns.errors import StorageError, regular, writing
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.locks import lock
 
@@ -19,27 +18,12 @@ LOCK = "training.lock"
 """Names the process that trains in a folder. The file stays; the system drops its lock when the process ends."""
 PRUNES, TRIALS, STOPPING = "prune.json", "trials.json", "stopping.json"
 """Records of what a resumed run does not repeat; the watch of the last one follows the decision of the trials."""
-UNPACKED = "unpacked"
-"""Timestamp of runs that were unpacked; they cannot be trained on."""
 _held: dict[Path, TextIO] = {}
 
 
 def new_name() -> str:
     """A name for a run: the local time to the microsecond."""
     return datetime.now().strftime("%Y-%m-%d_%H%M%S_%f")
-
-
-def unpacked_folder(output_dir: Path, name: str, *, overwrite: bool = False) -> Path:
-    """Folder below ``output_dir`` of the run that a packed scene is unpacked to; odd characters of its name change.
-
-    Raises:
-        PackError: there is a run already, and it is not to be replaced.
-    """
-    experiment = re.sub(r"[^\w.-]+", "-", name).strip(".") or "scene"
-    folder = output_dir.resolve() / experiment / "sundae" / UNPACKED
-    if (folder / "config.yml").exists() and not overwrite:
-        raise PackError(f"{folder} is a run already; choose another --name or folder, or replace it with --overwrite")
-    return folder
 
 
 def reserve(run: Path, busy: str = "trains in {}; wait for it, or give another --timestamp") -> int:
