@@ -1,7 +1,7 @@
 """Measure the flicker of a head along camera paths, over that of base colours, as StopThePop measures popping.
 
     python benchmarks/flicker.py --load-config RUN
-    python benchmarks/flicker.py --load-config RUN --phases 1 2 4 --json
+    python benchmarks/flicker.py --load-config RUN --json
 
 An earlier frame is warped onto a later one (Radl et al., SIGGRAPH 2024). Where both see the same surface, what is left
 of their difference is view dependence, error of the warp, and flicker. The first two are about the same in all methods,
@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -33,7 +33,6 @@ from harness.script import run_script
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.evaluation import without_nan
 from sundae_ns.evaluation.document import number
-from sundae_ns.scenes.measure import rendered_as
 from sundae_ns.scenes.opening import Opened, open_scene
 
 FRAMES_APART = (1, 7)
@@ -134,15 +133,13 @@ class Flicker:
 class FlickerFigures:
     """Flicker of frames at one distance; squared errors of colours in [0, 1], NaN where frames share no pixel."""
 
-    phases: int
-    """Runs of the head for a frame."""
     frames_apart: int
     mse: float
     """Mean squared error of warped compensated frames."""
     mse_base: float
     """The same of base colours."""
     excess: float
-    """:attr:`mse` without the least of each pixel over all measured images: base colours, and each number of runs."""
+    """:attr:`mse` without the least of each pixel over all measured images."""
     excess_base: float
     """:attr:`mse_base` without this least."""
     seen: float
@@ -198,14 +195,13 @@ def between(first: Tensor, second: Tensor, share: float) -> Tensor:
 
 @torch.no_grad()
 def measure_flicker(
-    opened: Opened, *, places: int = 3, phases: Sequence[int] = (), progress: Callable[[], object] | None = None
+    opened: Opened, *, places: int = 3, progress: Callable[[], object] | None = None
 ) -> list[FlickerFigures]:
-    """Measure the flicker of compensated images and base colours, for each of ``phases`` and :data:`FRAMES_APART`.
+    """Measure the flicker of compensated images and base colours, for each of :data:`FRAMES_APART`.
 
     Args:
         opened: a scene with a head.
         places: number of paths, each between two neighbouring training cameras.
-        phases: runs of the head for a frame, each one of ``PHASES``; by default the scene's own.
         progress: called after each frame.
 
     Raises:
@@ -220,29 +216,22 @@ def measure_flicker(
     cameras = opened.datamanager.train_dataset.cameras
     totals = {apart: Flicker() for apart in FRAMES_APART}
     pairs = neighbours(cameras.camera_to_worlds, places)
-    assert opened.model.head is not None
-    counts = list(dict.fromkeys(phases)) or [opened.model.head.config.phases]
     for pair in pairs:
         frames: list[Frame] = []
-        for frame in _path(opened, cameras, pair, counts):
+        for frame in _path(opened, cameras, pair):
             frames.append(frame)
             for apart, total in totals.items():
                 if len(frames) > apart:
                     total.add(frames[-1 - apart], frame)
             if progress is not None:
                 progress()
-    # Base colours are the last of the methods.
-    measured = [(apart, total.errors(), total.excess(), total.seen) for apart, total in totals.items()]
     return [
-        FlickerFigures(
-            count, apart, errors[number], errors[-1], excesses[number], excesses[-1], seen=seen, paths=len(pairs)
-        )
-        for number, count in enumerate(counts)
-        for apart, errors, excesses, seen in measured
+        FlickerFigures(apart, *total.errors(), *total.excess(), seen=total.seen, paths=len(pairs))
+        for apart, total in totals.items()
     ]
 
 
-def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int], phases: Sequence[int]) -> Iterator[Frame]:
+def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int]) -> Iterator[Frame]:
     """Frames of a path from the first camera of a pair towards the second: compensated ones, and last base colours."""
     first, second = (cameras.camera_to_worlds[index].double() for index in pair)
     model = opened.model
@@ -251,12 +240,8 @@ def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int], phases: Seque
         camera.camera_to_worlds = between(first, second, place / FRAMES_BETWEEN)[None].to(cameras.camera_to_worlds)
         camera.metadata = None  # the training view's own, such as its place in a camera optimizer
         camera = camera.to(model.device)
-        compensated = []
-        for count in phases:
-            with rendered_as(opened, phases=count):
-                outputs = model.get_outputs_for_camera(camera)
-                compensated.append(outputs["rgb"].clone())
-        images = torch.stack([*compensated, outputs["base_rgb"]]).float()
+        outputs = model.get_outputs_for_camera(camera)
+        images = torch.stack([outputs["rgb"], outputs["base_rgb"]]).float()
         view = model.view_of(camera)
         # Clones: a recorded frame draws into the same tensors again.
         yield Frame(images, outputs["depth"].clone(), outputs["accumulation"].clone(), view.viewmat, view.K)
@@ -265,7 +250,6 @@ def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int], phases: Seque
 def flicker(
     load_config: Path,
     places: int = 3,
-    phases: tuple[Literal[1, 2, 4], ...] = (),
     data: Path | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
@@ -274,9 +258,8 @@ def flicker(
     Args:
         load_config: the folder of a run with a head, or its config.yml.
         places: number of paths, each between two neighbouring training cameras.
-        phases: passes of the head for a frame, as in bench frame; by default those of the run.
         data: folder of the capture, if it moved.
-        as_json: print one line of JSON for each of these and each distance of frames, instead of a table.
+        as_json: print one line of JSON for each distance of frames, instead of a table.
     """
     console = Console(stderr=True)
     with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
@@ -284,7 +267,7 @@ def flicker(
         _ = run.datamanager.cached_train  # loads the training images, whose undistortion changes their cameras
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Rendering paths", total=places * FRAMES)
-        found = measure_flicker(run, places=places, phases=phases, progress=lambda: progress.advance(task))
+        found = measure_flicker(run, places=places, progress=lambda: progress.advance(task))
     if as_json:
         device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
         where = {"config": str(load_config), "scene": run.scene, "device": device, "fingerprint": run.fingerprint}
@@ -295,11 +278,11 @@ def flicker(
         title=f"{run.model.num_points:,} primitives, {found[0].paths} paths of {FRAMES} frames",
         caption="squared errors of warped frames x 1e6; flicker: without the least of all rows and base at each pixel",
     )
-    for column in ("runs", "frames apart", "head", "base", "flicker: head", "base", "head / base"):
+    for column in ("frames apart", "head", "base", "flicker: head", "base", "head / base"):
         table.add_column(column, justify="right", no_wrap=True)
     for one in found:
         errors = [number(1e6 * error, 1) for error in (one.mse, one.mse_base, one.excess, one.excess_base)]
-        table.add_row(str(one.phases), str(one.frames_apart), *errors, number(one.ratio, 2))
+        table.add_row(str(one.frames_apart), *errors, number(one.ratio, 2))
     Console().print(table)
     return 0
 

@@ -25,7 +25,6 @@ from nerfstudio.viewer.viewer_elements import (
 )
 from torch import Tensor
 
-from sundae_ns.compensation import PHASES
 from sundae_ns.errors import ConfigError, SundaeError, one_line
 from sundae_ns.evaluation.count_curve import CurvePoint, expected_change
 from sundae_ns.gaussians import mend
@@ -131,13 +130,6 @@ class ViewerControls(torch.nn.Module):
     ) -> None:
         super().__init__()
         self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
-        self.phases: ViewerDropdown[str] = ViewerDropdown(
-            "Runs of the head",
-            str(1 if state.head is None else state.head.config.phases),
-            [str(count) for count in PHASES],
-            hint="Mean over this many offsets of its pixel grid: slower, with less flicker",
-            cb_hook=self._set_phases,
-        )
         hint = "Show only what a prune to this share would keep; 1 shows everything"
         self.keep_ratio = ViewerSlider("Keep ratio", 1.0, STEP, 1.0, STEP, cb_hook=self._show_expected, hint=hint)
         hint = "Number of primitives and, where trials have found it, what so few lose if they are trained on"
@@ -162,11 +154,6 @@ class ViewerControls(torch.nn.Module):
         if self.training_field and self._state.densifying:
             return None
         return self._state.field.num_primitives, self._state.pruning["num_prunes"]
-
-    def _set_phases(self, chosen: ViewerDropdown[str]) -> None:
-        head = self._state.head
-        if head is not None:
-            head.config = replace(head.config, phases=int(chosen.value))  # type: ignore[arg-type]
 
     def _show_expected(self, slider: ViewerSlider) -> None:
         n = self._state.field.num_primitives

@@ -151,7 +151,7 @@ def change_model(pack: Pack, rng: random.Random) -> None:
     """State another model: every option has few values that matter."""
     model = pack.meta["model"]
     head = model["head"] or {"mode": "residual", "size": "tiny", "pixel_unshuffle": 1, "num_features": 3}
-    options = {**head, "precision": rng.choice(["fp32", "fp16", "fp8", None, 32])}
+    options = {**head, "precision": rng.choice(["fp32", "bf16", "fp8", None, 32])}
     name = rng.choice(["mode", "size", "pixel_unshuffle", "num_features", "precision"])
     options[name] = rng.choice([*WORDS, "tiny", "compact", "features", "residual", 1, 2, 3, 4, 13, 2.0, 3.0])
     focal = rng.choice([*NUMBERS, *NUMBERS, None, "1", True])

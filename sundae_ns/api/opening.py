@@ -128,7 +128,7 @@ def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path)
     if not weights or not isinstance(features, Tensor):
         return None
     known = options["head"] if isinstance(options.get("head"), dict) else {}
-    fields = {name: known[name] for name in ("pixel_unshuffle", "precision", "phases", "fused") if name in known}
+    fields = {name: known[name] for name in ("pixel_unshuffle", "precision") if name in known}
     mode = "features" if known.get("mode") == "features" else "residual"
     for size in sorted(SIZES, key=lambda size: size != known.get("size")):
         config = HeadConfig(mode=mode, size=size, num_features=features.shape[1], **fields)  # type: ignore[arg-type]

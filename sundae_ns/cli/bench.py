@@ -22,8 +22,7 @@ def bench(
     measurement: Annotated[Literal["frame"], tyro.conf.Positional],
     scene: Annotated[Path, tyro.conf.Positional],
     factors: tuple[float, ...] = (1.0,),
-    precisions: tuple[Literal["fp32", "bf16", "fp16"], ...] = (),
-    phases: tuple[Literal[1, 2, 4], ...] = (),
+    precisions: tuple[Literal["fp32", "bf16"], ...] = (),
     views: int | None = None,
     repeats: int = 5,
     data: Path | None = None,
@@ -37,8 +36,7 @@ def bench(
         measurement: frame.
         scene: a run (its folder or config.yml), or a packed scene.
         factors: on the sides of the images; the test images are resized alike.
-        precisions: arithmetic of the head; by default all three on CUDA, and fp32 on a CPU, the only one there.
-        phases: passes of the head for a frame, at as many offsets of its grid; by default those of the run.
+        precisions: arithmetic of the head; by default both on CUDA, and fp32 on a CPU, the only one there.
         views: number of test views to measure on, from the first; by default all.
         repeats: timed runs of each view; their median counts.
         data: folder of the capture, if it moved; a packed scene needs it.
@@ -64,15 +62,14 @@ def bench(
     run = replace(run, cameras=run.cameras[:views], truths=run.truths[:views])
     on_gpu, has_head = run.model.device.type == "cuda", run.model.head is not None
     device = torch.cuda.get_device_name() if on_gpu else "cpu"
-    every = ("fp32", "bf16", "fp16") if on_gpu and has_head else (None,)
-    runs = phases if has_head and phases else (None,)
-    jobs = [(factor, precision, count) for factor in factors for precision in precisions or every for count in runs]
+    every = ("fp32", "bf16") if on_gpu and has_head else (None,)
+    jobs = [(factor, precision) for factor in factors for precision in precisions or every]
     found: list[dict[str, Any]] = []
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Timing frames", total=len(jobs) * len(run.cameras))
-        for factor, precision, count in jobs:
+        for factor, precision in jobs:
             line = {"config": str(scene), "device": device, "primitives": run.model.num_points, "factor": factor}
-            with rendered_as(run, factor=factor, precision=precision, phases=count) as shown:
+            with rendered_as(run, factor=factor, precision=precision) as shown:
                 measured = measure_scene(
                     shown, label="", repeats=repeats, visible=False, progress=lambda: progress.advance(task)
                 )
@@ -94,7 +91,6 @@ def _figures(run: Opened, measured: Measured) -> dict[str, Any]:
         "width": int(run.cameras[0].width),
         "height": int(run.cameras[0].height),
         "precision": "fp32" if head is None else head.config.precision,
-        "phases": 1 if head is None else head.config.phases,
         "views": len(run.cameras),
         "fingerprint": run.fingerprint,
         **{"ms_frame": full.ms, "ms_splat": base.ms, "ms_head": measured.ms_head},
@@ -110,10 +106,10 @@ def _table(lines: Sequence[Mapping[str, Any]], title: str) -> Table:
     from sundae_ns.evaluation.document import number
 
     table = Table(title=title, caption="frame, splat and head in ms; off: without the head")
-    for column in ("size", "head in", "runs", "frame", "splat", "head", "PSNR", "SSIM", "PSNR off", "SSIM off"):
+    for column in ("size", "head in", "frame", "splat", "head", "PSNR", "SSIM", "PSNR off", "SSIM off"):
         table.add_column(column, justify="right", no_wrap=True)
     digits = {"ms_frame": 2, "ms_splat": 2, "ms_head": 2, "psnr": 2, "ssim": 4, "psnr_base": 2, "ssim_base": 4}
     for line in lines:
         figures = (number(line[name], places) for name, places in digits.items())
-        table.add_row(f"{line['width']}x{line['height']}", line["precision"], str(line["phases"]), *figures)
+        table.add_row(f"{line['width']}x{line['height']}", line["precision"], *figures)
     return table

@@ -1,4 +1,9 @@
-"""The compensation head: from splatted colours, features and accumulation to the final image."""
+"""The compensation head: from splatted colours, features and accumulation to the final image.
+
+Training sees random crops of large images (:func:`training_window`), so the cost of a step does not grow with the image
+size. A screen-space network learns one size of a pixel in the scene, and on an image of half or twice the focal length
+it may do harm. Such images are compensated at the trained scale, and the correction is resized (:func:`plan`).
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from sundae_ns.compensation.fused import FusedInference
@@ -19,34 +25,24 @@ SIZES: dict[str, tuple[int, int | None]] = {
     "tiny": (8, None),
     "compact": (32, 64),
     "wide": (64, 64),
-    "small": (32, None),
     "regular": (64, None),
-    "large": (128, None),
 }
-"""Channels of the finest level, and the maximum of the coarser ones. The last three are the paper's."""
-
-
-class Phase(NamedTuple):
-    """How one of several runs of the head sees the image."""
-
-    rows: int
-    """Shift down, in halves of the head's fold."""
-    columns: int
-    """Shift to the right, in the same unit."""
-    mirrored: bool = False
-    """Whether left and right change places, for heads that train on mirrored images."""
-
-
-PHASES: dict[int, tuple[Phase, ...]] = {
-    1: (Phase(0, 0),),
-    2: (Phase(0, 0), Phase(1, 1)),
-    4: (Phase(0, 0), Phase(1, 1), Phase(0, 1, mirrored=True), Phase(1, 0, mirrored=True)),
-}
-"""Runs of the head for a frame, by their number."""
+"""Channels of the finest level, and the maximum of the coarser ones. The last is the paper's."""
+TOLERANCE = 1.01
+"""Ratio of focal lengths up to which the head runs at the image's own scale: the difference between training and test
+cameras. An image 2% larger or smaller is better with the correction of the trained scale."""
+FADE = (4.0, 2.0)
+"""Images shrunk by more than the first factor are shown without the head, those by less than the second with all of it:
+a thumbnail must not cost a full-size image, nor the head appear abruptly during a zoom."""
+MAX_PIXELS = 2**24
+"""The head also fades out for images with more pixels than this at the trained scale, such as a wide view, unless they
+are rescaled by less than ``MARGIN``. It is off at twice as many: 33 million pixels take two gigabytes."""
+MARGIN = 1.25
+GRID = 16
+"""Sides of a training window are multiples of this many pixels, so that the U-Net needs no padding."""
+PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
 _log = logging.getLogger(__name__)
-
-PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 @dataclass
@@ -57,9 +53,9 @@ class HeadConfig:
     """auto: residual, if held-out training views show after a short trial that it pays, else off. residual: the head
     adds a correction to the spherical-harmonics image, which remains usable alone. features: the paper's, the head
     alone makes the image from splatted features, over the background. off: no head."""
-    size: Literal["tiny", "compact", "wide", "small", "regular", "large"] = "wide"
-    """Width of the U-Net: 0.5, 2, 2.5, 7.8, 31 or 124 MB in fp32. The last three are the paper's, whose default is
-    regular; compact is small with at most 64 channels per level, wide has 64 on each."""
+    size: Literal["tiny", "compact", "wide", "regular"] = "wide"
+    """Width of the U-Net: 0.5, 2, 2.5 or 31 MB in fp32. regular is the paper's; compact and wide have at most 64
+    channels on each level."""
     pixel_unshuffle: int = 2
     """Fold blocks of this many pixels per side into channels before the U-Net: 1 is the paper's, 2 is faster."""
     num_features: int = 13
@@ -71,15 +67,8 @@ class HeadConfig:
     max_train_pixels: int = 2**22
     """Train on a random window of at most this many pixels if images are larger, once the head is enabled; 0 for whole
     images."""
-    phases: Literal[1, 2, 4] = 1
-    """Without gradients: average the head over this many shifts of its pixel grid, half of four in a mirror. More take
-    proportionally longer, are a little better, and flicker less when a camera moves."""
-    precision: Literal["fp32", "bf16", "fp16"] = "bf16"
-    """Arithmetic of the U-Net on CUDA; a CPU always uses fp32. fp16 is for inference: its range is too small for
-    training, which uses bf16 instead, or fp32 on GPUs before Ampere."""
-    fused: bool = True
-    """On CUDA, in bf16 and fp16: use our own kernels between the convolutions, recorded as one CUDA graph per image
-    size, in training and inference. Otherwise run layer by layer."""
+    precision: Literal["fp32", "bf16"] = "bf16"
+    """Arithmetic of the U-Net on CUDA; a CPU always uses fp32."""
 
     @property
     def resolved(self) -> HeadConfig:
@@ -98,8 +87,6 @@ class HeadConfig:
             )
         if self.pixel_unshuffle < 1:
             raise ConfigError(f"head.pixel-unshuffle is {self.pixel_unshuffle}; set 1, 2 or 4")
-        if self.phases not in PHASES:
-            raise ConfigError(f"head.phases is {self.phases}; set 1, 2 or 4")
         if self.max_train_pixels < 0:
             raise ConfigError(f"head.max-train-pixels is {self.max_train_pixels}; set 0 for whole images, or more")
 
@@ -153,7 +140,7 @@ class CompensationHead(nn.Module):
     def _accelerate(self) -> None:
         residual = self.config.mode == "residual"
         self._inference, self._training = FusedInference(self.net, residual), FusedTraining(self.net, residual)
-        self._can_fuse = self.config.fused
+        self._can_fuse = True
         # Listed once, because every frame asks for the addresses and a walk over all layers takes 0.1 ms.
         self._weights = tuple(self.net.parameters())
 
@@ -193,32 +180,95 @@ class CompensationHead(nn.Module):
         Returns:
             ``[H, W, 3]`` float32, not clamped. Where nothing was splatted, the residual head returns ``base``.
         """
-        dtype = self._dtype(base.device)
+        residual = self.config.mode == "residual"
+        dtype = PRECISIONS[self.config.precision] if base.device.type == "cuda" else torch.float32
         if self._can_fuse and dtype != torch.float32:
             try:
-                return self._fused(base, splatted, alpha, dtype)
+                if not torch.is_grad_enabled():
+                    return self._inference(base, splatted, alpha, dtype)
+                out = self._training(splatted, alpha, dtype)
+                return base + out if residual else out
             except BackendError as error:
                 _log.warning("the head runs layer by layer, not with the kernels for %s: %s", base.device, error)
                 self._can_fuse = False
-        residual = self.config.mode == "residual"
         image = torch.cat([splatted[..., :3], alpha, splatted[..., 3:]], dim=-1) if residual else splatted[..., 3:]
         # [H, W, C] is the channels-last layout of [1, C, H, W]: no copy.
         with torch.autocast(image.device.type, dtype=dtype, enabled=dtype != torch.float32):
             out = self.net(image.permute(2, 0, 1)[None].to(dtype))[0].permute(1, 2, 0)
-        if out.dtype == torch.float16:
-            # Activations beyond 65504 become infinite, and NaN in the next layer: do not correct such pixels.
-            out = out.nan_to_num(0.0, 0.0, 0.0)
         return base + alpha * out.float() if residual else out.float()
 
-    def _dtype(self, device: torch.device) -> torch.dtype:
-        dtype = PRECISIONS[self.config.precision] if device.type == "cuda" else torch.float32
-        if dtype != torch.float16 or not torch.is_grad_enabled():
-            return dtype
-        # Overflow leaves a pixel uncorrected, but would be NaN in the gradients of all earlier layers.
-        return torch.bfloat16 if torch.cuda.get_device_capability(device) >= (8, 0) else torch.float32
 
-    def _fused(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
-        if not torch.is_grad_enabled():
-            return self._inference(base, splatted, alpha, dtype)
-        out = self._training(splatted, alpha, dtype)
-        return base + out if self.config.mode == "residual" else out
+class Window(NamedTuple):
+    """A rectangle of an image, in pixels."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    mirrored: bool = False
+    """Whether it is seen in a mirror: left and right change places."""
+
+
+def training_window(width: int, height: int, max_pixels: int, seed: int, *, mirror: bool = False) -> Window | None:
+    """A random window with the image's aspect ratio, or None to train on the whole image, not mirrored.
+
+    Positions are drawn from beyond the edges too and moved back inside, because uniform ones would rarely include the
+    pixels next to the edges.
+
+    Args:
+        width: image width in pixels.
+        height: image height in pixels.
+        max_pixels: largest number of pixels of a window; 0 for no limit.
+        seed: the window is a function of it, so that a resumed run uses the same windows.
+        mirror: whether one of two windows is mirrored.
+    """
+    whole = max_pixels == 0 or width * height <= max_pixels
+    if whole and not mirror:
+        return None
+    u, v, side = torch.rand(3, generator=torch.Generator().manual_seed(seed)).tolist()
+    mirrored = mirror and side < 0.5
+    if whole:
+        return Window(0, 0, width, height, mirrored) if mirrored else None
+    share = (max_pixels / (width * height)) ** 0.5
+    columns, rows = (min(max(int(length * share) // GRID * GRID, GRID), length) for length in (width, height))
+    left, top = int(width * u - columns / 2), int(height * v - rows / 2)
+    return Window(min(max(left, 0), width - columns), min(max(top, 0), height - rows), columns, rows, mirrored)
+
+
+class ScalePlan(NamedTuple):
+    """Scale and weight at which an image is compensated."""
+
+    zoom: float
+    """Factor on the focal length and sides of the image at which the head runs; 1 for the image itself."""
+    weight: float
+    """Share of the correction that is added; 0 means that the head need not run."""
+
+
+def plan(focal: float, trained: tuple[float, float] | None, pixels: int) -> ScalePlan:
+    """Plan the compensation of an image.
+
+    Args:
+        focal: focal length of the image, pixels.
+        trained: shortest and longest focal length of the training images; None if unknown.
+        pixels: number of pixels of the image.
+    """
+    if trained is None:
+        return ScalePlan(1.0, 1.0)
+    nearest = min(max(focal, trained[0]), trained[1])
+    zoom = nearest / focal
+    if 1 / TOLERANCE <= zoom <= TOLERANCE:
+        return ScalePlan(1.0, 1.0)
+    limit = max(MAX_PIXELS, MARGIN**2 * pixels)
+    return ScalePlan(zoom, min(_fading(zoom, *FADE), _fading(pixels * zoom**2, 2 * limit, limit)))
+
+
+def _fading(value: float, off: float, full: float) -> float:
+    """1 up to ``full``, then linearly down to 0 at ``off``."""
+    return min(max((off - value) / (off - full), 0.0), 1.0)
+
+
+def resize(image: Tensor, height: int, width: int) -> Tensor:
+    """Resize ``[h, w, C]`` to ``[height, width, C]``, antialiased where it shrinks."""
+    planes = image.permute(2, 0, 1)[None]
+    resized = F.interpolate(planes, size=(height, width), mode="bilinear", align_corners=False, antialias=True)
+    return resized[0].permute(1, 2, 0)

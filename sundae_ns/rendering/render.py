@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.compensation import CompensationHead, ScalePlan, over_phases, plan, resize
+from sundae_ns.compensation import CompensationHead, ScalePlan, plan, resize
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rasterization import Rasterization, rasterize
 from sundae_ns.rasterization.limits import check_memory
@@ -101,9 +101,7 @@ def draw(
     return images, splatted
 
 
-def compensate(
-    head: CompensationHead, base: Tensor, splatted: Rasterization, background: Tensor, *, training: bool
-) -> Tensor:
+def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, background: Tensor) -> Tensor:
     """The compensated image of one splatting pass ``[H, W, 3]``, not clamped. This is the one place that runs the head.
 
     Args:
@@ -111,7 +109,6 @@ def compensate(
         base: image without the head, ``[H, W, 3]``.
         splatted: colours and features without background.
         background: colour ``[3]``.
-        training: run once; otherwise as often as ``head.config.phases`` says.
 
     Raises:
         MemoryExhaustedError: on a CPU, the layers of the head need more memory than there is.
@@ -121,8 +118,7 @@ def compensate(
         # The last level: its input from below and beside, both joined, and its output, in float32.
         channels = 4 * head.net.out.in_channels // head.config.pixel_unshuffle**2
         check_memory(4 * channels * width * height, f"layers of the head for {width:,} x {height:,} pixels")
-    seen = (base, splatted.colors, splatted.alpha)
-    image = head(*seen) if training else over_phases(head, *seen)
+    image = head(base, splatted.colors, splatted.alpha)
     if head.config.mode == "features":
         # This head sees neither background nor accumulation; without blending it would paint empty space.
         image = splatted.alpha * image + (1 - splatted.alpha) * background
@@ -141,7 +137,7 @@ def render_view(
     """The images of one view: primitives, one splatting pass, and the head. With several ranks, collective.
 
     An image of another scale than the head was trained at is rendered at the trained scale too, and gets the resized
-    correction (:mod:`sundae_ns.compensation.scale`).
+    correction (:mod:`sundae_ns.compensation.head`).
 
     Args:
         source: of the primitives.
@@ -164,7 +160,7 @@ def render_view(
     zoom, weight = ScalePlan(1.0, 1.0) if settings.training else scale_plan(view, settings.trained_focal)
     base = images["base_rgb"]
     if zoom == 1.0:
-        images["rgb"] = compensate(head, base, splatted, background, training=settings.training)
+        images["rgb"] = compensate(head, base, splatted, background)
     elif weight > 0:
         at_scale, _ = render_view(source, view.zoomed(zoom), background, settings, depth=False)
         correction = at_scale["rgb"] - at_scale["base_rgb"]

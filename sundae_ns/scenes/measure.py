@@ -96,7 +96,7 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
         images, splatted = draw(
             model.source.primitives(view, settings, features=True), view, background, settings, depth=False
         )
-        run_head = partial(compensate, settings.head, images["base_rgb"], splatted, background, training=False)
+        run_head = partial(compensate, settings.head, images["base_rgb"], splatted, background)
         heads.append(milliseconds(run_head))
     return FrameTimes(median(frames), median(splats), median(heads))
 
@@ -107,19 +107,16 @@ def sizes(model: SundaeModel) -> Sizes:
 
 
 @contextmanager
-def rendered_as(
-    run: Opened, *, factor: float = 1.0, precision: str | None = None, phases: int | None = None
-) -> Iterator[Opened]:
+def rendered_as(run: Opened, *, factor: float = 1.0, precision: str | None = None) -> Iterator[Opened]:
     """The run with images of another size, and inside the block with another arithmetic of its head.
 
     Args:
         run: a finished scene.
         factor: on the sides of the images; the true images are resized alike.
         precision: of the head, one of ``PRECISIONS``; by default the run's own, and fp32 on a CPU.
-        phases: runs of the head for a frame, one of ``PHASES``; by default the run's own.
 
     Raises:
-        ConfigError: the factor is not above zero or too large, or phases are not of ``PHASES``.
+        ConfigError: the factor is not above zero or too large.
         BackendError: half precision is asked for on a CPU.
     """
     if not 0 < factor < MOST_ZOOM:
@@ -136,7 +133,7 @@ def rendered_as(
         yield shown
         return
     before: Any = head.config
-    changed = replace(before, precision=precision or _precision(model), phases=phases or before.phases)
+    changed = replace(before, precision=precision or _precision(model))
     changed.validate()
     head.config = changed
     try:

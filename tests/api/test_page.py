@@ -327,7 +327,6 @@ def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]]
         "model.head.num_features": 4,
         "model.head.pixel_unshuffle": 2,
         "model.head.precision": "fp8",
-        "model.head.phases": 4,
         "model.trained_focal": [0, 1],
         "model.trained_focal.0": 1e30,
         "source": [],

@@ -126,13 +126,6 @@ def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> N
     page.settle(lambda: page.tick("Neural compensation", True), SIDE)
     browser.wait_for(as_at_first, "the picture with the head", 20)
 
-    page.settle(lambda: page.choose("Runs of the head", "4"), SIDE)
-    assert model.head is not None
-    model.head.config.phases = 4
-    found["four runs of the head"] = differences(scene(page), outputs()["rgb"])
-    page.settle(lambda: page.choose("Runs of the head", "1"), SIDE)
-    browser.wait_for(as_at_first, "the picture of one run", 20)
-
     keep_ratio = page.settle(lambda: page.slide("Keep ratio", 0.1), SIDE)
     assert 0.05 < keep_ratio < 0.15
     rule = previewed_rule(model.config.pruning, "as configured")

@@ -13,14 +13,10 @@ from sundae_ns.scenes.opening import open_scene
 
 
 def test_the_head_is_compared_with_base_colours(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    assert flicker(tiny.folder, places=1, phases=(1, 4), as_json=True) == 0
+    assert flicker(tiny.folder, places=1, as_json=True) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [(line["phases"], line["frames_apart"]) for line in lines] == [(1, 1), (1, 7), (4, 1), (4, 7)]
-    # One least for all rows, so that they compare.
-    for name in ("mse_base", "excess_base", "seen", "paths"):
-        assert [line[name] for line in lines[:2]] == [line[name] for line in lines[2:]]
+    assert [line["frames_apart"] for line in lines] == [1, 7]
     assert lines[0]["paths"] == 1
-    assert lines[0]["mse"] != lines[2]["mse"]
     for line in lines:
         assert 0 < line["seen"] < 1
         assert 0 < line["excess"] < line["mse"]

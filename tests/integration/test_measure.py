@@ -177,7 +177,7 @@ def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
-        ({"precision": "fp16"}, BackendError, "a CPU runs the head in fp32"),
+        ({"precision": "bf16"}, BackendError, "a CPU runs the head in fp32"),
         ({"factor": 0.0}, ConfigError, "images cannot be 0.0 times"),
         ({"factor": float("nan")}, ConfigError, "images cannot be nan times"),
         ({"factor": float("inf")}, ConfigError, "images cannot be inf times"),
@@ -191,8 +191,8 @@ def test_frames_that_cannot_be_measured(tiny: Any, options: dict[str, Any], erro
 def test_the_head_runs_as_asked_for_inside_a_block(tiny: Any) -> None:
     run = open_scene(tiny.config)
     before = run.model.head.config
-    with rendered_as(run, phases=2):
-        assert run.model.head.config == replace(before, precision="fp32", phases=2)
+    with rendered_as(run, factor=0.5):
+        assert run.model.head.config == replace(before, precision="fp32")
     assert run.model.head.config is before
 
 

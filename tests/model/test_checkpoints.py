@@ -79,7 +79,7 @@ def _stock(state: dict[str, Any]) -> dict[str, Any]:
         ({}, _stock, "splatfacto checkpoint.*warm-start"),
         ({"head": {"num_features": 1}}, None, "length 1"),
         ({"head": {"mode": "off"}}, None, "length 0"),
-        ({"head": {"size": "small"}}, None, "head"),
+        ({"head": {"size": "compact"}}, None, "head"),
         ({"head": {"mode": "features"}}, None, "head"),
         ({"sh_degree": 2}, None, "features_rest"),
     ],

@@ -270,28 +270,6 @@ def test_full_memory_says_how_much_and_what_to_try(build: Build, camera: MakeCam
         assert option in text
 
 
-@torch.no_grad()
-def test_the_head_runs_as_often_as_the_viewer_asks_and_once_in_training(
-    build: Build, perturb: Perturb, camera: MakeCamera
-) -> None:
-    model = perturb(build(head={"pixel_unshuffle": 2}))
-    background = torch.zeros(3)
-
-    def images() -> list[torch.Tensor]:
-        view = model.view_of(camera())
-        both = (model.render_settings(training=training) for training in (False, True))
-        return [render_view(model.source, view, background, settings)[0]["rgb"] for settings in both]
-
-    shown, trained = images()
-    controls = model.viewer_controls
-    controls.phases.value = "4"
-    controls._set_phases(controls.phases)
-    steadied, trained_too = images()
-    assert torch.equal(trained, trained_too)
-    assert (steadied - shown).abs().max() > 1e-4
-    assert (steadied - shown).abs().mean() < 0.05
-
-
 @pytest.mark.parametrize("mode", ["residual", "features"])
 def test_a_model_trained_ten_times_too_fast_may_be_bad_but_not_broken(
     build: Build, camera: MakeCamera, training_of: TrainingOf, mode: str

@@ -100,7 +100,7 @@ def test_what_a_recording_has_fixed_makes_another_one(
     assert show() == 4
     model.compensated = True
     assert model.head is not None
-    model.head.config = replace(model.head.config, phases=2)
+    model.head.config = replace(model.head.config, precision="fp32")
     assert show() == 5
     model.state.trained_focal = (10.0, 10.0)  # the camera's is 30: the head runs at another scale
     assert show() == 6
@@ -220,7 +220,7 @@ def eager(model: SundaeModel, camera: Cameras) -> dict[str, Tensor]:
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("head", [{}, {"phases": 4}, {"precision": "fp32"}, {"mode": "features"}, {"mode": "off"}])
+@pytest.mark.parametrize("head", [{}, {"precision": "fp32"}, {"mode": "features"}, {"mode": "off"}])
 @pytest.mark.parametrize("focal", [None, 12.0])
 def test_what_is_played_back_is_what_would_be_rendered(
     build: Build, perturb: Perturb, camera: MakeCamera, head: dict[str, Any], focal: float | None
@@ -239,8 +239,8 @@ def test_what_is_played_back_is_what_would_be_rendered(
     shown = [model.get_outputs_for_camera(view) for view in views]
     assert len(replayed._frames) == 1
     assert replayed._can_record
-    # The frame's recording contains the head. The head has one of its own only if single frames ran it often enough.
-    if model.head is not None and model.head.config.phases < RECORD_AT:
+    # The frame's recording contains the head, so the head has none of its own.
+    if model.head is not None:
         assert len(model.head._inference._recorded) == 0
     for found, truth in zip(shown, expected, strict=True):
         for name, picture in truth.items():

@@ -88,7 +88,7 @@ def test_a_networks_weights_decay_by_a_share_of_the_rate() -> None:
 
 def test_rates_of_all_layers_decay_alike_and_come_back_from_a_checkpoint() -> None:
     def made() -> tuple[torch.optim.Optimizer, Any]:
-        head = CompensationHead(HeadConfig(size="small"))
+        head = CompensationHead(HeadConfig(size="regular"))
         optimizer = NetworkAdamConfig(lr=1e-3).setup(head.parameters())
         config = PruneAwareDecayConfig(lr_final=1e-5, max_steps=100, lr_restart=1e-3, hold_until_prune=True)
         return optimizer, config.setup().get_scheduler(optimizer, 1e-3)

@@ -117,7 +117,7 @@ def test_names_are_unique_and_heads_have_no_other_option() -> None:
     header = {**HEADER, "attributes": {**ATTRIBUTES, "head": {**ATTRIBUTES["head"], "tensors": twice}}}
     assert fault(header, FORMAT["header"]) == "attributes.head.tensors"
     assert fault({"sections": [SECTION, SECTION]}, FORMAT["container"]) == "sections"
-    assert fault({**MODEL, "head": {**HEAD, "phases": 4}}, FORMAT["model"]) == "head"
+    assert fault({**MODEL, "head": {**HEAD, "other": 4}}, FORMAT["model"]) == "head"
     assert fault({**MODEL, "other": 4}, FORMAT["model"]) is None
     assert fault({key: value for key, value in MODEL.items() if key != "sh_degree"}, FORMAT["model"]) == "sh_degree"
 
