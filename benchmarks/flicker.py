@@ -226,8 +226,9 @@ def measure_flicker(
             if progress is not None:
                 progress()
     return [
-        FlickerFigures(apart, *total.errors(), *total.excess(), seen=total.seen, paths=len(pairs))
+        FlickerFigures(apart, mse, mse_base, excess, excess_base, total.seen, len(pairs))
         for apart, total in totals.items()
+        for (mse, mse_base), (excess, excess_base) in [(total.errors(), total.excess())]
     ]
 
 

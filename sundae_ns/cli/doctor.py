@@ -139,7 +139,7 @@ def own_kernels() -> Finding:
     name = "our kernels"
     if not torch.cuda.is_available():
         return Finding(name, False, "need a CUDA device", "nothing; a CPU uses equivalent code")
-    from sundae_ns.compensation import CompensationHead, HeadConfig, kernels
+    from sundae_ns.compensation import CompensationHead, HeadConfig, fused
     from sundae_ns.errors import BackendError
     from sundae_ns.gpu import fused_loss, nvrtc
     from sundae_ns.graphs import traversal
@@ -150,7 +150,7 @@ def own_kernels() -> Finding:
         nvrtc.Kernel(traversal.FILE, traversal.KERNEL, device, options, traversal.BLOCK)
         fused_loss.loss_kernels(device)
         net = CompensationHead(HeadConfig()).net
-        kernels.head_kernels(device, torch.bfloat16, kernels.head_options(net, True))
+        fused.head_kernels(device, torch.bfloat16, fused.head_options(net, True))
     except BackendError as error:
         cause, fix = str(error).rsplit(": ", 1)
         detail = f"{cause}: neighbours are searched on the CPU; head and SSIM run layer by layer"

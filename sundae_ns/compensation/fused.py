@@ -1,6 +1,8 @@
 """The head without gradients, in a few kernels: for inference.
 
-cuDNN convolves; :mod:`sundae_ns.compensation.kernels` does the rest. The whole is recorded as one CUDA graph per image
+cuDNN convolves. Layer by layer, most of the head's time goes to reading and writing images: bias, activation, pooling,
+upsampling and concatenation are a pass each. A kernel of ``csrc/head.cu`` does everything between two convolutions in
+one pass, and writes its result where the next convolution reads it. The network is recorded as one CUDA graph per image
 size that repeats. :mod:`sundae_ns.compensation.fused_training` computes gradients.
 """
 
@@ -8,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple, cast
 
@@ -15,13 +18,48 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from sundae_ns.compensation.kernels import PACK, Launches, head_kernels, head_options
-from sundae_ns.compensation.unet import UNet
+from sundae_ns.compensation.unet import SLOPE, UNet
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu.cuda_graphs import GraphCache, is_recording, record, warm_up
-from sundae_ns.gpu.nvrtc import Argument
+from sundae_ns.gpu.nvrtc import Argument, Launch, load_kernels
 
 _log = logging.getLogger(__name__)
+
+PACK = 8
+"""Channels that a thread moves at once, 16 bytes; images are padded to a multiple, which tensor cores need too."""
+
+_FORWARD = ("fold", "activate", "pool", "upsample", "unfold")
+
+KERNELS = (*_FORWARD, *(f"{name}_backward" for name in _FORWARD), "sum_pixels")
+"""Names of the kernels of ``head.cu``."""
+
+_TYPES = {torch.bfloat16: "-DBF16"}
+"""Compiler option for the dtype of images between the convolutions; tests add float32, on a CPU."""
+
+Launches = Mapping[str, Launch]
+"""Launch functions by kernel name."""
+
+
+def head_options(net: UNet, residual: bool) -> tuple[str, ...]:
+    """Compiler options for a network: its fold, its widths, and whether it corrects an image."""
+    widths = [layer.out_channels for layer in net.modules() if isinstance(layer, nn.Conv2d)]
+    return (
+        f"-DMOST_CHANNELS={max(widths)}",
+        f"-DR={net.pixel_unshuffle}",
+        f"-DWIDTH={net.out.in_channels}",
+        f"-DPACK={PACK}",
+        f"-DSLOPE={SLOPE}f",
+        f"-DRESIDUAL={int(residual)}",
+    )
+
+
+def head_kernels(device: torch.device, dtype: torch.dtype, options: tuple[str, ...]) -> Launches:
+    """The kernels for a device, compiled on the first call.
+
+    Raises:
+        BackendError: the kernels cannot be compiled or loaded.
+    """
+    return load_kernels("head.cu", KERNELS, (_TYPES[dtype], *options), device)
 
 
 class Weights:
@@ -197,7 +235,7 @@ class FusedInference:
         """Compensate one image; see :meth:`sundae_ns.compensation.CompensationHead.forward`.
 
         All images are float32 on CUDA. Pixels of ``splatted`` and ``alpha`` may have a stride, rows must be adjacent.
-        ``dtype`` is that of the arithmetic, float16 or bfloat16.
+        ``dtype`` is that of the arithmetic, bfloat16.
 
         Raises:
             BackendError: the kernels cannot be compiled or loaded.

@@ -14,19 +14,22 @@ import torch
 from torch import Tensor
 
 from sundae_ns.compensation.fused import (
+    PACK,
+    Launches,
     Tape,
     Weights,
     bias_of,
     convolutions,
     fold_pixels,
     folded_input,
+    head_kernels,
+    head_options,
     image_like,
     last_layers,
     network,
     pixel_stride,
     unfold_pixels,
 )
-from sundae_ns.compensation.kernels import PACK, Launches, head_kernels, head_options
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, is_recording, record, warm_up
@@ -168,7 +171,7 @@ class FusedTraining:
         """One correction times accumulation, or one image if the network makes it by itself: ``[H, W, 3]`` float32.
 
         Colours and features ``[H, W, 3 + F]`` and accumulation ``[H, W, 1]`` are float32. ``dtype`` is that of the
-        arithmetic, float16 or bfloat16.
+        arithmetic, bfloat16.
 
         Raises:
             BackendError: the kernels cannot be compiled or loaded.

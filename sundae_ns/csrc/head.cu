@@ -1,9 +1,5 @@
 // T is the type of images between the convolutions.
-#if FP16
-typedef unsigned short T;
-__device__ __forceinline__ float load(T v) { float f; asm("cvt.f32.f16 %0, %1;" : "=f"(f) : "h"(v)); return f; }
-__device__ __forceinline__ T store(float f) { T v; asm("cvt.rn.f16.f32 %0, %1;" : "=h"(v) : "f"(f)); return v; }
-#elif BF16
+#if BF16
 typedef unsigned short T;
 __device__ __forceinline__ float load(T v) { return __uint_as_float((unsigned)v << 16); }
 __device__ __forceinline__ T store(float f) { T v; asm("cvt.rn.bf16.f32 %0, %1;" : "=h"(v) : "f"(f)); return v; }

@@ -35,7 +35,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Imaginary 9000")
     monkeypatch.setattr("sundae_ns.gpu.nvrtc.Kernel", lambda *_: None)
-    monkeypatch.setattr("sundae_ns.compensation.kernels.head_kernels", lambda *_: {})
+    monkeypatch.setattr("sundae_ns.compensation.fused.head_kernels", lambda *_: {})
     monkeypatch.setattr("sundae_ns.gpu.fused_loss.loss_kernels", lambda *_: None)
 
 
@@ -100,7 +100,7 @@ def test_own_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
     places = (
         "sundae_ns.gpu.nvrtc.Kernel",
-        "sundae_ns.compensation.kernels.head_kernels",
+        "sundae_ns.compensation.fused.head_kernels",
         "sundae_ns.gpu.fused_loss.loss_kernels",
     )
     for place in places:

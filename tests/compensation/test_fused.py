@@ -12,29 +12,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from sundae_ns.compensation import CompensationHead, HeadConfig, fused, fused_training, kernels
+from sundae_ns.compensation import CompensationHead, HeadConfig, fused, fused_training
 from sundae_ns.compensation.fused_training import FusedTraining, _Graphs, _Pass, network_backward
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, RECORD_AT
 
 
 @pytest.fixture(autouse=True, scope="module")
-def on_cpu(load_on_cpu: Callable[..., kernels.Launches]) -> Iterator[None]:
+def on_cpu(load_on_cpu: Callable[..., fused.Launches]) -> Iterator[None]:
     """Float32 images, which only these tests use, are those of the CPU."""
-    on_gpu = kernels.load_kernels
+    on_gpu = fused.load_kernels
 
-    def load(file: str, names: tuple[str, ...], options: tuple[str, ...], device: torch.device) -> kernels.Launches:
+    def load(file: str, names: tuple[str, ...], options: tuple[str, ...], device: torch.device) -> fused.Launches:
         return (load_on_cpu if device.type == "cpu" else on_gpu)(file, names, options, device)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernels, "load_kernels", load)
-        patch.setitem(kernels._TYPES, torch.float32, "-DFP32")
+        patch.setattr(fused, "load_kernels", load)
+        patch.setitem(fused._TYPES, torch.float32, "-DFP32")
         yield
 
 
-def compiled(head: CompensationHead) -> kernels.Launches:
-    options = kernels.head_options(head.net, head.config.mode == "residual")
-    return kernels.head_kernels(torch.device("cpu"), torch.float32, options)
+def compiled(head: CompensationHead) -> fused.Launches:
+    options = fused.head_options(head.net, head.config.mode == "residual")
+    return fused.head_kernels(torch.device("cpu"), torch.float32, options)
 
 
 def make(**options: object) -> CompensationHead:
@@ -83,7 +83,7 @@ def test_same_image_at_any_size(height: int, width: int, num_features: int, seed
 
 @torch.no_grad()
 def test_sizes_of_the_network() -> None:
-    for size in ("compact", "wide", "small"):
+    for size in ("compact", "wide"):
         head = make(size=size, num_features=13)
         images = splatted(20, 33, 13)
         torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
@@ -115,7 +115,7 @@ def layer_gradients(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor
 def kernel_gradients(
     head: CompensationHead, images: tuple[Tensor, Tensor, Tensor], grad_out: Tensor, training: FusedTraining
 ) -> Gradients:
-    """The image and gradients by the kernels."""
+    """The image and gradients by the fused."""
     base, *leaves = images[0], *(image.clone().requires_grad_() for image in images[1:])
     head.zero_grad()
     out = training(*leaves, torch.float32)
@@ -266,23 +266,18 @@ def test_late_gradients_of_replayed_passes_are_refused() -> None:
 
 
 def test_kernels_compile_for_gpus_that_have_the_types(compile_for_gpu: Callable[..., bytes]) -> None:
-    for architecture, dtype, head in (
-        ("sm_75", torch.float16, make(pixel_unshuffle=4)),
-        ("sm_80", torch.bfloat16, make(size="large", mode="features")),
-        ("sm_90", torch.float16, make()),
-    ):
-        options = kernels.head_options(head.net, head.config.mode == "residual")
-        code = compile_for_gpu("head.cu", architecture, (kernels._TYPES[dtype], *options))
-        assert all(name.encode() in code for name in kernels.KERNELS)
+    for architecture, head in (("sm_80", make(pixel_unshuffle=4)), ("sm_90", make(size="regular", mode="features"))):
+        options = fused.head_options(head.net, head.config.mode == "residual")
+        code = compile_for_gpu("head.cu", architecture, (fused._TYPES[torch.bfloat16], *options))
+        assert all(name.encode() in code for name in fused.KERNELS)
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize(("precision", "tolerance"), [("bf16", 0.02), ("fp16", 0.003)])
 @pytest.mark.parametrize("mode", ["residual", "features"])
 @torch.no_grad()
-def test_on_a_gpu_at_any_size_with_changing_weights(precision: str, tolerance: float, mode: str) -> None:
+def test_on_a_gpu_at_any_size_with_changing_weights(mode: str) -> None:
     exact = make(mode=mode, size="compact", num_features=13, precision="fp32").cuda().eval()
-    quick = make(mode=mode, size="compact", num_features=13, precision=precision).cuda().eval()
+    quick = make(mode=mode, size="compact", num_features=13).cuda().eval()
     sizes = [(33, 40)] * 5 + [(48, 64)] * 4 + [(33, 40), (16, 16)] + [(31, 30)] * 3 + [(20, 30)] * 3 + [(8, 8)] * 3
     kept = []
     for seed, (height, width) in enumerate([*sizes, *sizes]):
@@ -292,7 +287,7 @@ def test_on_a_gpu_at_any_size_with_changing_weights(precision: str, tolerance: f
         images = tuple(image.cuda() for image in splatted(height, width, 13, seed=seed))
         found, expected = quick(*images), exact(*images)
         scale = float((expected - images[0]).abs().max())
-        assert float((found - expected).abs().max()) < tolerance * scale
+        assert float((found - expected).abs().max()) < 0.02 * scale
         kept.append((found, found.clone()))
     assert quick._can_fuse
     assert len(quick._inference._recorded) == MAX_GRAPHS
@@ -314,7 +309,7 @@ def test_recorded_and_unrecorded_images_are_equal() -> None:
 @pytest.mark.gpu
 @torch.no_grad()
 def test_without_kernels_the_layers_run(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    def refuse(*_: object) -> kernels.Launches:
+    def refuse(*_: object) -> fused.Launches:
         raise BackendError("no compiler: install one")
 
     head = make().cuda().eval()
@@ -333,7 +328,8 @@ def test_without_kernels_the_layers_run(monkeypatch: pytest.MonkeyPatch, caplog:
 def test_training_on_a_gpu_matches_the_layers(mode: str) -> None:
     """Values and gradients, at more sizes than are recorded, with weights that change between steps."""
     exact = make(mode=mode, size="compact", num_features=13, precision="fp32").cuda()
-    layers = make(mode=mode, size="compact", num_features=13, fused=False).cuda()
+    layers = make(mode=mode, size="compact", num_features=13).cuda()
+    layers._can_fuse = False
     quick = make(mode=mode, size="compact", num_features=13).cuda()
     sizes = [(33, 40), (48, 64), (33, 40), (31, 30), (16, 16), (24, 56), (16, 16), (8, 8)]
     norms = []
