@@ -38,7 +38,7 @@ from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.scenes.finetune import RATE, finetune
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.storage.packing import (
+from sundae_ns.storage.pack import (
     FINETUNED,
     Codecs,
     PackConfig,

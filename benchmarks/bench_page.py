@@ -41,8 +41,8 @@ from harness.chromium import WEBGPU, Browser, find_chromium, wait_for
 from sundae_ns.api.packing import scene_of, stored_cameras
 from sundae_ns.api.page import write_page
 from sundae_ns.scenes.packed import model_of
-from sundae_ns.storage.packing import PackedScene, container, read_scene
-from sundae_ns.storage.packing.scene import CAMERAS as STORED
+from sundae_ns.storage.pack import PackedScene, container, read_scene
+from sundae_ns.storage.pack.scene import CAMERAS as STORED
 
 SECONDS = 400.0
 """Longest wait for the page: shaders compile in software."""

@@ -36,7 +36,7 @@ from harness.chromium import Browser, find_chromium, wait_for
 from sundae_ns.api.packing import scene_of, stored_cameras
 from sundae_ns.api.saving import save_for_viewers
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.storage.packing import PackedScene, read_scene
+from sundae_ns.storage.pack import PackedScene, read_scene
 
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <script type="module" src="viewers.js"></script>"""

@@ -33,7 +33,7 @@ from sundae_ns.api.page import page_of
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import SundaeError
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage.packing import PackedScene, read_scene, write_scene
+from sundae_ns.storage.pack import PackedScene, read_scene, write_scene
 
 WEB = Path(__file__).parents[1] / "web"
 SECONDS = 60

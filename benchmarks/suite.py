@@ -26,7 +26,7 @@ from harness.script import run_script
 from sundae_ns.errors import DataError
 from sundae_ns.evaluation.document import METRICS, number, table
 from sundae_ns.evaluation.measured import MEGABYTE
-from sundae_ns.storage.packing import FINETUNE_STEPS
+from sundae_ns.storage.pack import FINETUNE_STEPS
 
 ARMS = (
     *("splatfacto", "sundae", "sundae-with-head", "sundae-no-head", "sundae-no-head-bytes"),

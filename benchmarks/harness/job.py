@@ -37,7 +37,7 @@ from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import Opened, open_scene
 from sundae_ns.scenes.packed import contents_of_run, model_of
 from sundae_ns.storage.atomic import write_text
-from sundae_ns.storage.packing import (
+from sundae_ns.storage.pack import (
     FINETUNE_STEPS,
     FINETUNED,
     Codecs,

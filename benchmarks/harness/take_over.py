@@ -15,7 +15,7 @@ from harness.plan import Job
 from harness.stored import METHODS, lines_of
 from harness.today import SHARE, is_of_today
 from sundae_ns.evaluation import COLUMNS, csv_text
-from sundae_ns.storage.packing import FINETUNE_STEPS
+from sundae_ns.storage.pack import FINETUNE_STEPS
 
 CURVE = {"sundae": "sundae", "sundae-auto": "sundae", "sundae-no-head": "sundae-no-head"}
 """Arms of curve.csv by the method in its rows."""

@@ -59,7 +59,7 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
     kind = kind_of(path)
     if kind == "packed" or (kind is None and path.suffix.lower() == ".sundae"):
         from sundae_ns.api.packing import scene_of  # its decoder needs a compiler, which other files do not
-        from sundae_ns.storage.packing import read_scene
+        from sundae_ns.storage.pack import read_scene
 
         return scene_of(read_scene(path)).to(device), None
     if kind_of_primitives(path) is None:

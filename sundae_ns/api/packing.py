@@ -18,8 +18,8 @@ from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.gaussians import FEATURES, mend
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering.views import View
-from sundae_ns.storage.packing import PackedScene
-from sundae_ns.storage.packing.schema import FORMAT, fault
+from sundae_ns.storage.pack import PackedScene
+from sundae_ns.storage.pack.container import FORMAT, fault
 
 _MODEL: dict[str, Any] = FORMAT["model"]
 _PROPERTIES: dict[str, Any] = FORMAT["header"]["properties"]
@@ -66,7 +66,7 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
 
     Args:
         scene: any device; primitives that are not finite are left out (``gaussians.mend``).
-        cameras: arrays by the names of :data:`sundae_ns.storage.packing.scene.CAMERAS`; by default those of the
+        cameras: arrays by the names of :data:`sundae_ns.storage.pack.scene.CAMERAS`; by default those of the
             scene's views.
     """
     scene = scene.to("cpu")

@@ -68,7 +68,7 @@ def packed_file(path: Path) -> tuple[Scene, bytes]:
 def packed_bytes(scene: Scene) -> bytes:
     """The packed file of a scene, with default settings."""
     from sundae_ns.api.packing import contents_of  # its encoder needs a compiler, which other files do not
-    from sundae_ns.storage.packing import fit_scene, pack_bytes
+    from sundae_ns.storage.pack import fit_scene, pack_bytes
 
     return pack_bytes(*fit_scene(contents_of(scene)))[0]
 

@@ -19,7 +19,7 @@ from sundae_ns.gaussians import FEATURES
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering import LocalField, View
 from sundae_ns.rendering.render import render_view
-from sundae_ns.storage.packing import Sensitivity
+from sundae_ns.storage.pack import Sensitivity
 
 _VIEWS = 8
 """Rendered views."""

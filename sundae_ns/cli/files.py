@@ -65,7 +65,7 @@ def export(
         from sundae_ns.api.page import write_page
         from sundae_ns.api.saving import packed_bytes
         from sundae_ns.api.start import with_start
-        from sundae_ns.storage.packing import container
+        from sundae_ns.storage.pack import container
 
         opened, packed = open_packed_file(scene, data)
         if cleaning.chosen:

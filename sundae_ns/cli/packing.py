@@ -20,7 +20,7 @@ from sundae_ns.cli.outputs import Overwrite, check_file
 
 if TYPE_CHECKING:
     from sundae_ns.scenes.targets import Judge
-    from sundae_ns.storage.packing import Codecs, PackedScene
+    from sundae_ns.storage.pack import Codecs, PackedScene
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def pack(
     from sundae_ns.api.packing import contents_of, scene_of, stated_start
     from sundae_ns.api.start import with_start
     from sundae_ns.errors import ConfigError
-    from sundae_ns.storage.packing import FINETUNE_STEPS, FINETUNED, PackConfig, fit_scene, write_fitted
+    from sundae_ns.storage.pack import FINETUNE_STEPS, FINETUNED, PackConfig, fit_scene, write_fitted
     from sundae_ns.storage.runs.config_file import check_run
     from sundae_ns.storage.runs.folder import files_of
 
@@ -215,7 +215,7 @@ def _measured(
     """A line and figures of the quality of a pack; a second pack is that without the fine-tune. Adds to the notes."""
     from sundae_ns.errors import SundaeError
     from sundae_ns.scenes.targets import is_worth
-    from sundae_ns.storage.packing import pack_bytes
+    from sundae_ns.storage.pack import pack_bytes
 
     try:
         opened = judge()

@@ -26,7 +26,7 @@ def is_evaluation(path: Path) -> bool:
 
 def is_packed(path: Path) -> bool:
     """Whether a file is a packed scene whose checksums are right."""
-    from sundae_ns.storage.packing.container import read_header, read_sections
+    from sundae_ns.storage.pack.container import read_header, read_sections
 
     try:
         read_sections(path, read_header(path))

@@ -192,7 +192,7 @@ class Project:
         """Options of ns-train for the quality and the size."""
         if self.max_bytes is None:
             return QUALITIES[self.quality]
-        from sundae_ns.storage.packing import FINETUNED_SIZE
+        from sundae_ns.storage.pack import FINETUNED_SIZE
 
         # Trials count the bytes of packs without a fine-tune.
         most = round(self.max_bytes / FINETUNED_SIZE) if self.tunes else self.max_bytes
@@ -241,7 +241,7 @@ class Project:
         left = self._steps_left()
         if left is None or left <= 0:
             return left is not None
-        from sundae_ns.storage.packing import tuned_steps
+        from sundae_ns.storage.pack import tuned_steps
         from sundae_ns.storage.runs.config_file import schedule_length
 
         return self.tunes and left <= tuned_steps(schedule_length(self.run / "config.yml"))

@@ -102,7 +102,7 @@ def _pack(run: Path, *, tunes: bool) -> int:
 
 def pack_command(run: Path, out: Path, *more: str, finetune: bool) -> list[str]:
     """The words of the command that packs a run, with further words, and with a fine-tune if asked for."""
-    from sundae_ns.storage.packing import FINETUNE_STEPS
+    from sundae_ns.storage.pack import FINETUNE_STEPS
 
     words = ["sundae", "pack", word(run), "-o", word(out), *more]
     return [*words, "--finetune", str(FINETUNE_STEPS)] if finetune else words
@@ -110,7 +110,7 @@ def pack_command(run: Path, out: Path, *more: str, finetune: bool) -> list[str]:
 
 def finetune_words() -> list[str]:
     """Words of ns-train that leave the last steps to the fine-tune of :func:`pack_command`."""
-    from sundae_ns.storage.packing import FINETUNE_STEPS
+    from sundae_ns.storage.pack import FINETUNE_STEPS
 
     return ["--finetune-steps", str(FINETUNE_STEPS)]
 

@@ -24,8 +24,8 @@ from sundae_ns.rasterization import Capacity
 from sundae_ns.rendering.render import RenderSettings
 from sundae_ns.scenes.opening import open_pipeline
 from sundae_ns.scenes.packed import place
-from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene
-from sundae_ns.storage.packing.rate import estimated_bits
+from sundae_ns.storage.pack import Codecs, PackConfig, PackedScene, fit_scene
+from sundae_ns.storage.pack.codecs import estimated_bits
 from sundae_ns.storage.runs.folder import config_of
 from sundae_ns.training.optimizers import NetworkAdamConfig
 from sundae_ns.training.recordings import StepRecordings
@@ -80,7 +80,7 @@ def finetune(
         progress: called after each step with its loss ``[]``, which the next step overwrites.
 
     Returns:
-        The trained scene, and its codecs for ``storage.packing.write_fitted``.
+        The trained scene, and its codecs for ``storage.pack.write_fitted``.
 
     Raises:
         ConfigError: an option cannot work.

@@ -21,7 +21,7 @@ from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.scenes import stock
 from sundae_ns.scenes.packed import datamanager_of, model_of, put_scene
 from sundae_ns.storage.kinds import kind_of, refuse, unread
-from sundae_ns.storage.packing import read_scene
+from sundae_ns.storage.pack import read_scene
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.fingerprint import fingerprint
 from sundae_ns.storage.runs.folder import config_of, prunes_of

@@ -35,7 +35,7 @@ from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.parsing import check_capture
 from sundae_ns.scenes import stock
-from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
+from sundae_ns.storage.pack import PackedScene, fit_scene, pack_bytes
 from sundae_ns.storage.runs.config_file import check_run
 from sundae_ns.storage.runs.folder import config_of
 

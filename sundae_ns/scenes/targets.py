@@ -18,8 +18,8 @@ from sundae_ns.errors import DataError, PackError, SundaeError
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.scenes.opening import open_pipeline, views_to_test
 from sundae_ns.scenes.packed import place
-from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene, pack_bytes
-from sundae_ns.storage.packing.config import STEPS
+from sundae_ns.storage.pack import Codecs, PackConfig, PackedScene, fit_scene, pack_bytes
+from sundae_ns.storage.pack.config import STEPS
 from sundae_ns.storage.runs.folder import config_of
 from sundae_ns.training.trials.head import GAIN_PER_DOUBLING
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sundae_ns.errors import CheckpointError, ConfigError
-from sundae_ns.storage.packing import FINETUNE_STEPS, tuned_steps
+from sundae_ns.storage.pack import FINETUNE_STEPS, tuned_steps
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import find_config

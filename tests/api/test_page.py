@@ -31,7 +31,7 @@ from sundae_ns.cli import main
 from sundae_ns.errors import PackError
 from sundae_ns.rasterization.projection import project
 from sundae_ns.rasterization.types import Inputs
-from sundae_ns.storage.packing import read_scene
+from sundae_ns.storage.pack import read_scene
 
 ROOT = Path(__file__).parents[2]
 WEB = ROOT / "web"
@@ -211,11 +211,11 @@ def parts(content: bytes) -> tuple[Json, bytes]:
 def sealed(meta: Json, body: bytes) -> bytes:
     """A file with this header and body, and a valid checksum of the header."""
     text = json.dumps(meta).encode()
-    return b"\x89SUNDAE\n" + struct.pack("<II", 2, len(text)) + hashlib.sha256(text).digest() + text + body
+    return b"\x89SUNDAE\n" + struct.pack("<II", 3, len(text)) + hashlib.sha256(text).digest() + text + body
 
 
 def compressed(sections: list[Json]) -> tuple[int, int, Json]:
-    """First byte, length and entry of a section with frames of zstandard."""
+    """First byte, length and entry of a deflated section."""
     start = 0
     for entry in sections:
         length = sum(entry["parts"])
@@ -290,19 +290,19 @@ def test_the_decoder_refuses_what_python_refuses(
 ) -> None:
     good = packed.read_bytes()
     files = {"truncated": good[:-1], "longer": good + b"x", "empty": b"", "another file": b"ply\n" + good[4:]}
-    files |= {"cut in its header": good[:100], "another version": good[:8] + b"\x01" + good[9:]}
+    files |= {"cut in its header": good[:100], "another version": good[:8] + b"\x02" + good[9:]}
     files |= {"an altered header": good[:60] + b"~" + good[61:], "an altered section": good[:-1] + b"~"}
     meta, body = parts(good)
     for name, lie in LIES.items():
         changed = json.loads(json.dumps(meta))
         lie(changed)
         files[name] = sealed(changed, body)
-    # Frames that cannot be decompressed, under a valid checksum.
+    # Streams that cannot be decompressed, under a valid checksum.
     broken = json.loads(json.dumps(meta))
     start, length, entry = compressed(broken["sections"])
     frames = body[start : start + length // 2] + bytes(length - length // 2)
     entry["sha256"] = hashlib.sha256(frames).hexdigest()
-    files["broken frames"] = sealed(broken, body[:start] + frames + body[start + length :])
+    files["broken streams"] = sealed(broken, body[:start] + frames + body[start + length :])
     paths = []
     for i, content in enumerate(files.values()):
         paths.append(tmp_path / f"{i}.sundae")

@@ -15,7 +15,7 @@ from sundae_ns.api.sensitivity import sensitivity_of
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.rendering import LocalField, View
 from sundae_ns.rendering.render import render_view
-from sundae_ns.storage.packing import PackedScene
+from sundae_ns.storage.pack import PackedScene
 
 
 def head() -> dict[str, Tensor]:

@@ -23,7 +23,7 @@ from sundae_ns.api.start import with_start
 from sundae_ns.api.views import view_in_front
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.scenes.distill import distill
-from sundae_ns.storage.packing import container
+from sundae_ns.storage.pack import container
 
 UP = (0.6, 0.0, -0.8)
 

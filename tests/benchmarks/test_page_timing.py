@@ -10,7 +10,7 @@ import torch
 from chromium import bench_page, needs_packages
 from packed_scenes import FOCAL, HEIGHT, KINDS, WIDTH, write_kind
 
-from sundae_ns.storage.packing import read_scene
+from sundae_ns.storage.pack import read_scene
 
 SPLAT = {"project", "sort_depths", "list_tiles", "sort_tiles", "blend"}
 HEAD = {"head_fold", "head_convolve", "head_resize", "head_project"}

@@ -28,7 +28,7 @@ from sundae_ns.api import pruning
 from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.parameters import SH_C0, SPLAT_NAMES
 from sundae_ns.storage import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply
-from sundae_ns.storage.packing import PackedScene, read_scene, write_scene
+from sundae_ns.storage.pack import PackedScene, read_scene, write_scene
 from sundae_ns.storage.primitives import read_primitives
 from sundae_ns.storage.viewers import write_for_viewers
 

@@ -18,7 +18,7 @@ from sundae_ns.cli.outputs import check_file, check_folder
 from sundae_ns.errors import StorageError
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import write_ply
-from sundae_ns.storage.packing import PackedScene, write_scene
+from sundae_ns.storage.pack import PackedScene, write_scene
 
 LONG = "x" * 300
 Refused = Callable[..., str]

@@ -11,7 +11,7 @@ import pytest
 from command_line import run
 
 from sundae_ns.cli.packing import Precision, pack
-from sundae_ns.storage.packing import FINETUNED, PackConfig
+from sundae_ns.storage.pack import FINETUNED, PackConfig
 
 
 def test_options_are_those_of_the_configuration() -> None:

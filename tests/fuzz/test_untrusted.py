@@ -22,7 +22,7 @@ import torch
 
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import read_ply, write_ply
-from sundae_ns.storage.packing import PackedScene, container, read_scene, write_scene
+from sundae_ns.storage.pack import PackedScene, container, read_scene, write_scene
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.viewers import write_for_viewers
 

@@ -27,7 +27,7 @@ from harness.plan import Job, parser_of, plan_scene
 from harness.results import read_results
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import open_scene
-from sundae_ns.storage.packing import read_header
+from sundae_ns.storage.pack import read_header
 
 ROOT = Path(__file__).parents[2]
 SCALE, WARMUP = 0.02, 12

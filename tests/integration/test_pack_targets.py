@@ -16,7 +16,7 @@ from sundae_ns.cli import main
 from sundae_ns.errors import PackError
 from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.scenes.targets import COARSEST, Judge, Quality, Search, Try, fewest_bytes, is_worth, least_drop, scaled
-from sundae_ns.storage.packing import (
+from sundae_ns.storage.pack import (
     FINETUNED,
     Codecs,
     PackConfig,
@@ -26,7 +26,7 @@ from sundae_ns.storage.packing import (
     read_header,
     read_scene,
 )
-from sundae_ns.storage.packing.transform import Transform
+from sundae_ns.storage.pack.quantize import Transform
 
 
 def packed(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from sundae_ns.scenes import finetune as packing_finetune
 from sundae_ns.scenes.finetune import Through, TunedStep, finetune, rate_factor
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.storage.packing import (
+from sundae_ns.storage.pack import (
     FINETUNED,
     PackConfig,
     fit_scene,

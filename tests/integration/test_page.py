@@ -29,7 +29,7 @@ from sundae_ns.api.page import page_of, write_page
 from sundae_ns.api.saving import packed_file
 from sundae_ns.cli.view import serve
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.storage.packing import container, read_scene, write_scene
+from sundae_ns.storage.pack import container, read_scene, write_scene
 
 pytestmark = needs_chromium
 image, psnr, truths = bench_page.image, bench_page.psnr, bench_page.truths

@@ -13,7 +13,7 @@ from pages import SAID, SECONDS, STOP, WEBGL, opened, rested
 
 from sundae_ns.api.page import write_page
 from sundae_ns.api.saving import packed_file
-from sundae_ns.storage.packing import read_scene
+from sundae_ns.storage.pack import read_scene
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 image, psnr, truths = bench_page.image, bench_page.psnr, bench_page.truths

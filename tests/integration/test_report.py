@@ -27,7 +27,7 @@ from sundae_ns.rendering import render_view
 from sundae_ns.scenes.measure import walk
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.storage.packing import write_scene
+from sundae_ns.storage.pack import write_scene
 
 
 def sundae(*arguments: object) -> int:

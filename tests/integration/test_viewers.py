@@ -9,7 +9,7 @@ import pytest
 from chromium import bench_viewers, needs_chromium, needs_packages
 
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.storage.packing import write_scene
+from sundae_ns.storage.pack import write_scene
 
 pytestmark = [pytest.mark.browser, needs_chromium, needs_packages]
 

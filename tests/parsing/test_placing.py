@@ -23,7 +23,7 @@ from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanagerConfig
 from sundae_ns.errors import DataError
 from sundae_ns.parsing import other_frame
 from sundae_ns.scenes.packed import _describe, datamanager_of
-from sundae_ns.storage.packing import PackedScene
+from sundae_ns.storage.pack import PackedScene
 
 Load = Callable[..., Any]
 Edit = Callable[..., None]

@@ -23,7 +23,7 @@ from sundae_ns.errors import CheckpointError, DataError, PackError
 from sundae_ns.gaussians import from_points
 from sundae_ns.scenes import packed as packed_run
 from sundae_ns.scenes.packed import contents_of_run, datamanager_of, model_of
-from sundae_ns.storage.packing import PackedScene
+from sundae_ns.storage.pack import PackedScene
 from sundae_ns.storage.runs import checkpoint
 
 Json = dict[str, Any]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage.packing import PackConfig, PackedScene, Sensitivity, write_scene
+from sundae_ns.storage.pack import PackConfig, PackedScene, Sensitivity, write_scene
 
 WIDTH, HEIGHT = 50, 37
 FOCAL = 45.0

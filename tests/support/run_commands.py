@@ -17,7 +17,7 @@ from PIL import Image
 
 from sundae_ns.cli.forecast import Forecast
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
+from sundae_ns.storage.pack import PackedScene, fit_scene, pack_bytes
 
 PHOTOS = 8
 STEPS = ["sundae poses", "ns-train", "sundae eval", "sundae pack", "sundae report", "sundae export"]

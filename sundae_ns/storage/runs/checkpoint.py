@@ -319,7 +319,7 @@ def read_field(path: Path) -> FinishedField:
 
 def _packed_field(path: Path) -> FinishedField:
     """The field of a packed scene; its head and features are left out."""
-    from sundae_ns.storage.packing import read_scene  # its decoder needs a compiler, which other files do not
+    from sundae_ns.storage.pack import read_scene  # its decoder needs a compiler, which other files do not
 
     packed = read_scene(path)
     model, source = packed.meta.get("model"), packed.meta.get("source")

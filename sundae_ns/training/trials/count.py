@@ -28,7 +28,7 @@ from sundae_ns.pruning import kept_count
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rendering.contribution import contribution
 from sundae_ns.storage.morton import scene_order
-from sundae_ns.storage.packing.scene import PackedScene, fit_scene, pack_bytes
+from sundae_ns.storage.pack.scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.training.densification import Densification
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState

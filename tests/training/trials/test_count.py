@@ -9,7 +9,7 @@ import torch
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.storage.packing.scene import PackedScene, fit_scene, pack_bytes
+from sundae_ns.storage.pack.scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.trials.count import CountTrialProgress, CountTrials, packed_size
 from sundae_ns.training.trials.engine import TrialEngine

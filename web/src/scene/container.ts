@@ -1,8 +1,7 @@
 // The container of docs/formats.md: named arrays behind a JSON header, all bytes under checksums.
-// Its twin is sundae_ns/storage/packing/container.py; both refuse the same files.
+// Its twin is sundae_ns/storage/pack/container.py; both refuse the same files.
 
 import { type JsonObject, LIMITS, parsed, violation } from "./schema";
-import { decompress, FrameError } from "./zstd";
 
 export class PackError extends Error {}
 
@@ -51,7 +50,7 @@ export async function readHeader(file: Uint8Array<ArrayBuffer>): Promise<Header>
   const version = preamble.getUint32(8, true);
   if (version !== LIMITS.version) {
     throw new PackError(
-      `The file has version ${version} of the format, this page reads ${LIMITS.version}; export it again.`,
+      `The file has version ${version} of the format, this page reads ${LIMITS.version}; pack the run again.`,
     );
   }
   const length = preamble.getUint32(12, true);
@@ -98,34 +97,45 @@ export async function readAll(file: Uint8Array<ArrayBuffer>, header: Header): Pr
     const stored = file.subarray(section.offset, section.offset + sum(section.parts));
     if ((await sha256(stored)) !== section.sha256) throw damaged(`the checksum of ${section.name} is wrong`);
   }
-  const wanted = [...header.sections.values()].filter((section) => section.name !== PADDING);
-  return new Map(wanted.map((section) => [section.name, join(file, section)]));
+  const arrays = new Map<string, Stored>();
+  for (const section of header.sections.values()) {
+    if (section.name !== PADDING) arrays.set(section.name, await join(file, section));
+  }
+  return arrays;
 }
 
 /** Joins the planes of a section: one for each index of the first dimension and each byte of a number. */
-function join(file: Uint8Array, section: Section): Stored {
+async function join(file: Uint8Array<ArrayBuffer>, section: Section): Promise<Stored> {
   const { dtype, shape } = section;
   const out = new Uint8Array(sizeOf(section));
   const item = itemSize(section);
   const length = out.length / Math.max(planesOf(section), 1);
   let start = section.offset;
-  section.parts.forEach((part, index) => {
-    const plane = unpack(file.subarray(start, start + part), length);
+  for (const [index, part] of section.parts.entries()) {
+    const plane = await inflated(file.subarray(start, start + part), length);
     start += part;
     const first = Math.floor(index / item) * length * item + (index % item);
     if (item === 1) out.set(plane, first);
     else for (let i = 0; i < length; i++) out[first + i * item] = plane[i]!;
-  });
+  }
   return { dtype, shape, bytes: out.buffer };
 }
 
-/** Decompresses a plane of `size` bytes. */
-function unpack(part: Uint8Array, size: number): Uint8Array {
+/** A plane of `size` bytes: stored, or a raw deflate stream that ends with it. */
+async function inflated(part: Uint8Array<ArrayBuffer>, size: number): Promise<Uint8Array> {
   if (part.length === size) return part;
+  const plane = new Uint8Array(size);
+  const reader = new Blob([part]).stream().pipeThrough(new DecompressionStream("deflate-raw")).getReader();
+  let length = 0;
   try {
-    return decompress(part, size);
-  } catch (error) {
-    if (error instanceof FrameError) throw damaged("a section cannot be decompressed");
-    throw error;
+    for (let next = await reader.read(); !next.done; next = await reader.read()) {
+      plane.set(next.value, length); // throws where a stream holds more
+      length += next.value.length;
+    }
+  } catch {
+    await reader.cancel().catch(() => {});
+    length = -1;
   }
+  if (length !== size) throw damaged("a section cannot be decompressed");
+  return plane;
 }

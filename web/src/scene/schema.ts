@@ -1,11 +1,11 @@
-// The one description of headers and sections, and the checks by it; the twin of sundae_ns/storage/packing/schema.py.
+// The one description of headers and sections, and the checks by it; the twin of sundae_ns/storage/pack/container.py.
 
-import format from "../../../sundae_ns/storage/packing/format.json";
+import format from "../../../sundae_ns/storage/pack/format.json";
 
 export type Json = null | boolean | number | string | Json[] | { [key: string]: Json };
 export type JsonObject = { [key: string]: Json };
 
-/** JSON Schema with the keywords that `fault` reads; schema.py says what `uniqueBy` and `orthonormal` mean. */
+/** JSON Schema with the keywords that `fault` reads; container.py says what `uniqueBy`, `counts` and `orthonormal` mean. */
 type Schema = {
   type?: string | string[];
   enum?: Json[];
@@ -17,6 +17,7 @@ type Schema = {
   prefixItems?: Schema[];
   items?: Schema;
   uniqueBy?: string | number;
+  counts?: number;
   orthonormal?: boolean;
   required?: string[];
   additionalProperties?: boolean;
@@ -68,6 +69,10 @@ function faultOfList(value: Json[], schema: Schema, place: string): string | nul
   for (const [i, item] of value.entries()) {
     const found = fault(item, schema.prefixItems?.[i] ?? schema.items ?? {}, joined(place, i));
     if (found !== null) return found;
+  }
+  const most = schema.counts;
+  if (most !== undefined && !value.every((item) => is(item, "integer") && 0 <= Number(item) && Number(item) <= most)) {
+    return place;
   }
   const key = schema.uniqueBy;
   if (key !== undefined && new Set(value.map((item) => (item as JsonObject)[key])).size < count) return place;

@@ -9,8 +9,9 @@ import pytest
 import torch
 from fields import random_field
 
-from sundae_ns.storage.packing import PackConfig, PackedScene, fit_scene, rate, write_fitted
-from sundae_ns.storage.packing.rate import estimated_bits
+from sundae_ns.storage.pack import PackConfig, PackedScene, fit_scene, write_fitted
+from sundae_ns.storage.pack import codecs as codec_room
+from sundae_ns.storage.pack.codecs import estimated_bits
 
 
 def scene(n: int = 5000) -> PackedScene:
@@ -52,6 +53,6 @@ def test_one_primitive_and_no_head() -> None:
 def test_runs_pay_for_their_mean_and_for_deviations() -> None:
     """Equal levels are cheaper than different ones, and still cheaper near zero."""
     equal, different = torch.full((67, 2), 9.0), 9.0 * torch.randn(67, 2, generator=torch.Generator().manual_seed(0))
-    sizes = [float(rate._of_rows(levels)) for levels in (0.0 * equal, equal / 9, equal, different)]
+    sizes = [float(codec_room._of_rows(levels)) for levels in (0.0 * equal, equal / 9, equal, different)]
     assert sizes[0] == 0.0
     assert 0 < sizes[1] < sizes[2] < sizes[3] / 4

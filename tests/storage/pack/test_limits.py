@@ -17,7 +17,7 @@ from fields import random_field
 
 from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.storage import morton
-from sundae_ns.storage.packing import PackConfig, PackedScene, container, read_scene, write_scene
+from sundae_ns.storage.pack import PackConfig, PackedScene, container, read_scene, write_scene
 
 Json = dict[str, Any]
 LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sundae_ns.errors import PackError
 from sundae_ns.storage.morton import interleave
-from sundae_ns.storage.packing import entropy
+from sundae_ns.storage.pack import entropy
 
 LARGEST = entropy.LARGEST
 

@@ -15,19 +15,18 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sundae_ns.errors import PackError
-from sundae_ns.storage.packing import (
+from sundae_ns.storage.pack import (
     PackConfig,
     PackedScene,
     entropy,
     fit_scene,
     quantize,
     read_scene,
-    transform,
     write_fitted,
     write_scene,
 )
-from sundae_ns.storage.packing.codecs import HeadCodec, Sensitivity
-from sundae_ns.storage.packing.container import Floats
+from sundae_ns.storage.pack.codecs import HeadCodec, Sensitivity
+from sundae_ns.storage.pack.container import Floats
 
 hard = given(
     st.sampled_from(["normal", "constant", "huge", "tiny", "outliers"]), st.integers(1, 500), st.integers(0, 2**16)
@@ -68,11 +67,11 @@ def test_weights(kind: str, n: int, seed: int) -> None:
 @hard
 def test_transform(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 9, seed)
-    codec = transform.fit(x, 0.03)
+    codec = quantize.fit_transform(x, 0.03)
     for y in (x, drifted(x, seed)):
         _, levels, arrays = codec.encode(y)
         arrays["basis"] = arrays["basis"].reshape(9, 9)
-        found = transform.rows_at(levels, step=codec.step, **arrays)
+        found = quantize.rows_at(levels, step=codec.step, **arrays)
         assert np.array_equal(codec.rounded(torch.from_numpy(y)).numpy(), found)
         assert np.abs(levels).max() <= entropy.LARGEST
 
@@ -143,8 +142,8 @@ def test_other_steps_keep_grids_and_bases(tmp_path: Path) -> None:
         factor = {"scales": 0.2 / 0.05, "quats": 0.002 / 0.008}.get(name, 1.0)
         found = other.field[name]
         assert found.step == pytest.approx(factor * codec.step), name
-        if isinstance(codec, transform.Transform):
-            assert isinstance(found, transform.Transform)
+        if isinstance(codec, quantize.Transform):
+            assert isinstance(found, quantize.Transform)
             assert torch.equal(found.basis, codec.basis)
             assert torch.equal(found.mean, codec.mean)
     assert codecs.head is not None
@@ -161,7 +160,7 @@ def test_other_steps_keep_grids_and_bases(tmp_path: Path) -> None:
 
 def test_steps_that_are_too_fine_for_a_row_become_larger() -> None:
     rows = hard_values("normal", 50, 3, 0)
-    codec = transform.fit(rows, 0.01)
+    codec = quantize.fit_transform(rows, 0.01)
     rows[7] = 1e5
     finer = codec.with_step(0.0001, rows)
     assert finer.step > 0.005

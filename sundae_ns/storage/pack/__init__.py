@@ -1,9 +1,9 @@
 """Packed scenes: a field, its head and its cameras in one small, checksummed file without executable content."""
 
-from sundae_ns.storage.packing.codecs import Codecs, Sensitivity
-from sundae_ns.storage.packing.config import FINETUNE_STEPS, FINETUNED, FINETUNED_SIZE, PackConfig, tuned_steps
-from sundae_ns.storage.packing.container import read_header
-from sundae_ns.storage.packing.scene import (
+from sundae_ns.storage.pack.codecs import Codecs, Sensitivity
+from sundae_ns.storage.pack.config import FINETUNE_STEPS, FINETUNED, FINETUNED_SIZE, PackConfig, tuned_steps
+from sundae_ns.storage.pack.container import read_header
+from sundae_ns.storage.pack.scene import (
     PackedScene,
     PackReport,
     fit_scene,

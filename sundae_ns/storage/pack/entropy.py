@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sundae_ns.rasterization.cpu.parallel import compiled, inlined
-from sundae_ns.storage.packing.container import Array, DamagedError, Levels
+from sundae_ns.storage.pack.container import Array, DamagedError, Levels
 
 LARGEST = (1 << 24) - 1
 """Largest magnitude of a number."""

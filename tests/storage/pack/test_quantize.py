@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.storage import morton
-from sundae_ns.storage.packing import quantize, transform
-from sundae_ns.storage.packing.container import Floats
+from sundae_ns.storage.pack import quantize
+from sundae_ns.storage.pack.container import Floats
 
 hard = given(st.sampled_from(KINDS), st.integers(1, 700), st.integers(0, 2**16))
 
@@ -140,10 +140,10 @@ def test_weights(kind: str, n: int, seed: int) -> None:
 @hard
 def test_transform(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 9, seed)
-    codec = transform.fit(x, 0.03)
+    codec = quantize.fit_transform(x, 0.03)
     _, levels, arrays = codec.encode(x)
     arrays["basis"] = arrays["basis"].reshape(9, 9)
-    found = transform.rows_at(levels, step=codec.step, **arrays).astype(np.float64)
+    found = quantize.rows_at(levels, step=codec.step, **arrays).astype(np.float64)
     # Sums of nine products in float32.
     slack = 20 * ulp(np.linalg.norm(x.astype(np.float64), axis=1, keepdims=True))
     assert (np.abs(found - x) <= codec.bound + slack).all()
@@ -157,7 +157,7 @@ def test_a_transform_decorrelates_columns(kind: str) -> None:
     rng = np.random.default_rng(0)
     x = np.repeat(hard_values(kind, 2000, 3, 0), 3, axis=1) + 0.001 * rng.normal(size=(2000, 9)).astype(np.float32)
     x = x.astype(np.float32)
-    _, levels, _ = transform.fit(x, 0.03, centred=False).encode(x)
+    _, levels, _ = quantize.fit_transform(x, 0.03, centred=False).encode(x)
     zeros = (levels == 0).mean(axis=0)
     assert (zeros[3:] > 0.98).all()
     assert (zeros[:3] < 0.2).all()
@@ -166,7 +166,7 @@ def test_a_transform_decorrelates_columns(kind: str) -> None:
 def test_rows_of_zeros_stay_exact() -> None:
     x = hard_values("normal", 200, 9, 0) + 1
     x[::2] = 0
-    codec = transform.fit(x, 0.03, centred=False)
+    codec = quantize.fit_transform(x, 0.03, centred=False)
     assert not codec.rounded(torch.from_numpy(x))[::2].any()
 
 
@@ -176,12 +176,12 @@ def test_a_form_makes_errors_that_show_smaller() -> None:
     x = rng.normal(size=(4000, 6)).astype(np.float32)
     axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
     form = axes * np.array([1, 1, 1, 0.1, 0.1, 0.02]) @ axes.T
-    plain, weighted = transform.fit(x, 0.1), transform.fit(x, 0.1, form=torch.from_numpy(form))
+    plain, weighted = quantize.fit_transform(x, 0.1), quantize.fit_transform(x, 0.1, form=torch.from_numpy(form))
     errors = [codec.rounded(torch.from_numpy(x)).double().numpy() - x for codec in (plain, weighted)]
     seen = [np.einsum("ni,ij,nj->n", error, form, error).mean() for error in errors]
     bits = [np.log2(1 + np.abs(codec.encode(x)[1])).mean() for codec in (plain, weighted)]
     assert bits[1] < bits[0]
     assert 0.5 < seen[1] / (0.1**2 / 12 * np.trace(form)) < 1.3
     assert np.abs(errors[1] @ axes[:, 5]).mean() > 1.5 * np.abs(errors[0] @ axes[:, 5]).mean()
-    identity = transform.fit(x, 0.1, form=torch.eye(6, dtype=torch.float64) * 7)
+    identity = quantize.fit_transform(x, 0.1, form=torch.eye(6, dtype=torch.float64) * 7)
     assert np.abs(identity.rounded(torch.from_numpy(x)).numpy() - x).max() < identity.bound * (1 + 1e-5)

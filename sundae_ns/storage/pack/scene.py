@@ -22,13 +22,12 @@ from torch import Tensor
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.packing import container, entropy, quantize, transform
-from sundae_ns.storage.packing.codecs import Codecs, Sensitivity, as_matrix, fit_codecs
-from sundae_ns.storage.packing.config import PackConfig
-from sundae_ns.storage.packing.container import Array, DamagedError, Levels
-from sundae_ns.storage.packing.entropy import Near
-from sundae_ns.storage.packing.quantize import Blocks
-from sundae_ns.storage.packing.schema import FORMAT, fits, in_range
+from sundae_ns.storage.pack import container, entropy, quantize
+from sundae_ns.storage.pack.codecs import Codecs, Sensitivity, as_matrix, fit_codecs
+from sundae_ns.storage.pack.config import PackConfig
+from sundae_ns.storage.pack.container import FORMAT, Array, DamagedError, Levels, fits, in_range
+from sundae_ns.storage.pack.entropy import Near
+from sundae_ns.storage.pack.quantize import Blocks
 from sundae_ns.storage.ply import check_field
 
 CAMERAS: dict[str, dict[str, Any]] = FORMAT["sections"]["cameras"]
@@ -228,7 +227,7 @@ def _decode_rows(reader: _Reader, name: str, near: Near, width: int) -> NDArray[
     levels, step = reader.levels(name, near, width)
     mean = reader.array(name, "mean", width=width)
     basis = reader.array(name, "basis", square=width * width).reshape(width, width)
-    return transform.rows_at(levels, mean, basis, step)
+    return quantize.rows_at(levels, mean, basis, step)
 
 
 def _decode_head(reader: _Reader) -> dict[str, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
@@ -13,11 +14,10 @@ from torch import Tensor
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES
 from sundae_ns.storage.morton import scene_order
-from sundae_ns.storage.packing import quantize, transform
-from sundae_ns.storage.packing.config import STEPS, PackConfig
-from sundae_ns.storage.packing.container import Array, Coded, Floats
-from sundae_ns.storage.packing.quantize import Blocks, Rotations
-from sundae_ns.storage.packing.transform import Transform
+from sundae_ns.storage.pack import quantize
+from sundae_ns.storage.pack.config import STEPS, PackConfig
+from sundae_ns.storage.pack.container import Array, Coded, Floats
+from sundae_ns.storage.pack.quantize import Blocks, Rotations, Transform, fit_transform
 
 _LOGITS = (-6.0, 8.0)
 """Opacities outside of these logits look the same as at them: below 1/255 nothing is drawn."""
@@ -30,8 +30,8 @@ _STEPS = {
     FEATURES: "feature_step",
 }
 """Options of the steps of attributes."""
-_LARGEST_SHARE = 0.5
-"""Step of an output channel of the head, at most, as a share of its largest weight."""
+_LARGEST_SHARE = 0.5  # step of an output channel of the head, at most, relative to its largest weight
+_RUN = 16  # neighbours on the curve whose levels share a mean and a magnitude, in the estimate of bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ def fit_codecs(
         if name == "quats":
             codecs[name] = Rotations(step)
         elif name in values and values[name].size:
-            codecs[name] = transform.fit(values[name], step, centred=name != "features_rest", form=forms.get(name))
+            codecs[name] = fit_transform(values[name], step, centred=name != "features_rest", form=forms.get(name))
     ordered = {name: torch.from_numpy(values[name]).reshape(field[name].shape) for name in names}
     of_head = {} if sensitivity is None else sensitivity.head
     return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, of_head))
@@ -230,3 +230,39 @@ def _quarters(values: Tensor) -> Tensor:
 def as_matrix(values: Tensor) -> Floats:
     """Return a tensor ``[N, ...]`` as contiguous float32 ``[N, C]`` on the CPU."""
     return np.ascontiguousarray(values.detach().to("cpu", torch.float32).numpy().reshape(len(values), -1))
+
+
+def estimated_bits(codecs: Codecs, field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Estimate, with gradients, the bits of each attribute of a field, without positions, and of a head; {} for none.
+
+    A rounded number of the distribution of Laplace with mean magnitude m takes about log2(1 + 2 e m) bits. The entropy
+    coder's contexts know the magnitude nearby, so m is measured in runs along the curve. The codecs are on the device
+    of the field, whose primitives are in their order.
+    """
+    bits = {}
+    for name, codec in codecs.field.items():
+        values = field[name]
+        bits[name] = _of_rows(codec.coefficients(values.reshape(len(values), -1)))
+    if codecs.head is not None and head:
+        levels = [codecs.head.coefficients(name, value) for name, value in head.items() if value.ndim > 1]
+        bits["head"] = torch.stack([_of_magnitudes(level.abs().mean(dim=1), level.shape[1]) for level in levels]).sum()
+    return bits
+
+
+def _of_rows(levels: Tensor) -> Tensor:
+    """Bits of levels ``[N, C]``: the mean of each run, and the deviations from it."""
+    n, width = levels.shape
+    whole = n // _RUN * _RUN
+    runs = [levels[:whole].reshape(-1, _RUN, width), levels[whole:].reshape(-1, max(n - whole, 1), width)]
+    total = levels.new_zeros(())
+    for run in runs:
+        if run.numel():
+            means = run.mean(dim=1, keepdim=True)
+            deviations = (run - means).abs().mean(dim=1)
+            total = total + _of_magnitudes(deviations, run.shape[1]) + _of_magnitudes(means.abs(), 1)
+    return total
+
+
+def _of_magnitudes(means: Tensor, count: int) -> Tensor:
+    """Bits of groups of ``count`` levels with these mean magnitudes."""
+    return count * torch.log1p(2 * math.e * means).sum() / math.log(2)
