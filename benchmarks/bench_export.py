@@ -24,8 +24,7 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from sundae_ns.api.opening import load
-from sundae_ns.api.saving import save
+from sundae_ns.api.files import load, save
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering import LocalField, render_view

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from harness.chromium import WEBGPU, Browser, find_chromium, wait_for
-from sundae_ns.api.packing import scene_of, stored_cameras
+from sundae_ns.api.packing import arrays_of_views, scene_of
 from sundae_ns.api.page import write_page
 from sundae_ns.scenes.packed import model_of
 from sundae_ns.storage.pack import PackedScene, container, read_scene
@@ -63,7 +63,7 @@ SECONDS_OF_FRAMES = 20.0
 
 def sized(scene: PackedScene, intrinsics: Tensor, sizes: Tensor, picks: Tensor, share: float) -> PackedScene:
     """The scene with some of its cameras, with other lenses, and its head at ``share`` of the scale of its training."""
-    cameras = {name: value[picks].clone() for name, value in stored_cameras(scene).items()}
+    cameras = {name: value[picks].clone() for name, value in arrays_of_views(scene_of(scene).views).items()}
     cameras["intrinsics"] = intrinsics.to(cameras["intrinsics"])
     cameras["sizes"] = sizes.to(cameras["sizes"])
     meta = copy.deepcopy(scene.meta)
@@ -75,7 +75,7 @@ def sized(scene: PackedScene, intrinsics: Tensor, sizes: Tensor, picks: Tensor, 
 
 def picked(scene: PackedScene) -> tuple[Tensor, Tensor, Tensor]:
     """Six cameras, fewer if it has fewer: their indices, intrinsics ``[N, 4]`` and sizes ``[N, 2]`` in pixels."""
-    cameras = stored_cameras(scene)
+    cameras = arrays_of_views(scene_of(scene).views)
     picks = torch.linspace(0, len(cameras["poses"]) - 1, CAMERAS).round().long().unique()
     return picks, cameras["intrinsics"][picks].double(), cameras["sizes"][picks].double()
 
@@ -115,7 +115,7 @@ def write_changed(out: Path, scene: Path, small: PackedScene) -> PackedScene:
 def truths(scene: PackedScene, only: slice = slice(None)) -> list[dict[str, NDArray[np.float32]]]:
     """``rgb`` and ``base_rgb`` of each camera, or of some of them, by Python."""
     model = model_of(scene_of(scene))
-    cameras = {name: value[only] for name, value in stored_cameras(scene).items()}
+    cameras = {name: value[only] for name, value in arrays_of_views(scene_of(scene).views).items()}
     images = []
     for pose, lens, size in zip(*(cameras[name] for name in ("poses", "intrinsics", "sizes")), strict=True):
         fx, fy, cx, cy = lens.float().reshape(4, 1, 1)
@@ -154,7 +154,7 @@ def compared(scene: Path, side: int = SIDE, *, half: bool = False) -> dict[str, 
         small = write_changed(packed, scene, scaled(read_scene(scene), side))
         write_page(html, scene_of(small), packed.read_bytes(), title=scene.stem)
         images = truths(small)
-        width, height = (int(length) for length in stored_cameras(small)["sizes"][0])
+        width, height = (int(length) for length in arrays_of_views(scene_of(small).views)["sizes"][0])
         row: dict[str, Any] = {"scene": scene.name, "bytes": scene.stat().st_size, "size": f"{width}x{height}"}
         row |= {"primitives": len(small.field["means"]), "head": bool(small.head)}
         with Browser(chromium, width, height, WEBGPU) as page:
@@ -210,7 +210,7 @@ def half_images(packed: Path) -> tuple[str, list[NDArray[np.float64]]] | None:
         adapter = json.loads(found.stdout.splitlines()[-1])
         if adapter is None:
             return None
-        sizes = stored_cameras(read_scene(packed))["sizes"].tolist()
+        sizes = arrays_of_views(scene_of(read_scene(packed)).views)["sizes"].tolist()
         files = [np.fromfile(f"{copy}.{i}", np.uint8) for i in range(len(sizes))]
         pixels = [file.reshape(height, width, 4) for file, (width, height) in zip(files, sizes, strict=True)]
         return adapter, [each[..., :3] / 255 for each in pixels]

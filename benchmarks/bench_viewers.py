@@ -33,8 +33,8 @@ from bench_page import SECONDS, SIDE, bundled, has_packages, psnr, scaled, truth
 from numpy.typing import NDArray
 
 from harness.chromium import Browser, find_chromium, wait_for
-from sundae_ns.api.packing import scene_of, stored_cameras
-from sundae_ns.api.saving import save_for_viewers
+from sundae_ns.api.files import save_for_viewers
+from sundae_ns.api.packing import arrays_of_views, scene_of
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.storage.pack import PackedScene, read_scene
 
@@ -96,7 +96,7 @@ def base_colors(scene: PackedScene) -> PackedScene:
 def central(scene: PackedScene) -> PackedScene:
     """The scene with the primitives whose centres lie in the images of all cameras."""
     keep = torch.ones(len(scene.field["means"]), dtype=torch.bool)
-    cameras = stored_cameras(scene)
+    cameras = arrays_of_views(scene_of(scene).views)
     for pose, lens, size in zip(*(cameras[name].float() for name in ("poses", "intrinsics", "sizes")), strict=True):
         x, y, z = ((scene.field["means"] - pose[:, 3]) @ pose[:, :3]).T
         u, v = lens[0] * x / -z + lens[2], lens[3] - lens[1] * y / -z
@@ -114,7 +114,7 @@ class Viewers:
 
     def __init__(self, page: Browser, address: str, scene: PackedScene, file: str) -> None:
         self._page, self._address, self._file = page, address, file
-        cameras = stored_cameras(scene)
+        cameras = arrays_of_views(scene_of(scene).views)
         names = ("fx", "fy", "cx", "cy", "width", "height")
         self._sizes = cameras["sizes"].tolist()
         self._cameras = [
@@ -146,7 +146,7 @@ def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
     chromium = find_chromium()
     if chromium is None or not has_packages():
         sys.exit("no Chromium or no viewers here: apt-get install chromium, then make browser")
-    width, height = (int(side) for side in stored_cameras(scene)["sizes"][0])
+    width, height = (int(side) for side in arrays_of_views(scene_of(scene).views)["sizes"][0])
     with TemporaryDirectory() as folder:
         site = Path(folder)
         (site / "index.html").write_text(PAGE)

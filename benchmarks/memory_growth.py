@@ -32,7 +32,7 @@ import torch
 from ray_tracing import write_still_life
 
 import sundae_ns as sn
-from sundae_ns.api.saving import SUFFIXES
+from sundae_ns.api.files import SUFFIXES
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.method_configs import sundae_tiny

@@ -24,15 +24,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sundae_ns.api.cleaning import crop as crop
     from sundae_ns.api.cleaning import remove_floaters as remove_floaters
-    from sundae_ns.api.measuring import Quality as Quality
-    from sundae_ns.api.measuring import measure as measure
-    from sundae_ns.api.notebook import show as show
-    from sundae_ns.api.opening import load as load
+    from sundae_ns.api.files import load as load
+    from sundae_ns.api.files import save as save
+    from sundae_ns.api.page import show as show
     from sundae_ns.api.pruning import prune as prune
-    from sundae_ns.api.rendering import Rendering as Rendering
-    from sundae_ns.api.rendering import render as render
-    from sundae_ns.api.saving import save as save
+    from sundae_ns.api.scene import Quality as Quality
+    from sundae_ns.api.scene import Rendering as Rendering
     from sundae_ns.api.scene import Scene as Scene
+    from sundae_ns.api.scene import measure as measure
+    from sundae_ns.api.scene import render as render
     from sundae_ns.api.views import views_of as views_of
     from sundae_ns.api.virtual import virtual_views as virtual_views
     from sundae_ns.errors import SundaeError as SundaeError
@@ -44,20 +44,20 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "PruneRule": "sundae_ns.pruning",
-    "Quality": "sundae_ns.api.measuring",
-    "Rendering": "sundae_ns.api.rendering",
+    "Quality": "sundae_ns.api.scene",
+    "Rendering": "sundae_ns.api.scene",
     "Scene": "sundae_ns.api.scene",
     "SundaeError": "sundae_ns.errors",
     "View": "sundae_ns.rendering.views",
     "crop": "sundae_ns.api.cleaning",
     "distill": "sundae_ns.scenes.distill",
-    "load": "sundae_ns.api.opening",
-    "measure": "sundae_ns.api.measuring",
+    "load": "sundae_ns.api.files",
+    "measure": "sundae_ns.api.scene",
     "prune": "sundae_ns.api.pruning",
     "remove_floaters": "sundae_ns.api.cleaning",
-    "render": "sundae_ns.api.rendering",
-    "save": "sundae_ns.api.saving",
-    "show": "sundae_ns.api.notebook",
+    "render": "sundae_ns.api.scene",
+    "save": "sundae_ns.api.files",
+    "show": "sundae_ns.api.page",
     "views_of": "sundae_ns.api.views",
     "virtual_views": "sundae_ns.api.virtual",
 }

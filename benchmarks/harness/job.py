@@ -28,7 +28,7 @@ from nerfstudio.utils import profiler, writer
 from harness.alone import watched_gpu
 from harness.plan import Job, Words, done_file, job_folder
 from harness.script import run_script
-from sundae_ns.api.opening import load
+from sundae_ns.api.files import load
 from sundae_ns.errors import BackendError, CheckpointError, PackError, SundaeError
 from sundae_ns.evaluation import Lpips, Measured, lpips_weights_available
 from sundae_ns.model import SundaeModelConfig

@@ -1,42 +1,26 @@
-"""Cameras of a film: a closed, smooth path through the views of a scene, or around a scene without any."""
+"""The cameras of a film: a closed, smooth path among the views of a scene, or a circle around a scene without any."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from itertools import permutations
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 from scipy.interpolate import CubicSpline
 
-from sundae_ns.api.rendering import render
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.start import unit
-from sundae_ns.api.virtual import FOV, loop_around
+from sundae_ns.api.views import unit
+from sundae_ns.api.virtual import FOV, middle_and_reach, virtual_views
 from sundae_ns.errors import ConfigError
 from sundae_ns.rendering.views import View, poses_looking_at
 
-KEYS = 8
-"""Most views that the path leads through."""
 MOST_FRAMES = 36_000
 """Frames of 25 minutes."""
-LONGEST = 1280
-"""Longest side of the images, pixels."""
-_SIZE = (1280, 720)
-"""Width and height of images of a scene without views, pixels."""
-_ROUNDS = 10
-"""Rounds in which the chosen views move to the middle of those nearest to them."""
-_LEAST = 3
-"""Fewest views that make a path."""
 _STEEP = 0.95
-"""A view that looks up or down by more than this cosine has no upright image, and is passed over."""
-_OPPOSITE = -0.5
-"""Cosine below which two directions are so far apart that the spline between them would flip."""
-_SAMPLES = 64
-"""Points of the spline between two views, by which its length is measured."""
-_ASKED, _DEPTH_SIDE = 16, 48
-"""Most images that tell how far away things are, and their longest side, pixels."""
+"""Largest sine of the angle by which a camera looks up or down; steeper ones have no upright image."""
 
 Array = NDArray[np.float64]
 
@@ -44,9 +28,9 @@ Array = NDArray[np.float64]
 def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float = 24.0) -> list[View]:
     """Cameras of a film of a scene, along a closed and smooth path at an even speed; upright, without roll.
 
-    The path leads through some of the views that are stored with the scene, in an order that makes it short, and looks
-    where they look; it begins with the start view, else with the first. A scene without views is seen from all around,
-    or to and fro before it if it has a back side. The speed is that of motion and turning together.
+    The path leads through up to eight of the views that are stored with the scene, from the start view, else the first,
+    on the shortest way, and looks where they look. A scene with fewer than three views is seen from a circle around its
+    middle. The speed is that of motion and turning together.
 
     Args:
         scene: its up axis, else the mean of its views', else z, is upwards in the images.
@@ -54,7 +38,7 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
         frames_per_second: number of cameras a second.
 
     Returns:
-        One camera a frame, with the field of view and the shape of the first view's images.
+        One camera a frame, with the lens and the shape of the first view's images, at most 1,280 pixels a side.
 
     Raises:
         ConfigError: there is not even one frame, or there are more than :data:`MOST_FRAMES`.
@@ -68,38 +52,20 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
         )
     up = _up_of(scene)
     views = [view for view in (scene.start, *scene.views) if view is not None]
-    lens = views[0] if views else View.from_fov(torch.eye(4), FOV, *_SIZE)
-    views = [view for view in views if abs(float(_ahead(view) @ up)) < _STEEP]
-    chosen, distance = [], 1.0
-    if len(views) >= _LEAST:
-        places, ahead = (np.stack([part(view) for view in views]) for part in (_place, _ahead))
-        distance = _distance(scene, views)
-        chosen = _tour(np.hstack([places / distance, ahead]), KEYS)
-    if len(chosen) >= _LEAST:
-        places, ahead = places[chosen], ahead[chosen]
-    else:
-        loop = loop_around(scene, torch.from_numpy(up))
-        places, arms = loop.eyes.numpy(), (loop.target - loop.eyes).numpy()
-        distance = float(np.linalg.norm(arms[0]))
-        ahead = arms / np.linalg.norm(arms, axis=1, keepdims=True)
-    places, ahead = _even(*_with_turns(places, ahead, up), up, distance, count)
-    eyes, targets = torch.from_numpy(places), torch.from_numpy(places + ahead)
-    poses = poses_looking_at(eyes, targets, torch.from_numpy(up))
-    lens = lens.zoomed(min(LONGEST / max(lens.width, lens.height), 1.0))
+    lens = views[0] if views else View.from_fov(torch.eye(4), FOV, 1280, 720)
+    poses = np.array([view.pose.double().tolist() for view in views]).reshape(-1, 3, 4)
+    poses = poses[np.abs(poses[:, :, 2] @ up) < _STEEP]
+    poses = poses[np.sort(np.unique(poses.round(5), axis=0, return_index=True)[1])]
+    eyes, ahead = (poses[:, :, 3], -poses[:, :, 2]) if len(poses) >= 3 else _circle(scene, up)
+    # One unit of motion counts as much as a turn by a radian.
+    scale = max(float(np.median(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1))), 1e-9)
+    keys = _tour(np.hstack([eyes / scale, ahead]))
+    path = _even(keys, up, count)
+    centers = torch.from_numpy(path[:, :3] * scale)
+    found = poses_looking_at(centers, centers + torch.from_numpy(path[:, 3:]), torch.from_numpy(up))
+    lens = lens.zoomed(min(1280 / max(lens.width, lens.height), 1.0))
     intrinsics = [float(lens.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    return [View.from_pose(pose, intrinsics, lens.width, lens.height) for pose in poses]
-
-
-def _place(view: View) -> Array:
-    found: Array = view.center.double().cpu().numpy()
-    return found
-
-
-def _ahead(view: View) -> Array:
-    """The direction of view, of unit length ``[3]``."""
-    back = view.pose[:, 2].double().cpu().numpy()
-    found: Array = -back / np.linalg.norm(back)
-    return found
+    return [View.from_pose(pose, intrinsics, lens.width, lens.height) for pose in found]
 
 
 def _up_of(scene: Scene) -> Array:
@@ -110,97 +76,57 @@ def _up_of(scene: Scene) -> Array:
     return np.array(up or (0.0, 0.0, 1.0))
 
 
-def _distance(scene: Scene, views: Sequence[View]) -> float:
-    """The median distance of what views see; the unit in which the path measures motion against turning."""
-    found = []
-    for view in views[:: -(-len(views) // _ASKED)]:
-        depth = render(scene, view.zoomed(_DEPTH_SIDE / max(view.width, view.height)), head=False).depth
-        found.append(float(depth[depth > 0].median()) if bool((depth > 0).any()) else math.nan)
-    if np.isnan(found).all():  # they see nothing, or only what is nearer than the near plane
-        centers = np.stack([_place(view) for view in views])
-        found = np.linalg.norm(centers - centers.mean(axis=0), axis=1).tolist()
-    return max(float(np.nanmedian(found)), 1e-9)
+def _circle(scene: Scene, up: Array) -> tuple[Array, Array]:
+    """Eyes on a circle, at the median distance and height of the virtual views, and directions to its middle."""
+    middle, reach = middle_and_reach(scene)
+    center = middle.numpy()
+    arms = np.stack([view.center.double().numpy() for view in virtual_views(scene, 48)]) - center
+    height = np.median(arms @ up).clip(-0.5 * reach, 0.5 * reach)
+    side = np.cross(up, np.roll(up, 1) + [1e-3, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    angles = np.arange(8) * (math.pi / 4)
+    radius = np.median(np.linalg.norm(arms, axis=1))
+    arms = radius * (np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * np.cross(up, side)) + height * up
+    return center + arms, -arms / np.linalg.norm(arms, axis=1, keepdims=True)
 
 
-def _tour(points: Array, most: int) -> list[int]:
-    """Indices of points ``[N, C]`` along a short closed way: the first one, and at most ``most`` in all.
-
-    Those are spread over all points: each is the middle one of the points that are nearest to it.
-    """
-    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+def _tour(points: Array, most: int = 8) -> Array:
+    """The first of points ``[N, C]`` and at most ``most - 1`` typical others, in the order of the shortest way back."""
     chosen = [0]
-    while len(chosen) < most and (far := apart[chosen].min(axis=0)).max() > 1e-6:
-        chosen.append(int(far.argmax()))
-    for _ in range(_ROUNDS):
-        nearest = apart[chosen].argmin(axis=0)
-        for k in range(1, len(chosen)):
-            members = np.flatnonzero(nearest == k)
-            if len(members):
-                chosen[k] = int(members[apart[np.ix_(members, members)].sum(axis=0).argmin()])
-    sizes = np.bincount(apart[chosen].argmin(axis=0), minlength=len(chosen))
-    typical = sizes >= len(points) / len(chosen) / 3
-    chosen = [index for k, index in enumerate(chosen) if k == 0 or typical[k]]
-    return [chosen[i] for i in _short_way(apart[np.ix_(chosen, chosen)])]
+    if len(points) > most:
+        centers, _ = kmeans2(points, most, minit="++", rng=np.random.default_rng(0))
+        centers = np.delete(centers, np.linalg.norm(centers - points[0], axis=1).argmin(), axis=0)
+        chosen += [int(np.linalg.norm(points - center, axis=1).argmin()) for center in centers]
+    else:
+        chosen += range(1, len(points))
+    keys = points[sorted(set(chosen))]
+    apart = np.linalg.norm(keys[:, None] - keys, axis=2)
+    orders = np.array([(0, *order, 0) for order in permutations(range(1, len(keys)))])
+    return keys[orders[apart[orders[:, :-1], orders[:, 1:]].sum(axis=1).argmin()][:-1]]
 
 
-def _short_way(apart: Array) -> list[int]:
-    """An order of K points with distances ``[K, K]`` whose closed way no exchange of two parts makes shorter."""
-    count = len(apart)
-    way = [0]
-    while len(way) < count:  # the nearest one next
-        left = [i for i in range(count) if i not in way]
-        way.append(min(left, key=lambda i: apart[way[-1], i]))
-    better = True
-    while better:
-        better = False
-        for i in range(1, count - 1):
-            for j in range(i + 1, count):
-                a, b, c, d = way[i - 1], way[i], way[j], way[(j + 1) % count]
-                if apart[a, c] + apart[b, d] < apart[a, b] + apart[c, d] - 1e-12:
-                    way[i : j + 1] = way[i : j + 1][::-1]
-                    better = True
-    return way
-
-
-def _with_turns(places: Array, ahead: Array, up: Array) -> tuple[Array, Array]:
-    """The knots of a closed way ``[K, 3]``, with one more, to the side, where two look in opposite directions."""
-    found = []
-    for i, here in enumerate(ahead):
-        found.append((places[i], here))
-        there, place = ahead[(i + 1) % len(ahead)], places[(i + 1) % len(ahead)]
-        if here @ there < _OPPOSITE:
-            side = np.cross(up, here - there)
-            found.append(((places[i] + place) / 2, side / np.linalg.norm(side)))
-    knots = np.array(found)
-    return knots[:, 0], knots[:, 1]
-
-
-def _even(places: Array, ahead: Array, up: Array, distance: float, count: int) -> tuple[Array, Array]:
-    """Places and directions ``[count, 3]`` at an even speed on a smooth closed way through knots ``[K, 3]``."""
-    knots = np.hstack([places / distance, ahead])
-    knots = np.vstack([knots, knots[:1]])
+def _even(keys: Array, up: Array, count: int) -> Array:
+    """Places and directions ``[count, 6]`` at an even speed on a smooth closed way through keys ``[K, 6]``."""
+    knots = []
+    for here, there in zip(keys, np.roll(keys, -1, axis=0), strict=True):
+        knots.append(here)
+        if here[3:] @ there[3:] < -0.5:  # between opposite directions a spline would flip: look to the side
+            side = np.cross(up, here[3:] - there[3:])
+            knots.append(np.hstack([(here[:3] + there[:3]) / 2, side / np.linalg.norm(side)]))
+    ends = np.array([*knots, knots[0]])
     # Parameters of square roots of distances keep the spline from swinging out (centripetal).
-    steps = np.sqrt(np.linalg.norm(np.diff(knots, axis=0), axis=1)).clip(1e-3)
-    times = np.concatenate([[0.0], steps.cumsum()])
-    spline = CubicSpline(times, knots, bc_type="periodic")
+    times = np.hstack([0.0, np.sqrt(np.linalg.norm(np.diff(ends, axis=0), axis=1)).clip(1e-3).cumsum()])
+    spline = CubicSpline(times, ends, bc_type="periodic")
 
     def at(moments: Array) -> Array:
-        found: Array = spline(moments)
-        found[:, 3:] = _level(found[:, 3:], up)
-        return found
+        path: Array = spline(moments)
+        ahead = path[:, 3:] / np.linalg.norm(path[:, 3:], axis=1, keepdims=True).clip(1e-9)
+        rise = (ahead @ up)[:, None]
+        flat = ahead - rise * up
+        rise = rise.clip(-_STEEP, _STEEP)
+        flat *= np.sqrt(1 - rise**2) / np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
+        return np.hstack([path[:, :3], rise * up + flat])
 
-    fine = np.linspace(0.0, times[-1], _SAMPLES * len(steps) + 1)
-    lengths = np.concatenate([[0.0], np.linalg.norm(np.diff(at(fine), axis=0), axis=1).cumsum()])
-    frames = np.arange(count) / count * lengths[-1]
-    found = at(np.interp(frames, lengths, fine))
-    return found[:, :3] * distance, found[:, 3:]
-
-
-def _level(ahead: Array, up: Array) -> Array:
-    """Directions ``[..., 3]`` of unit length, those too steep for an upright image brought down."""
-    ahead = ahead / np.linalg.norm(ahead, axis=-1, keepdims=True).clip(1e-9)
-    rise = (ahead @ up)[..., None]
-    flat = ahead - rise * up
-    rise = rise.clip(-_STEEP, _STEEP)
-    level: Array = rise * up + np.sqrt(1 - rise**2) * flat / np.linalg.norm(flat, axis=-1, keepdims=True).clip(1e-9)
-    return level
+    fine = np.linspace(0.0, times[-1], 64 * len(knots))
+    lengths = np.hstack([0.0, np.linalg.norm(np.diff(at(fine), axis=0), axis=1).cumsum()])
+    return at(np.interp(np.arange(count) / count * lengths[-1], lengths, fine))

@@ -10,15 +10,16 @@ import torch
 from torch import Tensor
 
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.sensitivity import sensitivity_of
-from sundae_ns.api.start import Direction, unit
-from sundae_ns.api.views import is_frame, is_number, view_in_front
+from sundae_ns.api.views import Direction, is_frame, is_number, unit
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.gaussians import FEATURES, mend
 from sundae_ns.gaussians.field import Field
+from sundae_ns.rasterization.harmonics import harmonic_basis
+from sundae_ns.rendering.render import render_view
+from sundae_ns.rendering.source import LocalField
 from sundae_ns.rendering.views import View
-from sundae_ns.storage.pack import PackedScene
+from sundae_ns.storage.pack import PackedScene, Sensitivity, fit_scene, pack_bytes
 from sundae_ns.storage.pack.container import FORMAT, fault
 
 _MODEL: dict[str, Any] = FORMAT["model"]
@@ -93,6 +94,11 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
     )
 
 
+def packed_bytes(scene: Scene) -> bytes:
+    """The packed file of a scene, with default settings."""
+    return pack_bytes(*fit_scene(contents_of(scene)))[0]
+
+
 def stated_start(scene: Scene) -> dict[str, Any]:
     """Entries ``up`` and ``start`` of a packed file's header; without those that the scene does not know.
 
@@ -136,13 +142,6 @@ def start_of(stated: Mapping[str, Any]) -> tuple[Direction | None, View | None]:
     return unit(good["up"]) if "up" in good else None, view
 
 
-def stored_cameras(packed: PackedScene) -> dict[str, Tensor]:
-    """The stored cameras, as arrays; one in front of the scene if there are none."""
-    if packed.cameras is not None and len(packed.cameras["poses"]):
-        return packed.cameras
-    return arrays_of_views([view_in_front(scene_of(packed))])
-
-
 def views_of_arrays(cameras: Mapping[str, Tensor] | None) -> tuple[View, ...]:
     """Cameras of a packed file as views, on the CPU; none for None."""
     if cameras is None:
@@ -177,3 +176,63 @@ def _head_of(packed: PackedScene, stated: Mapping[str, Any] | None) -> Compensat
 def refusal(reason: str) -> PackError:
     """The error of a scene that states something impossible."""
     return PackError(f"the packed scene states {reason}; update this program, or pack it again")
+
+
+def sensitivity_of(scene: Scene, views: Sequence[View]) -> Sensitivity:
+    """Effect of quantisation errors on images, which decides where a pack spends its bits.
+
+    A camera sees a primitive from few directions, so some combinations of harmonics hardly show. Weights of the head
+    differ more: those of its finest level act on 64 times as many pixels as those of its coarsest. Derivatives of all
+    pixels are too many. With random signs r of the pixels, the mean square of the derivative of sum(r * image) is the
+    sum of the squared derivatives (Hutchinson, 1990). Views and signs are fixed, so that a run packs alike each time.
+
+    Args:
+        scene: on the CPU.
+        views: at least one.
+    """
+    rows = {}
+    degree = scene.field.sh_degree if scene.field.encoding == "harmonics" else 0
+    if degree > 0:
+        rows["features_rest"] = torch.kron(_of_harmonics(scene.field["means"].detach(), views, degree), torch.eye(3))
+    head: dict[str, Tensor] = {}
+    if scene.head is not None:
+        rows[FEATURES], head = _of_head(scene, views)
+    return Sensitivity(rows, head)
+
+
+def _of_harmonics(means: Tensor, views: Sequence[View], degree: int) -> Tensor:
+    """Sum of the products of basis functions of degrees 1 and up, over views and the primitives they see ``[K, K]``."""
+    chosen = means[:: -(-len(means) // (1 << 14))]
+    total = torch.zeros((degree + 1) ** 2 - 1, (degree + 1) ** 2 - 1, dtype=torch.float64)
+    for view in views:
+        x, y, z = (chosen @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).T
+        across, down = x / z * view.K[0, 0] + view.K[0, 2], y / z * view.K[1, 1] + view.K[1, 2]
+        seen = chosen[(z > 0) & (across >= 0) & (across < view.width) & (down >= 0) & (down < view.height)]
+        basis = harmonic_basis(degree, torch.nn.functional.normalize(seen - view.center, dim=1))[:, 1:].double()
+        total += basis.T @ basis
+    # A little of the identity: a form without any view is singular.
+    return total + 1e-6 * (1 + total.trace()) * torch.eye(len(total), dtype=torch.float64)
+
+
+@torch.enable_grad()  # type: ignore[untyped-decorator]
+def _of_head(scene: Scene, views: Sequence[View]) -> tuple[Tensor, dict[str, Tensor]]:
+    """Mean products of the derivatives by pairs of features ``[F, F]``, and mean squares of those by weights."""
+    assert scene.head is not None
+    features = scene.field[FEATURES].detach().requires_grad_()
+    source = LocalField(scene.field.replaced({FEATURES: features}))
+    settings = replace(scene.settings(), training=True)
+    weights = {name: value.requires_grad_() for name, value in scene.head.named_parameters() if value.ndim > 1}
+    form = torch.zeros(features.shape[1], features.shape[1], dtype=torch.float64)
+    squares = {name: torch.zeros(value.shape[:2], dtype=torch.float64) for name, value in weights.items()}
+    signs = torch.Generator().manual_seed(0)
+    for i in torch.linspace(0, len(views) - 1, min(8, len(views))).round().int().tolist():
+        view = views[i]
+        if view.width * view.height > 1 << 17:
+            view = view.zoomed((1 << 17 / (view.width * view.height)) ** 0.5)
+        image = render_view(source, view, scene.background, settings, depth=False)[0]["rgb"]
+        random = torch.randint(0, 2, image.shape, generator=signs) * 2.0 - 1
+        of_features, *grads = torch.autograd.grad((image * random).sum(), [features, *weights.values()])
+        form += of_features.double().T @ of_features.double()
+        for name, grad in zip(weights, grads, strict=True):
+            squares[name] += grad.double().square().flatten(2).mean(dim=2)
+    return form, squares

@@ -1,23 +1,29 @@
-"""A scene: a field, its head, and what is needed to render both."""
+"""A scene (field, head, and what is needed to render both), its images, and their quality."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from statistics import fmean
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
+from PIL import Image
 from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.errors import DataError
+from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.field import Field
+from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.rasterization import BackendName, select_backend
-from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, RenderSettings
+from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, RenderSettings, render_view
+from sundae_ns.rendering.source import LocalField
 from sundae_ns.rendering.views import View
 
+Camera = TypeVar("Camera")
 Background = Literal["random", "black", "white"]
 """Names of backgrounds; ``random`` is that of a run trained over random ones, and shows nerfstudio's grey."""
 
@@ -121,3 +127,125 @@ class Scene:
     def __repr__(self) -> str:
         head = "no head" if self.head is None else f"{self.head.config.size} head"
         return f"Scene({self.num_primitives:,} primitives, SH degree {self.field.sh_degree}, {head}, {self.device})"
+
+
+class Rendering(NamedTuple):
+    """Images of one view, float32 on the device of the scene."""
+
+    rgb: Tensor
+    """The image, corrected by the head if there is one, in [0, 1] ``[H, W, 3]``."""
+    base_rgb: Tensor
+    """The image of the primitives alone, in [0, 1] ``[H, W, 3]``."""
+    depth: Tensor
+    """Expected distance along the viewing axis, world units; 0 where nothing is seen ``[H, W, 1]``."""
+    accumulation: Tensor
+    """Opacity of the image, in [0, 1] ``[H, W, 1]``."""
+
+
+def image_of(rgb: Tensor) -> Image.Image:
+    """Colours in [0, 1] ``[H, W, 3]``, any device, as an image of 8 bits a channel."""
+    return Image.fromarray((rgb * 255).round().byte().cpu().numpy())
+
+
+@torch.no_grad()
+def render(scene: Scene, view: View, *, head: bool = True, backend: BackendName = "auto") -> Rendering:
+    """Render one view of a scene, on the device of the scene.
+
+    Args:
+        scene: from :func:`sundae_ns.load`, or made by hand.
+        view: the camera, on any device.
+        head: whether the head corrects the image; without one, ``rgb`` is ``base_rgb``.
+        backend: the rasteriser.
+
+    Raises:
+        BackendError: the rasteriser cannot run on the device of the scene.
+        MemoryExhaustedError: the memory is full, or, on a CPU, the view has more primitives than any real scene.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))
+    >>> view = sn.View.look_at((2.0, 2.0, 2.0), (0.5, 0.5, 0.5), width=64, height=48)
+    >>> sn.render(scene, view).rgb.shape
+    torch.Size([48, 64, 3])
+    """
+    with naming_full_memory(lambda: scene.num_primitives):
+        settings = scene.settings(backend, head=head)
+        images, _ = render_view(LocalField(scene.field), view.to(scene.device), scene.background, settings)
+    return Rendering(*(images[name] for name in Rendering._fields))
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Quality of images, a value for each camera."""
+
+    psnrs: tuple[float, ...]
+    """Peak signal-to-noise ratio over all pixels and channels, dB."""
+    ssims: tuple[float, ...]
+    """Structural similarity, window of 11 x 11 pixels without padding; NaN for smaller images."""
+
+    @property
+    def psnr(self) -> float:
+        """Mean PSNR over the cameras, dB."""
+        return fmean(self.psnrs)
+
+    @property
+    def ssim(self) -> float:
+        """Mean SSIM over the cameras."""
+        return fmean(self.ssims)
+
+
+@torch.no_grad()
+def evaluate(render: Callable[[Camera], Tensor], cameras: Iterable[Camera], targets: Iterable[Tensor]) -> Quality:
+    """Compare rendered images with true ones.
+
+    Args:
+        render: gives the image of a camera ``[H, W, 3]``.
+        cameras: at least one.
+        targets: the true image in [0, 1] ``[H, W, 3]`` of each camera, on any device.
+    """
+    values = []
+    for camera, target in zip(cameras, targets, strict=True):
+        image = render(camera)
+        values.append([float(metric(image, target.to(image))) for metric in (psnr, ssim)])
+    psnrs, ssims = zip(*values, strict=True)
+    return Quality(psnrs, ssims)
+
+
+@torch.no_grad()
+def measure(
+    scene: Scene,
+    reference: Scene | Sequence[Tensor],
+    views: Sequence[View] | None = None,
+    *,
+    head: bool = True,
+    backend: BackendName = "auto",
+) -> Quality:
+    """Compare the images of a scene with a reference.
+
+    Args:
+        scene: to measure.
+        reference: a scene, whose own images count as true, or an image in [0, 1] ``[H, W, 3]`` for each view. Both
+            scenes are rendered over the background of the reference.
+        views: the cameras; by default those stored with the reference, or with the scene.
+        head: whether the heads of both scenes correct their images.
+        backend: the rasteriser.
+
+    Raises:
+        DataError: there are no views, or not one image of its size for each view.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
+    >>> views = sn.virtual_views(scene, 2, size=32)
+    >>> sn.measure(sn.prune(scene, keep=0.5, views=views), scene, views).psnr > 10
+    True
+    """
+    stored = reference.views if isinstance(reference, Scene) else ()
+    views = tuple(views) if views is not None else stored or scene.views
+    if not views:
+        raise DataError("there is no view to measure in; give views, such as sundae_ns.virtual_views(scene)")
+    if not isinstance(reference, Scene) and len(reference) != len(views):
+        raise DataError(f"{len(reference)} images do not fit {len(views)} views; give one image for each view")
+    if isinstance(reference, Scene):
+        scene = dataclasses.replace(scene, background_color=reference.background_color)
+    options: dict[str, Any] = {"head": head, "backend": backend}
+    targets = (render(reference, view, **options).rgb for view in views) if isinstance(reference, Scene) else reference
+    return evaluate(lambda view: render(scene, view, **options).rgb, views, targets)

@@ -1,7 +1,8 @@
-"""Cameras of a file, and the one in front of a scene."""
+"""Cameras of a scene: those of a file, the one in front of it, its start view, and a path for a film."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,15 +16,11 @@ from sundae_ns.data.camera_axes import OPENGL_TO_OPENCV
 from sundae_ns.data.capture import finite, matrix, read_json, rigid, side
 from sundae_ns.data.colmap import images_of
 from sundae_ns.data.lenses import kind_of_frame, size_of_first_image, with_focal_lengths
-from sundae_ns.errors import DataError
+from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.rendering import View
 
-_INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
-_FOV = 60.0
-"""Vertical field of view of a keyframe that states none, degrees."""
-_FRONT_FOV = math.degrees(2 * math.atan(240 / 500))
-"""Field of view in front of a scene, degrees: that of the web page."""
+Direction = tuple[float, float, float]
 
 
 class CameraFile(NamedTuple):
@@ -42,7 +39,9 @@ def view_in_front(scene: Scene) -> View:
     up = torch.tensor(scene.up or (0.0, 0.0, 1.0))
     side = torch.tensor([1.0, 0.0, 0.0] if abs(float(up[0])) < 0.9 else [0.0, 1.0, 0.0])
     back = torch.nn.functional.normalize(torch.linalg.cross(side, up), dim=0)
-    return View.look_at(center + away * back, center, up, fov=_FRONT_FOV)
+    return View.look_at(
+        center + away * back, center, up, fov=2 * math.degrees(math.atan(240 / 500))
+    )  # that of the web page
 
 
 def views_of(path: Path | str, scene: Scene | None = None) -> list[View]:
@@ -89,7 +88,8 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
         stated = {**content, **entry} if isinstance(entry, dict) else {}
         kind_of_frame(stated, where)
         pose = rigid(matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where), where)
-        intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in _INTRINSICS]
+        names = ("fl_x", "fl_y", "cx", "cy")
+        intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in names]
         size = [side(stated.get(name), name, where) for name in ("w", "h")]
         views.append(_moved(pose, transform, scale, intrinsics, *size))
     return CameraFile(views, None)
@@ -147,7 +147,7 @@ def _camera_path(content: dict[str, Any], where: str) -> list[View]:
         flat = entry.get("camera_to_world") if isinstance(entry, dict) else None
         rows = [flat[k : k + 4] for k in range(0, 16, 4)] if isinstance(flat, list) and len(flat) == 16 else flat
         pose = matrix(rows, (4,), "camera_to_world", place)
-        fov = finite(entry.get("fov", _FOV), "fov", place, positive=True)
+        fov = finite(entry.get("fov", 60.0), "fov", place, positive=True)
         if not fov < 180:
             raise DataError(f"{place}: fov is {fov:g}; it must be below 180 degrees")
         views.append(View.from_fov(torch.from_numpy(pose), fov, width, height))
@@ -170,3 +170,41 @@ def is_number(value: Any) -> bool:
         return type(value) in (int, float) and math.isfinite(value)
     except OverflowError:
         return False
+
+
+def unit(direction: Sequence[float]) -> Direction:
+    """A direction scaled to unit length; ``ConfigError`` for one without a direction."""
+    if len(direction) != 3 or not all(map(is_number, direction)):
+        raise ConfigError("the up axis is not three finite numbers; give 0 0 1 for z")
+    length = math.hypot(*direction)
+    if not 0 < length < math.inf:
+        raise ConfigError("the up axis has no direction; give 0 0 1 for z")
+    x, y, z = (float(value) / length for value in direction)
+    return x, y, z
+
+
+def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None) -> Scene:
+    """The scene with another start view or up axis, as a user names them.
+
+    Args:
+        scene: whose stored views an index counts.
+        start_view: index of a stored view, or a file whose first camera it is (:func:`sundae_ns.views_of`); None keeps
+            that of the scene.
+        up: direction ``[3]`` of any length; None keeps that of the scene.
+
+    Raises:
+        ConfigError: there is no such view, or the direction is zero.
+        DataError: the file holds no cameras.
+    """
+    if up is not None:
+        scene = dataclasses.replace(scene, up=unit(up))
+    if start_view is None:
+        return scene
+    if not start_view.lstrip("-").isdigit():
+        return dataclasses.replace(scene, start=read_cameras(Path(start_view), scene).views[0])
+    count = len(scene.views)
+    if not count:
+        raise ConfigError("the scene has no stored cameras; give --start-view a camera file")
+    if not 0 <= int(start_view) < count:
+        raise ConfigError(f"there is no camera {start_view}; give --start-view 0 to {count - 1}, or a camera file")
+    return dataclasses.replace(scene, start=scene.views[int(start_view)])

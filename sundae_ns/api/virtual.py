@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from sundae_ns.api.rendering import render
 from sundae_ns.api.scene import Scene
 from sundae_ns.data.camera_axes import world_to_camera
 from sundae_ns.errors import ConfigError, DataError
@@ -22,38 +21,21 @@ from sundae_ns.rendering import View
 from sundae_ns.rendering.render import pass_options
 from sundae_ns.rendering.views import poses_looking_at
 
-NEAREST, FARTHEST = 0.3, 2.0
-"""Distances of the eyes from the middle of the scene, as multiples of the median distance of its primitives."""
 FOV = 40.0
-T = TypeVar("T")
 VIEWS = {"cpu": 128, "cuda": 256}
 """Default number of cameras by the device: a GPU has the time to look closer."""
 SIDE = 512
 """Default width and height of their images, pixels."""
-FIRST, ROUNDS, MOVED = 4, 4, 3
-"""Cameras that are drawn for each one that is kept; then rounds, and the moved ones of a round."""
-STEP = 0.3
-"""How far an eye moves in a round, as a share of its distance from the middle."""
-RESAMPLED = 3
-"""Rounds before which the even half is drawn anew, in proportion to exp(-coarseness)."""
-EVENNESS = 4.0
-"""Weight of the deviation of the angles beside their mean, for the half of the eyes that see all parts alike."""
-_LOOP_VIEWS, _LOOP_EYES = 48, 24
-"""Virtual views that loops are tried for, and eyes of a loop."""
-_SWAY = 30.0
-"""How far the loop before a scene goes to each side, degrees."""
-_BACK_SIDE = 1.0
-"""A scene has a back side if the worst eye all around sees primitives larger by this logarithm than before it."""
-_NEARNESS = 0.7
-"""Part of the logarithm of a loop's radius that is added to the measure, which alone would go far away."""
-_LEVEL = 0.75
-"""Least sine of the angle between the axis of a loop and the view that gives it: none from high above."""
-_PROBE_SIZE = 24
-"""Sides of the images that candidates are judged by, pixels."""
-_PROBE_PRIMITIVES = 20_000
-"""Most primitives of these images."""
-_PROBES = 64
-"""Images that are rendered at once."""
+T = TypeVar("T")
+
+# The search of virtual_views; distances are multiples of the median distance of the primitives from their middle.
+NEAREST, FARTHEST = 0.3, 2.0  # of the eyes from the middle
+FIRST, ROUNDS, MOVED = 4, 4, 3  # cameras drawn for each one that is kept; then rounds, and the moved ones of a round
+STEP = 0.3  # how far an eye moves in a round, as a share of its distance
+RESAMPLED = 3  # rounds before which the even half is drawn anew, in proportion to exp(-coarseness)
+EVENNESS = 4.0  # weight of the deviation of the angles beside their mean, for the half that sees all parts alike
+_PROBE_SIZE, _PROBES = 24, 64  # sides of the images that candidates are judged by, pixels, and images at once
+_PROBE_PRIMITIVES = 20_000  # most primitives of these images
 
 
 def by_device(values: Mapping[str, T], device: torch.device) -> T:
@@ -147,70 +129,6 @@ def virtual_views(scene: Scene, n: int | None = None, *, seed: int = 0, size: in
     ]
 
 
-class Loop(NamedTuple):
-    """A closed path of eyes that look at one point."""
-
-    eyes: Tensor
-    """Centres of the cameras in their order ``[V, 3]``, float64 on the CPU."""
-    target: Tensor
-    """The point that they look at ``[3]``."""
-
-
-@torch.no_grad()
-def loop_around(scene: Scene, up: Tensor) -> Loop:
-    """The best loop of eyes for a scene without cameras: all around what a virtual view sees, or to and fro before it.
-
-    Each of some virtual views gives both loops, about the point in the middle of its image and about the middle of the
-    scene. A loop is as good as its worst eye, by the measure of :func:`virtual_views`, and better the nearer it is. The
-    way all around is taken unless the scene has a back side.
-
-    Args:
-        scene: its finite primitives count.
-        up: axis of the loop, of unit length ``[3]``, float64 on the CPU.
-
-    Raises:
-        DataError: no primitive is finite.
-    """
-    field = _usable(scene)
-    middle, reach = _middle_and_reach(field)
-    probe, sizes = _probe(field, middle, reach, torch.Generator().manual_seed(0))
-    judge = dataclasses.replace(scene, field=probe)
-    turns = torch.arange(_LOOP_EYES, dtype=torch.float64) * (2 * math.pi / _LOOP_EYES)
-    sway = math.radians(_SWAY)
-    angles = {"around": (turns, 0 * turns), "before": (sway * turns.sin(), sway / 4 * turns.cos())}
-    best: dict[str, tuple[float, Loop]] = {}
-    for view in virtual_views(scene, _LOOP_VIEWS)[::2]:  # those of the finest primitives
-        eye, ahead = (view.center.double() - middle) / reach, -view.pose[:, 2].double()
-        image = View.look_at(eye, eye + ahead, up, fov=FOV / 3, width=_PROBE_SIZE, height=_PROBE_SIZE)
-        depth = render(judge, image, head=False).depth
-        seen = [eye + float(depth[depth > 0].median()) * ahead] if bool((depth > 0).any()) else []
-        for target in (*seen, torch.zeros_like(eye)):
-            arm = eye - target
-            side = torch.linalg.cross(up, arm)
-            if not (NEAREST <= float(arm.norm()) <= 2 * FARTHEST and float(side.norm()) >= _LEVEL * float(arm.norm())):
-                continue
-            for name, (across, above) in angles.items():
-                lifted = [_turned(arm, side / side.norm(), -float(angle)) for angle in above]
-                turned = [_turned(arm, up, float(angle)) for arm, angle in zip(lifted, across, strict=True)]
-                eyes = target + torch.stack(turned)
-                worst = float(_coarseness(judge, sizes, eyes, target.expand_as(eyes), 0.0).max())
-                worst += _NEARNESS * math.log(float(arm.norm()))
-                if worst < best.get(name, (math.inf,))[0]:
-                    best[name] = worst, Loop(middle + reach * eyes, middle + reach * target)
-    if not best:  # all virtual views are above or below
-        side = torch.linalg.cross(up.roll(1), up)
-        eyes = torch.stack([_turned(side, up, float(angle)) for angle in turns])
-        return Loop(middle + FARTHEST * reach * eyes, middle)
-    better = best["around"][0] < best["before"][0] + _BACK_SIDE
-    return best["around" if better else "before"][1]
-
-
-def _turned(arm: Tensor, axis: Tensor, angle: float) -> Tensor:
-    """A vector turned about an axis of unit length, radians."""
-    along = (arm @ axis) * axis
-    return along + math.cos(angle) * (arm - along) + math.sin(angle) * torch.linalg.cross(axis, arm)
-
-
 def _resampled(chances: Tensor, generator: torch.Generator) -> Tensor:
     """Indices of as many systematic draws as there are chances, which have the sum 1 ``[N]``."""
     places = torch.arange(len(chances), dtype=chances.dtype) + torch.rand(1, generator=generator, dtype=chances.dtype)
@@ -235,7 +153,17 @@ def of_unit_size(scene: Scene, views: Sequence[View]) -> tuple[Scene, list[View]
 
 def size_of(scene: Scene) -> float:
     """The median distance of the primitives from their middle; 1 for nerfstudio's model, which keeps its size."""
-    return 1.0 if scene.in_model_frame else _middle_and_reach(_usable(scene))[1]
+    return 1.0 if scene.in_model_frame else middle_and_reach(scene)[1]
+
+
+def middle_and_reach(scene: Scene) -> tuple[Tensor, float]:
+    """Median of the finite centres ``[3]``, float64 on the CPU, and the median distance of the primitives from it."""
+    return _middle_and_reach(_usable(scene))
+
+
+def split(views: Sequence[View]) -> tuple[list[View], list[View]]:
+    """The views that decide, and those that are held out: every eighth, from the first on."""
+    return [view for i, view in enumerate(views) if i % 8], list(views[::8])
 
 
 def resized(scene: Scene, factor: float) -> Scene:

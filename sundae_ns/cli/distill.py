@@ -46,17 +46,17 @@ def distill_file(
             steps begin from in place of virtual ones.
         overwrite: replace an existing file, once the new one is complete.
     """
-    from sundae_ns.api import opening, saving
+    from sundae_ns.api import files
     from sundae_ns.errors import ConfigError, writing
 
     check_one({"--keep": keep, "--count": count})
     suffix = out.suffix.lower()
-    if suffix not in saving.SUFFIXES:
-        raise ConfigError(f"{out} has no supported suffix; name it {', '.join(saving.SUFFIXES)}")
+    if suffix not in files.SUFFIXES:
+        raise ConfigError(f"{out} has no supported suffix; name it {', '.join(files.SUFFIXES)}")
     if head and suffix not in (".sundae", ".html"):
         raise ConfigError(f"{out} cannot hold a head; name it .sundae, or leave the head out with --no-head")
     check_file(out, reads=[source, cameras], overwrite=overwrite)
-    scene = opening.load(source)
+    scene = files.load(source)
     with loading():
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -105,7 +105,7 @@ def distill_file(
         print(f"    {shlex.join(['sundae', *sys.argv[1:]])}", file=sys.stderr)
         return 130
     result = made.result()
-    saving.save(result, out)
+    files.save(result, out)
     partial.unlink(missing_ok=True)
     print(f"{out}: {kept:,} of {before:,} primitives, {'with' if result.head else 'without'} a head")
     if made.gain is not None:

@@ -61,10 +61,9 @@ def export(
     if page:
         if upright:
             raise ConfigError("a page turns the scene upright by itself; leave out --upright")
-        from sundae_ns.api.packing import stated_start
+        from sundae_ns.api.packing import packed_bytes, stated_start
         from sundae_ns.api.page import write_page
-        from sundae_ns.api.saving import packed_bytes
-        from sundae_ns.api.start import with_start
+        from sundae_ns.api.views import with_start
         from sundae_ns.storage.pack import container
 
         opened, packed = open_packed_file(scene, data)
@@ -83,8 +82,7 @@ def export(
     if start_view is not None or up is not None:
         raise ConfigError(f"{out.suffix} files hold neither a start view nor an up axis; leave them out")
     from sundae_ns.api.cleaning import within
-    from sundae_ns.api.opening import load, load_with_mask
-    from sundae_ns.api.saving import save_for_viewers
+    from sundae_ns.api.files import load, load_with_mask, save_for_viewers
     from sundae_ns.storage.ply import keep_vertices
 
     if copies:
@@ -115,7 +113,7 @@ def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     from sundae_ns.storage.runs.config_file import check_run
 
     if kind_of(path) == "packed" or kind_of_primitives(path) is not None or path.suffix == ".sundae":
-        from sundae_ns.api.saving import packed_file
+        from sundae_ns.api.files import packed_file
 
         return packed_file(path)
     check_run(path)  # before nerfstudio is imported, which takes seconds
@@ -157,7 +155,7 @@ def cameras_of(scene: Scene, cameras: Path | None, most: int | None) -> Sequence
         cameras: the file or the run.
         most: largest number of cameras that are taken from a run.
     """
-    from sundae_ns.api import opening
+    from sundae_ns.api.files import load
     from sundae_ns.api.views import views_of
     from sundae_ns.storage.kinds import kind_of
     from sundae_ns.storage.runs.folder import find_config
@@ -165,7 +163,7 @@ def cameras_of(scene: Scene, cameras: Path | None, most: int | None) -> Sequence
     if cameras is None:
         return scene.views
     if kind_of(cameras) == "packed":
-        return opening.load(cameras).views
+        return load(cameras).views
     is_run = (cameras.is_dir() or cameras.name == "config.yml") and find_config(cameras) is not None
     if not is_run:
         return views_of(cameras, scene)
@@ -202,8 +200,7 @@ def prune_file(
     """Prune a scene of any program, without its photos.
 
     Kept are the primitives that virtual cameras see most of; the others are merged into them, and some steps fit pairs
-    to the scene's own images. On a CPU a million primitives with three bands of harmonics take about 1.7 GB; a prune of
-    more than a minute states its cost first.
+    to the scene's own images. On a CPU a million primitives with three bands of harmonics take about 1.7 GB.
 
     Args:
         source: a .ply, .spz, .sog, .glb, .splat, .ksplat or gsplat's .pt, a packed scene, or a run.
@@ -228,39 +225,28 @@ def prune_file(
         seed: random seed.
         overwrite: replace an existing file, once the new one is complete.
     """
-    from sundae_ns.api import opening, pruning, saving
+    from sundae_ns.api import files, pruning
     from sundae_ns.api.cleaning import kept, within
-    from sundae_ns.api.cost import prune_cost, require_memory, state
-    from sundae_ns.api.virtual import SIDE, VIEWS, virtual_views
+    from sundae_ns.api.virtual import virtual_views
     from sundae_ns.errors import ConfigError
     from sundae_ns.gpu.memory import naming_full_memory
     from sundae_ns.pruning import PruneRule
     from sundae_ns.rasterization.select import fastest_device
-    from sundae_ns.storage.kinds import kind_of
-    from sundae_ns.storage.ply import keep_vertices, stated_size
+    from sundae_ns.storage.ply import keep_vertices
 
     amounts = {"--keep": keep, "--count": count, "--target-drop": target_drop}
     check_one(amounts)
     if target_drop is None:
         keep = 0.1 if keep is None and count is None else keep
         pruning.check_amount(keep, count)
-    if out.suffix.lower() not in saving.SUFFIXES:
-        raise ConfigError(f"{out} has no supported suffix; name it {', '.join(saving.SUFFIXES)}")
+    if out.suffix.lower() not in files.SUFFIXES:
+        raise ConfigError(f"{out} has no supported suffix; name it {', '.join(files.SUFFIXES)}")
     check_file(out, reads=[source, cameras], overwrite=overwrite)
     redistribution: Literal["merge", "none"] = "merge" if merge else "none"
     rule = PruneRule(selection, score, signal, redistribution=redistribution, gamma=gamma, seed=seed)
     rule.validate()
-    stated, device = False, fastest_device()
-    if kind_of(source) == "ply" and device.type == "cpu":  # its header has the size; reading takes minutes
-        n, numbers = stated_size(source)
-        share = keep if keep is not None else (count or 0) / max(n, 1)
-        looks = (VIEWS["cpu"] if views is None else views) if rule.uses_contribution and cameras is None else 0
-        cost = prune_cost(n, numbers, rule, share, looks, looks * SIDE**2)
-        require_memory(cost, n, loaded=False)
-        if cameras is None and target_drop is None:
-            stated = True
-            state(cost, n, looks)
-    scene, usable = opening.load_with_mask(source)
+    device = fastest_device()
+    scene, usable = files.load_with_mask(source)
     total = scene.num_primitives if usable is None else len(usable)
     with naming_full_memory(lambda: total):
         scene, seen, clean = scene.to(device), None, None
@@ -272,22 +258,17 @@ def prune_file(
         if looks_around:
             seen = given or virtual_views(scene, views, seed=seed)
         if target_drop is not None:
-            from sundae_ns.api.target import count_for_drop
-
             assert seen is not None
-            found = count_for_drop(scene, target_drop, seen, rule, progress=True)
-            count = found.kept
-            for number, psnr in found.curve:
+            count, curve = pruning.count_for_drop(scene, target_drop, seen, rule, progress=True)
+            for number, psnr in curve:
                 print(f"{number:12,} primitives: {psnr:.2f} dB against the full field, on held-out cameras")
-        pruned = pruning.prune_with_mask(
-            scene, keep=keep, count=count, views=seen, rule=rule, progress=True, stated=stated
-        )
+        pruned = pruning.prune_with_mask(scene, keep, count, seen, rule, progress=True)
     small = pruned.scene.to("cpu")
     if copies_rows(source, out):
         rows = within(usable, within(clean, pruned.mask).cpu())
         keep_vertices(source, out, rows, small.field if merge else None)
     else:
-        saving.save(small, out)
+        files.save(small, out)
     print(f"{out}: {small.num_primitives:,} of {total:,} primitives")
     if pruned.seen is not None and seen:
         print(f"{len(seen)} cameras see {pruned.seen:.1%} of the primitives")

@@ -85,7 +85,7 @@ def pack(
     from rich.progress import Progress
 
     from sundae_ns.api.packing import contents_of, scene_of, stated_start
-    from sundae_ns.api.start import with_start
+    from sundae_ns.api.views import with_start
     from sundae_ns.errors import ConfigError
     from sundae_ns.storage.pack import FINETUNE_STEPS, FINETUNED, PackConfig, fit_scene, write_fitted
     from sundae_ns.storage.runs.config_file import check_run
@@ -125,7 +125,7 @@ def pack(
 
                 source = contents_of_run(run, max_cameras=max_cameras, data=data)
             else:
-                from sundae_ns.api.opening import load
+                from sundae_ns.api.files import load
 
                 source = contents_of(load(run))
             if cleaning.chosen:

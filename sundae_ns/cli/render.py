@@ -51,10 +51,10 @@ def render_file(
     from rich.console import Console
     from rich.progress import track
 
-    from sundae_ns.api import opening, rendering
+    from sundae_ns.api.files import load
     from sundae_ns.api.film import film_views
-    from sundae_ns.api.start import with_start
-    from sundae_ns.api.views import CameraFile, read_cameras, view_in_front
+    from sundae_ns.api.scene import image_of, render
+    from sundae_ns.api.views import CameraFile, read_cameras, view_in_front, with_start
     from sundae_ns.errors import ConfigError
     from sundae_ns.evaluation.video import write_video
     from sundae_ns.rasterization.select import fastest_device
@@ -71,7 +71,7 @@ def render_file(
     if fps is not None and not (video and 0 < fps <= 240):
         raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
     check_file(out, reads=[scene, camera], overwrite=overwrite)
-    opened = with_start(opening.load(scene), None, up)
+    opened = with_start(load(scene), None, up)
     if camera is not None:
         cameras = read_cameras(camera, opened)
     elif video:
@@ -87,7 +87,7 @@ def render_file(
     opened = opened.to(fastest_device())
 
     def rendered(view: View) -> Image.Image:
-        return rendering.image_of(rendering.render(opened, view, head=head).rgb)
+        return image_of(render(opened, view, head=head).rgb)
 
     if video:
         shown = track(views, "Rendering", transient=True, console=Console(stderr=True))

@@ -12,7 +12,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import Tensor
 
-from sundae_ns.api.opening import FRAME_FILE
+from sundae_ns.api.files import FRAME_FILE
 from sundae_ns.data.advice import no_model, no_transforms
 from sundae_ns.data.beside import beside
 from sundae_ns.data.capture import check_transforms, read_json

@@ -17,12 +17,9 @@ import torch
 from pytorch_msssim import SSIM
 from torch.nn import Parameter
 
-from sundae_ns.api.measuring import measure
 from sundae_ns.api.pruning import prune_with_mask
-from sundae_ns.api.rendering import render
-from sundae_ns.api.scene import Scene
-from sundae_ns.api.target import split
-from sundae_ns.api.virtual import VIEWS, by_device, of_unit_size, resized, size_of, virtual_views
+from sundae_ns.api.scene import Scene, measure, render
+from sundae_ns.api.virtual import VIEWS, by_device, of_unit_size, resized, size_of, split, virtual_views
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError, reading
 from sundae_ns.gaussians import FEATURES, initial_features, mend
@@ -120,7 +117,7 @@ class Distillation:
         self.steps, self._seed = steps, seed
         """Number of steps to train."""
         seen = self.cameras[: by_device(VIEWS, teacher.device)]
-        cut = prune_with_mask(self._teacher, keep, count, seen, None, progress=progress, trains=True)
+        cut = prune_with_mask(self._teacher, keep, count, seen, None, progress=progress, fit=False)
         self._config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
         self._head_config = None
         if head:

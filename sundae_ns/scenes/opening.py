@@ -13,7 +13,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from sundae_ns.api.opening import scene_of_checkpoint
+from sundae_ns.api.files import scene_of_checkpoint
 from sundae_ns.api.packing import scene_of
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, DataError

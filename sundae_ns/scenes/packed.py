@@ -24,11 +24,10 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
 
-from sundae_ns.api.opening import load
+from sundae_ns.api.files import load
 from sundae_ns.api.packing import contents_of, refusal, scene_of
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.start import unit
-from sundae_ns.api.views import is_number
+from sundae_ns.api.views import is_number, unit
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.errors import ConfigError, PackError

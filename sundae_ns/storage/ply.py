@@ -137,19 +137,6 @@ def _check_header(path: Path, primitives: bool) -> None:
             )
 
 
-def stated_size(path: Path) -> tuple[int, int]:
-    """Number of primitives in a 3DGS .ply, and of the numbers that :func:`read_ply` returns of each; reads the header.
-
-    Raises:
-        DataError: the file is missing, not a binary .ply, or shorter than its header states.
-    """
-    with reading(path, "a complete .ply file"):
-        _check_header(path, primitives=True)
-        header = _header(path)
-    counts = [int(words[2]) for words in map(bytes.split, header.splitlines()) if words[:2] == [b"element", b"vertex"]]
-    return sum(counts), sum(map(len, _COLUMNS.values())) + header.count(b" f_rest_")
-
-
 def _incomplete(path: Path, reason: str) -> DataError:
     return DataError(f"{path} is not a complete .ply file ({reason}); export it again.")
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import sundae_ns as sn
-from sundae_ns.api.film import KEYS, MOST_FRAMES, film_views
+from sundae_ns.api.film import MOST_FRAMES, film_views
 from sundae_ns.errors import ConfigError
 
 COUNT = 120
@@ -71,7 +71,7 @@ def test_the_path_leads_through_views_and_closes() -> None:
     whole = (turns.roll(-1) - turns + math.pi).remainder(2 * math.pi) - math.pi
     assert abs(float(whole.sum())) == pytest.approx(2 * math.pi, rel=1e-5), "once around, not to and fro"
     apart = torch.cdist(torch.tensor(eyes), centers).amin(dim=1)
-    assert int((apart < 0.1).sum()) >= KEYS
+    assert int((apart < 0.1).sum()) >= 6
     assert float(centers.norm(dim=1).min()) > 3.5, "the spline cuts no corner"
 
 
@@ -130,22 +130,6 @@ def test_a_scene_without_a_path_is_seen_from_all_around(stored: int, factor: flo
     seen = [float(sn.render(scene, view.zoomed(0.05)).accumulation.mean()) for view in views[::20]]
     assert min(seen) > 0.1
     assert (views[0].width, views[0].height) == ((40, 30) if stored else (1280, 720))
-
-
-def test_a_scene_with_a_back_side_is_seen_from_before() -> None:
-    """A wall of fine primitives, with coarse ones behind, as training leaves where no photo looked."""
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(4000, 3, generator=generator) * torch.tensor([2.0, 0.05, 2.0]) - 1
-    behind = torch.rand(60, 3, generator=generator) * torch.tensor([3.0, 1.5, 3.0]) + torch.tensor([-1.5, -0.6, -1.5])
-    scene = sn.Scene.from_points(torch.cat([points, behind]), torch.rand(4060, 3, generator=generator))
-    values = {"opacities": scene.field["opacities"] + 5, "scales": scene.field["scales"].clone()}
-    values["scales"][4000:] = math.log(0.3)
-    scene = dataclasses.replace(scene, field=scene.field.replaced(values))
-    views = film(scene)
-    assert max(float(view.center[1]) for view in views) < -1
-    across = torch.stack([view.center for view in views])[:, 0]
-    assert float(across.max() - across.min()) > 0.3
-    assert float(steps(views, 2.0).max()) < 0.1
 
 
 @pytest.mark.parametrize(

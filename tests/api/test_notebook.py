@@ -17,9 +17,9 @@ from chromium import CHROMIUM, browser, needs_chromium
 from packed_scenes import KINDS, write_kind
 
 import sundae_ns as sn
-from sundae_ns.api import notebook
+from sundae_ns.api import page as notebook
+from sundae_ns.api.packing import packed_bytes
 from sundae_ns.api.page import page_of
-from sundae_ns.api.saving import packed_bytes
 from sundae_ns.errors import ConfigError
 
 HOSTILE = """"></iframe><script>alert('&amp;')</script><b x='"""

@@ -23,10 +23,9 @@ from chromium import bench_page, needs_node
 from packed_scenes import KINDS, write_bomb, write_kind
 from PIL import Image
 
-from sundae_ns.api.opening import load
+from sundae_ns.api.files import load, packed_file
 from sundae_ns.api.packing import scene_of
 from sundae_ns.api.page import page_of, render_first, write_page
-from sundae_ns.api.saving import packed_file
 from sundae_ns.cli import main
 from sundae_ns.errors import PackError
 from sundae_ns.rasterization.projection import project

@@ -9,9 +9,8 @@ import torch
 from fields import random_field
 from torch import Tensor
 
-from sundae_ns.api.packing import scene_of, views_of_arrays
+from sundae_ns.api.packing import scene_of, sensitivity_of, views_of_arrays
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.sensitivity import sensitivity_of
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.rendering import LocalField, View
 from sundae_ns.rendering.render import render_view

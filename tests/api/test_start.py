@@ -18,9 +18,8 @@ from short_prunes import short_prunes  # noqa: F401
 import sundae_ns as sn
 from sundae_ns.api.packing import start_of, stated_start
 from sundae_ns.api.page import render_first
-from sundae_ns.api.rendering import image_of
-from sundae_ns.api.start import with_start
-from sundae_ns.api.views import view_in_front
+from sundae_ns.api.scene import image_of
+from sundae_ns.api.views import view_in_front, with_start
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.scenes.distill import distill
 from sundae_ns.storage.pack import container

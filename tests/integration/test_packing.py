@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from sundae_ns.api.opening import load
+from sundae_ns.api.files import load
 from sundae_ns.cli import main
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes.opening import open_scene

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from packed_scenes import KINDS, write_bomb, write_kind
 from pages import SAID, SECONDS, SIZE, STOP, TICKING, WEBGL, Quiet, hold, opened, rested, touch
 
+from sundae_ns.api.files import packed_file
 from sundae_ns.api.packing import stated_start
 from sundae_ns.api.page import page_of, write_page
-from sundae_ns.api.saving import packed_file
 from sundae_ns.cli.view import serve
 from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage.pack import container, read_scene, write_scene

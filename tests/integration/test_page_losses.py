@@ -11,8 +11,8 @@ from chromium import bench_page, browser, needs_chromium
 from packed_scenes import KINDS, write_kind
 from pages import SAID, SECONDS, STOP, WEBGL, opened, rested
 
+from sundae_ns.api.files import packed_file
 from sundae_ns.api.page import write_page
-from sundae_ns.api.saving import packed_file
 from sundae_ns.storage.pack import read_scene
 
 pytestmark = [pytest.mark.browser, needs_chromium]

@@ -6,8 +6,8 @@ import pytest
 
 STEPS, VIEWS, SIDE = 4, 8, 64
 SHORT = f"""
-from sundae_ns.api import refit, virtual
-refit.STEPS["cpu"], virtual.VIEWS["cpu"], virtual.SIDE = {STEPS}, {VIEWS}, {SIDE}
+from sundae_ns.api import pruning, virtual
+pruning.REFIT_STEPS["cpu"], virtual.VIEWS["cpu"], virtual.SIDE = {STEPS}, {VIEWS}, {SIDE}
 """
 """What the fixture does, as lines of a program of its own."""
 
@@ -15,8 +15,8 @@ refit.STEPS["cpu"], virtual.VIEWS["cpu"], virtual.SIDE = {STEPS}, {VIEWS}, {SIDE
 @pytest.fixture
 def short_prunes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Prunes by few small views and few steps; they train nothing by themselves."""
-    from sundae_ns.api import refit, virtual
+    from sundae_ns.api import pruning, virtual
 
-    monkeypatch.setitem(refit.STEPS, "cpu", STEPS)
+    monkeypatch.setitem(pruning.REFIT_STEPS, "cpu", STEPS)
     monkeypatch.setitem(virtual.VIEWS, "cpu", VIEWS)
     monkeypatch.setattr(virtual, "SIDE", SIDE)

@@ -1,4 +1,4 @@
-"""The one opener of finished scenes, without nerfstudio: files of primitives, packed scenes, and runs."""
+"""Scenes as files: packed scenes, primitives of any program, and runs of ns-train. Needs no nerfstudio."""
 
 from __future__ import annotations
 
@@ -9,21 +9,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sundae_ns.api.page import write_page
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import is_frame
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.compensation.head import SIZES
 from sundae_ns.data.capture import read_json
-from sundae_ns.errors import CheckpointError, DataError
+from sundae_ns.errors import CheckpointError, ConfigError, DataError, writing
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rendering.source import degree_in_use
+from sundae_ns.storage.atomic import write_bytes
 from sundae_ns.storage.kinds import kind_of, kind_of_primitives, unread
 from sundae_ns.storage.primitives import read_primitives
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import model_options, parser_options
 from sundae_ns.storage.runs.folder import find_config
+from sundae_ns.storage.viewers import FORMATS, ViewerFile, write_for_viewers
 
 _HEAD = "networks.head."
+SUFFIXES = (*FORMATS, ".sundae", ".html")
+"""Suffixes of the files that :func:`save` writes."""
 FRAME_FILE = "dataparser_transforms.json"
 """Transform from the capture's coordinates to the model's, which nerfstudio writes into the folder of a run."""
 
@@ -67,6 +72,68 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
     found = read_primitives(path)
     scene = Scene(found.mended.field, antialiased=found.antialiased, in_model_frame=found.in_model_frame)
     return scene.to(device), found.mended.mask
+
+
+def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
+    """Write a scene in the format of the file's suffix, atomically; an existing file is replaced.
+
+    ``.sundae`` holds everything that a render needs, quantised. ``.html`` is a web page that renders it. ``.ply``
+    and ``.glb`` (exact), ``.spz`` and ``.sog`` (quantised) hold base colours only, for other viewers.
+
+    Args:
+        scene: any device.
+        path: file to write; a missing folder of it is made.
+        upright: turn from nerfstudio's z-up axes to the -y-up axes of viewers; ``.ply``, ``.spz`` and ``.sog`` only. A
+            ``.glb`` is upright in any case.
+
+    Raises:
+        ConfigError: the suffix is not supported, or the format is not turned.
+        DataError, PackError: the format cannot store the scene.
+        StorageError: the disk is full or not writable.
+
+    >>> import pathlib, tempfile, torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3))
+    >>> path = pathlib.Path(tempfile.mkdtemp(), "cloud.sundae")
+    >>> sn.save(scene, path)
+    >>> sn.load(path).num_primitives
+    50
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+    if upright and suffix not in FORMATS:
+        raise ConfigError(f"{suffix} files keep their coordinates; leave out upright")
+    with writing(f"cannot write {path}"):
+        if suffix in FORMATS:
+            save_for_viewers(scene, path, upright=upright)
+            return
+        from sundae_ns.api.packing import packed_bytes  # its encoder needs a compiler, which other files do not
+
+        packed = packed_bytes(scene)
+        if suffix == ".html":
+            write_page(path, scene, packed, title=path.resolve().stem)
+        else:
+            write_bytes(path, packed)
+
+
+def packed_file(path: Path) -> tuple[Scene, bytes]:
+    """A scene and the bytes of its packed file; a file that is not packed is packed with default settings."""
+    from sundae_ns.api.packing import packed_bytes  # its encoder needs a compiler, which other files do not
+
+    scene = load(path)
+    return scene, path.read_bytes() if kind_of(path) == "packed" else packed_bytes(scene)
+
+
+def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:
+    """Write base colours in a format of other viewers; returns what was left out or clamped. See :func:`save`."""
+    return write_for_viewers(
+        path,
+        scene.field,
+        antialiased=scene.antialiased,
+        upright=upright,
+        in_model_frame=scene.in_model_frame,
+    )
 
 
 def _of_run(path: Path) -> Scene:

@@ -1,18 +1,23 @@
-"""The refit of a pruned field: it matches the images of the full field better, or changes nothing."""
+"""Prunes of scenes: the refit of a pruned field, the count for a loss, and memory."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
+from fields import random_field
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 import sundae_ns as sn
-from sundae_ns.api import refit as module
-from sundae_ns.api.refit import refit
+from sundae_ns.api import pruning as module
+from sundae_ns.api.pruning import count_for_drop, refit
+from sundae_ns.gaussians import covariance
 from sundae_ns.gaussians.field import Encoding, Field
 from sundae_ns.gaussians.parameters import sh_to_rgb
-from sundae_ns.pruning import prune_field
+from sundae_ns.pruning import prune_field, redistribution
 
 N = 1500
 
@@ -58,20 +63,25 @@ def test_a_field_that_matches_already_is_unchanged() -> None:
 def test_a_refit_that_diverges_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     full = scene()
     small, views = pruned(full), sn.virtual_views(full, 4, size=24)
-    monkeypatch.setattr(module, "_RATES", dict.fromkeys(module._RATES, math.inf))
+
+    def diverge(_: Any, optimizers: Any, *__: Any, **___: Any) -> None:
+        for group in optimizers["field"].param_groups:
+            group["params"][0].data.fill_(math.nan)
+
+    monkeypatch.setattr(module, "optimise", diverge)
     assert refit(small, full.field, views, full.settings()) is small
 
 
 def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MOST_PIXELS", 24 * 24)
+    monkeypatch.setattr(module, "REFIT_PIXELS", 24 * 24)
     full, sizes = scene(), set()
-    images = module._images
+    images = module._blended
 
     def spy(field: Field, views: list[sn.View], settings: object) -> list[torch.Tensor]:
         sizes.update((view.width, view.height) for view in views)
         return images(field, views, settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(module, "_images", spy)
+    monkeypatch.setattr(module, "_blended", spy)
     refit(
         pruned(full),
         full.field,
@@ -85,7 +95,7 @@ def test_images_are_those_of_the_renderer() -> None:
     """Also of views of several sizes."""
     full = scene()
     views = [*sn.virtual_views(full, 2, size=24), *sn.virtual_views(full, 1, size=12)]
-    for view, image in zip(views, module._images(full.field, views, full.settings()), strict=True):
+    for view, image in zip(views, module._blended(full.field, views, full.settings()), strict=True):
         truth = sn.render(full, view)
         torch.testing.assert_close(image[..., 3:], truth.accumulation)
         torch.testing.assert_close(image[..., :3] + (1 - image[..., 3:]) * full.background, truth.rgb)
@@ -99,8 +109,8 @@ def test_a_gpu_takes_the_views_of_a_step_together(encoding: Encoding) -> None:
     settings, views = full.settings(), [view.to("cuda") for view in sn.virtual_views(full, 40, size=48)]
     field = full.field.replaced({name: value.clone().requires_grad_() for name, value in full.field.items()})
     weights = torch.rand(4, 48, 48, 4, device="cuda")
-    together = (torch.stack(module._images(field, views[:4], settings)) * weights).sum()
-    apart = sum((module._images(field, [v], settings)[0] * w).sum() for v, w in zip(views[:4], weights, strict=True))
+    together = (torch.stack(module._blended(field, views[:4], settings)) * weights).sum()
+    apart = sum((module._blended(field, [v], settings)[0] * w).sum() for v, w in zip(views[:4], weights, strict=True))
     names = ("means", "scales", "quats", "opacities", "features_dc")
     gradients = [torch.autograd.grad(loss, [field[name] for name in names]) for loss in (together, apart)]
     for one, other in zip(*gradients, strict=True):
@@ -119,3 +129,65 @@ def test_prune_refits_after_merges_by_pairs_alone(monkeypatch: pytest.MonkeyPatc
         assert not called
         sn.prune(full, keep=0.1, views=views, rule=rule)
     assert [small.num_primitives for small in called] == [150]
+
+
+@pytest.fixture(scope="module")
+def ball() -> sn.Scene:
+    """Points on a sphere, coloured smoothly."""
+    torch.manual_seed(0)
+    points = torch.nn.functional.normalize(torch.randn(2000, 3), dim=1)
+    scene = sn.Scene.from_points(points, (points + 1) / 2)
+    scene.field["opacities"][:] = 3.0
+    return scene
+
+
+@pytest.fixture(scope="module")
+def views() -> list[sn.View]:
+    turns = torch.arange(16) * 0.4
+    eyes = torch.stack([2.5 * turns.cos(), 2.5 * turns.sin(), 0.1 * turns], dim=1)
+    return [sn.View.look_at(eye, (0, 0, 0), width=48, height=48) for eye in eyes]
+
+
+@pytest.mark.parametrize("drop", [1.0, 6.0])
+def test_the_count_meets_the_tolerated_loss(drop: float, ball: sn.Scene, views: list[sn.View]) -> None:
+    kept, curve = count_for_drop(ball, drop, views, sn.PruneRule())
+    counts = [count for count, _ in curve]
+    assert counts == [2000 // 2 ** (i + 1) for i in range(len(counts))]
+    assert counts[-1] <= kept <= 2 * counts[-1] + 1
+    held_out = views[::8]
+    shown = [view for i, view in enumerate(views) if i % 8]
+    small = sn.prune(ball, count=kept, views=shown, rule=sn.PruneRule())
+    error = 10 ** (-sn.measure(small, ball, held_out).psnr / 10)
+    tolerated = 1e-3 * (10 ** (drop / 10) - 1)
+    assert tolerated / 2 < error < 2 * tolerated
+
+
+def test_more_loss_keeps_fewer(ball: sn.Scene, views: list[sn.View]) -> None:
+    one, three = (count_for_drop(ball, drop, views, sn.PruneRule())[0] for drop in (0.5, 6.0))
+    assert three < one
+
+
+class Doubles(TorchDispatchMode):
+    """Collects the numbers of elements of the float64 tensors that are made."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sizes: list[int] = []
+
+    def __torch_dispatch__(self, function: Any, types: Any, arguments: Any = (), options: Any = None) -> Any:
+        made = function(*arguments, **(options or {}))
+        for value in tree_leaves(made):
+            if isinstance(value, torch.Tensor) and value.dtype == torch.float64:
+                self.sizes.append(value.numel())
+        return made
+
+
+def test_values_between_are_computed_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of twenty million primitives, each number of an edge in float64 takes 2.6 GB."""
+    for part, name, size in ((covariance, "ROWS", 64), (redistribution, "ROWS", 64), (covariance, "PAIRS", 1024)):
+        monkeypatch.setattr(part, name, size)
+    weights = torch.rand(N, generator=torch.Generator().manual_seed(0))
+    with Doubles() as found:
+        prune_field(random_field(N), sn.PruneRule(), N // 10, weights)
+    assert max(found.sizes) == 9 * N  # the covariances
+    assert found.sizes.count(9 * N) == 1

@@ -1,0 +1,46 @@
+"""The loop of every training outside of nerfstudio's: refits, distillations and fine-tunes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from torch import Tensor
+from torch.optim import Optimizer
+
+
+def optimise(
+    step: Callable[[int], object],
+    optimizers: Mapping[str, Optimizer],
+    steps: int,
+    factor: Callable[[str, int], float],
+    *,
+    first: int = 0,
+    on_step: Callable[[int], object] | None = None,
+) -> int:
+    """Train, with learning rates that are a function of the step, so that a resumed training repeats them.
+
+    Args:
+        step: takes step ``i``: its loss, gradients and updates.
+        optimizers: by name. The rates that their groups have now are the initial ones, unless they hold ``initial_lr``.
+        steps: number of steps in all.
+        factor: of the initial rate of an optimizer (by name) at a step.
+        first: step to begin with, if others were taken before.
+        on_step: called after each step with the number of steps taken; False stops.
+
+    Returns:
+        Number of steps taken.
+    """
+    groups = [(name, group) for name, optimizer in optimizers.items() for group in optimizer.param_groups]
+    for _, group in groups:
+        group.setdefault("initial_lr", float(group["lr"]))
+    for i in range(first, steps):
+        for name, group in groups:
+            rate = group["initial_lr"] * factor(name, i)
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)  # in place, where a recorded CUDA graph reads it
+            else:
+                group["lr"] = rate
+        step(i)
+        if on_step is not None and on_step(i + 1) is False:
+            return i + 1
+    return max(first, steps)
