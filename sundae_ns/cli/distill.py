@@ -61,7 +61,7 @@ def distill_file(
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        from sundae_ns.rasterization.select import fastest_device
+        from sundae_ns.rasterization import fastest_device
         from sundae_ns.scenes.distill import Distillation
         from sundae_ns.training.interruption import Interruption
         from sundae_ns.training.progress import duration

@@ -231,7 +231,7 @@ def prune_file(
     from sundae_ns.errors import ConfigError
     from sundae_ns.gpu.memory import naming_full_memory
     from sundae_ns.pruning import PruneRule
-    from sundae_ns.rasterization.select import fastest_device
+    from sundae_ns.rasterization import fastest_device
     from sundae_ns.storage.ply import keep_vertices
 
     amounts = {"--keep": keep, "--count": count, "--target-drop": target_drop}

@@ -57,7 +57,7 @@ def render_file(
     from sundae_ns.api.views import CameraFile, read_cameras, view_in_front, with_start
     from sundae_ns.errors import ConfigError
     from sundae_ns.evaluation.video import write_video
-    from sundae_ns.rasterization.select import fastest_device
+    from sundae_ns.rasterization import fastest_device
     from sundae_ns.storage.atomic import replacing, write_image
 
     suffix = out.suffix.lower()

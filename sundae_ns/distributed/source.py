@@ -13,7 +13,6 @@ from sundae_ns.distributed.ahead import Ahead, Timetable, slack_of_step, stamped
 from sundae_ns.distributed.shards import Shards
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
-from sundae_ns.rasterization.reference import largest_axis
 from sundae_ns.rasterization.sharded import (
     Cameras,
     Route,
@@ -23,6 +22,7 @@ from sundae_ns.rasterization.sharded import (
     plan_exchange,
     swap,
 )
+from sundae_ns.rasterization.types import largest_axis
 from sundae_ns.rendering.source import (
     NEAR_PLANE,
     ColorSettings,

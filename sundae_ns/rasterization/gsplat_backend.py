@@ -9,12 +9,10 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
-from sundae_ns.rasterization.constants import constant
-from sundae_ns.rasterization.gsplat_blending import blend
-from sundae_ns.rasterization.gsplat_colors import harmonic_colors
-from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, GsplatLists, Splats, tile_lists
-from sundae_ns.rasterization.reference import ReferenceBackend, finished
-from sundae_ns.rasterization.types import Inputs, Rasterization
+from sundae_ns.rasterization.gsplat_kernels import TILE, Capacity, GsplatLists, Splats, blend, tile_lists
+from sundae_ns.rasterization.gsplat_kernels import harmonic_colors as harmonic_colors_by_our_kernels
+from sundae_ns.rasterization.reference import ReferenceBackend
+from sundae_ns.rasterization.types import Inputs, Rasterization, constant, result_of
 
 _CHANNELS_PER_PASS = 32
 
@@ -43,7 +41,7 @@ class GsplatBackend:
         blended = [self._blend(splats, part[None], lists, inputs.absgrad) for part in passes]
         alpha = blended[0][1][0]
         image = blended[0][0][0] if len(blended) == 1 else torch.cat([part[0] for part, _ in blended], dim=-1)
-        return finished(image, alpha, splats.means2d, splats.radii, inputs)
+        return result_of(image, alpha, splats.means2d, splats.radii, inputs)
 
     def rasterize_views(self, inputs: Inputs, viewmats: Tensor, Ks: Tensor, colors: Tensor) -> Tensor:
         """Render several views at once; one wait for the device in all.
@@ -58,13 +56,13 @@ class GsplatBackend:
         return torch.cat([GsplatBackend._blend(self, splats, part, lists, False)[0] for part in parts], dim=-1)
 
     def _lists(self, splats: Splats, width: int, height: int) -> GsplatLists:
-        """gsplat's own lists: every tile that a primitive's bounding square touches."""
+        """gsplat's own lists: every tile that a Gaussian's bounding square touches."""
         from gsplat import isect_offset_encode, isect_tiles
 
         columns, rows = -(-width // TILE), -(-height // TILE)
-        _, pairs, primitives = isect_tiles(splats.means2d, splats.radii, splats.depths, TILE, columns, rows)
+        _, pairs, ids = isect_tiles(splats.means2d, splats.radii, splats.depths, TILE, columns, rows)
         starts = isect_offset_encode(pairs, len(splats.means2d), columns, rows)
-        return GsplatLists(width, height, starts, primitives)
+        return GsplatLists(width, height, starts, ids)
 
     def _blend(self, splats: Splats, colors: Tensor, lists: GsplatLists, absgrad: bool) -> tuple[Tensor, Tensor]:
         """Images ``[V, H, W, C]`` and alphas ``[V, H, W, 1]`` of colours ``[V, N, C]``."""
@@ -97,7 +95,7 @@ class RecordableGsplat(GsplatBackend):
     Tiles get our own lists, shorter than gsplat's. Colours, and blending with gradients, have kernels of our own.
 
     Args:
-        capacity: for tile/primitive pairs.
+        capacity: for tile/Gaussian pairs.
     """
 
     def __init__(self, capacity: Capacity) -> None:
@@ -121,11 +119,11 @@ class RecordableGsplat(GsplatBackend):
             BackendError: The tensors are not float32 on a CUDA device, or the kernels cannot be compiled.
         """
         _check_kernels_take(means)
-        return harmonic_colors(degree, means, center, features_dc, features_rest)
+        return harmonic_colors_by_our_kernels(degree, means, center, features_dc, features_rest)
 
 
 def _project(inputs: Inputs, viewmats: Tensor, Ks: Tensor) -> Splats:
-    """Project primitives to the screens of views, transforms ``[V, 4, 4]`` and intrinsics ``[V, 3, 3]``."""
+    """Project Gaussians to the screens of views, transforms ``[V, 4, 4]`` and intrinsics ``[V, 3, 3]``."""
     from gsplat import fully_fused_projection
 
     opacities = inputs.opacities

@@ -16,7 +16,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN, camera_center
+from sundae_ns.rasterization.reference import BLUR, FOV_MARGIN, camera_center
 
 
 class Cameras(NamedTuple):

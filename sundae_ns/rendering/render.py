@@ -12,7 +12,7 @@ from torch import Tensor
 from sundae_ns.compensation import CompensationHead, ScalePlan, plan, resize
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rasterization import Rasterization, rasterize
-from sundae_ns.rasterization.limits import check_memory
+from sundae_ns.rasterization.types import check_memory
 from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, FieldSource, Primitives, StepResolution
 from sundae_ns.rendering.views import View
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import Window
 from sundae_ns.data.camera_axes import OPENGL_TO_OPENCV, world_to_camera, world_to_camera_floats
-from sundae_ns.rasterization.projection import camera_center
+from sundae_ns.rasterization.reference import camera_center
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sundae_ns.gaussians.covariance import quaternions
 from sundae_ns.gaussians.parameters import sh_degree
-from sundae_ns.rasterization.harmonics import harmonic_basis
+from sundae_ns.rasterization.reference import harmonic_basis
 
 
 def multiply_quaternions(a: Tensor, b: Tensor) -> Tensor:

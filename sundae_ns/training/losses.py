@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sundae_ns.gpu.fused_loss import SSIM_WINDOW, fused_loss, loss_kernels
 from sundae_ns.gpu.nvrtc import kernels_where_possible
-from sundae_ns.rasterization.select import numba_problem
+from sundae_ns.rasterization import numba_problem
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.options import ModelOptions
 

@@ -28,7 +28,7 @@ from sundae_ns.api.packing import scene_of
 from sundae_ns.api.page import page_of, render_first, write_page
 from sundae_ns.cli import main
 from sundae_ns.errors import PackError
-from sundae_ns.rasterization.projection import project
+from sundae_ns.rasterization.reference import project
 from sundae_ns.rasterization.types import Inputs
 from sundae_ns.storage.pack import read_scene
 

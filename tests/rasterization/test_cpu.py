@@ -285,7 +285,7 @@ def test_any_scene(
 
 
 def test_results_do_not_depend_on_the_number_of_threads(threads: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("projection._MIN_PER_THREAD", "tiles._MIN_PER_THREAD", "compositing._MIN_PER_THREAD_TO_SUM"):
+    for name in ("backend._MIN_PER_THREAD", "tiles._MIN_PER_THREAD", "compositing._MIN_PER_THREAD_TO_SUM"):
         monkeypatch.setattr(f"sundae_ns.rasterization.cpu.{name}", 100)
     scene, view = make_scene(3000, channels=8), make_view(130, 70, torch.float32)
     results = []

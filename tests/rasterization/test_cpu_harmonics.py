@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sundae_ns.errors import BackendError
 from sundae_ns.rasterization import select_backend, spherical_harmonics
-from sundae_ns.rasterization.cpu import harmonics
+from sundae_ns.rasterization.cpu import backend
 
 CPU, REFERENCE = select_backend("cpu", "cpu"), select_backend("reference", "cpu")
 
@@ -54,7 +54,7 @@ def test_only_what_needs_a_gradient_gets_one() -> None:
 def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     directions, coeffs = torch.randn(500, 3), torch.randn(500, 16, 3)
     one = graded(3, directions, coeffs, CPU)
-    monkeypatch.setattr(harmonics, "_MIN_PER_THREAD", 1)
+    monkeypatch.setattr(backend, "_MIN_TO_EVALUATE", 1)
     monkeypatch.setattr("sundae_ns.rasterization.cpu.parallel.torch.get_num_threads", lambda: 3)
     for ours, expected in zip(graded(3, directions, coeffs, CPU), one, strict=True):
         assert torch.equal(ours, expected)

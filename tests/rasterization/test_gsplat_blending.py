@@ -10,20 +10,17 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import SundaeError
-from sundae_ns.rasterization import gsplat_blending
-from sundae_ns.rasterization.compositing import composite
-from sundae_ns.rasterization.gsplat_blending import blend
-from sundae_ns.rasterization.gsplat_tiles import TILE, GsplatLists
-from sundae_ns.rasterization.projection import Projection
-from sundae_ns.rasterization.tiles import build_tile_lists
+from sundae_ns.rasterization import gsplat_kernels
+from sundae_ns.rasterization.gsplat_kernels import TILE, GsplatLists, blend
+from sundae_ns.rasterization.reference import Projection, composite
 
 NAMES = ("means2d", "conics", "colors", "opacities")
 
 
 @pytest.fixture(autouse=True)
 def on_cpu(load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gsplat_blending, "load_kernels", load_on_cpu)
-    monkeypatch.setattr(gsplat_blending, "LANES", 1)
+    monkeypatch.setattr(gsplat_kernels, "load_kernels", load_on_cpu)
+    monkeypatch.setattr(gsplat_kernels, "LANES", 1)
 
 
 def field(n: int, channels: int, width: int, height: int, *, opacity: float = 1.0) -> dict[str, Tensor]:
@@ -62,14 +59,13 @@ def expected(
     projection = Projection(
         means2d=primitives["means2d"][0],
         covars2d=primitives["covariances"],
-        conics=primitives["conics"][0],
+        conics=leaves["conics"][0],
         depths=primitives["depths"],
         compensations=torch.ones_like(primitives["depths"]),
         radii=radii.int(),
     )
     opacities = leaves["opacities"][0]
-    lists = build_tile_lists(projection, opacities.detach(), width, height)
-    return composite(leaves["means2d"], leaves["conics"][0], opacities, leaves["colors"][0], lists, absgrad)
+    return composite(leaves["means2d"], projection, opacities, leaves["colors"][0], width, height, absgrad=absgrad)
 
 
 def leaves_of(primitives: dict[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
@@ -140,7 +136,7 @@ def test_second_derivatives_are_refused() -> None:
 
 
 def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gsplat_blending, "LANES", 32)
+    monkeypatch.setattr(gsplat_kernels, "LANES", 32)
     for architecture, channels, absgrad in (("sm_75", 3, True), ("sm_90", 16, False), ("sm_90", 32, False)):
-        options = gsplat_blending.blending_options(channels, absgrad=absgrad)
+        options = gsplat_kernels.blending_options(channels, absgrad=absgrad)
         compile_for_gpu("blending.cu", architecture, options)

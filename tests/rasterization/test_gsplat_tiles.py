@@ -17,20 +17,18 @@ from sundae_ns.rasterization import (
     GsplatBackend,
     RecordableGsplat,
     gsplat_backend,
-    gsplat_colors,
-    gsplat_tiles,
+    gsplat_kernels,
     harmonic_colors,
     select_backend,
 )
-from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, Splats, tile_lists
+from sundae_ns.rasterization.gsplat_kernels import TILE, Capacity, Splats, tile_lists
 
 Field = dict[str, Tensor]
 
 
 @pytest.fixture(autouse=True)
 def on_cpu(load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gsplat_tiles, "load_kernels", load_on_cpu)
-    monkeypatch.setattr(gsplat_colors, "load_kernels", load_on_cpu)
+    monkeypatch.setattr(gsplat_kernels, "load_kernels", load_on_cpu)
     monkeypatch.setattr(gsplat_backend, "_check_kernels_take", lambda _: None)
 
 
@@ -220,15 +218,15 @@ def test_colors_and_gradients_match_the_reference(degree: int, each: bool) -> No
 
 def test_second_derivatives_of_colors_are_refused() -> None:
     means, center, dc, rest = colors_inputs()
-    found = gsplat_colors.harmonic_colors(1, means.requires_grad_(), center, dc, rest)
+    found = gsplat_kernels.harmonic_colors(1, means.requires_grad_(), center, dc, rest)
     with pytest.raises(SundaeError, match="second derivative"):
         torch.autograd.grad(found.sum(), means, create_graph=True)
 
 
 def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes]) -> None:
     for dtype in (torch.int16, torch.int32):
-        compile_for_gpu("tiles.cu", "sm_75", gsplat_tiles.listing_options(dtype))
-    compile_for_gpu("colors.cu", "sm_90", gsplat_colors.OPTIONS)
+        compile_for_gpu("tiles.cu", "sm_75", gsplat_kernels.listing_options(dtype))
+    compile_for_gpu("colors.cu", "sm_90", gsplat_kernels.COLOR_OPTIONS)
 
 
 def test_harmonics_that_are_not_recorded_are_gsplats(monkeypatch: pytest.MonkeyPatch) -> None:

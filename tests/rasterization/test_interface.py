@@ -83,7 +83,7 @@ def test_gsplat_on_cpu_tensors_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_kernels_that_fail_are_reported_and_auto_falls_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr("sundae_ns.rasterization.select._kernel_problem", lambda: "its kernels do not run (x); mend")
+    monkeypatch.setattr("sundae_ns.rasterization.interface._kernel_problem", lambda: "its kernels do not run (x); mend")
     with pytest.raises(BackendError, match="its kernels do not run"):
         select_backend("gsplat", "cuda")
     assert select_backend("auto", "cuda:0").name == "reference"

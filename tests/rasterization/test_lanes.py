@@ -9,6 +9,7 @@ import pytest
 import torch
 from splat_inputs import geometry
 
+from sundae_ns.rasterization.cpu.backend import project
 from sundae_ns.rasterization.cpu.lanes import (
     WIDTH,
     absolute,
@@ -24,9 +25,7 @@ from sundae_ns.rasterization.cpu.lanes import (
     store_sums,
 )
 from sundae_ns.rasterization.cpu.parallel import compiled
-from sundae_ns.rasterization.cpu.projection import project
-from sundae_ns.rasterization.cpu.tiles import HALF_XX, HALF_YY, LIMIT, STEP, XY, U, V, build_lists
-from sundae_ns.rasterization.tiles import TILE
+from sundae_ns.rasterization.cpu.tiles import HALF_XX, HALF_YY, LIMIT, STEP, TILE, XY, U, V, build_lists
 
 DTYPES = [np.float32, np.float64]
 

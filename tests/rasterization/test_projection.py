@@ -8,8 +8,7 @@ from splat_inputs import geometry
 from torch import Tensor
 
 from sundae_ns.gaussians.covariance import rotation_matrices
-from sundae_ns.rasterization.harmonics import evaluate_harmonics
-from sundae_ns.rasterization.projection import project
+from sundae_ns.rasterization.reference import evaluate_harmonics, project
 
 gsplat_torch = pytest.importorskip("gsplat.cuda._torch_impl")
 

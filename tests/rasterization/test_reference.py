@@ -10,7 +10,7 @@ from splat_inputs import geometry
 from torch import Tensor
 
 from sundae_ns.rasterization import Rasterization, blending_weights, rasterize, select_backend, spherical_harmonics
-from sundae_ns.rasterization.projection import project
+from sundae_ns.rasterization.reference import project
 
 REFERENCE = select_backend("reference", "cpu")
 NAMES = ("means", "quats", "scales", "opacities", "colors")
@@ -114,9 +114,8 @@ def test_stops_early_like_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     scene["opacities"] = scene["opacities"].clamp(min=0.9)  # opaque after a few
     image, alpha, _, _ = _oracle(scene, view)
     results = []
-    for segment, elements in [(128, 2**17), (3, 2**10)]:
-        monkeypatch.setattr("sundae_ns.rasterization.compositing._SEGMENT", segment)
-        monkeypatch.setattr("sundae_ns.rasterization.compositing._BATCH_ELEMENTS", elements)
+    for segment in (4096, 3):
+        monkeypatch.setattr("sundae_ns.rasterization.reference._SEGMENT", segment)
         leaves = _leaves(scene)
         ours = rasterize(**leaves, **view, absgrad=True)
         torch.testing.assert_close(ours.colors, image, rtol=0, atol=1e-12)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from splat_inputs import geometry
 from torch import Tensor
 
-from sundae_ns.rasterization.projection import project
+from sundae_ns.rasterization.reference import project
 from sundae_ns.rasterization.sharded import UNMOVED, Slack, frustum_bounds, may_be_seen
 
 NEAR = 0.01

@@ -7,7 +7,7 @@ import torch
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from sundae_ns.rasterization.reference import _radii_per_axis, strategy_info
+from sundae_ns.rasterization.types import _radii_per_axis, strategy_info
 from sundae_ns.training.densification import (
     CappedStrategy,
     count_view,

@@ -2,11 +2,9 @@
 
 - ``parallel``: compilation, its cache on disk, and threads;
 - ``lanes``: SIMD values for compiled loops;
-- ``projection``: projection of primitives, with hand-written derivatives;
-- ``harmonics``: colours from harmonics, with hand-written derivatives;
 - ``tiles``: sorting by depth, and the list of each tile;
 - ``compositing``: front-to-back blending, and its derivatives back to front;
-- ``backend``: the backend made of these stages.
+- ``backend``: projection and harmonics with their derivatives, and the backend made of these stages.
 """
 
 from sundae_ns.rasterization.cpu.backend import CpuBackend

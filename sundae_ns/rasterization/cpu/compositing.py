@@ -1,6 +1,10 @@
 """Front-to-back blending of tile lists, and its derivatives back to front.
 
-The equations are in :mod:`sundae_ns.rasterization.compositing`.
+For pixel p and list entry m, with g the gradient of the loss with respect to the blended channels:
+
+- alpha_m = min(0.999, opacity exp(-e_m)), where e_m is half the squared Mahalanobis distance to the centre;
+- T_m = prod over k < m of (1 - alpha_k), w_m = alpha_m T_m, and the image is sum_m w_m c_m;
+- -dL/de_m = w_m <g, c_m> - alpha_m / (1 - alpha_m) * sum over k > m of w_k <g, c_k>, and 0 where alpha is clamped.
 
 A loop over the pixels of a tile handles one primitive at a time, many pixels in SIMD lanes, without branches. The
 backward pass starts from the final transmittance and divides by (1 - alpha) where the forward pass multiplied; the
@@ -16,7 +20,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sundae_ns.rasterization.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
 from sundae_ns.rasterization.cpu.lanes import (
     WIDTH,
     absolute,
@@ -33,8 +36,8 @@ from sundae_ns.rasterization.cpu.lanes import (
     zeros,
 )
 from sundae_ns.rasterization.cpu.parallel import as_array, compiled, inlined, parallel_for
-from sundae_ns.rasterization.cpu.tiles import HALF_XX, HALF_YY, OPACITY, XY, Lists, U, V
-from sundae_ns.rasterization.tiles import MIN_ALPHA, TILE
+from sundae_ns.rasterization.cpu.tiles import HALF_XX, HALF_YY, OPACITY, TILE, XY, Lists, U, V
+from sundae_ns.rasterization.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 _PIXELS = TILE * TILE
 _CHECK_EVERY = 8  # list entries between two checks for opaque tiles
@@ -85,7 +88,12 @@ class _Composite(torch.autograd.Function):
 
 
 composite = _Composite.apply
-"""As :data:`sundae_ns.rasterization.compositing.composite`; the geometry is read from the lists."""
+"""Blend to an image ``[H, W, C]`` and its alpha ``[H, W, 1]``; once differentiable.
+
+It takes centres ``[1, N, 2]`` in pixels, conics ``[N, 3]``, opacities ``[N]`` and colours ``[N, C]``, for their
+gradients; the lists, which hold the geometry that is read; and ``absgrad``: the backward pass sets ``absgrad``
+``[1, N, 2]`` of the centres, as :func:`sundae_ns.rasterization.reference.composite` does.
+"""
 
 
 @inlined

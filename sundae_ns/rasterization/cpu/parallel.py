@@ -27,9 +27,8 @@ from torch import Tensor
 _RANGES_PER_THREAD = 8  # enough for an even load, few enough to cost nothing
 _NOTICE_AFTER = 1.0  # seconds of compilation before a notice is printed
 
-_FILES = (*sorted(Path(__file__).parent.glob("*.py")), Path(__file__).parents[1] / "harmonics.py")
-_SOURCES = "".join(path.read_text(encoding="utf-8") for path in _FILES)
-"""Sources of all loops: a loop calls functions of other modules, but numba's cache checks one file only."""
+_FILES = (*sorted(Path(__file__).parent.glob("*.py")), Path(__file__).parents[1] / "reference.py")
+_SOURCES = "".join(path.read_text(encoding="utf-8") for path in _FILES)  # of all functions that loops call
 
 _ready: set[tuple[Any, ...]] = set()  # loops already called, with the dtypes of their arguments
 
@@ -46,7 +45,8 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
     """
     # x / 0 gives inf or NaN, as in torch: raising would cost a branch.
     options |= {"nogil": True, "error_model": "numpy"}
-    # Constants of other modules are compiled in: a hash of them in the name selects the cache file.
+    # numba renews its cache when the function's own file changes. But constants and functions of other modules are
+    # compiled in too. Their hash becomes part of the function's name, so that a change selects another cache file.
     numbers = sorted((k, v) for k, v in function.__globals__.items() if isinstance(v, (int, float)))
     function.__qualname__ += "_" + hashlib.sha256(f"{numbers} {_SOURCES}".encode()).hexdigest()[:8]
     try:

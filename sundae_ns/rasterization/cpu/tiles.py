@@ -1,4 +1,9 @@
-"""Depth-ordered lists of the primitives of each tile, by the rule of :mod:`sundae_ns.rasterization.tiles`.
+"""Depth-ordered lists of the primitives of each tile.
+
+gsplat 1.4 bins primitives into 16-pixel tiles by their three-sigma square and blends them in every pixel of those
+tiles. So its images depend on that grid. The lists here use a finer grid and leave out only primitives that cannot
+reach an alpha of 1/255 in a tile: the image is that of the 16-pixel grid, with fewer evaluations. (gsplat 1.5 fits the
+bins to the opacity instead, which also keeps the rim of opaque primitives from 3 to 3.33 sigma.)
 
 Primitives are sorted by depth once and are then identified by their rank. A rank owns consecutive slots, one per tile
 that it can touch; the list of a tile is a list of slots. The backward pass writes its sums per tile into the slots. The
@@ -17,15 +22,20 @@ from torch import Tensor
 
 from sundae_ns.rasterization.cpu.lanes import WIDTH
 from sundae_ns.rasterization.cpu.parallel import as_array, compiled, parallel_for
-from sundae_ns.rasterization.limits import check_pairs
-from sundae_ns.rasterization.projection import Projection
-from sundae_ns.rasterization.tiles import BIN, MIN_ALPHA, ROUNDING, TILE
+from sundae_ns.rasterization.reference import BIN, MIN_ALPHA, Projection
+from sundae_ns.rasterization.types import check_pairs
+
+TILE = 8
+"""Side of a tile in pixels."""
 
 U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT, HALF_WIDTH, HALF_HEIGHT = range(9)
 """Columns of the table: centre, conic, opacity, largest exponent that is blended, and its distance from the centre."""
 
 STEP = WIDTH // TILE
 """Rows of pixels of a tile that are blended in one step."""
+
+ROUNDING = 1e-3
+"""Slack on exponents, so that rounding never drops a primitive that is blended."""
 
 _PAIR_BYTES = 10
 _MIN_PER_THREAD = 2_500  # primitives: below 0.1 ms of work, waking a thread costs more than it saves
