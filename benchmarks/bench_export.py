@@ -28,7 +28,7 @@ from sundae_ns.api.files import load, save
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering import LocalField, render_view
-from sundae_ns.scenes.opening import Opened, open_scene
+from sundae_ns.scenes.models import Opened, load_model
 from sundae_ns.storage import read_ply
 from sundae_ns.storage.viewers import ANTIALIASED
 
@@ -76,7 +76,7 @@ def main() -> None:
             "splat-transform is not in PATH; npm install @playcanvas/splat-transform, or give --splat-transform"
         )
 
-    run = open_scene(options.run / "config.yml")
+    run = load_model(options.run / "config.yml")
     model = run.model
     scene = load(options.run)
     views = torch.linspace(0, len(run.cameras) - 1, min(options.views, len(run.cameras))).round().long().tolist()

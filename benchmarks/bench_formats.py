@@ -29,9 +29,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 import sundae_ns as sn
+from sundae_ns.api.packing import packed_bytes
 from sundae_ns.rendering.views import view_of
-from sundae_ns.scenes.opening import Opened, open_scene
-from sundae_ns.scenes.packed import packed_run
+from sundae_ns.scenes.models import Opened, load_model, load_run
 from sundae_ns.storage import bytes_of, bytes_of_module
 from sundae_ns.storage.atomic import replacing
 
@@ -66,7 +66,7 @@ def packed_files(run: Path, scene: sn.Scene, folder: Path, data: Path | None, pr
         sn.save(scene, folder / f"scene{kind}")
         yield Packed(folder / f"scene{kind}", OURS, f"sundae export RUN -o scene{kind}")
     packed = folder / "scene.sundae"
-    packed.write_bytes(packed_run(run, data=data)[1])
+    packed.write_bytes(packed_bytes(load_run(run, data=data)))
     yield Packed(packed, OURS, "sundae pack RUN -o scene.sundae")
     if program is not None:
         theirs = folder / "theirs.sog"
@@ -139,7 +139,7 @@ def main() -> int:
     )
     options = parser.parse_args()
 
-    opened = open_scene(options.run, data=options.data)
+    opened = load_model(options.run, data=options.data)
     scene = sn.load(options.run, device=opened.model.device)
     with tempfile.TemporaryDirectory() as name:
         files = packed_files(options.run, scene, Path(name), options.data, options.splat_transform)

@@ -33,11 +33,11 @@ import torch
 from rich.progress import Progress, track
 from torch import Tensor
 
+from sundae_ns.api.packing import contents_of
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.scenes.finetune import RATE, finetune
-from sundae_ns.scenes.opening import open_scene
-from sundae_ns.scenes.packed import contents_of_run
+from sundae_ns.scenes.models import load_model, load_run
 from sundae_ns.storage.pack import (
     FINETUNED,
     Codecs,
@@ -140,8 +140,8 @@ def sizes(report: PackReport) -> dict[str, Any]:
 
 @torch.no_grad()
 def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
-    before = open_scene(run / "config.yml")
-    after = open_scene(file, data=before.capture).model
+    before = load_model(run / "config.yml")
+    after = load_model(file, data=before.capture).model
     chosen = torch.linspace(0, len(before.cameras) - 1, min(views, len(before.cameras))).round().long().tolist()
     names = ("psnr", "psnr_packed", "psnr_between", "ssim", "ssim_packed")
     sums = {name + suffix: 0.0 for name in names for suffix in ("", "_base")}
@@ -204,7 +204,7 @@ def main() -> None:
         return
     config = config_of(options.set, options.finetune > 0)
     steps = options.finetune
-    scene = random_scene(options.primitives) if options.run is None else contents_of_run(options.run)
+    scene = random_scene(options.primitives) if options.run is None else contents_of(load_run(options.run))
     with tempfile.TemporaryDirectory() as name:
         file = Path(name) / "scene.sundae"
         start = time.perf_counter()

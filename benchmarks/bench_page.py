@@ -40,7 +40,7 @@ from torch import Tensor
 from harness.chromium import WEBGPU, Browser, find_chromium, wait_for
 from sundae_ns.api.packing import arrays_of_views, scene_of
 from sundae_ns.api.page import write_page
-from sundae_ns.scenes.packed import model_of
+from sundae_ns.scenes.models import model_of
 from sundae_ns.storage.pack import PackedScene, container, read_scene
 from sundae_ns.storage.pack.scene import CAMERAS as STORED
 

@@ -33,7 +33,7 @@ from harness.script import run_script
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.evaluation import without_nan
 from sundae_ns.evaluation.document import number
-from sundae_ns.scenes.opening import Opened, open_scene
+from sundae_ns.scenes.models import Opened, load_model
 
 FRAMES_APART = (1, 7)
 """Distances of compared frames, as in StopThePop: flicker from one frame to the next, and what builds up slowly."""
@@ -264,7 +264,7 @@ def flicker(
     """
     console = Console(stderr=True)
     with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
-        run = open_scene(load_config, data=data)
+        run = load_model(load_config, data=data)
         _ = run.datamanager.cached_train  # loads the training images, whose undistortion changes their cameras
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Rendering paths", total=places * FRAMES)

@@ -48,7 +48,7 @@ from harness.processes import Bench, command_here, train_here
 from harness.watcher import Watcher, free_port
 from sundae_ns.errors import CheckpointError
 from sundae_ns.rendering.views import view_of
-from sundae_ns.scenes.opening import open_scene
+from sundae_ns.scenes.models import load_model
 from sundae_ns.storage.runs import checkpoint
 
 SPREAD = 3.0
@@ -119,7 +119,7 @@ def same_tensors(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool
 
 def quality(run: Path) -> float:
     """PSNR of the test views, dB."""
-    opened = open_scene(run)
+    opened = load_model(run)
     views = [view_of(camera, opened.model.device) for camera in opened.cameras]
     return sn.measure(sn.load(run, device=opened.model.device), opened.truths, views).psnr
 

@@ -33,7 +33,7 @@ from torch import Tensor
 import sundae_ns as sn
 from sundae_ns.errors import SundaeError
 from sundae_ns.rendering.views import view_of
-from sundae_ns.scenes.opening import open_scene
+from sundae_ns.scenes.models import load_model
 from sundae_ns.storage.atomic import replacing
 
 COLUMNS = (
@@ -62,7 +62,7 @@ class Full(NamedTuple):
 
 def full_field(run: Path, data: Path | None) -> Full:
     """Open a run with its test views."""
-    opened = open_scene(run, data=data)
+    opened = load_model(run, data=data)
     device = opened.model.device
     scene = dataclasses.replace(sn.load(run, device=device), head=None)
     views = [view_of(camera, device) for camera in opened.cameras]

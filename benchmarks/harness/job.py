@@ -29,13 +29,13 @@ from harness.alone import watched_gpu
 from harness.plan import Job, Words, done_file, job_folder
 from harness.script import run_script
 from sundae_ns.api.files import load
+from sundae_ns.api.packing import contents_of
 from sundae_ns.errors import BackendError, CheckpointError, PackError, SundaeError
 from sundae_ns.evaluation import Lpips, Measured, lpips_weights_available
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.scenes.finetune import finetune
 from sundae_ns.scenes.measure import measure_scene
-from sundae_ns.scenes.opening import Opened, open_scene
-from sundae_ns.scenes.packed import contents_of_run, model_of
+from sundae_ns.scenes.models import Opened, load_model, load_run, model_of
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.pack import (
     FINETUNE_STEPS,
@@ -143,7 +143,7 @@ def pack(opened: Opened, path: Path) -> dict[str, Any] | None:
         None for a field that cannot be packed.
     """
     try:
-        return _written(opened, path, *fit_scene(contents_of_run(opened.source), PackConfig()))
+        return _written(opened, path, *fit_scene(contents_of(load_run(opened.source)), PackConfig()))
     except PackError as error:
         print(f"not packed: {error}")
         return None
@@ -157,7 +157,7 @@ def tune(opened: Opened, path: Path) -> dict[str, Any] | None:
     """
     config = PackConfig(**FINETUNED)  # type: ignore[arg-type]
     try:
-        scene, codecs = finetune(opened.source, contents_of_run(opened.source), config, FINETUNE_STEPS)
+        scene, codecs = finetune(opened.source, contents_of(load_run(opened.source)), config, FINETUNE_STEPS)
         _forget()
         return _written(opened, path, scene, codecs)
     # The training of hours before it must not be lost.
@@ -200,7 +200,7 @@ def _measured(job: Job, config: TrainerConfig, command: str) -> tuple[Opened, Me
     folder = trainer.base_dir
     del trainer, save
     _forget()
-    opened = open_scene(folder)
+    opened = load_model(folder)
     lpips = Lpips(download=False) if lpips_weights_available() else None
     measured = measure_scene(opened, label=job.key, lpips=lpips, command=command)
     measured = replace(measured, scene=job.scene, variant=job.arm, seed=job.seed, train_s=seconds, peak_vram_mib=peak)

@@ -62,20 +62,15 @@ def scene_of(packed: PackedScene) -> Scene:
     )
 
 
-def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> PackedScene:
-    """The contents of a packed file for a scene, with how much errors are seen in its cameras.
+def contents_of(scene: Scene) -> PackedScene:
+    """The contents of a packed file for a scene on any device, with how much errors are seen in its views.
 
-    Args:
-        scene: any device; primitives that are not finite are left out (``gaussians.mend``).
-        cameras: arrays by the names of :data:`sundae_ns.storage.pack.scene.CAMERAS`; by default those of the
-            scene's views.
+    Primitives that are not finite are left out (``gaussians.mend``).
     """
     scene = scene.to("cpu")
     scene = replace(scene, field=mend(scene.field).field)
     head = {} if scene.head is None else dict(scene.head.state_dict())
     field = {name: value.detach() for name, value in scene.field.items() if name != FEATURES or head}
-    if cameras is None and scene.views:
-        cameras = arrays_of_views(scene.views)
     options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in _HEAD_OPTIONS}
     # Degree 0 stands for logits.
     degree = 0 if scene.field.encoding == "logits" else max(scene.field.sh_degree, 1)
@@ -88,10 +83,9 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
     }
     source = {**scene.meta.get("source", {}), **({} if scene.in_model_frame else {"model_frame": False})}
     meta = {**scene.meta, "source": source, "model": model, **stated_start(scene)}
-    views = views_of_arrays(cameras)
-    return PackedScene(
-        field, head, None if cameras is None else dict(cameras), meta, sensitivity_of(scene, views) if views else None
-    )
+    if not scene.views:
+        return PackedScene(field, head, None, meta, None)
+    return PackedScene(field, head, arrays_of_views(scene.views), meta, sensitivity_of(scene, scene.views))
 
 
 def packed_bytes(scene: Scene) -> bytes:

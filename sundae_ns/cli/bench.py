@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from sundae_ns.evaluation import Measured
-    from sundae_ns.scenes.opening import Opened
+    from sundae_ns.scenes.models import Opened
 
 
 def bench(
@@ -54,11 +54,11 @@ def bench(
 
     from sundae_ns.evaluation import without_nan
     from sundae_ns.scenes.measure import measure_scene, rendered_as
-    from sundae_ns.scenes.opening import open_scene
+    from sundae_ns.scenes.models import load_model
 
     console = Console(stderr=True)
     with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
-        run = open_scene(scene, data=data)
+        run = load_model(scene, data=data)
     run = replace(run, cameras=run.cameras[:views], truths=run.truths[:views])
     on_gpu, has_head = run.model.device.type == "cuda", run.model.head is not None
     device = torch.cuda.get_device_name() if on_gpu else "cpu"

@@ -70,22 +70,23 @@ def demo(
 
         # nerfstudio prints messages while it imports and loads.
         with open(out / "measure.log", "w", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
+            from sundae_ns.api.packing import packed_bytes
             from sundae_ns.api.page import write_page
             from sundae_ns.scenes.measure import comparison_of, evaluation, frame_times, sizes
-            from sundae_ns.scenes.opening import open_scene
-            from sundae_ns.scenes.packed import packed_run
+            from sundae_ns.scenes.models import load_model, load_run
             from sundae_ns.storage.atomic import write_bytes, write_image, write_text
             from sundae_ns.storage.runs.folder import prunes_of
 
             evaluated = evaluation(run)
             write_text(out / "eval.json", json.dumps(evaluated, indent=2, allow_nan=False) + "\n")
-            opened = open_scene(run / "config.yml")
+            opened = load_model(run / "config.yml")
             model, cameras = opened.model, opened.cameras
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
             chosen = range(0, len(cameras), max(len(cameras) // SHOWN, 1))[:SHOWN]
             rows = [comparison_of(model, cameras[i], opened.truths[i], f"test view {i}") for i in chosen]
             write_image(out / "comparison.png", comparison_sheet(rows))
-            finished, packed = packed_run(run)
+            finished = load_run(run)
+            packed = packed_bytes(finished)
             write_bytes(out / "scene.sundae", packed)
             write_page(out / "scene.html", finished, packed, title="sundae demo")
 

@@ -117,10 +117,12 @@ def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
 
         return packed_file(path)
     check_run(path)  # before nerfstudio is imported, which takes seconds
-    from sundae_ns.scenes.packed import packed_run
+    from sundae_ns.api.packing import packed_bytes
+    from sundae_ns.scenes.models import load_run
 
     with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
-        return packed_run(path, data=data)
+        scene = load_run(path, data=data)
+    return scene, packed_bytes(scene)
 
 
 def copies_rows(source: Path, out: Path) -> bool:
@@ -170,12 +172,11 @@ def cameras_of(scene: Scene, cameras: Path | None, most: int | None) -> Sequence
     from sundae_ns.storage.runs.config_file import check_run
 
     check_run(cameras)  # before nerfstudio is imported, which takes seconds
-    from sundae_ns.api.packing import views_of_arrays
     from sundae_ns.api.virtual import VIEWS
-    from sundae_ns.scenes.packed import contents_of_run
+    from sundae_ns.scenes.models import load_run
 
     with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
-        return views_of_arrays(contents_of_run(cameras, max_cameras=most or VIEWS["cpu"]).cameras)
+        return load_run(cameras, max_cameras=most or VIEWS["cpu"]).views
 
 
 def prune_file(

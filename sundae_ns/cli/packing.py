@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cache
 from io import StringIO
 from json import dumps
@@ -84,7 +84,8 @@ def pack(
     from rich.console import Console
     from rich.progress import Progress
 
-    from sundae_ns.api.packing import contents_of, scene_of, stated_start
+    from sundae_ns.api.files import load
+    from sundae_ns.api.packing import contents_of
     from sundae_ns.api.views import with_start
     from sundae_ns.errors import ConfigError
     from sundae_ns.storage.pack import FINETUNE_STEPS, FINETUNED, PackConfig, fit_scene, write_fitted
@@ -121,18 +122,14 @@ def pack(
         task = progress.add_task("Reading the run", total=3 + finetune)
         with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
             if has_photos:
-                from sundae_ns.scenes.packed import contents_of_run  # takes seconds
+                from sundae_ns.scenes.models import load_run  # takes seconds
 
-                source = contents_of_run(run, max_cameras=max_cameras, data=data)
+                opened = load_run(run, max_cameras=max_cameras, data=data)
             else:
-                from sundae_ns.api.files import load
-
-                source = contents_of(load(run))
+                opened = load(run)
             if cleaning.chosen:
-                source = contents_of(cleaning.cleaned(scene_of(source), progress=False))
-            if start_view is not None or up is not None:
-                stated = stated_start(with_start(scene_of(source), start_view, up))
-                source = replace(source, meta={**source.meta, **stated})
+                opened = cleaning.cleaned(opened, progress=False)
+            source = contents_of(with_start(opened, start_view, up))
             progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
             judge = _judge_of(run, data)
             if finetune:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sundae_ns.evaluation.plots import Cost
     from sundae_ns.evaluation.report_page import ShownRun
     from sundae_ns.evaluation.shown_views import ShownView
-    from sundae_ns.scenes.opening import Opened
+    from sundae_ns.scenes.models import Opened
 
 PNG_WIDTH = 400
 """Widest images, in pixels, whose comparison is written as PNG; wider ones are JPEG files, which are much smaller."""
@@ -83,7 +83,7 @@ def report(
         from sundae_ns.evaluation.report_page import ShownRun, report_page
         from sundae_ns.evaluation.shown_views import views_for_each
         from sundae_ns.scenes.measure import measure_scene
-        from sundae_ns.scenes.opening import open_scene
+        from sundae_ns.scenes.models import load_model
         from sundae_ns.storage.atomic import write_files
 
     words = ["sundae", "report", *map(str, runs), "-o", str(out), "--lpips-net", lpips_net]
@@ -116,7 +116,7 @@ def report(
 
             try:
                 with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # nerfstudio's messages
-                    opened = open_scene(path, data=data)
+                    opened = load_model(path, data=data)
                 label = _label(opened, {run.label for run in done})
                 progress.update(task, description=f"Measuring {escape(label)}", total=len(opened.cameras))
                 measured = measure_scene(

@@ -22,11 +22,9 @@ from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization import Capacity
 from sundae_ns.rendering.render import RenderSettings
-from sundae_ns.scenes.opening import open_pipeline
-from sundae_ns.scenes.packed import place
+from sundae_ns.scenes.models import load_model, place
 from sundae_ns.storage.pack import Codecs, PackConfig, PackedScene, fit_scene
 from sundae_ns.storage.pack.codecs import estimated_bits
-from sundae_ns.storage.runs.folder import config_of
 from sundae_ns.training.optimizers import NetworkAdamConfig
 from sundae_ns.training.recordings import StepRecordings
 from sundae_ns.training.step import StepInputs, StepResult
@@ -72,7 +70,7 @@ def finetune(
 
     Args:
         run: folder of a run of sundae or splatfacto, or its ``config.yml``.
-        scene: the same run, from ``scenes.packed.contents_of_run``.
+        scene: the same run, from ``api.packing.contents_of``.
         config: bits of the pack.
         steps: number of steps, at least 1.
         rate: added to the loss for each bit per stored number, of the field and of the head.
@@ -90,9 +88,8 @@ def finetune(
     """
     if steps < 1:
         raise ConfigError(f"a fine-tune of {steps} steps changes nothing; give 1 or more")
-    path = config_of(run)
     scene, codecs = fit_scene(scene, config)
-    opened = open_pipeline(path, data=data, test_mode="val")
+    opened = load_model(run, data, split="val")
     pipeline, model = opened.pipeline, opened.model
     if model.state.densifying:
         raise CheckpointError(
@@ -114,10 +111,10 @@ def finetune(
     step = TunedStep(model, codecs, field, head, optimizer, rate / numbers)
     generators = [torch.cuda.current_device()] if model.device.type == "cuda" else []
     with naming_full_memory(lambda: model.num_points), torch.random.fork_rng(generators):
-        torch.manual_seed(opened.config.machine.seed)  # of random backgrounds
+        torch.manual_seed(opened.seed or 0)  # of random backgrounds
         for i in range(steps):
             _set_rates(optimizer, [peak * rate_factor(i, steps) for peak in highest])
-            at = opened.step + 1 + i
+            at = opened.steps + i
             if weights:
                 model.step = at  # chooses the window of a large image
             camera, batch = pipeline.datamanager.next_train(at)

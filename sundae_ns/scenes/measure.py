@@ -16,7 +16,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.compensation import resize
-from sundae_ns.errors import BackendError, ConfigError, DataError
+from sundae_ns.errors import BackendError, ConfigError
 from sundae_ns.evaluation import (
     HEAD_OFF,
     HEAD_ON,
@@ -32,9 +32,8 @@ from sundae_ns.evaluation import (
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import compensate, draw, scale_plan, zoomed
-from sundae_ns.scenes.opening import Opened, open_pipeline
+from sundae_ns.scenes.models import Opened, load_model
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
-from sundae_ns.storage.runs.folder import config_of
 
 MOST_ZOOM = 1000
 """Factor on the sides of an image beyond which no memory holds it."""
@@ -231,18 +230,15 @@ def evaluation(run: Path, *, data: Path | None = None) -> dict[str, Any]:
         CheckpointError: the run is of another method, or has no whole checkpoint.
         DataError: its capture is missing, or cannot be used, or has no test views.
     """
-    path = config_of(run)
-    opened = open_pipeline(path, data=data)
-    if not opened.pipeline.datamanager.eval_dataset:
-        raise DataError(f"{opened.capture} has no test views, so there is nothing to evaluate {run} on")
+    opened = load_model(run, data)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "std_mean", UserWarning)  # of a single view, which has no deviation
         results = opened.pipeline.get_average_eval_image_metrics(get_std=True)
     plain: dict[str, Any] = without_nan(
         {
-            "experiment_name": opened.config.experiment_name,
-            "method_name": opened.config.method_name,
-            "checkpoint": str(path.parent / opened.config.relative_model_dir / f"step-{opened.step:09d}.ckpt"),
+            "experiment_name": opened.variant,
+            "method_name": opened.method,
+            "checkpoint": str(opened.source / "nerfstudio_models" / f"step-{opened.steps - 1:09d}.ckpt"),
             "results": results,
         }
     )

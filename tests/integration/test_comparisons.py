@@ -26,7 +26,7 @@ from harness.job import fingerprint_of, perform
 from harness.plan import Job, parser_of, plan_scene
 from harness.results import read_results
 from sundae_ns.scenes.measure import measure_scene
-from sundae_ns.scenes.opening import open_scene
+from sundae_ns.scenes.models import load_model
 from sundae_ns.storage.pack import read_header
 
 ROOT = Path(__file__).parents[2]
@@ -101,7 +101,7 @@ def test_stopped_and_continued(
     assert peaks["sundae"] == peaks["random-no-head"] == rows[WARM_UP].primitives <= peaks[WARM_UP]
     assert rows["sundae"].bytes_head > 0 == rows["random-no-head"].bytes_head
     # What was measured is what lies there: the run can be opened and looked at.
-    assert open_scene(out / "jobs" / warm_up.key / WARM_UP / "sundae-tiny" / "run").steps == WARMUP
+    assert load_model(out / "jobs" / warm_up.key / WARM_UP / "sundae-tiny" / "run").steps == WARMUP
     # The options in a run's config.yml are those of its job; every arm has others.
     assert {row.fingerprint for row in rows.values()} == {fingerprint_of(job) for job in jobs}
     assert len({row.fingerprint for row in rows.values()}) == len(jobs)
@@ -109,7 +109,7 @@ def test_stopped_and_continued(
     assert results[WARM_UP]["packed"] is results[WARM_UP]["tuned"] is None
     for arm in arms:
         packed, key = results[arm]["packed"], results[arm]["job"]["key"]
-        scene = open_scene(out / "jobs" / key / "scene.sundae", data=tiny.scene)
+        scene = load_model(out / "jobs" / key / "scene.sundae", data=tiny.scene)
         found = measure_scene(scene, label="", repeats=0, visible=False)
         assert packed["bytes"] == scene.packed_bytes == found.bytes_total
         assert (packed["psnr"], packed["psnr_base"]) == pytest.approx(
@@ -121,7 +121,7 @@ def test_stopped_and_continued(
 def test_a_run_is_packed_with_a_fine_tune(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a job does on a GPU."""
     monkeypatch.setattr(jobs, "FINETUNE_STEPS", 3)
-    opened = open_scene(tiny.folder)
+    opened = load_model(tiny.folder)
     plain = jobs.pack(opened, tmp_path / "plain.sundae")
     tuned = jobs.tune(opened, tmp_path / "tuned.sundae")
     assert plain is not None
@@ -133,7 +133,7 @@ def test_a_run_is_packed_with_a_fine_tune(tiny: Any, tmp_path: Path, monkeypatch
     for checkpoint in (tmp_path / "run" / "nerfstudio_models").iterdir():
         if checkpoint.name != tiny.checkpoint(30).name:
             checkpoint.unlink()
-    assert jobs.tune(open_scene(tmp_path / "run"), tmp_path / "b.sundae") is None  # it still densifies
+    assert jobs.tune(load_model(tmp_path / "run"), tmp_path / "b.sundae") is None  # it still densifies
 
 
 def test_the_suite_trains_a_method_as_its_command_does(tiny: Any, tmp_path: Path) -> None:
@@ -204,7 +204,7 @@ def test_a_scene_as_it_is_published(tiny: Any, tmp_path: Path) -> None:
     assert {row.scene for row in rows} == {"bicycle", "counter"}
     # The published pictures, not the large ones, rounded as they are.
     assert {row.resolution for row in rows} == {f"{meta['w']}x{meta['h']}"}
-    opened = open_scene(tmp_path / "out" / "jobs" / "bicycle-sundae-50pct-s42" / "sundae" / "sundae-tiny" / "run")
+    opened = load_model(tmp_path / "out" / "jobs" / "bicycle-sundae-50pct-s42" / "sundae" / "sundae-tiny" / "run")
     assert len(opened.cameras) == -(-len(meta["frames"]) // 8)
     assert [float(camera.fx) for camera in opened.cameras] == pytest.approx([meta["fl_x"]] * len(opened.cameras))
     page = (tmp_path / "out" / "table.md").read_text()

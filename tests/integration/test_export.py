@@ -14,7 +14,7 @@ from torch import Tensor
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering import LocalField, render_view
-from sundae_ns.scenes.opening import open_scene
+from sundae_ns.scenes.models import load_model
 from sundae_ns.storage import read_ply
 
 PROGRAM = shutil.which("splat-transform")
@@ -24,7 +24,7 @@ PROGRAM = shutil.which("splat-transform")
     PROGRAM is None, reason="splat-transform is not in PATH: npm install -g @playcanvas/splat-transform (node 22)"
 )
 def test_exported_files_show_the_base_colours(tiny: Any, call: Any, tmp_path: Path) -> None:
-    run = open_scene(tiny.config)
+    run = load_model(tiny.config)
     background = run.model._get_background_color()
 
     settings = run.model.render_settings(training=False).without_head()

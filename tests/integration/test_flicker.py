@@ -9,7 +9,7 @@ import pytest
 from flicker import FRAMES, flicker, measure_flicker
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.scenes.opening import open_scene
+from sundae_ns.scenes.models import load_model
 
 
 def test_the_head_is_compared_with_base_colours(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
@@ -27,7 +27,7 @@ def test_the_head_is_compared_with_base_colours(tiny: Any, capsys: pytest.Captur
 
 
 def test_flicker_says_how_many_paths_there_were(tiny: Any) -> None:
-    run = open_scene(tiny.config)
+    run = load_model(tiny.config)
     cameras = len(run.datamanager.train_dataset.cameras)
     frames = []
     found = measure_flicker(run, places=10 * cameras, progress=lambda: frames.append(1))
@@ -36,7 +36,7 @@ def test_flicker_says_how_many_paths_there_were(tiny: Any) -> None:
 
 
 def test_flicker_needs_a_head_and_a_path(tiny: Any) -> None:
-    run = open_scene(tiny.config)
+    run = load_model(tiny.config)
     with pytest.raises(ConfigError, match="at 0 places"):
         measure_flicker(run, places=0)
     run.model.state.head_starts_at = 10**9

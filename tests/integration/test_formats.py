@@ -14,7 +14,7 @@ import torch
 
 import sundae_ns as sn
 from sundae_ns.rendering.views import view_of
-from sundae_ns.scenes.opening import open_scene
+from sundae_ns.scenes.models import load_model
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "bench_formats.py"
 TRANSFORM = """#!{python}
@@ -56,7 +56,7 @@ def test_each_format_has_a_row(tiny: Any, transform: Path, tmp_path: Path, monke
         *((kind, "sundae_ns") for kind in (".ply", ".spz", ".sog", ".sundae")),
         (".sog", "splat-transform 9.8.7"),
     ]
-    opened = open_scene(tiny.folder)
+    opened = load_model(tiny.folder)
     scene = sn.load(tiny.folder)
     assert scene.head is not None
     views = [view_of(camera, "cpu") for camera in opened.cameras]

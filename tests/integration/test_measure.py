@@ -20,9 +20,9 @@ from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import Measured, psnr
 from sundae_ns.rendering import render_view, zoomed
-from sundae_ns.scenes import opening
+from sundae_ns.scenes import models as opening
 from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, rendered_as, sizes
-from sundae_ns.scenes.opening import Opened, open_scene
+from sundae_ns.scenes.models import Opened, load_model
 from sundae_ns.storage.runs import checkpoint
 
 
@@ -32,7 +32,7 @@ def figures_of(run: Opened, factor: float = 1.0) -> Measured:
 
 
 def test_figures_of_a_run(tiny: Any) -> None:
-    run = open_scene(tiny.config)
+    run = load_model(tiny.config)
     model, cameras, truths = run.model, run.cameras, run.truths
     assert [truth.shape[:2] for truth in truths] == [(int(c.height), int(c.width)) for c in cameras]
     assert all(0 <= truth.min() <= truth.max() <= 1 for truth in truths)
@@ -47,7 +47,7 @@ def test_figures_of_a_run(tiny: Any) -> None:
 
 
 def test_the_timed_frames_are_those_compared_with_the_truth(tiny: Any) -> None:
-    run = open_scene(tiny.config)
+    run = load_model(tiny.config)
     run = replace(run, cameras=run.cameras[:2], truths=run.truths[:2])
     whole = figures_of(run)
     height, width = run.truths[0].shape[:2]
@@ -70,13 +70,13 @@ def test_a_run_opens_while_its_training_replaces_the_checkpoint(
     run = Path(shutil.copytree(tiny.folder, tmp_path / "run"))
     newest = checkpoint.newest_whole(run)[0]
     monkeypatch.setattr(opening, "_device", lambda: (newest.unlink(missing_ok=True), torch.device("cpu"))[1])
-    assert open_scene(run).steps == tiny.steps  # it reads the capture for seconds after it has found the checkpoint
+    assert load_model(run).steps == tiny.steps  # it reads the capture for seconds after it has found the checkpoint
 
 
 @pytest.mark.parametrize("factor", [0.4, 1.3])
 @torch.no_grad()
 def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> None:
-    run = open_scene(tiny.config)
+    run = load_model(tiny.config)
     model = run.model
     found = figures_of(run, factor)
     height, width = (round(factor * side) for side in run.truths[0].shape[:2])
@@ -96,7 +96,7 @@ def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> N
 
 @torch.no_grad()
 def test_the_head_is_timed_at_the_size_at_which_it_runs(tiny: Any) -> None:
-    run = open_scene(tiny.config)
+    run = load_model(tiny.config)
     model, whole = run.model, tuple(run.truths[0].shape[:2])
     seen: list[tuple[int, ...]] = []
     model.head.register_forward_pre_hook(lambda _, arguments: seen.append(tuple(arguments[0].shape[:2])))
@@ -115,7 +115,7 @@ def test_the_head_is_timed_at_the_size_at_which_it_runs(tiny: Any) -> None:
 
 
 def test_the_head_is_disabled_inside_a_block(tiny: Any) -> None:
-    run = open_scene(tiny.config)
+    run = load_model(tiny.config)
 
     def corrected() -> bool:
         shown = run.model.get_outputs_for_camera(run.cameras[0])
@@ -150,11 +150,11 @@ def test_a_capture_that_has_moved_is_found_or_named(
         main([*arguments, "--data", str(tiny.scene)])
     assert caught.value.code == 0
     shutil.copytree(tiny.scene, capture)
-    assert open_scene(run).capture == capture
+    assert load_model(run).capture == capture
 
 
 def test_a_head_that_is_not_enabled_yet_counts_no_bytes(tiny: Any) -> None:
-    run = open_scene(tiny.config)
+    run = load_model(tiny.config)
     assert figures_of(run).bytes_head > 0
     run.model.state.head_starts_at = 10**9
     figures = figures_of(run)
@@ -163,14 +163,14 @@ def test_a_head_that_is_not_enabled_yet_counts_no_bytes(tiny: Any) -> None:
 
 
 def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path) -> None:
-    assert open_scene(tiny.config).kept == tiny.keep_ratio
+    assert load_model(tiny.config).kept == tiny.keep_ratio
     run = Path(shutil.copytree(tiny.folder, tmp_path / "run"))
     prunes = [{"before": 200, "after": 50, "seconds": 1.0}, {"before": 80, "after": 40, "seconds": 0.5}]
     (run / "prune.json").write_text(json.dumps(prunes))
-    found = open_scene(run)
+    found = load_model(run)
     assert (found.kept, found.prune_s) == (0.125, 1.5)
     (run / "prune.json").unlink()
-    found = open_scene(run)
+    found = load_model(run)
     assert (found.kept, found.prune_s) == (None, None)
 
 
@@ -184,12 +184,12 @@ def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path
     ],
 )
 def test_frames_that_cannot_be_measured(tiny: Any, options: dict[str, Any], error: type, match: str) -> None:
-    with pytest.raises(error, match=match), rendered_as(open_scene(tiny.config), **options):
+    with pytest.raises(error, match=match), rendered_as(load_model(tiny.config), **options):
         pass
 
 
 def test_the_head_runs_as_asked_for_inside_a_block(tiny: Any) -> None:
-    run = open_scene(tiny.config)
+    run = load_model(tiny.config)
     before = run.model.head.config
     with rendered_as(run, factor=0.5):
         assert run.model.head.config == replace(before, precision="fp32")
@@ -235,4 +235,4 @@ def test_bench_frame_prints_null_for_undefined_figures(tiny: Any, capsys: pytest
 
 def test_a_run_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="does not exist"):
-        open_scene(tmp_path / "config.yml")
+        load_model(tmp_path / "config.yml")

@@ -12,10 +12,12 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
+from sundae_ns.api.packing import contents_of
+from sundae_ns.api.scene import Quality
 from sundae_ns.cli import main
 from sundae_ns.errors import PackError
-from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.scenes.targets import COARSEST, Judge, Quality, Search, Try, fewest_bytes, is_worth, least_drop, scaled
+from sundae_ns.scenes.models import load_run
+from sundae_ns.scenes.targets import COARSEST, Judge, Search, Try, fewest_bytes, is_worth, least_drop, scaled
 from sundae_ns.storage.pack import (
     FINETUNED,
     Codecs,
@@ -51,22 +53,22 @@ def test_a_target_of_bytes_is_met_and_used(tiny: Any, tmp_path: Path, capsys: py
 class Stated:
     """Judges packs by a function of their options; a finished run has 30 dB."""
 
-    before, views, all_views = Quality(30.0, 0.9), 3, 3
+    before, views, all_views = Quality((30.0,), (0.9,)), 3, 3
 
     def __init__(self, drop: Callable[[PackConfig], float]) -> None:
         self.drop = drop
 
     def quality(self, _: PackedScene, codecs: Codecs) -> Quality:
-        return Quality(30 - self.drop(codecs.config), 0.9)
+        return Quality((30 - self.drop(codecs.config),), (0.9,))
 
 
 def search(run: Path, drop: Callable[[PackConfig], float], config: PackConfig | None = None) -> Search:
-    scene = contents_of_run(run, max_cameras=0)
+    scene = contents_of(load_run(run, max_cameras=0))
     return Search(scene, config or PackConfig(), lambda: Stated(drop))  # type: ignore[arg-type, return-value]
 
 
 def test_a_target_of_quality_is_met(tiny: Any) -> None:
-    found = Search(contents_of_run(tiny.folder, max_cameras=0), PackConfig(), lambda: Judge(tiny.folder, None))
+    found = Search(contents_of(load_run(tiny.folder, max_cameras=0)), PackConfig(), lambda: Judge(tiny.folder, None))
     assert found.drop(found.better_than(0.02)) <= 0.02
 
 
@@ -100,7 +102,7 @@ def test_the_quality_before_and_after_is_stated(tiny: Any, tmp_path: Path, capsy
 
 def test_positions_are_rounded_once(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By the steps that the search finds, not by those that it begins with."""
-    exact = contents_of_run(tiny.folder, max_cameras=0).field["means"].double()
+    exact = contents_of(load_run(tiny.folder, max_cameras=0)).field["means"].double()
     errors = []
     for words in ([], ["--target-bytes", 10**7]):
         file = tmp_path / f"{len(words)}.sundae"
@@ -120,7 +122,7 @@ class Faithful(Stated):
     def quality(self, scene: PackedScene, codecs: Codecs) -> Quality:
         pairs = [(codecs.field[name], one) for name, one in self.trained.field.items() if isinstance(one, Transform)]
         same = all(isinstance(a, Transform) and torch.equal(a.basis, b.basis) for a, b in pairs)
-        return Quality(super().quality(scene, codecs).psnr - (0 if same else 1), 0.9)
+        return Quality((super().quality(scene, codecs).psnr - (0 if same else 1),), (0.9,))
 
 
 class Tuned(NamedTuple):
@@ -137,7 +139,7 @@ class Tuned(NamedTuple):
 def tuned(tiny: Any) -> Tuned:
     """A scene whose rows have moved since its codecs were fitted, as training moves them."""
     config = PackConfig(**FINETUNED)  # type: ignore[arg-type]
-    scene, codecs = fit_scene(contents_of_run(tiny.folder, max_cameras=0), config)
+    scene, codecs = fit_scene(contents_of(load_run(tiny.folder, max_cameras=0)), config)
     generator = torch.Generator().manual_seed(0)
     for name in codecs.field:
         scene.field[name] += 0.3 * torch.randn(scene.field[name].shape, generator=generator)
@@ -187,7 +189,7 @@ def test_the_finest_steps_may_lose_more_than_those_of_the_training(tuned: Tuned)
 
 def test_coarser_steps_that_take_more_bytes_are_not_taken(tuned: Tuned) -> None:
     class Growing(Search):
-        def _tried(self, power: float) -> Try:
+        def at(self, power: float) -> Try:
             return Try(self.scene, tuned.codecs, round(100 + 10 * power))
 
     assert Growing(tuned.scene, tuned.codecs, lambda: Stated(lambda _: 0.0)).better_than(0.1).bytes == 100  # type: ignore[arg-type, return-value]

@@ -15,7 +15,7 @@ import torch
 from sundae_ns.api.files import load
 from sundae_ns.cli import main
 from sundae_ns.evaluation import psnr
-from sundae_ns.scenes.opening import open_scene
+from sundae_ns.scenes.models import load_model
 from sundae_ns.storage.runs.checkpoint import read_field
 
 
@@ -81,7 +81,7 @@ def test_a_run_is_cut_before_it_is_packed_or_exported(
 
 
 def test_a_packed_scene_is_measured_on_its_capture(tiny: Any, packed: Packed) -> None:
-    before, after = open_scene(tiny.config), open_scene(packed.file, data=tiny.scene)
+    before, after = load_model(tiny.config), load_model(packed.file, data=tiny.scene)
     for name in ("rgb", "base_rgb"):
         values = [
             fmean(

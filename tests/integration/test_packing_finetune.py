@@ -14,14 +14,14 @@ import yaml
 from nerfstudio.configs.method_configs import all_methods
 from torch import Tensor
 
+from sundae_ns.api.packing import contents_of
 from sundae_ns.cli import main
 from sundae_ns.cli.packing import pack
 from sundae_ns.errors import CheckpointError, ConfigError, MemoryExhaustedError
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes import finetune as packing_finetune
 from sundae_ns.scenes.finetune import Through, TunedStep, finetune, rate_factor
-from sundae_ns.scenes.opening import open_scene
-from sundae_ns.scenes.packed import contents_of_run
+from sundae_ns.scenes.models import load_model, load_run
 from sundae_ns.storage.pack import (
     FINETUNED,
     PackConfig,
@@ -51,7 +51,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 def quality(run: Any, file: Path) -> float:
     """Mean PSNR of a packed scene on the test views, dB."""
-    pipeline = open_scene(file, data=run.scene)
+    pipeline = load_model(file, data=run.scene)
     with torch.no_grad():
         values = [
             float(psnr(pipeline.model.get_outputs_for_camera(camera)["rgb"], truth))
@@ -72,7 +72,7 @@ def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypat
         return found
 
     before = digests(tiny.folder)
-    scene = contents_of_run(tiny.folder)
+    scene = contents_of(load_run(tiny.folder))
     losses: list[Tensor] = []
     monkeypatch.setattr(TunedStep, "__call__", watched)
     trained, codecs = finetune(tiny.folder, scene, COARSE, 60, progress=losses.append)
@@ -130,7 +130,7 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert meta["source"]["finetuned"] == 3
     stored = meta["attributes"]
     config = PackConfig(**{**FINETUNED, "feature_step": 0.01})  # type: ignore[arg-type]
-    _, codecs = fit_scene(contents_of_run(run, data=tiny.scene), config)
+    _, codecs = fit_scene(contents_of(load_run(run, data=tiny.scene)), config)
     for name in codecs.field:
         assert stored[name]["step"] == codecs.field[name].step, name  # type: ignore[attr-defined]
     assert stored["scales"]["step"] == FINETUNED["scale_step"]
@@ -159,7 +159,7 @@ def test_full_memory_is_one_line(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> 
     def full(*_: Any, **__: Any) -> None:
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 300.00 MiB.")
 
-    scene = contents_of_run(tiny.folder, max_cameras=0)
+    scene = contents_of(load_run(tiny.folder, max_cameras=0))
     monkeypatch.setattr(torch.autograd, "grad", full)
     count = len(scene.field["means"])
     with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} primitives"):
@@ -170,14 +170,14 @@ def test_a_run_of_splatfacto(tiny: Any, tmp_path: Path) -> None:
     config = copy.deepcopy(all_methods["splatfacto"])
     config.data = config.pipeline.datamanager.data = tiny.scene
     config.pipeline.model.sh_degree = 2
-    field = contents_of_run(tiny.folder, max_cameras=0).field
+    field = contents_of(load_run(tiny.folder, max_cameras=0)).field
     rest = 0.1 * torch.randn(len(field["means"]), 8, 3)
     rest[::2] = 0  # these colours stay view-independent
     state = {f"_model.gauss_params.{name}": value for name, value in field.items() if name != "features"}
     state |= {"_model.gauss_params.features_rest": rest, "_model.device_indicator_param": torch.zeros(0)}
     checkpoint.write({"step": 29999, "pipeline": state}, tmp_path / "nerfstudio_models" / "step-000029999.ckpt")
     (tmp_path / "config.yml").write_text(yaml.dump(config))
-    scene = contents_of_run(tmp_path, max_cameras=0)
+    scene = contents_of(load_run(tmp_path, max_cameras=0))
     trained, codecs = finetune(tmp_path, scene, PackConfig(), 3)
     assert codecs.head is None
     assert trained.head == {}
@@ -193,7 +193,7 @@ def test_runs_that_cannot_be_fine_tuned(tiny: Any, tmp_path: Path) -> None:
     (run / "nerfstudio_models").mkdir(parents=True)
     shutil.copy(tiny.config, run)
     shutil.copy(tiny.checkpoint(30), run / "nerfstudio_models")
-    scene = contents_of_run(run)
+    scene = contents_of(load_run(run))
     with pytest.raises(CheckpointError, match="was saved during densification"):
         finetune(run, scene, PackConfig(), 3)
     with pytest.raises(ConfigError, match="changes nothing"):
@@ -222,7 +222,7 @@ def test_gradients_follow_a_quaternion_to_its_negative() -> None:
 @pytest.mark.gpu
 def test_replayed_steps_train_the_same_scene(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """One training kernel by kernel, one by recordings: the same losses up to the order of sums."""
-    scene = contents_of_run(tiny.folder)
+    scene = contents_of(load_run(tiny.folder))
     steps: list[TunedStep] = []
     train = TunedStep.__call__
 

@@ -25,10 +25,10 @@ from packed_scenes import KINDS, write_bomb, write_kind
 from pages import SAID, SECONDS, SIZE, STOP, TICKING, WEBGL, Quiet, hold, opened, rested, touch
 
 from sundae_ns.api.files import packed_file
-from sundae_ns.api.packing import stated_start
+from sundae_ns.api.packing import contents_of, stated_start
 from sundae_ns.api.page import page_of, write_page
 from sundae_ns.cli.view import serve
-from sundae_ns.scenes.packed import contents_of_run
+from sundae_ns.scenes.models import load_run
 from sundae_ns.storage.pack import container, read_scene, write_scene
 
 pytestmark = needs_chromium
@@ -72,7 +72,7 @@ def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     if request.param == "SCENE":
         given = os.environ.get("SUNDAE_BROWSER_SCENE")
         return Path(given) if given else pytest.skip("no scene was given (make browser SCENE=scene.sundae)")
-    write_scene(tmp_path / "tiny.sundae", contents_of_run(request.getfixturevalue("tiny").folder))
+    write_scene(tmp_path / "tiny.sundae", contents_of(load_run(request.getfixturevalue("tiny").folder)))
     return tmp_path / "tiny.sundae"
 
 

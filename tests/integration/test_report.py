@@ -20,13 +20,13 @@ from csv_rows import read_rows
 from nerfstudio.configs.method_configs import method_configs
 from PIL import Image
 
+from sundae_ns.api.packing import contents_of
 from sundae_ns.cli import main
 from sundae_ns.evaluation import COLUMNS, flip_available, quality_of
 from sundae_ns.evaluation.jod import jod_available
 from sundae_ns.rendering import render_view
 from sundae_ns.scenes.measure import walk
-from sundae_ns.scenes.opening import open_scene
-from sundae_ns.scenes.packed import contents_of_run
+from sundae_ns.scenes.models import load_model, load_run
 from sundae_ns.storage.pack import write_scene
 
 
@@ -123,7 +123,7 @@ def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any
     ours, theirs = json.loads((report / "report.json").read_text())
     assert [way["name"] for way in ours["configurations"]] == ["head on", "head off"]
     assert [way["name"] for way in theirs["configurations"]] == ["head off"]
-    opened = open_scene(tiny.folder)
+    opened = load_model(tiny.folder)
     model = opened.model
     with_head = model.render_settings(training=False)
     for way, settings in zip(ours["configurations"], (with_head, with_head.without_head()), strict=True):
@@ -143,7 +143,7 @@ def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any
 
 def test_nerfstudios_own_evaluation_agrees(report: Path, tiny: Any) -> None:
     ours, _ = json.loads((report / "report.json").read_text())
-    opened = open_scene(tiny.folder)
+    opened = load_model(tiny.folder)
     with torch.no_grad():
         outputs = opened.model.get_outputs_for_camera(opened.cameras[2])
         theirs, _ = opened.model.get_image_metrics_and_images(outputs, {"image": opened.truths[2]})
@@ -163,7 +163,7 @@ def test_a_video_of_every_view(tiny: Any, stock: Path, tmp_path: Path) -> None:
     frames = frames_of(out / "views.mp4")
     photographs = sorted((tiny.scene / "images").iterdir())
     assert len(frames) == len(photographs) == 15
-    opened = open_scene(tiny.folder)
+    opened = load_model(tiny.folder)
     rows = list(walk(opened))
     assert [row.title for row in rows] == [
         f"{path.name}, {'test' if index in (2, 7, 12) else 'training'} view" for index, path in enumerate(photographs)
@@ -258,7 +258,7 @@ def test_a_packed_scene_counts_the_bytes_of_its_file(
 ) -> None:
     packed = tmp_path / "tiny.sundae"
     with torch.no_grad():
-        write_scene(packed, contents_of_run(tiny.folder))
+        write_scene(packed, contents_of(load_run(tiny.folder)))
     assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0) == 2
     assert "give the capture with --data" in one_line(capsys)
     assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0, "--data", tiny.scene) == 0

@@ -16,10 +16,11 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.eval_utils import eval_setup
 from trial_runs import LENGTH, PRUNE_AT, STEPS, same, tidy, tiny_run, tiny_scene
 
+from sundae_ns.api.packing import contents_of
 from sundae_ns.callbacks import NerfstudioRun
 from sundae_ns.errors import CheckpointError
 from sundae_ns.scenes.measure import sizes
-from sundae_ns.scenes.packed import contents_of_run
+from sundae_ns.scenes.models import load_run
 from sundae_ns.training.heldout import HeldOutQuality
 from sundae_ns.training.trials import engine
 from sundae_ns.training.trials import head as head_trials
@@ -136,7 +137,7 @@ def test_a_head_that_does_not_pay_costs_nothing(make: Make, judge: Any, gains: t
         images = [one.eval().get_outputs_for_camera(camera) for one in (model, opened)]
     assert torch.equal(images[0]["rgb"], images[1]["rgb"])
     assert torch.equal(images[0]["rgb"], images[0]["base_rgb"])
-    scene = contents_of_run(trainer.base_dir)
+    scene = contents_of(load_run(trainer.base_dir))
     assert not scene.head
     assert not any(value.numel() for name, value in scene.field.items() if name == "features")
 
@@ -191,7 +192,7 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     with torch.no_grad():
         images = [one.eval().get_outputs_for_camera(camera)["rgb"] for one in (model, opened)]
     assert torch.equal(*images)
-    assert contents_of_run(trainer.base_dir).field.get("features", torch.zeros(1, 0)).shape[1] == width
+    assert contents_of(load_run(trainer.base_dir)).field.get("features", torch.zeros(1, 0)).shape[1] == width
 
 
 def test_the_verdict_is_on_the_mean_of_the_weights(make: Make, judge: Any, monkeypatch: pytest.MonkeyPatch) -> None:

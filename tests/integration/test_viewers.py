@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from chromium import bench_viewers, needs_chromium, needs_packages
 
-from sundae_ns.scenes.packed import contents_of_run
+from sundae_ns.api.packing import contents_of
+from sundae_ns.scenes.models import load_run
 from sundae_ns.storage.pack import write_scene
 
 pytestmark = [pytest.mark.browser, needs_chromium, needs_packages]
@@ -27,7 +28,7 @@ A .spz rounds everything; GaussianSplats3D rounds base colours to bytes, and doe
 
 @pytest.mark.parametrize("kind", ["ply", "spz", "sog", "glb"])
 def test_viewers_agree_with_python(kind: str, tiny: Any, tmp_path: Path) -> None:
-    write_scene(tmp_path / "a.sundae", contents_of_run(tiny.folder))
+    write_scene(tmp_path / "a.sundae", contents_of(load_run(tiny.folder)))
     rows = list(bench_viewers.rows(tmp_path / "a.sundae", kind=kind, center=True))
     found = {(row["viewer"], kind): row["psnr_of_all"] for row in rows}
     assert found.keys() == {name for name in LEAST if name[1] == kind}

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,7 @@ from sundae_ns.api.views import views_of
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanagerConfig
 from sundae_ns.errors import DataError
 from sundae_ns.parsing import other_frame
-from sundae_ns.scenes.packed import _describe, datamanager_of
-from sundae_ns.storage.pack import PackedScene
+from sundae_ns.scenes.models import datamanager_of, describe_capture
 
 Load = Callable[..., Any]
 Edit = Callable[..., None]
@@ -171,8 +171,8 @@ def test_a_packed_scene_is_measured_in_the_frame_of_its_training(capture: Path, 
     places = {}
     for robust in (True, False):
         manager = SundaeDatamanagerConfig(data=capture, dataparser=parser, robust_frame=robust)
-        stated = json.loads(json.dumps(_describe(manager)))
-        again = datamanager_of(PackedScene({}, None, None, {"capture": stated}), capture)
+        stated = json.loads(json.dumps(describe_capture(manager)))
+        again = datamanager_of(SimpleNamespace(meta={"capture": stated}), capture)  # type: ignore[arg-type]
         assert again.robust_frame is robust
         made = again.setup(device="cpu", test_mode="test").train_dataset.cameras.camera_to_worlds
         places[robust] = float(made[:, :, 3].norm(dim=1).median())

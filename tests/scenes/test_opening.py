@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from sundae_ns.scenes.opening import _product, _seconds
+from sundae_ns.scenes.models import _kept, _seconds
 
 
 @pytest.mark.parametrize(
@@ -20,8 +20,8 @@ from sundae_ns.scenes.opening import _product, _seconds
         ([{"before": "many", "after": 1}], None),
     ],
 )
-def test_the_share_is_the_product_over_all_prunes(prunes: list[dict[str, Any]], kept: float | None) -> None:
-    assert _product(prunes) == (None if kept is None else pytest.approx(kept))
+def test_the_share_is_the_kept_over_all_prunes(prunes: list[dict[str, Any]], kept: float | None) -> None:
+    assert _kept(prunes) == (None if kept is None else pytest.approx(kept))
 
 
 def test_seconds_are_summed() -> None:

@@ -16,13 +16,12 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
 
-from sundae_ns.api.packing import scene_of
+from sundae_ns.api.packing import contents_of, scene_of
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, DataError, PackError
 from sundae_ns.gaussians import from_points
-from sundae_ns.scenes import packed as packed_run
-from sundae_ns.scenes.packed import contents_of_run, datamanager_of, model_of
+from sundae_ns.scenes.models import datamanager_of, describe_capture, load_run, model_of, stated_capture
 from sundae_ns.storage.pack import PackedScene
 from sundae_ns.storage.runs import checkpoint
 
@@ -98,7 +97,7 @@ def test_a_folder_without_a_capture_is_refused(tmp_path: Path, kind: str, parser
     found = scene()
     found.meta["capture"] = {"parser": parser, "options": {}, "scale": 1.0}
     with pytest.raises(DataError, match=str(capture)):
-        datamanager_of(found, capture)
+        datamanager_of(scene_of(found), capture)
 
 
 LIES: dict[str, Json] = {
@@ -149,7 +148,7 @@ def test_the_options_of_a_capture_survive(parser: Any) -> None:
     if hasattr(parser, "load_3D_points"):
         parser.load_3D_points = False
     manager = SundaeDatamanagerConfig(dataparser=parser, camera_res_scale_factor=0.5)
-    found, scale = packed_run._capture(packed_run._describe(manager))
+    found, scale = stated_capture(describe_capture(manager))
     assert scale == 0.5
     assert type(found) is type(parser)
     assert vars(found) == vars(parser)
@@ -160,13 +159,13 @@ def test_captures_that_are_not_described() -> None:
         BlenderDataParserConfig(alpha_color="pink"),
         ColmapDataParserConfig(images_path=Path("/elsewhere/images")),
     ):
-        assert packed_run._describe(SundaeDatamanagerConfig(dataparser=parser)) is None
+        assert describe_capture(SundaeDatamanagerConfig(dataparser=parser)) is None
     for stated in (None, {}, {"parser": "dnerf-data", "options": {}}, {"parser": "colmap", "options": None}):
         with pytest.raises(PackError, match="how its capture is read"):
-            packed_run._capture(stated)
+            stated_capture(stated)
     for scale in (0, 2, "1", None, float("nan")):
         with pytest.raises(PackError, match="an impossible scale"):
-            packed_run._capture({"parser": "colmap", "options": {}, "scale": scale})
+            stated_capture({"parser": "colmap", "options": {}, "scale": scale})
 
 
 @pytest.mark.parametrize(
@@ -193,7 +192,7 @@ def test_captures_that_are_not_described() -> None:
 )
 def test_impossible_options_of_a_capture(name: str, value: Any) -> None:
     with pytest.raises(PackError, match="an impossible option"):
-        packed_run._capture({"parser": "colmap", "options": {name: value}, "scale": 1.0})
+        stated_capture({"parser": "colmap", "options": {name: value}, "scale": 1.0})
 
 
 @pytest.mark.parametrize(
@@ -201,7 +200,7 @@ def test_impossible_options_of_a_capture(name: str, value: Any) -> None:
 )
 def test_impossible_options_of_a_capture_of_blender(name: str, value: Any) -> None:
     with pytest.raises(PackError, match="an impossible option"):
-        packed_run._capture({"parser": "blender-data", "options": {name: value}, "scale": 1.0})
+        stated_capture({"parser": "blender-data", "options": {name: value}, "scale": 1.0})
 
 
 # ------------------------------------------------------------------------------------------------------- runs to pack
@@ -239,7 +238,7 @@ def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path
 
 def test_a_packed_run_holds_what_its_images_need(tmp_path: Path) -> None:
     run, truth = run_folder(tmp_path / "run", "sundae-tiny", 1100)
-    found = contents_of_run(run, max_cameras=0)
+    found = contents_of(load_run(run, max_cameras=0))
     assert set(found.field) == set(truth)
     assert all(torch.equal(found.field[name], truth[name]) for name in truth)
     assert found.head
@@ -248,12 +247,12 @@ def test_a_packed_run_holds_what_its_images_need(tmp_path: Path) -> None:
     assert found.meta["model"]["head"]["size"] == "tiny"
     # No path of the machine that trained it.
     assert str(tmp_path) not in str(found.meta)
-    assert contents_of_run(run / "config.yml", max_cameras=0).meta == found.meta
+    assert contents_of(load_run(run / "config.yml", max_cameras=0)).meta == found.meta
 
 
 def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path: Path) -> None:
     run, truth = run_folder(tmp_path / "run", "sundae-tiny", 30, sh_degree_interval=20)
-    found = contents_of_run(run, max_cameras=0)
+    found = contents_of(load_run(run, max_cameras=0))
     assert found.head == {}
     assert "features" not in found.field
     assert torch.equal(found.field["features_rest"], truth["features_rest"][:, :3])
@@ -262,7 +261,7 @@ def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path: Path) ->
 
 def test_a_run_of_splatfacto(tmp_path: Path) -> None:
     run, truth = run_folder(tmp_path / "run", "splatfacto", 29999, sh_degree=2, rasterize_mode="antialiased")
-    found = contents_of_run(run, max_cameras=0)
+    found = contents_of(load_run(run, max_cameras=0))
     assert found.head == {}
     assert all(torch.equal(found.field[name], truth[name]) for name in truth)
     assert found.meta["model"]["rasterize_mode"] == "antialiased"
@@ -270,16 +269,16 @@ def test_a_run_of_splatfacto(tmp_path: Path) -> None:
 
 def test_runs_that_cannot_be_packed(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="cannot be read"):
-        contents_of_run(tmp_path / "nothing")
+        contents_of(load_run(tmp_path / "nothing"))
     (tmp_path / "config.yml").write_text("a: [1")
     with pytest.raises(CheckpointError, match=r"is not a run's config\.yml"):
-        contents_of_run(tmp_path)
+        contents_of(load_run(tmp_path))
     (tmp_path / "config.yml").write_text(yaml.dump(all_methods["nerfacto"]))
     with pytest.raises(CheckpointError, match="without Gaussians"):
-        contents_of_run(tmp_path)
+        contents_of(load_run(tmp_path))
     run, _ = run_folder(tmp_path / "run", "sundae-tiny", 30)
     with pytest.raises(DataError):
-        contents_of_run(run)  # its capture is missing
+        contents_of(load_run(run))  # its capture is missing
     (run / "nerfstudio_models" / "step-000000030.ckpt").write_bytes(b"PK")
     with pytest.raises(CheckpointError, match="no whole checkpoint"):
-        contents_of_run(run, max_cameras=0)
+        contents_of(load_run(run, max_cameras=0))

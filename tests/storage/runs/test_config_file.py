@@ -12,10 +12,10 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.writer import EventName
 
 from harness.cameras import training_cameras
+from sundae_ns.api.packing import contents_of
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.method_configs import sundae_tiny
-from sundae_ns.scenes.opening import open_scene
-from sundae_ns.scenes.packed import contents_of_run
+from sundae_ns.scenes.models import load_model, load_run
 from sundae_ns.storage.runs.config_file import load_config, schedule_length
 
 METHODS = sorted(name for name in all_methods if name.startswith("sundae")) + ["splatfacto", "nerfacto"]
@@ -103,7 +103,7 @@ HOSTILE = {
 def test_no_code_that_it_names_runs(tmp_path: Path, kind: str) -> None:
     mark, path = tmp_path / "ran", tmp_path / "config.yml"
     path.write_text(HOSTILE[kind].format(mark) if "{}" in HOSTILE[kind] else HOSTILE[kind])
-    for read in (load_config, contents_of_run, open_scene, training_cameras):
+    for read in (load_config, load_run, load_model, training_cameras):
         with pytest.raises(CheckpointError) as raised:
             read(path)
         assert "\n" not in str(raised.value)
@@ -128,9 +128,9 @@ def test_a_file_that_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(DataError, match="another layout"):
         training_cameras(path)
     with pytest.raises(CheckpointError):
-        contents_of_run(path)
+        contents_of(load_run(path))
     with pytest.raises(CheckpointError):
-        open_scene(path)
+        load_model(path)
     with pytest.raises(CheckpointError, match=r"cannot be read \(No such file"):
         load_config(tmp_path / "gone.yml")
     path.write_bytes(b"\xff\xfe\x80")
