@@ -67,12 +67,6 @@ ROOMS = {
     ),
     "surgery": Room(("gaussians/surgery.py", "gaussians/merging.py"), ("gaussians/test_*.py",)),
     "packing": Room(("storage/pack/[!_]*.py",), ("storage/pack/test_*.py", "fuzz/test_packs.py")),
-    # Tests of the collectives start processes, which import the modules on disk: only functions without any are here.
-    "ranks": Room(
-        ("distributed/[!_]*.py",),
-        ("distributed/test_blocks.py",),
-        ("bounds", "moves", "scaled_group", "state_of_rank", "_map_state"),
-    ),
 }
 
 _COMPARE: dict[type[ast.cmpop], type[ast.cmpop]] = {

@@ -15,7 +15,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sundae_ns.datamanager import SundaeDatamanager
-from sundae_ns.rendering import FieldSource, RenderSettings, TrainingView
+from sundae_ns.distributed import Ranks
+from sundae_ns.rendering import LocalField, RenderSettings, TrainingView
 from sundae_ns.storage.accounting import BYTES_PER_FLOAT, bytes_of_module, megabytes
 from sundae_ns.storage.runs.folder import find_config, take_records
 from sundae_ns.training.extension import Extension, Photo
@@ -33,10 +34,16 @@ class NerfstudioRun:
     def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
         self.model = model
         self.state: FieldState = model.state
-        self.source: FieldSource = model.source
         self.background: Tensor = model.background_color.to(model.device)
         self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
         self._trainer = cast(Any, attributes.trainer)
+        self._ranks: Ranks = Ranks() if self._trainer is None else self._trainer.ranks
+
+    @property
+    def source(self) -> LocalField:
+        """Where views get their primitives from."""
+        source: LocalField = self.model.source
+        return source
 
     @property
     def settings(self) -> RenderSettings:
@@ -56,14 +63,13 @@ class NerfstudioRun:
 
     @property
     def images_per_step(self) -> int:
-        """Number of images in the batch of a step."""
-        return self._datamanager.place[1]
+        """Number of images in a batch."""
+        return self._ranks.count
 
     @property
     def folder(self) -> Path | None:
         """Folder for records, on the first rank."""
-        first = self._datamanager.place[0] == 0
-        return self._trainer.base_dir if self._trainer is not None and first else None
+        return self._trainer.base_dir if self._trainer is not None and self._ranks.rank == 0 else None
 
     @property
     def num_heldout(self) -> int:
@@ -111,8 +117,6 @@ class NerfstudioRun:
         """Mean ``psnr`` and ``ssim`` over all test views."""
         if not self._datamanager.eval_dataset:
             return {}
-        if self._trainer is not None:
-            self._trainer.team.agree(self.state)
         results = self._pipeline.get_average_eval_image_metrics(step=self.state.step)
         return {name: results[name] for name in ("psnr", "ssim")}
 
@@ -152,7 +156,7 @@ class NerfstudioRun:
         place = self._trainer.config.load_dir or self._trainer.config.load_checkpoint
         config = None if place is None else find_config(place)
         if config is not None and config.parent.resolve() != self.folder.resolve():
-            take_records(config.parent, self.folder, (self.state.schedule_step + 1) * self.images_per_step - 1)
+            take_records(config.parent, self.folder, self.state.schedule_step)
 
     def _begin_step(self, step: int) -> None:
         self.state.step = step
@@ -160,7 +164,7 @@ class NerfstudioRun:
     def act(self, extensions: Sequence[Extension]) -> None:
         """Let extensions act after a step, in their order."""
         for extension in extensions:
-            extension.after_step(self)
+            self._ranks.after_step(extension, self)
         self._hand_over()
 
     def _hand_over(self) -> None:
@@ -170,18 +174,18 @@ class NerfstudioRun:
             self._optimizers.parameters[name] = [value]
 
     def _finish(self, step: int) -> None:
-        for extension in self.model.extensions:
-            extension.finish(self)
-        self._summarize()
+        with self._ranks.whole() as first:
+            if first:
+                for extension in self.model.extensions:
+                    extension.finish(self)
+                self._summarize()
         writer.write_out_storage()
 
     def _summarize(self) -> None:
-        """Print quality, size and the next command, on the first rank."""
-        if self._trainer is None:
-            return
-        results = self.evaluate() if self.model.config.evaluate_prune else {}  # collective
+        """Print quality, size and the next command."""
         if self.folder is None:
             return
+        results = self.evaluate() if self.model.config.evaluate_prune else {}
         head = self.state.head if self.state.head_enabled else None
         numbers = sum(value[:1].numel() for value in self.state.field.values())
         size = BYTES_PER_FLOAT * self.source.total * numbers + (0 if head is None else bytes_of_module(head))

@@ -173,8 +173,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             raise DataError(f"{data} cannot be parsed ({one_line(error)}); check the capture") from error
         self.hold_back(())
         self._cameras: dict[int, Cameras] = {}
-        self.place: tuple[int, int] = (0, 1)
-        """Rank of this process and number of ranks; each rank gets another view at a step."""
+        self.rank = 0
+        """Rank of this process: at a step, rank r trains on the view that one process takes r steps later."""
 
     def create_train_dataset(self) -> CheckedDataset:
         """Training set, with the transform from the capture's coordinates to the model's in its metadata."""
@@ -273,8 +273,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         """Camera (on the CPU) and batch of ``step``."""
-        rank, ranks = self.place
-        return self._view(self.view_of_step(step * ranks + rank))
+        return self._view(self.view_of_step(step + self.rank))
 
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]

@@ -33,7 +33,7 @@ from sundae_ns.rendering.contribution import contribution
 from sundae_ns.rendering.outputs import Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs
 from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, RenderSettings
 from sundae_ns.rendering.replay import FrameReplay
-from sundae_ns.rendering.source import FieldSource, LocalField, StepResolution
+from sundae_ns.rendering.source import LocalField, StepResolution
 from sundae_ns.rendering.views import View, crop_image, view_of
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.training.build import build
@@ -100,7 +100,7 @@ class SundaeModel(SplatfactoModel):
     config: SundaeModelConfig
     state: FieldState
     """Field, head, optimizers, running states, and the clock."""
-    source: FieldSource
+    source: LocalField
     """Where views get their primitives from."""
     extensions: list[Extension]
     """Parts of training beside the step, in the order in which they act."""
@@ -201,8 +201,7 @@ class SundaeModel(SplatfactoModel):
         extra = checkpoint.check_extra_state(state_dict, self.config.num_features, self.state.field.encoding)
         for extension in self.extensions:
             extension.prepare_loading(self.state, extra["extensions"].get(extension.name, {}))
-        # A shard may be empty.
-        checkpoint.check_model_state(state_dict, self.state_dict(), may_be_empty=self.source.collective)
+        checkpoint.check_model_state(state_dict, self.state_dict())
         n = state_dict["gauss_params.means"].shape[0]
         for value in self.gauss_params.values():
             value.data = value.data.new_zeros(n, *value.shape[1:])
@@ -249,13 +248,11 @@ class SundaeModel(SplatfactoModel):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
 
     def _training_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
-        background, state, at = self._get_background_color(), self.state, self.resolution(self.step)
+        background, state = self._get_background_color(), self.state
         view, window = self._training_view(camera)
         settings, depth = self.render_settings(training=True), self.config.output_depth_during_training
-        images, splatted = self.training_step.images(view, background, settings, at=at, depth=depth)
+        images, splatted = self.training_step.images(view, background, settings, depth=depth)
         state.info = splatted.info
-        # Now, while the GPU works on this step.
-        self.source.plan_next(self.resolution(self.step + 1), state.optimizers)
         for extension in self.extensions:
             extension.before_backward(state)
         del images["feature_image"]
@@ -268,7 +265,7 @@ class SundaeModel(SplatfactoModel):
         if visible is None:
             return empty_outputs(view.width, view.height, background)
         settings = self.render_settings(training=False)
-        splattable = settings.head is not None and not self.source.collective
+        splattable = settings.head is not None
         if not visible.compensate:
             settings = settings.without_head()
         images = self._replay.render(visible.source, view, background, settings)
@@ -314,7 +311,7 @@ class SundaeModel(SplatfactoModel):
         return self.resolution(self.step).downscale if self.training else 1
 
     def resolution(self, step: int) -> StepResolution:
-        """Form of the training images at a step; for a later step, as far as it is known now."""
+        """Form of the training images at a step."""
         config, state = self.config, self.state
         rising = config.num_downscales - step // config.resolution_schedule if config.warm_start is None else 0
         # Densification takes its statistics from whole images.

@@ -145,15 +145,17 @@ class SundaeTrainer(Trainer):
     config: SundaeTrainerConfig
 
     def __init__(self, config: SundaeTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        self.team = distributed.Team(local_rank, world_size)
+        self.ranks = distributed.Ranks(local_rank, world_size)
         # nerfstudio sees one process. For more it would use DDP, which breaks when the field changes its size.
-        super().__init__(self.team.configured(config), local_rank, world_size=1)
+        super().__init__(self.ranks.configured(config), local_rank, world_size=1)
         with writing(f"cannot make the run's folder {self.base_dir}"):
             self.base_dir.mkdir(parents=True, exist_ok=True)  # nerfstudio's own way fails if two ranks do so at once
         self._recorded: RecordedStep | None = None
         """Runs whole steps; None where they run kernel by kernel."""
         self._result: Any = None
         """Loss, its terms and metrics of the last step that was trained."""
+        self._batch_ends = 0
+        """Step after the last image of the present batch."""
         self._trained: int | None = None
         """The last step that is trained."""
         self._stopped_by = 0
@@ -167,6 +169,7 @@ class SundaeTrainer(Trainer):
         except KeyboardInterrupt:
             CONSOLE.print(NOTHING_SAVED)
             raise SystemExit(130) from None
+        self.ranks.share(self.model, self.pipeline.datamanager, self.optimizers)
         if self._recordable():
             self._recorded = RecordedStep(self.model.losses)
         writer.GLOBAL_BUFFER["max_iter"] = self.last_step + 1  # nerfstudio forgets the steps before a resume
@@ -183,20 +186,17 @@ class SundaeTrainer(Trainer):
         return self._start_step + self.config.max_num_iterations - 1
 
     def setup_optimizers(self) -> Optimizers:
-        """Optimizers of the primitives of this process; with several ranks the field is sharded first."""
-        model, seed = self.model, self.config.machine.seed
-        model.source, model.extensions = self.team.share(
-            model.state, model.source, model.extensions, self.pipeline.datamanager, seed
-        )
-        groups = self.pipeline.get_param_groups()
-        return self.team.optimizers(super().setup_optimizers, self.config.optimizers, groups, list(model.state.field))
+        """Optimizers for batches of one image a rank."""
+        kind = Optimizers if self.ranks.count == 1 else distributed.BatchOptimizers
+        return kind(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     def eval_iteration(self, step: int) -> None:
-        """Evaluate if it is due; every rank must run the head at the same scale."""
+        """Evaluate on the first rank if it is due."""
         every = ("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images")
         if any(step_check(step, getattr(self.config, name)) for name in every):
-            self.team.agree(self.model.state)
-        super().eval_iteration(step)
+            with self.ranks.whole() as first:
+                if first:
+                    super().eval_iteration(step)
 
     def train(self) -> None:
         """Train.
@@ -216,17 +216,24 @@ class SundaeTrainer(Trainer):
                 stop_rendering(self.viewer_state)
 
     def train_iteration(self, step: int) -> Any:
-        """Train one step; several ranks agree on whether to stop after it."""
+        """Train one step. Several ranks train a batch at the first of its steps, and may stop after the last."""
         model = self.model
-        if all(extension.trains(model.state) for extension in model.extensions):
-            self._result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
-        elif self._result is None:  # the run was resumed while training is paused
-            self._result = self._untrained(step)
+        if step < self._batch_ends:
+            for scheduler in self.optimizers.schedulers.values():
+                scheduler.step()
+        else:
+            self._batch_ends = step + self.ranks.count
+            if all(extension.trains(model.state) for extension in model.extensions):
+                self._result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
+                if self.ranks.count > 1:
+                    self.ranks.sharded.count_views(model.state, absgrad=model.config.use_absgrad)
+            elif self._result is None:  # the run was resumed while training is paused
+                self._result = self._untrained(step)
         self._trained = step
         self._warn_if_long(step - self._start_step)
-        self._stopped_by = self.team.agreed(self._interruption.number, step)
-        if self._stopped_by:
-            self.stop_training = True
+        if step + 1 == self._batch_ends:
+            self._stopped_by = self.ranks.agreed(self._interruption.number, step // self.ranks.count)
+            self.stop_training = self.stop_training or bool(self._stopped_by)
         return self._result
 
     @torch.no_grad()
@@ -280,7 +287,7 @@ class SundaeTrainer(Trainer):
 
     def _warn_if_long(self, number: int) -> None:
         """On a CPU, warn of a training of hours, by ten steps; the first compiles, and the second warms up."""
-        if self.config.machine.device_type != "cpu" or self.team.collective:
+        if self.config.machine.device_type != "cpu" or self.ranks.count > 1:
             return
         if number == 1:
             self._measured_from = time.perf_counter()
@@ -291,7 +298,7 @@ class SundaeTrainer(Trainer):
                 warn(warning)
 
     def _stop(self) -> None:
-        if not self.team.collective:  # ranks stop together
+        if self.ranks.count == 1:  # several stop together
             self._stopped_by = self._interruption.number
             self.stop_training = True
 
@@ -307,8 +314,9 @@ class SundaeTrainer(Trainer):
             super()._after_train()
             return
         if self._trained is not None:
-            self.save_checkpoint(self.step)
-            self.team.meet()  # a rank that leaves ends the others
+            self.save_checkpoint(
+                self.step
+            )  # collective: no rank leaves before it is written, which would end the others
             data = self.config.pipeline.datamanager.data
             command = resume_command(sys.argv, self.checkpoint_dir, str(self.config.method_name), data)
             CONSOLE.print("Stopped and saved. To train the remaining steps:")
@@ -329,14 +337,15 @@ class SundaeTrainer(Trainer):
     def save_checkpoint(self, step: int) -> None:
         """Save model, optimizers, schedules and random state; older checkpoints are removed afterwards.
 
-        With several ranks, collective: the first gathers the field and writes the checkpoint of one process.
-
         Raises:
             StorageError: no space or no right to write; older checkpoints stay.
         """
-        model = self.model
-        self.team.agree(model.state)
-        own = {
+        with self.ranks.whole() as first:
+            if first:
+                self._write_checkpoint(step)
+
+    def _write_checkpoint(self, step: int) -> None:
+        state = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
             "optimizers": {name: value.state_dict() for name, value in self.optimizers.optimizers.items()},
@@ -344,10 +353,7 @@ class SundaeTrainer(Trainer):
             "scalers": self.grad_scaler.state_dict(),
             "random": random_state(),
         }
-        state = self.team.gathered(own, model.head, list(model.state.field))
-        if state is None:  # another rank writes
-            return
-        path = self.checkpoint_dir / f"step-{state['step']:09d}.ckpt"
+        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         checkpoint.write(state, path)
         if self.config.save_only_latest_checkpoint:
             for other in self.checkpoint_dir.glob("*.ckpt"):
@@ -361,7 +367,6 @@ class SundaeTrainer(Trainer):
             return
         loaded = checkpoint.read(path)
         try:
-            loaded = self.team.part(loaded, list(self.model.state.field))
             self._restore(loaded)
         except SundaeError:
             raise
@@ -397,4 +402,3 @@ class SundaeTrainer(Trainer):
         self.grad_scaler.load_state_dict(loaded["scalers"])
         if "random" in loaded:  # nerfstudio's own trainer saves none
             set_random_state(loaded["random"])
-        self.team.restored(self.model.state, self.config.machine.seed, self._start_step)

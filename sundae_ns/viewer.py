@@ -31,7 +31,7 @@ from sundae_ns.gaussians import mend
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import Pruned, PruneRule, band_rule, field_graph, kept_count, prune_field
 from sundae_ns.rendering.outputs import FieldKey
-from sundae_ns.rendering.source import FieldSource, LocalField
+from sundae_ns.rendering.source import LocalField
 from sundae_ns.training.field_state import FieldState
 
 RuleName = Literal["as configured", "band: high", "band: low", "band: both", "opacity", "random"]
@@ -86,7 +86,7 @@ def previewed_rule(configured: PruneRule, name: RuleName) -> PruneRule:
 class Visible:
     """What an image shows."""
 
-    source: FieldSource
+    source: LocalField
     mask: Tensor | None
     """Primitives of the field in it, bool ``[N]``; None for all."""
     compensate: bool
@@ -162,7 +162,7 @@ class ViewerControls(torch.nn.Module):
         figures = "" if change is None else f": {change[0]:+.2f} dB, SSIM {change[1]:+.4f}"
         self.expected.value = f"{count:,} primitives{figures}"
 
-    def visible(self, source: FieldSource, crop: Tensor | None, *, compensate: bool) -> Visible | None:
+    def visible(self, source: LocalField, crop: Tensor | None, *, compensate: bool) -> Visible | None:
         """What the next image shows; None if it shows no primitive.
 
         Args:

@@ -21,7 +21,7 @@ from sundae_ns.pruning.rule import PruneRule
 
 @dataclass(eq=False)
 class FieldPruner:
-    """Prunes the field of one process in place; ``distributed.pruning.RankPruner`` does so over ranks."""
+    """Prunes a field in place."""
 
     params: MutableMapping[str, Parameter]
     """The field, name to parameter ``[N, ...]``; its parameters are replaced."""
@@ -59,13 +59,13 @@ class FieldPruner:
         """Remove the primitives under a mask, unless they are too many.
 
         Args:
-            mask: of the primitives of this process, bool ``[N]``.
+            mask: bool ``[N]``.
             at_most: largest share of the whole field that is removed, below 1.
 
         Returns:
-            Number of removed primitives of the whole field.
+            Number of removed primitives.
         """
-        count = self._over_all(int(mask.sum()))
+        count = int(mask.sum())
         if not 0 < count <= at_most * self.total:
             return 0
         self._keep(~mask)
@@ -75,19 +75,12 @@ class FieldPruner:
         """Keep the primitives of this process under a mask ``[N]``."""
         keep(self.params, self.optimizers, self.states, mask)
 
-    def _over_all(self, number: int) -> int:
-        """The sum of a number over all processes."""
-        return number
-
     @torch.no_grad()
     def cut(self, rule: PruneRule, count: int, contribution: Tensor | None = None) -> Decision:
         """Decide, remove and merge; see :func:`sundae_ns.pruning.decide` for arguments and errors.
 
         Args:
-            contribution: of the primitives of this process.
-
-        Returns:
-            The decision over the whole field.
+            contribution: of the primitives ``[N]``.
         """
         decision = decide(self.params, rule, count, contribution)
         self._keep(decision.mask)

@@ -2,14 +2,12 @@
 
 from sundae_ns.rendering.contribution import contribution
 from sundae_ns.rendering.render import RenderSettings, compensate, draw, render_view, scale_plan
-from sundae_ns.rendering.source import ColorSettings, FieldSource, LocalField, Primitives, StepResolution, TrainingView
+from sundae_ns.rendering.source import ColorSettings, LocalField, StepResolution, TrainingView
 from sundae_ns.rendering.views import View, view_of, zoomed
 
 __all__ = [
     "ColorSettings",
-    "FieldSource",
     "LocalField",
-    "Primitives",
     "RenderSettings",
     "StepResolution",
     "TrainingView",

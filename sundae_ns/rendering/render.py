@@ -13,7 +13,7 @@ from sundae_ns.compensation import CompensationHead, ScalePlan, plan, resize
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rasterization import Rasterization, rasterize
 from sundae_ns.rasterization.types import check_memory
-from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, FieldSource, Primitives, StepResolution
+from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, LocalField
 from sundae_ns.rendering.views import View
 
 SHOWN_BACKGROUNDS = {"random": (0.1490, 0.1647, 0.2157), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -70,12 +70,12 @@ def scale_plan(view: View, trained_focal: tuple[float, float] | None) -> ScalePl
 
 
 def draw(
-    primitives: Primitives, view: View, background: Tensor, settings: RenderSettings, *, depth: bool
+    primitives: Mapping[str, Tensor], view: View, background: Tensor, settings: RenderSettings, *, depth: bool
 ) -> tuple[dict[str, Any], Rasterization]:
     """Splat colours, features and depth in one pass.
 
     Args:
-        primitives: from a :class:`FieldSource`; with ``features`` if the head is enabled.
+        primitives: from a :class:`LocalField`; with ``features`` if the head is enabled.
         view: the camera.
         background: colour ``[3]``.
         settings: everything else.
@@ -126,15 +126,14 @@ def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, ba
 
 
 def render_view(
-    source: FieldSource,
+    source: LocalField,
     view: View,
     background: Tensor,
     settings: RenderSettings,
     *,
     depth: bool = True,
-    at: StepResolution | None = None,
 ) -> tuple[dict[str, Any], Rasterization]:
-    """The images of one view: primitives, one splatting pass, and the head. With several ranks, collective.
+    """The images of one view: primitives, one splatting pass, and the head.
 
     An image of another scale than the head was trained at is rendered at the trained scale too, and gets the resized
     correction (:mod:`sundae_ns.compensation.head`).
@@ -145,16 +144,13 @@ def render_view(
         background: colour ``[3]``.
         settings: everything else; ``head=None`` leaves the head out.
         depth: whether to render depth.
-        at: the step, for a training image; None outside of training.
 
     Returns:
-        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result; its
-        ``info`` has the ``route`` of the primitives.
+        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result.
     """
     head = settings.head
-    primitives = source.primitives(view, settings, features=head is not None, at=at)
+    primitives = source.primitives(view, settings, features=head is not None)
     images, splatted = draw(primitives, view, background, settings, depth=depth)
-    splatted.info["route"] = primitives.route
     if head is None:
         return images, splatted
     zoom, weight = ScalePlan(1.0, 1.0) if settings.training else scale_plan(view, settings.trained_focal)

@@ -20,7 +20,7 @@ from sundae_ns.errors import BackendError
 from sundae_ns.gpu.cuda_graphs import GraphCache, record, warm_up
 from sundae_ns.rasterization import Capacity, RecordableGsplat
 from sundae_ns.rendering.render import RenderSettings, render_view, scale_plan
-from sundae_ns.rendering.source import FieldSource, degree_in_use
+from sundae_ns.rendering.source import LocalField, degree_in_use
 from sundae_ns.rendering.views import View
 
 SPARE_CAPACITY = 1.5
@@ -55,7 +55,7 @@ class FrameReplay:
         # A viewer renders in its own thread; a replay and its inputs belong together.
         self._lock = Lock()
 
-    def render(self, source: FieldSource, view: View, background: Tensor, settings: RenderSettings) -> dict[str, Any]:
+    def render(self, source: LocalField, view: View, background: Tensor, settings: RenderSettings) -> dict[str, Any]:
         """The images of a view, as :func:`sundae_ns.rendering.render_view` makes them.
 
         Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of a whole local field. Other
@@ -68,8 +68,7 @@ class FrameReplay:
             settings: everything else.
 
         Returns:
-            ``rgb, base_rgb, accumulation``, each ``[H, W, C]``, owned by the caller; if the source is collective also
-            ``depth`` and ``feature_image``, which cannot be rendered later by one rank alone.
+            ``rgb, base_rgb, accumulation``, each ``[H, W, C]``, owned by the caller.
         """
         if self._can_record and _recordable(source, settings):
             with self._lock:
@@ -83,11 +82,11 @@ class FrameReplay:
                     self._can_record, images = False, None
             if images is not None:
                 return images
-        images = render_view(source, view, background, settings, depth=source.collective)[0]
-        return images if source.collective else {name: images[name] for name in REPLAYED}
+        images = render_view(source, view, background, settings, depth=False)[0]
+        return {name: images[name] for name in REPLAYED}
 
     def _replayed(
-        self, source: FieldSource, view: View, background: Tensor, settings: RenderSettings
+        self, source: LocalField, view: View, background: Tensor, settings: RenderSettings
     ) -> dict[str, Any] | None:
         record_frame = partial(_record, source, view, background, settings)
         key = self._key(source, view, settings)
@@ -101,7 +100,7 @@ class FrameReplay:
             images, _ = _replay(frame, view, background)
         return images
 
-    def _key(self, source: FieldSource, view: View, settings: RenderSettings) -> object:
+    def _key(self, source: LocalField, view: View, settings: RenderSettings) -> object:
         """What a recorded frame has fixed. Addresses identify the field, because the frame reads these."""
         field = source.field
         addresses = tuple((name, value.data_ptr(), value.shape) for name, value in field.items())
@@ -118,7 +117,7 @@ class FrameReplay:
         return view.width, view.height, settings.antialiased, field.encoding, degree, of_head
 
 
-def _recordable(source: FieldSource, settings: RenderSettings) -> bool:
+def _recordable(source: LocalField, settings: RenderSettings) -> bool:
     return (
         settings.backend.name == "gsplat"
         and source.replayable
@@ -129,7 +128,7 @@ def _recordable(source: FieldSource, settings: RenderSettings) -> bool:
 
 
 def _record(
-    source: FieldSource, view: View, background: Tensor, settings: RenderSettings, capacity: int | None = None
+    source: LocalField, view: View, background: Tensor, settings: RenderSettings, capacity: int | None = None
 ) -> _Frame:
     """Record a frame with a capacity for tile and primitive pairs; by default measured on this view, with a reserve."""
     with torch.inference_mode(False), torch.no_grad():

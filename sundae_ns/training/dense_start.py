@@ -7,7 +7,7 @@ agree.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -51,10 +51,6 @@ class DenseStart(Extension):
         self._options, self._points, self._num_features, self._cap = options, points, num_features, cap
         wanted = 2 <= num_images <= options.dense_start_views and options.warm_start is None and not options.random_init
         self._done = not wanted or points is None or len(points[0]) == 0
-        self.found: Callable[[Callable[[], Points]], Points] = lambda sweep: sweep()
-        """Runs the sweep and returns its points; with several ranks, those of the first."""
-        self.put: Callable[[FieldState, Mapping[str, Tensor]], None] = put
-        """Replaces the field; each of several ranks keeps its own rows."""
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing: a checkpoint holds the field that has begun."""
@@ -74,12 +70,13 @@ class DenseStart(Extension):
         too_many = state.device.type == "cpu" and len(run.view_indices()) > MOST_ON_CPU
         if too_many or len(sparse) >= by_device(FILLED, state.device):
             return
-        xyz, rgb = self.found(lambda: self._swept(run, sparse.to(state.device)))
+        xyz, rgb = self._swept(run, sparse.to(state.device))
         colours = colours.float()
         colours = colours if len(colours) else torch.full_like(sparse, 127.5)
         points = torch.cat([sparse, xyz.to(sparse)]), torch.cat([colours, 255 * rgb.to(colours)])
         params, _ = initial_field(self._options, points, None, num_features=self._num_features, cap=self._cap)
-        self.put(state, params)
+        for name, value in params.items():  # without moments
+            replace_parameter(state.field.data, state.optimizers, name, value.to(state.device), {})
         CONSOLE.log(
             f"{len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones "
             "(--pipeline.model.dense-start-views 0 leaves them out)"
@@ -97,9 +94,3 @@ class DenseStart(Extension):
             even = select_systematic(torch.ones(len(xyz)), most, neighbor_order(xyz), self._options.pruning.seed)
             xyz, rgb = xyz[even.to(xyz.device)], rgb[even.to(rgb.device)]
         return xyz.cpu(), rgb.cpu()
-
-
-def put(state: FieldState, params: Mapping[str, Tensor]) -> None:
-    """Replace the field, and drop the moments of its optimizers."""
-    for name, value in params.items():
-        replace_parameter(state.field.data, state.optimizers, name, value.to(state.device), {})

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -21,7 +21,7 @@ STATISTICS = ("grad2d", "count", "radii")
 """Tensors ``[N]`` in the running state of gsplat's strategy."""
 
 COUNTED = "counted"
-"""Entry of ``info`` of a recorded step, which has added its statistics to the running state by itself."""
+"""Entry of ``info`` of a step that has added its statistics to the running state: recorded, or of several ranks."""
 
 
 def limit_growth(
@@ -47,17 +47,6 @@ def limit_growth(
     state["grad2d"][left_out] = 0
     if radii is not None:
         radii[left_out] = radii[left_out].clamp_max(radius)
-
-
-class Statistics(NamedTuple):
-    """Statistics of primitives in the views of several ranks; a primitive may have several rows."""
-
-    ids: Tensor
-    """Index of the primitive ``[S]``."""
-    norms: Tensor
-    """Norm of the gradient of its centre, in units of half the image; 0 if it is not drawn ``[S]``."""
-    radii: Tensor
-    """Radius as a share of the longer side of the image; 0 if it is not drawn ``[S]``."""
 
 
 def start_counting(state: MutableMapping[str, Any], means: Tensor) -> None:
@@ -118,19 +107,9 @@ class CappedStrategy(DefaultStrategy):
 
     @torch.no_grad()
     def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
-        """Add the statistics of a step; those of several ranks include rows of zeros, so that nothing waits."""
-        if info.get(COUNTED):
-            return
-        found: Statistics | None = info.get("statistics")
-        if found is None:
+        """Add the statistics of a step, unless they have been added."""
+        if not info.get(COUNTED):
             super()._update_state(params, state, info, packed=packed)
-            return
-        start_counting(state, params["means"])
-        norms, radii = found.norms.to(state["grad2d"]), found.radii.to(state["grad2d"])
-        state["grad2d"].index_add_(0, found.ids, norms)
-        state["count"].index_add_(0, found.ids, (radii > 0).to(state["count"]))
-        if "radii" in state:
-            state["radii"].scatter_reduce_(0, found.ids, radii, "amax")
 
     @torch.no_grad()
     def _grow_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> tuple[int, int]:
@@ -169,14 +148,10 @@ class Densification(Extension):
 
     def after_step(self, run: TrainingRun) -> None:
         """Let the strategy add, move and remove primitives."""
-        state = run.state
+        state, params = run.state, run.state.field.data
         if state.densifying:
-            self.densify(state)
-
-    def densify(self, state: FieldState) -> None:
-        """The strategy's step; several ranks have their own."""
-        params, running = state.field.data, state.densification
-        self.strategy.step_post_backward(params, state.optimizers, running, state.schedule_step, state.info)
+            running = state.densification
+            self.strategy.step_post_backward(params, state.optimizers, running, state.schedule_step, state.info)
 
 
 def make_strategy(options: ModelOptions, num_images: int) -> CappedStrategy:

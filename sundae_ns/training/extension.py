@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 from torch import Tensor
 
 from sundae_ns.rendering.render import RenderSettings
-from sundae_ns.rendering.source import FieldSource, TrainingView
+from sundae_ns.rendering.source import LocalField, TrainingView
 from sundae_ns.rendering.views import View
 from sundae_ns.training.field_state import FieldState
 
@@ -29,7 +29,7 @@ class TrainingRun(Protocol):
 
     state: FieldState
     """The field in training."""
-    source: FieldSource
+    source: LocalField
     """Where views get their primitives from."""
     background: Tensor
     """Background of images that are not trained on ``[3]``."""
@@ -48,7 +48,7 @@ class TrainingRun(Protocol):
 
     @property
     def images_per_step(self) -> int:
-        """Number of images in the batch of a step: the number of ranks."""
+        """Number of images in a batch: the number of ranks. Each counts as a step."""
 
     @property
     def folder(self) -> Path | None:
@@ -74,7 +74,7 @@ class TrainingRun(Protocol):
         """The training views that are not held out for the whole training, in full size; transparent pixels masked."""
 
     def evaluate(self) -> dict[str, float]:
-        """Mean ``psnr`` (dB) and ``ssim`` over all test views; empty without any. With several ranks, collective."""
+        """Mean ``psnr`` (dB) and ``ssim`` over all test views; empty without any."""
 
     def save(self) -> None:
         """Save a checkpoint, if there is a trainer."""
@@ -98,6 +98,10 @@ class Extension:
 
     def before_backward(self, state: FieldState) -> None:
         """Prepare ``state.info`` of a training image for the backward pass."""
+
+    def needs_all(self, run: TrainingRun) -> bool:
+        """Whether :meth:`after_step` must see the primitives of all ranks at this step; the same on all of them."""
+        return False
 
     def after_step(self, run: TrainingRun) -> None:
         """Act after the optimizers' step. May replace parameters of the field."""

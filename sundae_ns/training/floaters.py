@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -28,8 +28,6 @@ class FloaterRemoval(Extension):
 
     def __init__(self, points: Tensor | None) -> None:
         self._points, self._done = points, points is None
-        self.pruner: Callable[..., FieldPruner] = FieldPruner
-        """Makes the pruner of field, optimizers and running states; several ranks have their own."""
 
     def state_dict(self) -> dict[str, Any]:
         """Whether it is done."""
@@ -39,10 +37,14 @@ class FloaterRemoval(Extension):
         """Counterpart of :meth:`state_dict`; a run that was pruned before this extension existed is done."""
         self._done = self._points is None or bool(saved.get("done", state.pruning["num_prunes"] > 0))
 
+    def needs_all(self, run: TrainingRun) -> bool:
+        """Whether this is the last step at which the field grows, so that a saved warm-up has no floaters."""
+        return not self._done and run.state.schedule_step + 1 >= run.state.densify_until
+
     def after_step(self, run: TrainingRun) -> None:
-        """Remove floaters after the last step at which the field grows, so that a saved warm-up has none."""
+        """Remove floaters once."""
         state = run.state
-        if self._done or state.schedule_step + 1 < state.densify_until:
+        if not self.needs_all(run):
             return
         self._done = True
         assert self._points is not None
@@ -50,7 +52,7 @@ class FloaterRemoval(Extension):
         if not views:
             return
         eyes = torch.stack([view.center for view in views])
-        pruner = self.pruner(state.field, state.optimizers, [state.densification])
+        pruner = FieldPruner(state.field, state.optimizers, [state.densification])
         removed = pruner.drop(near_cameras(state.field["means"], eyes, self._points), at_most=MOST)
         if removed:
             CONSOLE.log(f"step {state.step}: removed {removed:,} floaters right in front of a camera")

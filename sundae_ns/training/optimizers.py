@@ -39,7 +39,7 @@ class NetworkAdamConfig(FusedAdamConfig):
 
     The output is a product of layers, so aligned steps of all weights multiply it. Two measures keep such steps short.
     The mean of squares forgets fast and follows gradients that suddenly grow. With the usual betas a weight moves by up
-    to 7.3 times the rate while they grow, with these by up to 1.2 (``sundae_ns.distributed.ahead.longest_step``).
+    to 7.3 times the rate while they grow, with these by up to 1.2 (``(1 - b1) / sqrt((1 - b2) (1 - b1^2 / b2))``).
     Weights of layers with many inputs get a smaller rate, because their sum grows with the inputs (Yang et al. 2022,
     "Tensor Programs V"). Weight decay shrinks weights, not biases.
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
@@ -34,13 +32,15 @@ class ScheduledPruning(Extension):
     def __init__(self, schedule: PruningSchedule, *, evaluate: bool) -> None:
         self.schedule = schedule
         self.evaluate = evaluate
-        self.pruner: Callable[..., FieldPruner] = FieldPruner
-        """Makes the pruner of field, optimizers and running states; several ranks have their own."""
 
     def before_training(self, run: TrainingRun) -> None:
         """Warn if training ends before the prune or the head."""
         if run.last_step is not None:
             _warn_if_too_short(run, self.schedule.config, run.last_step)
+
+    def needs_all(self, run: TrainingRun) -> bool:
+        """Whether a prune is due."""
+        return self.schedule.due(run.state.pruning, run.state.schedule_step, run.source.total)
 
     def after_step(self, run: TrainingRun) -> None:
         """Prune if it is due, evaluate, report, and restart the learning rates.
@@ -62,7 +62,7 @@ class ScheduledPruning(Extension):
             return contribution(run.source, run.training_views(), run.background, run.settings, count, console=CONSOLE)
 
         try:
-            pruner = self.pruner(state.field, state.optimizers, [state.densification])
+            pruner = FieldPruner(state.field, state.optimizers, [state.densification])
             report = self.schedule.after_step(pruner, state.pruning, state.schedule_step, contribute)
         except SundaeError:
             # Do not lose the warm-up to an option that can be corrected: a resumed run prunes at its first step.
@@ -75,8 +75,6 @@ class ScheduledPruning(Extension):
             notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
             return
-        # In steps of one image, as in checkpoints.
-        report = replace(report, step=(report.step + 1) * run.images_per_step - 1)
         CONSOLE.log(report.summary())
         if report.dropped_nonfinite:
             warn(f"removed {report.dropped_nonfinite} primitives that were not finite")
@@ -114,9 +112,8 @@ def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int)
         option = "head.start-at" if state.head_starts_at != pruning.settled_at else f"pruning.{ends}"
     else:
         return
-    images = run.images_per_step  # options count steps of one image
     warn(
-        f"training ends after {(last_step + 1) * images:,} steps, and the {event} needs more than {step * images:,} "
+        f"training ends after {last_step + 1:,} steps, and the {event} needs more than {step:,} "
         f"({option}): {found}; train longer, or {'enable it' if option.startswith('head') else 'prune'} earlier"
     )
 

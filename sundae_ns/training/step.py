@@ -17,7 +17,7 @@ from torch import Tensor
 from sundae_ns.compensation import Window, training_window
 from sundae_ns.rasterization import Rasterization
 from sundae_ns.rendering.render import RenderSettings, render_view
-from sundae_ns.rendering.source import FieldSource, StepResolution
+from sundae_ns.rendering.source import LocalField, StepResolution
 from sundae_ns.rendering.views import View
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.losses import StepLosses
@@ -89,7 +89,7 @@ def training_part(state: FieldState, view: View, at: StepResolution) -> tuple[Vi
 class TrainingStep(NamedTuple):
     """The step of a field, from a view to its loss."""
 
-    source: FieldSource
+    source: LocalField
     """Where the view gets its primitives from."""
     state: FieldState
     """Says what is enabled at this step."""
@@ -104,11 +104,10 @@ class TrainingStep(NamedTuple):
         background: Tensor,
         settings: RenderSettings,
         *,
-        at: StepResolution | None = None,
         depth: bool = False,
     ) -> tuple[dict[str, Any], Rasterization]:
         """The first half: primitives, one splatting pass, and the head; see :func:`sundae_ns.rendering.render_view`."""
-        return render_view(self.source, view, background, settings, depth=depth, at=at)
+        return render_view(self.source, view, background, settings, depth=depth)
 
     def terms(
         self, images: Mapping[str, Tensor], target: Tensor, mask: Tensor | None, count: Tensor | None = None

@@ -19,7 +19,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch.amp import GradScaler
 
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.distributed.team import Team
+from sundae_ns.distributed import Ranks
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.trainer import SundaeTrainer
@@ -56,7 +56,7 @@ class Pipeline(torch.nn.Module):
 def trainer() -> SundaeTrainer:
     """A trainer with only the attributes that saving and resuming use; shared, because every case loads its state."""
     made = SundaeTrainer.__new__(SundaeTrainer)
-    made.team = Team()
+    made.ranks = Ranks()
     made.pipeline = Pipeline()  # type: ignore[assignment]
     groups = made.pipeline._model.get_param_groups()
     made.optimizers = Optimizers({n: {"optimizer": FusedAdamConfig(), "scheduler": None} for n in groups}, groups)

@@ -340,9 +340,10 @@ def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, tria
     model: Any = resumed.pipeline.model
     trials_of_run = _trials(model)
     assert "start" in trials_of_run.state_dict()["engine"]["kept"]
-    resumed.pipeline.datamanager.place = (0, 2)
+    resumed.ranks.count = 2
     attributes = TrainingCallbackAttributes(resumed.optimizers, resumed.grad_scaler, resumed.pipeline, resumed)
     trials_of_run.before_training(NerfstudioRun(model, attributes))
+    resumed.ranks.count = 1
     resumed.train()
     assert _record(resumed)["reason"] == "trials need a single GPU"
     assert model.state.head_enabled

@@ -21,7 +21,7 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.cuda_graphs import RECORD_AT
 from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization import Capacity, RecordableGsplat
-from sundae_ns.rendering import FieldSource, LocalField, RenderSettings, View, render_view, replay
+from sundae_ns.rendering import LocalField, RenderSettings, View, render_view, replay
 from sundae_ns.rendering.replay import FrameReplay
 
 Build = Callable[..., SundaeModel]
@@ -40,7 +40,7 @@ class Recorder:
 
     def record(
         self,
-        source: FieldSource,
+        source: LocalField,
         view: View,
         background: Tensor,
         settings: RenderSettings,

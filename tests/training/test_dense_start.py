@@ -14,7 +14,6 @@ from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.model import SundaeModel
 from sundae_ns.training import dense_start
-from sundae_ns.training.dense_start import DenseStart
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[..., Any]
@@ -143,14 +142,6 @@ def test_a_cpu_sweeps_few_views(
     assert model.num_points == 60 + swept * FOUND
 
 
-def test_ranks_take_what_the_first_finds(build: Build, training_of: TrainingOf) -> None:
-    model = few(build)
-    (dense,) = (one for one in model.extensions if isinstance(one, DenseStart))
-    put: list[int] = []
-    dense.found = lambda sweep: (torch.full((7, 3), 9.0), torch.zeros(7, 3))
-    dense.put = lambda state, params: put.append(len(params["means"]))
-    training_of(model)
-    assert (model.num_points, put) == (60, [67])
 
 
 def test_a_negative_number_of_views_is_an_error(build: Build) -> None:

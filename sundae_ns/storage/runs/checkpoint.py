@@ -240,10 +240,8 @@ def _check_format(extra: Mapping[str, Any]) -> None:
         )
 
 
-def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], *, may_be_empty: bool = False) -> None:
+def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) -> None:
     """Check that a ``state``, whose extra state was checked, fits the ``state_dict`` that a model has.
-
-    A shard ``may_be_empty``, without a primitive.
 
     Raises:
         CheckpointError: a tensor is missing or has another shape, or the running states do not fit.
@@ -262,7 +260,7 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], 
                 f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {mend}{hint}"
             )
     rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
-    if len(rows) != 1 or (rows[0] == 0 and not may_be_empty):
+    if len(rows) != 1 or rows[0] == 0:
         raise CheckpointError(f"the checkpoint has parameters of {rows} primitives; give another")
     extra, n = state[EXTRA_STATE], rows[0]
     pruning, strategy = extra["running"].get("pruning"), extra["running"].get("densification")

@@ -84,8 +84,7 @@ def test_another_number_of_primitives_fits() -> None:
     check(model_state(9))
 
 
-def test_a_shard_may_be_empty_and_a_field_may_not() -> None:
-    check(model_state(0), may_be_empty=True)
+def test_a_field_may_not_be_empty() -> None:
     with pytest.raises(CheckpointError, match=r"parameters of \[0\] primitives"):
         check(model_state(0))
 
