@@ -40,7 +40,6 @@ ARMS: dict[str, list[str]] = {
     "splatfacto": ["splatfacto"],
     "sundae": ["sundae"],
     "sundae-fast": ["sundae-fast"],
-    "sundae-unrecorded": ["sundae", "--record-steps", "False"],
     "sundae-with-head": ["sundae", "--pipeline.model.head.mode", "residual"],
 }
 PROFILED = 100

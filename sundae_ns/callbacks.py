@@ -37,19 +37,17 @@ class NerfstudioRun:
         self.background: Tensor = model.background_color.to(model.device)
         self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
         self._trainer = cast(Any, attributes.trainer)
-        self._ranks: Ranks = Ranks() if self._trainer is None else self._trainer.ranks
+        self._ranks: Ranks = getattr(self._trainer, "ranks", None) or Ranks()
 
     @property
     def source(self) -> LocalField:
         """Where views get their primitives from."""
-        source: LocalField = self.model.source
-        return source
+        return cast(LocalField, self.model.source)
 
     @property
     def settings(self) -> RenderSettings:
         """Settings of images that are not trained on, at this step."""
-        settings: RenderSettings = self.model.render_settings(training=False)
-        return settings
+        return cast(RenderSettings, self.model.render_settings(training=False))
 
     @property
     def last_step(self) -> int | None:
@@ -69,25 +67,24 @@ class NerfstudioRun:
     @property
     def folder(self) -> Path | None:
         """Folder for records, on the first rank."""
-        return self._trainer.base_dir if self._trainer is not None and self._ranks.rank == 0 else None
+        return None if self._trainer is None or self._ranks.rank > 0 else self._trainer.base_dir
+
+    @property
+    def _datamanager(self) -> SundaeDatamanager:
+        return cast(SundaeDatamanager, self._pipeline.datamanager)
 
     @property
     def num_heldout(self) -> int:
         """Number of held-out training views."""
         return len(self._datamanager.holdout_indices)
 
-    @property
-    def _datamanager(self) -> SundaeDatamanager:
-        manager: SundaeDatamanager = self._pipeline.datamanager
-        return manager
-
-    def training_views(self) -> list[TrainingView]:
-        """The training views that are not held out."""
-        return training_views(self.model, self._datamanager)
-
     def view_indices(self) -> list[int]:
         """Indices of the training views."""
         return self._datamanager.train_indices
+
+    def training_views(self) -> list[TrainingView]:
+        """The training views that are not held out for the whole training."""
+        return training_views(self.model, self._datamanager)
 
     def hold_out(self, indices: Iterable[int]) -> None:
         """Hold out these training views from the next step on."""
@@ -99,7 +96,7 @@ class NerfstudioRun:
             yield self._photo(camera, batch)
 
     def photos(self) -> Iterator[Photo]:
-        """The training views that are not held out for the whole training."""
+        """The training views that are not held out for the whole training; transparent pixels are masked."""
         for camera, batch in self._datamanager.views(self.view_indices()):
             photo, image = self._photo(camera, batch), batch["image"]
             if image.shape[-1] == 4:
@@ -129,7 +126,7 @@ class NerfstudioRun:
         """Write numbers to the run's event file."""
         writer.put_dict(name=name, scalar_dict=dict(values), step=self.state.step)
 
-    # --------------------------------------------------------------------------------------------------- callbacks
+    # -------------------------------------------------------------------------------------------------------- callbacks
 
     def callbacks(self) -> list[TrainingCallback]:
         """Callbacks that set the step, call the extensions after each step, and let them report at the end."""
@@ -141,22 +138,17 @@ class NerfstudioRun:
         ]
 
     def start(self) -> None:
-        """Hand the optimizers to the state, and let the extensions check the run."""
+        """Hand the optimizers to the state, take over records, and let the extensions check the run."""
         assert self._optimizers is not None
         self.state.optimizers, self.state.schedulers = self._optimizers.optimizers, self._optimizers.schedulers
-        self._take_records()
+        if self.folder is not None:
+            resumed = self._trainer.config.load_dir or self._trainer.config.load_checkpoint
+            config = None if resumed is None else find_config(resumed)
+            if config is not None and config.parent.resolve() != self.folder.resolve():
+                take_records(config.parent, self.folder, self.state.schedule_step)
         for extension in self.model.extensions:
             extension.before_training(self)
         self._hand_over()
-
-    def _take_records(self) -> None:
-        """Take over the records of the run that is resumed, which may lie in another folder."""
-        if self._trainer is None or self.folder is None:
-            return
-        place = self._trainer.config.load_dir or self._trainer.config.load_checkpoint
-        config = None if place is None else find_config(place)
-        if config is not None and config.parent.resolve() != self.folder.resolve():
-            take_records(config.parent, self.folder, self.state.schedule_step)
 
     def _begin_step(self, step: int) -> None:
         self.state.step = step
@@ -186,17 +178,19 @@ class NerfstudioRun:
         if self.folder is None:
             return
         results = self.evaluate() if self.model.config.evaluate_prune else {}
-        head = self.state.head if self.state.head_enabled else None
-        numbers = sum(value[:1].numel() for value in self.state.field.values())
-        size = BYTES_PER_FLOAT * self.source.total * numbers + (0 if head is None else bytes_of_module(head))
-        kind = "without" if head is None else "with"
-        lines = [f"{self.source.total:,} primitives, {kind} a head: {megabytes(size)} before packing"]
         if results:
             quality = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
-            lines.insert(0, f"trained: {quality} on {len(self._datamanager.eval_dataset)} test views")
-        lines.append(f"next: {shlex.join(['sundae', 'pack', str(self.folder), '-o', 'scene.sundae'])}")
-        for line in lines:
-            CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
+            _say(f"trained: {quality} on {len(self._datamanager.eval_dataset)} test views")
+        head = self.state.head if self.state.head_enabled else None
+        numbers = sum(value.numel() for value in self.state.field.values())
+        size = BYTES_PER_FLOAT * numbers + (0 if head is None else bytes_of_module(head))
+        with_head = f"{'without' if head is None else 'with'} a head"
+        _say(f"{self.source.total:,} primitives, {with_head}: {megabytes(size)} before packing")
+        _say(f"next: {shlex.join(['sundae', 'pack', str(self.folder), '-o', 'scene.sundae'])}")
+
+
+def _say(line: str) -> None:
+    CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def training_views(model: Any, datamanager: SundaeDatamanager) -> list[TrainingView]:

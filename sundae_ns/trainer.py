@@ -48,9 +48,6 @@ class SundaeTrainerConfig(TrainerConfig):
     """Configuration of a run."""
 
     _target: type = field(default_factory=lambda: SundaeTrainer)
-    record_steps: bool = True
-    """On one CUDA device: record training steps as CUDA graphs, which saves most of Python's time. Steps that cannot be
-    recorded (camera optimizer, mixed precision, gradient accumulation or clipping) run kernel by kernel."""
     schedule_length: int | None = None
     """Steps over which prune, densification, resolution and learning rates are spread, unless you set their options: by
     default max_num_iterations, and the length of the run that is resumed. A larger number trains the first part."""
@@ -58,9 +55,7 @@ class SundaeTrainerConfig(TrainerConfig):
     """Steps at the end of the schedule, at most a twentieth of it, that are left to sundae pack RUN --finetune."""
 
     def print_to_terminal(self) -> None:
-        """Check the capture, make the schedule and log it; the other options are in ``config.yml``.
-
-        ``ns-train`` calls this before it saves the configuration and starts the ranks.
+        """Check the capture, make the schedule and log it; ``ns-train`` calls this first of all.
 
         Raises:
             DataError: the capture cannot be used.
@@ -83,24 +78,21 @@ class SundaeTrainerConfig(TrainerConfig):
     def make_paths_absolute(self) -> None:
         """Make the paths absolute that a finished run is opened with, because it may be opened from another folder."""
         datamanager: Any = self.pipeline.datamanager
-        model = self.pipeline.model
-        for owner, name in ((self, "data"), (self, "output_dir"), (datamanager, "data"), (model, "warm_start")):
-            value = getattr(owner, name, None)
-            if isinstance(value, Path):
+        owners = [(self, "data"), (self, "output_dir"), (datamanager, "data"), (self.pipeline.model, "warm_start")]
+        if datamanager.data is None:  # an unset path is nerfstudio's example
+            owners.append((datamanager.dataparser, "data"))
+        for owner, name in owners:
+            if isinstance(value := getattr(owner, name, None), Path):
                 setattr(owner, name, value.absolute())
-        parser = datamanager.dataparser
-        # An unset path is nerfstudio's example.
-        if datamanager.data is None and isinstance(getattr(parser, "data", None), Path):
-            parser.data = parser.data.absolute()
 
     def get_base_dir(self) -> Path:
         """Folder of the run: where a command of nerfstudio has found it, for a run that was copied or moved."""
-        found = loaded_run(sys.argv)
-        if found is None or not (found / self.relative_model_dir).is_dir():
+        run = loaded_run(sys.argv)
+        if run is None or not (run / self.relative_model_dir).is_dir():
             base: Path = super().get_base_dir()
             return base
-        find_capture(self, found)
-        return found
+        find_capture(self, run)
+        return run
 
     def set_timestamp(self) -> None:
         """Name the run, unless ``--timestamp`` did; runs that start in the same second get different names."""
@@ -128,14 +120,9 @@ class SundaeTrainerConfig(TrainerConfig):
 
 
 def _detached(result: tuple[Tensor, Mapping[str, Any], Mapping[str, Any]]) -> tuple[Any, ...]:
-    """Loss, its terms, and metrics without their graph.
-
-    nerfstudio holds them until the next step. Trials that resize the head in between need the graph to be gone.
-    """
-    loss, *figures = result
-    values = [
-        {name: one.detach() if isinstance(one, Tensor) else one for name, one in part.items()} for part in figures
-    ]
+    """Loss, its terms, and metrics without their graph; nerfstudio holds them until the next step."""
+    loss, *parts = result
+    values = [{k: v.detach() if isinstance(v, Tensor) else v for k, v in part.items()} for part in parts]
     return loss.detach(), *values
 
 
@@ -150,16 +137,11 @@ class SundaeTrainer(Trainer):
         super().__init__(self.ranks.configured(config), local_rank, world_size=1)
         with writing(f"cannot make the run's folder {self.base_dir}"):
             self.base_dir.mkdir(parents=True, exist_ok=True)  # nerfstudio's own way fails if two ranks do so at once
-        self._recorded: RecordedStep | None = None
-        """Runs whole steps; None where they run kernel by kernel."""
-        self._result: Any = None
-        """Loss, its terms and metrics of the last step that was trained."""
-        self._batch_ends = 0
-        """Step after the last image of the present batch."""
-        self._trained: int | None = None
-        """The last step that is trained."""
-        self._stopped_by = 0
-        """The signal that ends this training after the step; 0 for none."""
+        self._recorded: RecordedStep | None = None  # runs whole steps; None where they run kernel by kernel
+        self._result: Any = None  # loss, its terms and metrics of the last step that was trained
+        self._batch_ends = 0  # step after the last image of the present batch
+        self._trained: int | None = None  # the last step
+        self._stopped_by = 0  # the signal that ends this training after the step; 0 for none
         self._interruption = Interruption(self._stop, quiet=local_rank != 0)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -177,8 +159,11 @@ class SundaeTrainer(Trainer):
     @property
     def model(self) -> SundaeModel:
         """The model in training."""
-        model: SundaeModel = self.pipeline.model
-        return model
+        return cast(SundaeModel, self.pipeline.model)
+
+    @property
+    def _datamanager(self) -> SundaeDatamanager:
+        return cast(SundaeDatamanager, self.pipeline.datamanager)
 
     @property
     def last_step(self) -> int:
@@ -199,12 +184,7 @@ class SundaeTrainer(Trainer):
                     super().eval_iteration(step)
 
     def train(self) -> None:
-        """Train.
-
-        Raises:
-            StorageError: the run's folder cannot be written.
-            MemoryExhaustedError: the GPU's memory is full.
-        """
+        """Train; errors of a full disk or a full GPU say so in one line."""
         with (
             naming_full_memory(lambda: self.model.num_points),
             writing(f"cannot write to the run's folder {self.base_dir}"),
@@ -219,8 +199,7 @@ class SundaeTrainer(Trainer):
         """Train one step. Several ranks train a batch at the first of its steps, and may stop after the last."""
         model = self.model
         if step < self._batch_ends:
-            for scheduler in self.optimizers.schedulers.values():
-                scheduler.step()
+            self._step_schedulers()
         else:
             self._batch_ends = step + self.ranks.count
             if all(extension.trains(model.state) for extension in model.extensions):
@@ -248,25 +227,29 @@ class SundaeTrainer(Trainer):
         return _detached((torch.stack(list(terms.values())).sum(), terms, metrics))
 
     def _recordable(self) -> bool:
-        """Whether options allow to record training steps."""
+        """Whether a CUDA graph can hold a training step under these options."""
         model, config = self.model, self.config
-        single = config.record_steps and model.source.replayable
-        plain = model.camera_optimizer.config.mode == "off" and not model.config.output_depth_during_training
-        one_batch = set(self.gradient_accumulation_steps.values()) <= {1}
-        usual = one_batch and not (self.mixed_precision or config.log_gradients)
         adam = all(
-            isinstance(options["optimizer"], FusedAdamConfig) and options["optimizer"].max_norm is None
-            for name, options in config.optimizers.items()
-            if name in self.optimizers.optimizers
+            isinstance(config.optimizers[name]["optimizer"], FusedAdamConfig)
+            and config.optimizers[name]["optimizer"].max_norm is None
+            for name in self.optimizers.optimizers
         )
-        return single and plain and usual and adam and model.device.type == "cuda" and model.backend.name == "gsplat"
+        varying = (
+            model.camera_optimizer.config.mode != "off"
+            or model.config.output_depth_during_training
+            or max(self.gradient_accumulation_steps.values(), default=1) > 1
+            or self.mixed_precision
+            or config.log_gradients
+        )
+        on_gpu = model.device.type == "cuda" and model.backend.name == "gsplat" and model.source.replayable
+        return on_gpu and adam and not varying
 
     def _recorded_iteration(self, step: int) -> Any:
         """Train one step by a recording: loss, its terms, and metrics; None if it has to run kernel by kernel."""
         if self._recorded is None:
             return None
         model = self.model
-        camera, batch = cast(SundaeDatamanager, self.pipeline.datamanager).next_train(step)
+        camera, batch = self._datamanager.next_train(step)
         try:
             inputs = model.step_inputs(camera, batch)
             result = self._recorded(model.state, inputs, model.render_settings(training=True))
@@ -276,25 +259,25 @@ class SundaeTrainer(Trainer):
             torch.cuda.empty_cache()
             return None
         model.photo_gains.observe(result.images["rgb"], inputs.target, inputs.mask, batch)
-        # Not nerfstudio's method, which also writes every rate at every step; that takes longer than to launch one.
-        for scheduler in self.optimizers.schedulers.values():
-            scheduler.step()
+        self._step_schedulers()
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
             for name, scheduler in self.optimizers.schedulers.items():
                 writer.put_scalar(f"learning_rate/{name}", scheduler.get_last_lr()[0], step)
         outputs = {**result.images, "background": inputs.background, "window": inputs.window}
         return result.loss, result.losses, model.get_metrics_dict(outputs, batch)
 
+    def _step_schedulers(self) -> None:
+        # nerfstudio's method also writes every rate at every step, which takes longer than a recorded step.
+        for scheduler in self.optimizers.schedulers.values():
+            scheduler.step()
+
     def _warn_if_long(self, number: int) -> None:
         """On a CPU, warn of a training of hours, by ten steps; the first compiles, and the second warms up."""
-        if self.config.machine.device_type != "cpu" or self.ranks.count > 1:
-            return
         if number == 1:
             self._measured_from = time.perf_counter()
-        elif number == 11:
+        elif number == 11 and self.config.machine.device_type == "cpu":
             seconds = (time.perf_counter() - self._measured_from) / 10
-            warning = long_on_cpu(seconds, self.last_step - self._start_step - 11)
-            if warning is not None:
+            if (warning := long_on_cpu(seconds, self.last_step - self._start_step - 11)) is not None:
                 warn(warning)
 
     def _stop(self) -> None:
@@ -303,26 +286,20 @@ class SundaeTrainer(Trainer):
             self.stop_training = True
 
     def _after_train(self) -> None:
-        """Save and report; a run that was stopped says how to resume, and exits with 130 (SIGINT) or 143 (SIGTERM).
-
-        Raises:
-            SystemExit: a signal stopped the run before its last step.
-        """
+        """Save and report; a run that was stopped says how to resume, and exits with 130 (SIGINT) or 143 (SIGTERM)."""
         if self._trained is not None:
             self.step = self._trained  # nerfstudio has counted a step that it does not train
         if not self._stopped_by or self._trained == self.last_step:
             super()._after_train()
             return
-        if self._trained is not None:
-            self.save_checkpoint(
-                self.step
-            )  # collective: no rank leaves before it is written, which would end the others
+        if self._trained is None:
+            CONSOLE.print(NOTHING_SAVED)
+        else:
+            self.save_checkpoint(self.step)  # ranks leave after it, because one that leaves ends the others
             data = self.config.pipeline.datamanager.data
             command = resume_command(sys.argv, self.checkpoint_dir, str(self.config.method_name), data)
             CONSOLE.print("Stopped and saved. To train the remaining steps:")
             CONSOLE.print(f"    {command}", markup=False, highlight=False, soft_wrap=True)
-        else:
-            CONSOLE.print(NOTHING_SAVED)
         profiler.PROFILER.clear()  # else nerfstudio's table would hide the command
         raise SystemExit(128 + self._stopped_by)
 
@@ -341,20 +318,18 @@ class SundaeTrainer(Trainer):
             StorageError: no space or no right to write; older checkpoints stay.
         """
         with self.ranks.whole() as first:
-            if first:
-                self._write_checkpoint(step)
-
-    def _write_checkpoint(self, step: int) -> None:
-        state = {
-            "step": step,
-            "pipeline": self.pipeline.state_dict(),
-            "optimizers": {name: value.state_dict() for name, value in self.optimizers.optimizers.items()},
-            "schedulers": {name: value.state_dict() for name, value in self.optimizers.schedulers.items()},
-            "scalers": self.grad_scaler.state_dict(),
-            "random": random_state(),
-        }
-        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        checkpoint.write(state, path)
+            if not first:
+                return
+            state = {
+                "step": step,
+                "pipeline": self.pipeline.state_dict(),
+                "optimizers": {name: value.state_dict() for name, value in self.optimizers.optimizers.items()},
+                "schedulers": {name: value.state_dict() for name, value in self.optimizers.schedulers.items()},
+                "scalers": self.grad_scaler.state_dict(),
+                "random": random_state(),
+            }
+            path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+            checkpoint.write(state, path)
         if self.config.save_only_latest_checkpoint:
             for other in self.checkpoint_dir.glob("*.ckpt"):
                 if other != path:
@@ -367,7 +342,15 @@ class SundaeTrainer(Trainer):
             return
         loaded = checkpoint.read(path)
         try:
-            self._restore(loaded)
+            self.step = int(loaded["step"])  # else a run of no further step would be saved as step 0
+            self._start_step = self.step + 1
+            self.pipeline.load_pipeline(loaded["pipeline"], loaded["step"])
+            self.optimizers.load_optimizers(loaded["optimizers"])
+            if "schedulers" in loaded and self.config.load_scheduler:
+                self.optimizers.load_schedulers(loaded["schedulers"])
+            self.grad_scaler.load_state_dict(loaded["scalers"])
+            if "random" in loaded:  # nerfstudio's own trainer saves none
+                set_random_state(loaded["random"])
         except SundaeError:
             raise
         except Exception as error:  # torch and nerfstudio raise many kinds; each means that the checkpoint does not fit
@@ -375,7 +358,7 @@ class SundaeTrainer(Trainer):
                 f"{path} does not fit this run ({one_line(error)}); load it with the options that it was trained with"
             ) from error
         CONSOLE.print(f"Resuming after step {loaded['step']} from {path}")
-        outputs = cast(SundaeDatamanager, self.pipeline.datamanager).train_dataparser_outputs
+        outputs = self._datamanager.train_dataparser_outputs
         other = other_frame(path.parent.parent, outputs.dataparser_transform, outputs.dataparser_scale)
         if other is not None:
             warn(other)
@@ -391,14 +374,3 @@ class SundaeTrainer(Trainer):
         for line in passed_over:
             warn(f"skipped a damaged checkpoint: {line}")
         return path
-
-    def _restore(self, loaded: dict[str, Any]) -> None:
-        self.step = int(loaded["step"])  # else a run of no further step would be saved as step 0
-        self._start_step = self.step + 1
-        self.pipeline.load_pipeline(loaded["pipeline"], loaded["step"])
-        self.optimizers.load_optimizers(loaded["optimizers"])
-        if "schedulers" in loaded and self.config.load_scheduler:
-            self.optimizers.load_schedulers(loaded["schedulers"])
-        self.grad_scaler.load_state_dict(loaded["scalers"])
-        if "random" in loaded:  # nerfstudio's own trainer saves none
-            set_random_state(loaded["random"])

@@ -142,8 +142,6 @@ def test_a_cpu_sweeps_few_views(
     assert model.num_points == 60 + swept * FOUND
 
 
-
-
 def test_a_negative_number_of_views_is_an_error(build: Build) -> None:
     with pytest.raises(ConfigError, match="dense-start-views is -1; give a number of images, 0 for no sweep"):
         build(dense_start_views=-1)

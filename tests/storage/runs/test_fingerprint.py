@@ -127,7 +127,6 @@ def test_the_capture_changes_nothing() -> None:
         "--optimizers.compensation.scheduler.shape exponential",
         "--max-num-iterations 7000",
         "--schedule-length 60000",
-        "--record-steps False",
     ],
 )
 def test_options_that_decide_a_result_change_it(words: str) -> None:
