@@ -40,7 +40,7 @@ from sundae_ns.errors import NOTHING_SAVED, ConfigError, passed_on
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.surgery import change_parameter, per_primitive
-from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN, camera_center
+from sundae_ns.rasterization.reference import BLUR, FOV_MARGIN, camera_center
 from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, LocalField, colors_from
 from sundae_ns.rendering.views import View
 from sundae_ns.training.densification import COUNTED, start_counting

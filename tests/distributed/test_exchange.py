@@ -25,7 +25,7 @@ from sundae_ns.distributed import BatchOptimizers, Ranks, ShardedField, _summed,
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.surgery import keep
 from sundae_ns.rasterization import rasterize, select_backend
-from sundae_ns.rasterization.projection import project
+from sundae_ns.rasterization.reference import project
 from sundae_ns.rendering import ColorSettings, LocalField, View
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
