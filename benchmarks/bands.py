@@ -32,11 +32,9 @@ from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import PruneRule, band_rule, check_share, decide, field_graph, kept_count, response
-from sundae_ns.storage import replacing, write_text
-from sundae_ns.storage.atomic import writing
-from sundae_ns.storage.kinds import kind_of
-from sundae_ns.storage.runs.checkpoint import read_field
-from sundae_ns.storage.runs.folder import find_config
+from sundae_ns.storage.atomic import replacing, write_text, writing
+from sundae_ns.storage.config_file import find_config
+from sundae_ns.storage.formats import kind_of, read_field
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras

@@ -29,8 +29,8 @@ from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.scenes.models import Opened, load_model
-from sundae_ns.storage import read_ply
-from sundae_ns.storage.viewers import ANTIALIASED
+from sundae_ns.storage.formats import ANTIALIASED
+from sundae_ns.storage.ply import read_ply
 
 
 def transform(program: str, source: Path, out: Path) -> Path:

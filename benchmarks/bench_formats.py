@@ -32,7 +32,7 @@ import sundae_ns as sn
 from sundae_ns.api.packing import packed_bytes
 from sundae_ns.rendering.views import view_of
 from sundae_ns.scenes.models import Opened, load_model, load_run
-from sundae_ns.storage import bytes_of, bytes_of_module
+from sundae_ns.storage.accounting import bytes_of, bytes_of_module
 from sundae_ns.storage.atomic import replacing
 
 COLUMNS = (

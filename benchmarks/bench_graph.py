@@ -37,7 +37,7 @@ from sundae_ns.evaluation.timing import now
 from sundae_ns.filters import high_pass
 from sundae_ns.graphs import NeighborGraph, build_graph
 from sundae_ns.graphs.host_search import cores
-from sundae_ns.storage.runs.checkpoint import read_field
+from sundae_ns.storage.formats import read_field
 
 NEIGHBORS = 16
 TIE = 1e-12

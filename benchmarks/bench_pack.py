@@ -38,6 +38,7 @@ from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.scenes.finetune import RATE, finetune
 from sundae_ns.scenes.models import load_model, load_run
+from sundae_ns.storage.config_file import load_config
 from sundae_ns.storage.pack import (
     FINETUNED,
     Codecs,
@@ -48,7 +49,6 @@ from sundae_ns.storage.pack import (
     read_scene,
     write_fitted,
 )
-from sundae_ns.storage.runs.config_file import load_config
 
 FIRST_IMAGE = """
 import sys

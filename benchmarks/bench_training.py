@@ -34,7 +34,7 @@ from nerfstudio.scripts.train import _set_random_seed
 from harness.job import configure, without_lpips
 from harness.plan import Job, parser_of
 from sundae_ns.evaluation import psnr, ssim
-from sundae_ns.storage.runs.fingerprint import fingerprint
+from sundae_ns.storage.fingerprint import fingerprint
 
 ARMS: dict[str, list[str]] = {
     "splatfacto": ["splatfacto"],

@@ -166,7 +166,7 @@ def tried(disk: Disk, words: list[object], exact: bool) -> Counter[str]:
 def tried_training(disk: Disk, scene: Path, whole: dict[str, Any], size: int, exact: bool) -> Counter[str]:
     """Trainings whose disk gets full: at their start, before the first save, and at a later one."""
     from sundae_ns.errors import CheckpointError
-    from sundae_ns.storage.runs import checkpoint
+    from sundae_ns.storage import checkpoint
 
     tally: Counter[str] = Counter()
     words = ["ns-train", "sundae-tiny", "--data", scene, "--output-dir", disk.place / "out", *TRAIN.split()]
@@ -201,7 +201,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="COMMAND", help=", ".join(names))
     options = parser.parse_args()
     inside()
-    from sundae_ns.storage.runs import checkpoint
+    from sundae_ns.storage import checkpoint
 
     exact = not torch.cuda.is_available()  # sums have no fixed order there
     found: dict[str, Counter[str]] = {}

@@ -49,7 +49,7 @@ from harness.watcher import Watcher, free_port
 from sundae_ns.errors import CheckpointError
 from sundae_ns.rendering.views import view_of
 from sundae_ns.scenes.models import load_model
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage import checkpoint
 
 SPREAD = 3.0
 """Decibels that a resumed run on CUDA may be below the worse of two undisturbed ones."""

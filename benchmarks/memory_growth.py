@@ -36,7 +36,7 @@ from sundae_ns.api.files import SUFFIXES
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.method_configs import sundae_tiny
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage import checkpoint
 
 PRUNE_AT, SETTLE, EVERY = 60, 200, 50
 M_ARENA_MAX = -8

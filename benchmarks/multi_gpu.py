@@ -26,7 +26,8 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.scripts.train import _set_random_seed
 
 from harness.plan import parser_of
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage import checkpoint
+from sundae_ns.storage.formats import read_field
 from sundae_ns.training.run_length import set_schedule
 
 WARM = 100
@@ -158,7 +159,7 @@ def main() -> None:
             if options.only == ("whole" if tiled else "tiled"):
                 continue
             if tiled:
-                field = tile(checkpoint.read_field(options.field or folder / "warm.ckpt")[0], options.primitives)
+                field = tile(read_field(options.field or folder / "warm.ckpt")[0], options.primitives)
                 state = {"step": 0, "pipeline": {f"_model.gauss_params.{key}": value for key, value in field.items()}}
                 checkpoint.write(state, folder / "tiled.ckpt")
                 del field, state

@@ -18,7 +18,8 @@ from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.distributed import Ranks
 from sundae_ns.rendering import LocalField, RenderSettings, TrainingView
 from sundae_ns.storage.accounting import BYTES_PER_FLOAT, bytes_of_module, megabytes
-from sundae_ns.storage.runs.folder import find_config, take_records
+from sundae_ns.storage.config_file import find_config
+from sundae_ns.storage.run_folder import take_records
 from sundae_ns.training.extension import Extension, Photo
 from sundae_ns.training.field_state import FieldState
 
@@ -143,8 +144,7 @@ class NerfstudioRun:
         self.state.optimizers, self.state.schedulers = self._optimizers.optimizers, self._optimizers.schedulers
         if self.folder is not None:
             resumed = self._trainer.config.load_dir or self._trainer.config.load_checkpoint
-            config = None if resumed is None else find_config(resumed)
-            if config is not None and config.parent.resolve() != self.folder.resolve():
+            if resumed and (config := find_config(resumed)) and config.parent.resolve() != self.folder.resolve():
                 take_records(config.parent, self.folder, self.state.schedule_step)
         for extension in self.model.extensions:
             extension.before_training(self)

@@ -35,7 +35,7 @@ from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, RenderSettings
 from sundae_ns.rendering.replay import FrameReplay
 from sundae_ns.rendering.source import LocalField, StepResolution
 from sundae_ns.rendering.views import View, crop_image, view_of
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage import checkpoint
 from sundae_ns.training.build import build
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState

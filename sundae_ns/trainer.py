@@ -29,10 +29,10 @@ from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, Stora
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.parsing import other_frame
+from sundae_ns.storage import checkpoint, run_folder
 from sundae_ns.storage.atomic import write_text, writing
-from sundae_ns.storage.runs import checkpoint, folder
-from sundae_ns.storage.runs.config_file import find_capture
-from sundae_ns.storage.runs.random_state import random_state, set_random_state
+from sundae_ns.storage.checkpoint import random_state, set_random_state
+from sundae_ns.storage.config_file import find_capture
 from sundae_ns.training.interruption import Interruption, resume_command
 from sundae_ns.training.loaded_run import loaded_run
 from sundae_ns.training.optimizers import FusedAdamConfig
@@ -97,7 +97,7 @@ class SundaeTrainerConfig(TrainerConfig):
     def set_timestamp(self) -> None:
         """Name the run, unless ``--timestamp`` did; runs that start in the same second get different names."""
         if self.timestamp == "{timestamp}":
-            self.timestamp = folder.new_name()
+            self.timestamp = run_folder.new_name()
 
     def save_config(self) -> None:
         """Write ``config.yml`` into the run's folder atomically.
@@ -114,7 +114,7 @@ class SundaeTrainerConfig(TrainerConfig):
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise StorageError(f"cannot make {path.parent} ({error.strerror}); choose another --output-dir") from error
-        folder.reserve(path.parent)
+        run_folder.reserve(path.parent)
         CONSOLE.log(f"Saving config to: {path}")
         write_text(path, yaml.dump(self))
 

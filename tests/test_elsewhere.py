@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import ast
+import errno
 import os
 import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from sundae_ns.cli import guard, process
-from sundae_ns.errors import StorageError, SundaeError
-from sundae_ns.storage import atomic, locks
-from sundae_ns.storage.runs import folder
+from sundae_ns.errors import SundaeError
+from sundae_ns.storage import atomic, run_folder
 
 fcntl = pytest.importorskip("fcntl", reason="tests what Linux can tell of Windows")
 ROOT = Path(__file__).parents[1]
@@ -103,7 +102,7 @@ def test_every_text_has_an_encoding() -> None:
 
 
 def test_names_of_new_runs_are_names_on_windows() -> None:
-    assert re.fullmatch(r"[\w-]+", folder.new_name())
+    assert re.fullmatch(r"[\w-]+", run_folder.new_name())
 
 
 def test_no_file_of_the_repository_has_a_name_that_windows_refuses() -> None:
@@ -118,42 +117,11 @@ def test_no_file_of_the_repository_has_a_name_that_windows_refuses() -> None:
 
 # --------------------------------------------------------------------------------------------------------------- locks
 
-HOLDER = """
-import fcntl, sys, time
-file = open(sys.argv[1], "a+")
-fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, int(sys.argv[2]))
-print("process 7", file=file, flush=True)
-print(flush=True)
-time.sleep(600)
-"""
-
 
 @pytest.fixture
 def windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The functions of Windows for locks, from POSIX's locks of a range, and its rules for folders."""
-
-    def locking(handle: int, mode: int, size: int) -> None:
-        assert mode == 2
-        fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB, size, 0, os.SEEK_CUR)
-
-    monkeypatch.setattr(locks, "fcntl", None)
-    monkeypatch.setattr(locks, "msvcrt", SimpleNamespace(LK_NBLCK=2, locking=locking))
+    """The rules of Windows for files and folders."""
     monkeypatch.setattr(atomic, "_WINDOWS", True)
-
-
-@pytest.mark.usefixtures("windows")
-def test_a_folder_is_reserved_by_a_byte(tmp_path: Path) -> None:
-    words = [sys.executable, "-c", HOLDER, str(tmp_path / folder.LOCK), str(locks._PLACE)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout is not None
-        holder.stdout.readline()
-        try:
-            with pytest.raises(StorageError, match="^process 7 trains in"):
-                folder.reserve(tmp_path)
-        finally:
-            holder.kill()
-    folder.reserve(tmp_path)
-    assert (tmp_path / folder.LOCK).read_text() == f"process {os.getpid()} on {os.uname().nodename}\n"
 
 
 @pytest.mark.usefixtures("windows")
@@ -176,11 +144,11 @@ def test_files_are_replaced_without_a_lock_and_a_flushed_folder(
 
 
 def test_a_system_without_locks_reserves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(locks, "fcntl", None)
-    monkeypatch.setattr(locks, "msvcrt", None)
-    with (tmp_path / "a").open("wb") as file:
-        assert not locks.lock(file)
-    folder.reserve(tmp_path / "run")
+    def missing(*_: object, **__: object) -> bool:
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(atomic, "lock_descriptor", missing)
+    run_folder.reserve(tmp_path / "run")
 
 
 # ----------------------------------------------------------------------------------------------------------- processes
@@ -204,7 +172,9 @@ def no_groups(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("no_groups")
 def test_a_command_runs_without_groups(tmp_path: Path) -> None:
-    assert process.run_in_group([sys.executable, "-c", "raise SystemExit(7)"], locks=[folder.reserve(tmp_path)]) == 7
+    assert (
+        process.run_in_group([sys.executable, "-c", "raise SystemExit(7)"], locks=[run_folder.reserve(tmp_path)]) == 7
+    )
     with pytest.raises(SundaeError, match="failed with 3"):
         process.run_logged([sys.executable, "-c", "raise SystemExit(3)"], tmp_path / "log")
 

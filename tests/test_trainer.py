@@ -28,9 +28,9 @@ from ray_tracing import write_still_life
 from sundae_ns import method_configs
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, StorageError
 from sundae_ns.method_configs import sundae_tiny
-from sundae_ns.storage.runs import checkpoint
-from sundae_ns.storage.runs.config_file import load_config
-from sundae_ns.storage.runs.random_state import random_state, set_random_state
+from sundae_ns.storage import checkpoint
+from sundae_ns.storage.checkpoint import random_state, set_random_state
+from sundae_ns.storage.config_file import load_config
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 from sundae_ns.training.interruption import Interruption
 from sundae_ns.training.run_length import set_schedule

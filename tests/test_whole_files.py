@@ -23,7 +23,7 @@ ELSEWHERE = {
     "poses/capture.py": ["(out / CLOUD).open('wb')"],
     "poses/reconstruction.py": ["(work / _LISTED).open('w', encoding='utf-8', newline='\\n')"],
     "poses/video.py": ["name.open('wb')"],
-    "storage/runs/folder.py": ["(run / LOCK).open('a+', encoding='utf-8')"],  # a lock stays
+    "storage/run_folder.py": ["(run / LOCK).open('a+', encoding='utf-8')"],  # a lock stays
     "training/pruning.py": ["run.save()"],  # checkpoints
 }
 """Calls that write in another way, by module."""

@@ -11,7 +11,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 
 from sundae_ns.errors import DataError, SundaeError
 from sundae_ns.parsing import check_capture, set_parser
-from sundae_ns.storage.runs.config_file import load_config
+from sundae_ns.storage.config_file import load_config
 
 
 def training_cameras(config: Path) -> Cameras:

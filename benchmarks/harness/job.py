@@ -37,6 +37,7 @@ from sundae_ns.scenes.finetune import finetune
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.models import Opened, load_model, load_run, model_of
 from sundae_ns.storage.atomic import write_text
+from sundae_ns.storage.fingerprint import fingerprint
 from sundae_ns.storage.pack import (
     FINETUNE_STEPS,
     FINETUNED,
@@ -46,7 +47,6 @@ from sundae_ns.storage.pack import (
     fit_scene,
     write_fitted,
 )
-from sundae_ns.storage.runs.fingerprint import fingerprint
 from sundae_ns.trainer import SundaeTrainerConfig
 from sundae_ns.training.run_length import set_schedule
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import sundae_ns.pruning.cutting
 import sundae_ns.storage.atomic
-import sundae_ns.storage.runs.checkpoint
+import sundae_ns.storage.checkpoint
 import sundae_ns.training.report
 from sundae_ns.training.trials import engine
 
@@ -74,7 +74,7 @@ def half_written(original: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-_checkpoint, _atomic = sundae_ns.storage.runs.checkpoint, sundae_ns.storage.atomic
+_checkpoint, _atomic = sundae_ns.storage.checkpoint, sundae_ns.storage.atomic
 SAVES: dict[str, Place] = {
     "save: half written": lambda n: after(n, _checkpoint.torch, "save", half_saved),
     "save: not yet on the disk": lambda n: after(3 * n, _atomic, "flush", at_once),

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.evaluation.plots import PALETTE
-from sundae_ns.storage import replacing
+from sundae_ns.storage.atomic import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

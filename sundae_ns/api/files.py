@@ -18,13 +18,10 @@ from sundae_ns.data.capture import read_json
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, writing
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rendering.source import degree_in_use
+from sundae_ns.storage import checkpoint, formats
 from sundae_ns.storage.atomic import write_bytes
-from sundae_ns.storage.kinds import kind_of, kind_of_primitives, unread
-from sundae_ns.storage.primitives import read_primitives
-from sundae_ns.storage.runs import checkpoint
-from sundae_ns.storage.runs.config_file import model_options, parser_options
-from sundae_ns.storage.runs.folder import find_config
-from sundae_ns.storage.viewers import FORMATS, ViewerFile, write_for_viewers
+from sundae_ns.storage.config_file import find_config, model_options, parser_options
+from sundae_ns.storage.formats import FORMATS, ViewerFile, kind_of, kind_of_primitives
 
 _HEAD = "networks.head."
 SUFFIXES = (*FORMATS, ".sundae", ".html")
@@ -69,7 +66,7 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
         return scene_of(read_scene(path)).to(device), None
     if kind_of_primitives(path) is None:
         return _of_run(path).to(device), None
-    found = read_primitives(path)
+    found = formats.read_primitives(path)
     scene = Scene(found.mended.field, antialiased=found.antialiased, in_model_frame=found.in_model_frame)
     return scene.to(device), found.mended.mask
 
@@ -127,7 +124,7 @@ def packed_file(path: Path) -> tuple[Scene, bytes]:
 
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:
     """Write base colours in a format of other viewers; returns what was left out or clamped. See :func:`save`."""
-    return write_for_viewers(
+    return formats.write_for_viewers(
         path,
         scene.field,
         antialiased=scene.antialiased,
@@ -141,7 +138,7 @@ def _of_run(path: Path) -> Scene:
     if config is None:
         reason = "is no run" if path.exists() else "does not exist"
         wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .glb, .splat, .ksplat or .pt file"
-        raise CheckpointError(f"{path} {unread(path) or f'{reason}; {wanted}'}")
+        raise CheckpointError(f"{path} {formats.unread(path) or f'{reason}; {wanted}'}")
     if path.suffix == ".ckpt":
         return scene_of_checkpoint(path, checkpoint.read(path), config)
     return scene_of_checkpoint(*checkpoint.read_newest(config.parent), config)
@@ -168,7 +165,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         # Coefficients of degrees that training has not reached are not in use.
         degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))
     field["features_rest"] = field["features_rest"][:, : (degree + 1) ** 2 - 1]
-    field = checkpoint.usable_of(field, source)
+    field = formats.usable(field, source).field
     frame = _frame_of(config.parent)
     # nerfstudio turns captures so that z is upwards, unless the options forbid it.
     upright = parser_options(config).get("orientation_method") in ("up", "vertical")

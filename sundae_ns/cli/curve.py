@@ -30,7 +30,7 @@ def curve(
         overwrite: replace an existing file.
     """
     from sundae_ns.evaluation.count_curve import CURVE, curve_table, read_count_curve
-    from sundae_ns.storage.runs.folder import config_of
+    from sundae_ns.storage.config_file import config_of
 
     folder = config_of(run).parent
     if out is not None:

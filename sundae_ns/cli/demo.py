@@ -75,7 +75,7 @@ def demo(
             from sundae_ns.scenes.measure import comparison_of, evaluation, frame_times, sizes
             from sundae_ns.scenes.models import load_model, load_run
             from sundae_ns.storage.atomic import write_bytes, write_image, write_text
-            from sundae_ns.storage.runs.folder import prunes_of
+            from sundae_ns.storage.run_folder import prunes_of
 
             evaluated = evaluation(run)
             write_text(out / "eval.json", json.dumps(evaluated, indent=2, allow_nan=False) + "\n")

@@ -32,8 +32,8 @@ def evaluate(
         overwrite: replace an existing file.
     """
     from sundae_ns.storage.atomic import write_text
-    from sundae_ns.storage.runs.config_file import check_run
-    from sundae_ns.storage.runs.folder import files_of
+    from sundae_ns.storage.config_file import check_run
+    from sundae_ns.storage.run_folder import files_of
 
     check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
     check_run(run)

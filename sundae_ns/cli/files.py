@@ -50,8 +50,8 @@ def export(
     from rich.console import Console
 
     from sundae_ns.errors import ConfigError
-    from sundae_ns.storage.runs.folder import files_of
-    from sundae_ns.storage.viewers import check_format
+    from sundae_ns.storage.formats import check_format
+    from sundae_ns.storage.run_folder import files_of
 
     page = out.suffix.lower() == ".html" or not out.suffix
     if not page:
@@ -109,8 +109,8 @@ def export(
 
 def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     """A scene, and the packed file that holds it; a run, whose capture may have moved, is packed in memory."""
-    from sundae_ns.storage.kinds import kind_of, kind_of_primitives
-    from sundae_ns.storage.runs.config_file import check_run
+    from sundae_ns.storage.config_file import check_run
+    from sundae_ns.storage.formats import kind_of, kind_of_primitives
 
     if kind_of(path) == "packed" or kind_of_primitives(path) is not None or path.suffix == ".sundae":
         from sundae_ns.api.files import packed_file
@@ -127,7 +127,7 @@ def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
 
 def copies_rows(source: Path, out: Path) -> bool:
     """Whether a .ply is written with the rows of another one, its properties and comments."""
-    from sundae_ns.storage.kinds import kind_of
+    from sundae_ns.storage.formats import kind_of
     from sundae_ns.storage.ply import has_own_columns
 
     return kind_of(source) == "ply" and out.suffix.lower() == ".ply" and has_own_columns(source)
@@ -159,8 +159,8 @@ def cameras_of(scene: Scene, cameras: Path | None, most: int | None) -> Sequence
     """
     from sundae_ns.api.files import load
     from sundae_ns.api.views import views_of
-    from sundae_ns.storage.kinds import kind_of
-    from sundae_ns.storage.runs.folder import find_config
+    from sundae_ns.storage.config_file import find_config
+    from sundae_ns.storage.formats import kind_of
 
     if cameras is None:
         return scene.views
@@ -169,7 +169,7 @@ def cameras_of(scene: Scene, cameras: Path | None, most: int | None) -> Sequence
     is_run = (cameras.is_dir() or cameras.name == "config.yml") and find_config(cameras) is not None
     if not is_run:
         return views_of(cameras, scene)
-    from sundae_ns.storage.runs.config_file import check_run
+    from sundae_ns.storage.config_file import check_run
 
     check_run(cameras)  # before nerfstudio is imported, which takes seconds
     from sundae_ns.api.virtual import VIEWS

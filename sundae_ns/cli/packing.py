@@ -88,9 +88,9 @@ def pack(
     from sundae_ns.api.packing import contents_of
     from sundae_ns.api.views import with_start
     from sundae_ns.errors import ConfigError
+    from sundae_ns.storage.config_file import check_run
     from sundae_ns.storage.pack import FINETUNE_STEPS, FINETUNED, PackConfig, fit_scene, write_fitted
-    from sundae_ns.storage.runs.config_file import check_run
-    from sundae_ns.storage.runs.folder import files_of
+    from sundae_ns.storage.run_folder import files_of
 
     if max_cameras < 0:
         raise ConfigError(f"max-cameras is {max_cameras}; give the number of cameras, or 0 for none")
@@ -183,7 +183,7 @@ def pack(
 def _has_photos(source: Path, options: Mapping[str, object]) -> bool:
     """Whether a scene is a run; ``ConfigError`` for a file of primitives with one of the options that need photos."""
     from sundae_ns.errors import ConfigError
-    from sundae_ns.storage.kinds import PRIMITIVES, kind_of_primitives
+    from sundae_ns.storage.formats import PRIMITIVES, kind_of_primitives
 
     kind = kind_of_primitives(source)
     if kind is None:

@@ -241,13 +241,13 @@ class Project:
         left = self._steps_left()
         if left is None or left <= 0:
             return left is not None
+        from sundae_ns.storage.config_file import schedule_length
         from sundae_ns.storage.pack import tuned_steps
-        from sundae_ns.storage.runs.config_file import schedule_length
 
         return self.tunes and left <= tuned_steps(schedule_length(self.run / "config.yml"))
 
     def _steps_left(self) -> int | None:
-        from sundae_ns.storage.runs.unfinished import steps_left
+        from sundae_ns.storage.run_folder import steps_left
 
         return steps_left(self.run)
 
@@ -262,7 +262,7 @@ class Project:
             StorageError: another process works in the folder, it holds other files, or it cannot be written.
         """
         from sundae_ns.storage.atomic import write_text
-        from sundae_ns.storage.runs.folder import LOCK, reserve
+        from sundae_ns.storage.run_folder import LOCK, reserve
 
         settings = {**asdict(self), "photos": str(self.photos.resolve())}
         settings["masks"] = None if self.masks is None else str(self.masks.resolve())

@@ -50,8 +50,7 @@ def train(
         steps: number of training steps; by default that of the method.
         resume: train the remaining steps of the newest unfinished run of this method on this capture.
     """
-    from sundae_ns.storage.runs.folder import new_name
-    from sundae_ns.storage.runs.unfinished import unfinished_run
+    from sundae_ns.storage.run_folder import new_name, unfinished_run
 
     if further and not (further[0].startswith("-") or _is_parser(further[0])):
         raise ConfigError(f"{further[0]} is no option; options of ns-train follow a --")

@@ -15,7 +15,7 @@ from sundae_ns.data.lenses import PERSPECTIVE, lens_of, own_intrinsics, size_of_
 from sundae_ns.errors import DataError
 from sundae_ns.parsing.placing import Placing, check_one_kind, rebound
 from sundae_ns.parsing.points import colmap_cloud, in_model_frame, warn_of_coarse_cloud
-from sundae_ns.storage import read_point_cloud
+from sundae_ns.storage.ply import read_point_cloud
 
 OLD_MODEL = "colmap/sparse/0"
 """Where ns-process-data leaves COLMAP's model; its first versions made no cloud of it."""

@@ -23,7 +23,7 @@ from sundae_ns.poses.pairs import Matching
 from sundae_ns.poses.reconstruction import Advance, Model
 from sundae_ns.poses.video import is_video, write_frames
 from sundae_ns.storage.atomic import flush, write_text
-from sundae_ns.storage.runs.folder import reserve
+from sundae_ns.storage.run_folder import reserve
 
 _REQUEST = "request.json"
 _BUSY = "works in {}; wait for it, or choose another folder"

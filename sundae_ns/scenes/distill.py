@@ -28,7 +28,7 @@ from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.rendering import LocalField, View
 from sundae_ns.scenes.finetune import rate_factor
-from sundae_ns.storage import stored_bytes
+from sundae_ns.storage.accounting import stored_bytes
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.training.field_state import FieldState

@@ -33,7 +33,7 @@ from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import compensate, draw, scale_plan, zoomed
 from sundae_ns.scenes.models import Opened, load_model
-from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
+from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module
 
 MOST_ZOOM = 1000
 """Factor on the sides of an image beyond which no memory holds it."""

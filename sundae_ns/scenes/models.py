@@ -39,11 +39,11 @@ from sundae_ns.errors import CheckpointError, ConfigError, DataError, PackError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.parsing import check_capture
 from sundae_ns.rendering.views import View
-from sundae_ns.storage.kinds import kind_of, refuse, unread
-from sundae_ns.storage.runs import checkpoint
-from sundae_ns.storage.runs.config_file import check_run, load_config
-from sundae_ns.storage.runs.fingerprint import fingerprint
-from sundae_ns.storage.runs.folder import config_of, prunes_of
+from sundae_ns.storage import checkpoint
+from sundae_ns.storage.config_file import check_run, config_of, load_config
+from sundae_ns.storage.fingerprint import fingerprint
+from sundae_ns.storage.formats import kind_of, refuse, unread
+from sundae_ns.storage.run_folder import prunes_of
 from sundae_ns.training.pruning_config import PruningConfig
 
 _PARSERS: dict[str, type[DataParserConfig]] = {

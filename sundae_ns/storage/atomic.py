@@ -5,20 +5,33 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from glob import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
+
+from filelock import lock_descriptor
 
 from sundae_ns.errors import writing
-from sundae_ns.storage.locks import lock
 
 if TYPE_CHECKING:
     from PIL import Image
 
 PARTIAL = ".partial"
 """Suffix of files that are not complete yet."""
-_WINDOWS = os.name == "nt"
+_WINDOWS = os.name == "nt"  # renames no open file, opens no folder, and flushes only what it may write
+
+
+def locked(file: IO[Any]) -> bool | None:
+    """Lock an open file without waiting, for as long as a process has it open: the system drops locks of the dead.
+
+    Returns:
+        True if this process holds the lock, False if another one does, None if the file system has no locks.
+    """
+    try:
+        return lock_descriptor(file.fileno(), blocking=False)
+    except OSError:
+        return None
 
 
 @contextmanager
@@ -36,12 +49,14 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
     Raises:
         StorageError: the disk is full or not writable.
     """
-    owned = partial is None
+    owned = partial is None and not _WINDOWS
     partial = partial or path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
     try:
-        with writing(f"cannot write {path}"):
+        with writing(f"cannot write {path}"), ExitStack() as stack:
             path.parent.mkdir(parents=True, exist_ok=True)
-        with writing(f"cannot write {path}"), _reserved(path, partial) if owned else nullcontext():
+            if owned:
+                _remove_abandoned(path)
+                locked(stack.enter_context(partial.open("wb")))
             yield partial
             flush(partial)
             partial.replace(path)
@@ -51,36 +66,20 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
             partial.unlink()
 
 
-@contextmanager
-def _reserved(path: Path, partial: Path) -> Iterator[None]:
-    """Hold a lock on the partial file, and remove those of killed processes: the system drops a lock with its process.
-
-    Where the file system has no locks, none is removed; nor on Windows, which renames no file that is open.
-    """
-    if _WINDOWS:
-        yield
-        return
+def _remove_abandoned(path: Path) -> None:
+    """Remove partial files of killed processes, which hold no lock."""
     for other in path.parent.glob(f"{escape(path.name)}.*{PARTIAL}"):
-        if not other.name[len(path.name) + 1 : -len(PARTIAL)].isdigit():  # of a file with a longer name
-            continue
-        with suppress(OSError), other.open("rb") as file:
-            if lock(file):
-                other.unlink()
-    with partial.open("wb") as file:
-        with suppress(OSError):
-            lock(file)
-        yield
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a small text file atomically; ``StorageError`` if the disk is full or not writable."""
-    write_files({path: text.encode()})
+        if other.name[len(path.name) + 1 : -len(PARTIAL)].isdigit():  # else of a file with a longer name
+            with suppress(OSError), other.open("rb") as file:
+                if locked(file):
+                    other.unlink()
 
 
 def write_files(contents: Mapping[Path, bytes]) -> None:
     """Write files that belong together: all, or none if the disk is full or not writable, a ``StorageError``."""
     with ExitStack() as stack:
-        for partial, content in [(stack.enter_context(replacing(path)), one) for path, one in contents.items()]:
+        partials = [stack.enter_context(replacing(path)) for path in contents]
+        for partial, content in zip(partials, contents.values(), strict=True):
             partial.write_bytes(content)
 
 
@@ -89,8 +88,13 @@ def write_bytes(path: Path, content: bytes) -> None:
     write_files({path: content})
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8 as :func:`write_bytes` does."""
+    write_files({path: text.encode()})
+
+
 def write_image(path: Path, image: Image.Image) -> None:
-    """Write an image atomically in the format of its suffix; ``StorageError`` as for :func:`write_text`."""
+    """Write an image as :func:`write_bytes` does, in the format of its suffix."""
     kind = path.suffix.lower()[1:]
     with replacing(path) as partial:
         image.save(partial, format={"jpg": "jpeg"}.get(kind, kind))
@@ -99,18 +103,17 @@ def write_image(path: Path, image: Image.Image) -> None:
 def put_aside(path: Path) -> None:
     """Rename a damaged file or folder, if there is one, to ``NAME.damaged``, in place of an earlier one."""
     aside = path.with_name(f"{path.name}.damaged")
-    if not path.exists():
-        return
-    if aside.is_dir():
-        shutil.rmtree(aside)
-    path.replace(aside)
+    if path.exists():
+        if aside.is_dir():
+            shutil.rmtree(aside)
+        path.replace(aside)
 
 
 def flush(path: Path) -> None:
-    """Wait until a file, or the entries of a folder, are on the disk; Windows does not open folders."""
+    """Wait until a file, or the entries of a folder, are on the disk."""
     if _WINDOWS and path.is_dir():
         return
-    handle = os.open(path, os.O_RDWR if _WINDOWS else os.O_RDONLY)  # Windows flushes only what it may write
+    handle = os.open(path, os.O_RDWR if _WINDOWS else os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

@@ -1,7 +1,12 @@
 """Primitives in glTF: binary files (.glb) with Khronos' extension ``KHR_gaussian_splatting``.
 
-three.js, PlayCanvas and Babylon.js read them. Values are exact: centres, widths and opacities after activation,
-unit quaternions (xyzw) and SH coefficients in float32. Programs without the extension show coloured points.
+    12 bytes   "glTF", u4 2, u4 length of the file
+    8 + J      u4 J, "JSON", the document, padded with spaces
+    8 + B      u4 B, "BIN\0", the buffer
+
+The document has a node, a mesh and a primitive of points. Its attributes are float32 accessors of the buffer: POSITION,
+and after the extension's name ROTATION (unit quaternions xyzw), SCALE (widths), OPACITY, and SH_DEGREE_l_COEF_n; and
+COLOR_0 in bytes, for programs without the extension. Values are exact. three.js, PlayCanvas and Babylon.js read them.
 
 In glTF +y points up. A scene of nerfstudio's model, where z does, is turned to that and says so, and is turned back
 when it is read. Other scenes have no known axes; like ``splat-transform`` this module takes the file's -y as up, as in
@@ -23,16 +28,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.errors import DataError, reading, regular
+from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.gaussians.parameters import SH_C0, sh_degree
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.compressed_ply import LEAST_OPACITY
-from sundae_ns.storage.ply import check_field
-from sundae_ns.storage.transform import similarity
+from sundae_ns.storage.coordinates import similarity
+from sundae_ns.storage.ply import LEAST_OPACITY, check_field
 
 EXTENSION = "KHR_gaussian_splatting"
 MAX_SH_DEGREE = 3
-"""Highest SH degree of the extension."""
-MAGIC = b"glTF"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _MOST_JSON = 1 << 24
@@ -47,14 +50,11 @@ _OURS, _MODEL_FRAME, _ANTIALIASED = "sundae_ns", "modelFrame", "antialiased"
 
 
 class GltfScene(NamedTuple):
-    """The primitives of a .glb."""
+    """The primitives of a .glb: a field, float32 on the CPU, and the marks of :func:`write_glb`."""
 
     params: dict[str, Tensor]
-    """A field by the names of ``gaussians.parameters.SPLAT_NAMES``, float32 on the CPU."""
     antialiased: bool
-    """Whether we marked it as trained with antialiasing."""
     in_model_frame: bool
-    """Whether coordinates are those of nerfstudio's model."""
 
 
 def semantics(degree: int) -> list[str]:
@@ -88,10 +88,10 @@ def write_glb(
     opacities = field["opacities"].sigmoid()
     quats = torch.nn.functional.normalize(field["quats"], dim=1)
     quats[quats.norm(dim=1) < 0.5] = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    shown = torch.cat([SH_C0 * field["features_dc"] + 0.5, opacities], dim=1).clamp(0, 1)
+    colors = torch.cat([SH_C0 * field["features_dc"] + 0.5, opacities], dim=1).clamp(0, 1)
     attributes = {
         "POSITION": field["means"],
-        "COLOR_0": (255 * shown).round().to(torch.uint8),
+        "COLOR_0": (255 * colors).round().to(torch.uint8),
         f"{EXTENSION}:ROTATION": quats.roll(-1, dims=1),
         f"{EXTENSION}:SCALE": field["scales"].exp(),
         f"{EXTENSION}:OPACITY": opacities,
@@ -99,54 +99,57 @@ def write_glb(
     }
     rest = field["features_rest"].unbind(dim=1)
     attributes |= dict(zip(semantics(sh_degree(field["features_rest"])), rest, strict=True))
-    stated = {_MODEL_FRAME: in_model_frame, _ANTIALIASED: antialiased}
-    document, binary = _document(attributes, {name: True for name, true in stated.items() if true})
+    marks = {_MODEL_FRAME: in_model_frame, _ANTIALIASED: antialiased}
+    document, binary = _document(attributes, {name: True for name, true in marks.items() if true})
     with replacing(path) as partial, partial.open("wb") as file:
-        file.write(_HEADER.pack(MAGIC, 2, _HEADER.size + 2 * _CHUNK.size + len(document) + len(binary)))
+        file.write(_HEADER.pack(b"glTF", 2, _HEADER.size + 2 * _CHUNK.size + len(document) + len(binary)))
         file.write(_CHUNK.pack(len(document), _JSON) + document)
         file.write(_CHUNK.pack(len(binary), _BINARY))
         file.write(binary)
 
 
-def _document(attributes: Mapping[str, Tensor], stated: Mapping[str, bool]) -> tuple[bytes, bytes]:
-    """The JSON and the binary part of a file with one primitive of these attributes."""
+def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tuple[bytes, bytearray]:
+    """The JSON and the buffer of a file with one primitive of these attributes."""
     accessors: list[dict[str, Any]] = []
-    views: list[dict[str, int]] = []
-    parts, offset = [], 0
-    kinds = {number: kind for kind, number in _NUMBERS.items()}
+    buffer_views: list[dict[str, int]] = []
+    buffer = bytearray()
     for name, value in attributes.items():
-        data = value.contiguous().numpy().tobytes()
-        accessor = {"bufferView": len(views), "count": len(value), "type": kinds[value.shape[1]]}
-        accessor |= {"componentType": _FLOAT} if value.is_floating_point() else {}
-        accessor |= {} if value.is_floating_point() else {"componentType": _UNSIGNED_BYTE, "normalized": True}
+        data = value.contiguous().numpy().tobytes()  # a multiple of four bytes
+        kind = next(kind for kind, number in _NUMBERS.items() if number == value.shape[1])
+        accessor: dict[str, Any] = {"bufferView": len(buffer_views), "count": len(value), "type": kind}
+        if value.is_floating_point():
+            accessor["componentType"] = _FLOAT
+        else:
+            accessor |= {"componentType": _UNSIGNED_BYTE, "normalized": True}
         if name == "POSITION":  # as glTF demands
             accessor |= {"min": value.amin(dim=0).tolist(), "max": value.amax(dim=0).tolist()}
         accessors.append(accessor)
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data), "target": _VERTICES})
-        parts.append(data)
-        offset += len(data)
-    splats = {
-        **{"kernel": "ellipse", "colorSpace": "srgb_rec709_display"},
-        **{"projection": "perspective", "sortingMethod": "cameraDistance"},
+        buffer_views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": _VERTICES})
+        buffer += data
+    extension = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
     }
     primitive = {
         "attributes": {name: i for i, name in enumerate(attributes)},
         "mode": _POINTS,
-        "extensions": {EXTENSION: splats},
+        "extensions": {EXTENSION: extension},
     }
     document = {
-        "asset": {"version": "2.0", "generator": "sundae_ns", **({"extras": {_OURS: stated}} if stated else {})},
+        "asset": {"version": "2.0", "generator": "sundae_ns", **({"extras": {_OURS: marks}} if marks else {})},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
+        "bufferViews": buffer_views,
+        "buffers": [{"byteLength": len(buffer)}],
     }
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    return text + b" " * (-len(text) % 4), b"".join(parts)  # every part is a multiple of four bytes
+    return text + b" " * (-len(text) % 4), buffer
 
 
 def read_glb(path: Path) -> GltfScene:
@@ -164,16 +167,16 @@ def read_glb(path: Path) -> GltfScene:
 
 
 def _scene_of(document: Mapping[str, Any], binary: memoryview) -> GltfScene:
-    found = [_read_primitive(document, binary, *place) for place in _placed(document)]
-    if not found:
+    parts = [_read_primitive(document, binary, *placed) for placed in _placed(document)]
+    if not parts:
         raise ValueError(f"no mesh of its scene has {EXTENSION}")
-    if len({part["features_rest"].shape[1] for part in found}) > 1:
+    if len({part["features_rest"].shape[1] for part in parts}) > 1:
         raise ValueError("its Gaussians have different SH degrees")
-    params = {name: torch.cat([part[name] for part in found]) for name in found[0]}
-    stated = document["asset"].get("extras", {}).get(_OURS, {})
-    in_model_frame = stated.get(_MODEL_FRAME) is True
+    params = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    marks = document["asset"].get("extras", {}).get(_OURS, {})
+    in_model_frame = marks.get(_MODEL_FRAME) is True
     params = similarity(params, _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0)
-    return GltfScene(params, stated.get(_ANTIALIASED) is True, in_model_frame)
+    return GltfScene(params, marks.get(_ANTIALIASED) is True, in_model_frame)
 
 
 def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
@@ -181,7 +184,7 @@ def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
     size = regular(path).stat().st_size
     with path.open("rb") as file:
         magic, version, length = _HEADER.unpack(file.read(_HEADER.size))
-        if magic != MAGIC or version != 2 or length > size:
+        if magic != b"glTF" or version != 2 or length > size:
             raise ValueError("its header is not that of a whole glTF 2.0 file")
         count, kind = _CHUNK.unpack(file.read(_CHUNK.size))
         if kind != _JSON or count > min(_MOST_JSON, size):
@@ -199,58 +202,52 @@ def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
 
 
 def _placed(document: Mapping[str, Any]) -> Iterator[tuple[Mapping[str, Any], NDArray[np.float64]]]:
-    """Primitives of the scene with Gaussians, and where the nodes above them put them ``[4, 4]``."""
+    """Primitives of the scene with Gaussians, and the transform ``[4, 4]`` of the nodes above them."""
     nodes = document.get("nodes", [])
     scene = document["scenes"][document.get("scene", 0)]
-    open_nodes = [(index, np.eye(4)) for index in scene.get("nodes", [])]
+    waiting = [(index, np.eye(4)) for index in scene.get("nodes", [])]
     for _ in range(_MOST_NODES):
-        if not open_nodes:
+        if not waiting:
             return
-        index, above = open_nodes.pop()
+        index, above = waiting.pop()
         node = nodes[_index(index)]
-        place = above @ _matrix(node)
-        open_nodes += [(child, place) for child in node.get("children", [])]
+        transform = above @ _matrix(node)
+        waiting += [(child, transform) for child in node.get("children", [])]
         if "mesh" in node:
             for primitive in document["meshes"][_index(node["mesh"])]["primitives"]:
                 if EXTENSION in primitive.get("extensions", {}):
-                    yield primitive, place
+                    yield primitive, transform
     raise ValueError(f"its scene has more than {_MOST_NODES:,} nodes, or a node below itself")
 
 
 def _index(value: object) -> int:
-    """An index of the document."""
+    """An index or a count of the document."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"{value!r} is no index")
     return value
 
 
 def _matrix(node: Mapping[str, Any]) -> NDArray[np.float64]:
-    """A node's transform."""
+    """A node's transform ``[4, 4]``."""
+
+    def numbers(name: str, default: tuple[int, ...]) -> NDArray[np.float64]:
+        values = node.get(name, default)
+        plain = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+        if len(values) != len(default) or not plain:
+            raise TypeError(f"{values!r} are not {len(default)} numbers")
+        return np.array(values, dtype=np.float64)
+
     if "matrix" in node:
-        return _numbers(node["matrix"], 16).reshape(4, 4).T
-    x, y, z, w = _numbers(node.get("rotation", (0, 0, 0, 1)), 4)
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    found = np.eye(4)
-    found[:3, :3] = turn * _numbers(node.get("scale", (1, 1, 1)), 3)
-    found[:3, 3] = _numbers(node.get("translation", (0, 0, 0)), 3)
-    return found
-
-
-def _numbers(values: Any, count: int) -> NDArray[np.float64]:
-    """Some numbers of the document."""
-    if len(values) != count or any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):
-        raise TypeError(f"{values!r} are not {count} numbers")
-    return np.array(values, dtype=np.float64)
+        return numbers("matrix", (0,) * 16).reshape(4, 4).T
+    turn = torch.from_numpy(numbers("rotation", (0, 0, 0, 1))).roll(1)
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_matrices(turn[None])[0].numpy() * numbers("scale", (1, 1, 1))
+    matrix[:3, 3] = numbers("translation", (0, 0, 0))
+    return matrix
 
 
 def _read_primitive(
-    document: Mapping[str, Any], binary: memoryview, primitive: Mapping[str, Any], place: NDArray[np.float64]
+    document: Mapping[str, Any], binary: memoryview, primitive: Mapping[str, Any], transform: NDArray[np.float64]
 ) -> dict[str, Tensor]:
     """The field of one primitive of the document, where its nodes put it."""
     stated = primitive["extensions"][EXTENSION]
@@ -277,21 +274,15 @@ def _read_primitive(
         "opacities": torch.logit(values(f"{EXTENSION}:OPACITY"), eps=LEAST_OPACITY),
     }
     check_field(params)
-    return _moved(params, place)
-
-
-def _moved(params: dict[str, Tensor], place: NDArray[np.float64]) -> dict[str, Tensor]:
-    """A field where a transform of nodes puts it."""
-    if np.array_equal(place, np.eye(4)):
+    if np.array_equal(transform, np.eye(4)):
         return params
-    linear = place[:3, :3]
+    linear = transform[:3, :3]
     factor = np.cbrt(np.linalg.det(linear))
-    if not (math.isfinite(factor) and factor > 0) or not np.allclose(
-        linear @ linear.T, factor**2 * np.eye(3), rtol=1e-4
-    ):
+    is_similarity = np.allclose(linear @ linear.T, factor**2 * np.eye(3), rtol=1e-4)
+    if not (math.isfinite(factor) and factor > 0 and is_similarity):
         raise ValueError("a node mirrors or stretches its Gaussians")
-    moved = np.concatenate([linear / factor, place[:3, 3:] / factor], axis=1)
-    return similarity(params, torch.from_numpy(moved).float(), float(factor))
+    rigid = np.concatenate([linear / factor, transform[:3, 3:] / factor], axis=1)
+    return similarity(params, torch.from_numpy(rigid).float(), float(factor))
 
 
 def _values(document: Mapping[str, Any], binary: memoryview, index: object) -> NDArray[np.float32]:
@@ -307,14 +298,11 @@ def _values(document: Mapping[str, Any], binary: memoryview, index: object) -> N
     stride = _index(view.get("byteStride", kind.itemsize * columns))
     inside = _index(accessor.get("byteOffset", 0))
     used = inside + (rows - 1) * stride + kind.itemsize * columns if rows else 0
-    if (
-        used > _index(view["byteLength"])
-        or start + view["byteLength"] > len(binary)
-        or stride < kind.itemsize * columns
-    ):
+    beyond = used > _index(view["byteLength"]) or start + view["byteLength"] > len(binary)
+    if beyond or stride < kind.itemsize * columns:
         raise ValueError("its accessors reach beyond its data")
     table: NDArray[Any] = np.ndarray((rows, columns), kind, binary, start + inside, (stride, kind.itemsize))
-    found = table.astype(np.float32)
+    values = table.astype(np.float32)
     if accessor.get("normalized") is True and kind.kind in "iu":
-        found = np.maximum(found / np.float32(np.iinfo(kind).max), -1)
-    return found
+        values = np.maximum(values / np.float32(np.iinfo(kind).max), -1)
+    return values

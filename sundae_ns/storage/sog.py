@@ -1,15 +1,17 @@
 """The .sog of PlayCanvas, version 2: a zip of lossless WebP images with one pixel per primitive, and ``meta.json``.
 
-Written from the format's public description, because no maintained Python package writes it. The format rounds
+Written from the format's public description, because no maintained Python package writes it:
 
-- positions to 65,536 levels per axis after ``sign(x) log(1 + |x|)``;
-- log-scales, SH coefficients of degree 0 and those of higher degrees to 256 values each, by k-means in one dimension;
-- opacities to 256 levels after activation;
-- rotations to the three smallest components, 8 bits each.
+    meta.json                  {"version": 2, "count", "antialias", "means", "scales", "quats", "sh0", "shN"}
+    means_l, means_u .webp     low and high bytes of 65,536 levels per axis, after sign(x) log(1 + |x|)
+    scales.webp                log-scales, indices in a codebook of 256 numbers
+    quats.webp                 the three smallest components, 8 bits each; alpha is 252 + the index of the largest
+    sh0.webp                   SH coefficients of degree 0, indices in a codebook; alpha is the opacity
+    shN_labels.webp            index in a palette of at most 65,536 rows, in red and green
+    shN_centroids.webp         the palette: 64 rows of SH coefficients of degrees 1 to 3 in a row of pixels
 
-SH coefficients of degrees 1 to 3 of a primitive are a row of a palette of at most 65,536 rows. With more primitives
-than rows, the rows are centres of a two-level k-means. Coordinates are those of a .ply, as in files of
-``splat-transform``.
+Codebooks are k-means in one dimension. With more primitives than palette rows, these are centres of a two-level
+k-means. Coordinates are those of a .ply, as in files of ``splat-transform``.
 """
 
 from __future__ import annotations
@@ -31,13 +33,12 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError, reading, regular
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.morton import scene_order
+from sundae_ns.storage.coordinates import scene_order
+from sundae_ns.storage.ply import from_smallest_three
 from sundae_ns.storage.spz import MAX_SH_DEGREE, checked
 
 META = "meta.json"
-"""Name of the file that describes the others."""
-MAX_PALETTE = 1 << 16
-"""Palette rows that two bytes can index."""
+MAX_PALETTE = 1 << 16  # palette rows that two bytes can index
 _ROW_ENTRIES = 64  # palette rows in a row of the palette's image
 _ENTRIES = 256  # codebook entries that a byte can index
 _COARSE = 256  # coarse cells of a large palette
@@ -74,7 +75,6 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
     scale_values, scale_codes = codebook(arrays["scales"])
     color_values, color_codes = codebook(arrays["features_dc"])
     alphas = np.rint(255 / (1 + np.exp(-arrays["opacities"].astype(np.float64)))).astype(np.uint8)
-
     images = {
         "means_l": _square((levels & 255).astype(np.uint8)),
         "means_u": _square((levels >> 8).astype(np.uint8)),
@@ -87,8 +87,7 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
         "asset": {"generator": "sundae-ns"},
         "count": n,
         "antialias": antialiased,
-        # splat-transform reads this entry instead of the previous one (2026).
-        **({"model": "antialiased"} if antialiased else {}),
+        **({"model": "antialiased"} if antialiased else {}),  # what splat-transform reads
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_values.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
@@ -101,8 +100,9 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
         padded = np.zeros((math.ceil(len(rows) / _ROW_ENTRIES) * _ROW_ENTRIES, coefficients, 3), np.uint8)
         padded[: len(rows)] = codes
         images["shN_centroids"] = padded.reshape(-1, _ROW_ENTRIES * coefficients, 3)
-        label_bytes = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)
-        images["shN_labels"] = _square(label_bytes.astype(np.uint8))
+        images["shN_labels"] = _square(
+            np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1).astype(np.uint8)
+        )
         meta["shN"] = {
             "count": len(rows),
             "bands": math.isqrt(coefficients + 1) - 1,
@@ -131,14 +131,9 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
     """
     with reading(path, "a complete .sog"), ExitStack() as stack:
         if path.is_dir() or path.name == META:
-            folder = path if path.is_dir() else path.parent
-
-            def entry(name: str) -> bytes:
-                if Path(name).name != name:
-                    raise ValueError(f"{name} lies elsewhere")
-                return regular(folder / name).read_bytes()
+            entry = partial(_file_entry, path if path.is_dir() else path.parent)
         else:
-            entry = partial(_entry, stack.enter_context(zipfile.ZipFile(regular(path))))
+            entry = partial(_zip_entry, stack.enter_context(zipfile.ZipFile(regular(path))))
         meta = json.loads(entry(META))
         if (version := meta.get("version", 1)) != 2:
             raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
@@ -147,7 +142,13 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
     return field, bool(meta.get("antialias")) or meta.get("model") == "antialiased"
 
 
-def _entry(bundle: zipfile.ZipFile, name: str) -> bytes:
+def _file_entry(folder: Path, name: str) -> bytes:
+    if Path(name).name != name:
+        raise ValueError(f"{name} lies elsewhere")
+    return regular(folder / name).read_bytes()
+
+
+def _zip_entry(bundle: zipfile.ZipFile, name: str) -> bytes:
     """An entry of a bundle, which is stored, not deflated, so that it cannot grow."""
     info = bundle.getinfo(name)
     if info.compress_type != zipfile.ZIP_STORED and info.file_size > _MAX_INFLATED:
@@ -167,7 +168,11 @@ def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str,
     bent = low + levels / _LEVELS * (high - low)
     color = pixels(meta["sh0"], 0, 4)
     opacity = np.clip(color[:, 3:] / 255.0, 1e-3 / 255, 1 - 1e-6)
-    coefficients, rest = 0, np.zeros((n, 0, 3), np.float32)
+    turns = pixels(meta["quats"], 0, 4)
+    largest = turns[:, 3].astype(np.int64) - _FIRST_MODE
+    if ((largest < 0) | (largest > 3)).any():
+        raise ValueError("a rotation has no valid mode")
+    rest = np.zeros((n, 0, 3), np.float32)
     if "shN" in meta:
         entry = meta["shN"]
         coefficients = (int(entry["bands"]) + 1) ** 2 - 1
@@ -179,7 +184,7 @@ def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str,
     field = {
         "means": np.sign(bent) * np.expm1(np.abs(bent)),
         "scales": np.asarray(meta["scales"]["codebook"], np.float32)[pixels(meta["scales"], 0, 3)],
-        "quats": _from_smallest_three(pixels(meta["quats"], 0, 4)),
+        "quats": from_smallest_three((turns[:, :3] / 255.0 - 0.5) * math.sqrt(2.0), largest),
         "features_dc": np.asarray(meta["sh0"]["codebook"], np.float32)[color[:, :3]],
         "features_rest": rest,
         "opacities": np.log(opacity / (1 - opacity)),
@@ -196,19 +201,6 @@ def _pixels(file: bytes) -> NDArray[np.uint8]:
 
     with Image.open(io.BytesIO(file), formats=["WEBP"]) as image:
         return np.asarray(image.convert("RGBA"))
-
-
-def _from_smallest_three(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Unit quaternions wxyz ``[N, 4]``; the inverse of :func:`_smallest_three`."""
-    others = (pixels[:, :3] / 255.0 - 0.5) * math.sqrt(2.0)
-    largest = pixels[:, 3].astype(np.int64) - _FIRST_MODE
-    if ((largest < 0) | (largest > 3)).any():
-        raise ValueError("a rotation has no valid mode")
-    quats = np.empty((len(pixels), 4))
-    rows = np.arange(len(pixels))
-    quats[np.arange(4) != largest[:, None]] = others.ravel()
-    quats[rows, largest] = np.sqrt(np.clip(1 - (others**2).sum(axis=1), 0, None))
-    return quats
 
 
 def codebook(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

@@ -1,12 +1,14 @@
 """The .spz of Niantic: quantised, deflated primitives, which most web viewers read; coded by ``gsply``.
 
-The format rounds values before activation, except opacities:
+One gzip stream (versions 1 to 3), little-endian; version 4 starts with the header itself:
 
-- positions to fixed point in 24 bits;
-- log-scales to steps of 1/16 within [-10, 5.94];
-- opacities to 256 levels after activation;
-- SH coefficients of degree 0 to 1/38, of degrees 1 to 3 to 1/128 within [-1, 1]; higher degrees do not fit;
-- rotations to the three smallest components, 9 bits and a sign each.
+    16 bytes  "NGSP", u4 version, u4 count, u1 SH degree, u1 fractional bits, u1 flags (1: antialiased), u1 reserved
+    9 N       positions, fixed point in 24 bits
+    N         opacities, 256 levels after activation
+    3 N       SH coefficients of degree 0, steps of 1/38
+    3 N       log-scales, steps of 1/16 within [-10, 5.94]
+    4 N       rotations: the three smallest components, 9 bits and a sign each
+    3 K N     SH coefficients of degrees 1 to 3, steps of 1/128 within [-1, 1]; higher degrees do not fit
 
 The specification asks for right-up-back axes, but its own converter from .ply does not rotate, nor do ``gsply`` and
 ``splat-transform`` (nianticlabs/spz, issue 84). Neither does this module: a .ply and a .spz show the same scene.
@@ -30,8 +32,7 @@ from sundae_ns.storage.ply import check_field
 
 MAX_SH_DEGREE = 3
 """Highest SH degree that .spz and .sog can store."""
-_HARMONICS_STEP = 1 / 64
-"""Step of SH coefficients of degrees 1 and up. Costs 0.03 dB; twice this step costs 0.12 dB (docs/formats.md)."""
+_HARMONICS_STEP = 1 / 64  # costs 0.03 dB; twice this step costs 0.12 dB (docs/formats.md)
 _VERSION = 3  # one gzip stream; more programs read it than version 4
 _HEADER_FLAGS = 14  # offset of the flags in the header
 _ANTIALIASED = 0x1  # flag

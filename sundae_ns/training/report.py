@@ -9,7 +9,7 @@ from typing import Any
 
 from sundae_ns.evaluation import without_nan
 from sundae_ns.storage.atomic import write_text
-from sundae_ns.storage.runs.folder import prunes_before
+from sundae_ns.storage.run_folder import prunes_before
 from sundae_ns.training.extension import TrainingRun
 
 

@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from sundae_ns.errors import CheckpointError, ConfigError
+from sundae_ns.storage import checkpoint
+from sundae_ns.storage.config_file import find_config, load_config
 from sundae_ns.storage.pack import FINETUNE_STEPS, tuned_steps
-from sundae_ns.storage.runs import checkpoint
-from sundae_ns.storage.runs.config_file import load_config
-from sundae_ns.storage.runs.folder import find_config
 from sundae_ns.training.warning import warn
 
 SCHEDULE = {

@@ -120,7 +120,7 @@ def test_a_sog_that_would_grow_is_refused(tmp_path: Path) -> None:
 def test_a_field_without_a_finite_primitive_is_refused(tmp_path: Path) -> None:
     broken = {name: torch.full_like(value, torch.nan) for name, value in scene().field.items()}
     sn.save(scene(), tmp_path / "a.ply")
-    from sundae_ns.storage import write_ply
+    from sundae_ns.storage.ply import write_ply
 
     write_ply(tmp_path / "a.ply", broken)
     with pytest.raises(DataError, match="none is finite"):

@@ -19,7 +19,7 @@ from torch import Tensor
 from harness.script import run_script
 from sundae_ns.gaussians import from_points
 from sundae_ns.pruning import PruneRule, band_rule, response
-from sundae_ns.storage import read_ply, read_point_cloud, write_ply
+from sundae_ns.storage.ply import read_ply, read_point_cloud, write_ply
 
 N = 300
 

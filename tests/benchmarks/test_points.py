@@ -23,7 +23,7 @@ from harness.points import (
     write_points,
 )
 from sundae_ns.errors import DataError
-from sundae_ns.storage import read_point_cloud
+from sundae_ns.storage.ply import read_point_cloud
 
 RED, BLUE = torch.tensor([[255, 0, 0], [0, 0, 255]], dtype=torch.uint8)
 K = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 40.0], [0.0, 0.0, 1.0]])

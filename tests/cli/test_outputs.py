@@ -17,8 +17,8 @@ from sundae_ns.cli import main
 from sundae_ns.cli.outputs import check_file, check_folder
 from sundae_ns.errors import StorageError
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage import write_ply
 from sundae_ns.storage.pack import PackedScene, write_scene
+from sundae_ns.storage.ply import write_ply
 
 LONG = "x" * 300
 Refused = Callable[..., str]

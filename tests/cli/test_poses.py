@@ -17,7 +17,7 @@ from PIL import Image
 from run_commands import photo, write_video
 
 from sundae_ns.poses import reconstruction
-from sundae_ns.storage.runs import folder as run_folder
+from sundae_ns.storage import run_folder
 
 PHOTOS = 6
 

@@ -14,7 +14,7 @@ import pytest
 
 from sundae_ns.cli.process import quoted, run_in_group, word
 from sundae_ns.errors import StorageError
-from sundae_ns.storage.runs.folder import reserve
+from sundae_ns.storage.run_folder import reserve
 
 CHILD = """
 import pathlib, signal, subprocess, sys
@@ -111,7 +111,7 @@ PARENT = """
 import sys
 from pathlib import Path
 from sundae_ns.cli.process import run_in_group, run_logged
-from sundae_ns.storage.runs.folder import reserve
+from sundae_ns.storage.run_folder import reserve
 words, here = [sys.executable, "-c", sys.argv[1], sys.argv[2]], Path(sys.argv[2])
 if sys.argv[3] == "in a group":
     run_in_group(words, locks=[reserve(here)])

@@ -19,8 +19,7 @@ from sundae_ns import method_configs
 from sundae_ns.cli import main
 from sundae_ns.cli.train import methods
 from sundae_ns.data import layouts
-from sundae_ns.storage.runs.folder import LOCK
-from sundae_ns.storage.runs.unfinished import unfinished_run
+from sundae_ns.storage.run_folder import LOCK, unfinished_run
 
 
 class Replaced(Exception):

@@ -30,7 +30,7 @@ from torch.multiprocessing.spawn import ProcessExitedException
 from sundae_ns import distributed
 from sundae_ns.errors import ConfigError, rank_ended, show_in_one_line
 from sundae_ns.method_configs import sundae_tiny
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage import checkpoint
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 from sundae_ns.training import averaging
 

@@ -21,7 +21,7 @@ from torch.amp import GradScaler
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.distributed import Ranks
 from sundae_ns.model import SundaeModel, SundaeModelConfig
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage.formats import read_field
 from sundae_ns.trainer import SundaeTrainer
 from sundae_ns.training.optimizers import FusedAdamConfig
 
@@ -91,7 +91,7 @@ def resume(path: Path) -> None:
 
 
 def start_warm(path: Path) -> None:
-    checkpoint.read_field(path)
+    read_field(path)
 
 
 def test_a_valid_checkpoint_is_read(good: bytes, verdict: Any, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from foreign_files import FOREIGN, small_field
 
-from sundae_ns.storage.primitives import read_primitives
+from sundae_ns.storage.formats import read_primitives
 
 
 @pytest.mark.parametrize("name", FOREIGN)

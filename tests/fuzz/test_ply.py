@@ -12,8 +12,8 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage import read_point_cloud, write_ply
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage.formats import read_field
+from sundae_ns.storage.ply import read_point_cloud, write_ply
 
 HEADER = b"ply\nformat %s 1.0\nelement vertex %s\n%send_header\n"
 XYZ = b"property float x\nproperty float y\nproperty float z\n"
@@ -42,7 +42,7 @@ def cloud(text: bool) -> Callable[[Path], bytes]:
 def test_corrupted_field(field: bytes, corrupted: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(corrupted(field, seed))
-    verdict(lambda: checkpoint.read_field(path), path.stat().st_size)
+    verdict(lambda: read_field(path), path.stat().st_size)
 
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
@@ -84,7 +84,7 @@ ODD: dict[str, bytes] = {
 
 
 @pytest.mark.parametrize("kind", ODD)
-@pytest.mark.parametrize("reader", [read_point_cloud, checkpoint.read_field])
+@pytest.mark.parametrize("reader", [read_point_cloud, read_field])
 def test_other_contents_are_refused(reader: Any, verdict: Any, tmp_path: Path, kind: str) -> None:
     path = tmp_path / "ünï cöde.ply"
     path.write_bytes(ODD[kind])

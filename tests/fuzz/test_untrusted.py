@@ -21,10 +21,10 @@ import pytest
 import torch
 
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage import read_ply, write_ply
+from sundae_ns.storage import checkpoint
+from sundae_ns.storage.formats import read_field, write_for_viewers
 from sundae_ns.storage.pack import PackedScene, container, read_scene, write_scene
-from sundae_ns.storage.runs import checkpoint
-from sundae_ns.storage.viewers import write_for_viewers
+from sundae_ns.storage.ply import read_ply, write_ply
 
 PLACES = (
     "../../outside",
@@ -112,7 +112,7 @@ def a_ply(path: Path, place: str) -> None:
 
 CASES: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], Any]]] = {
     "a.ckpt": (a_checkpoint, checkpoint.read),
-    "b.ckpt": (a_checkpoint, checkpoint.read_field),
+    "b.ckpt": (a_checkpoint, read_field),
     "a.sundae": (a_pack, read_scene),
     "a.ply": (a_ply, read_ply),
 }

@@ -16,7 +16,7 @@ from PIL import Image
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
-from sundae_ns.storage import is_nerfstudio_ply, read_ply
+from sundae_ns.storage.ply import is_nerfstudio_ply, read_ply
 
 
 def test_ns_eval(tiny: Any, call_here: Any, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from sundae_ns.errors import MemoryExhaustedError
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage import checkpoint
 
 pytestmark = pytest.mark.gpu
 SPREAD = 1.0

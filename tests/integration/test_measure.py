@@ -23,7 +23,7 @@ from sundae_ns.rendering import render_view, zoomed
 from sundae_ns.scenes import models as opening
 from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, rendered_as, sizes
 from sundae_ns.scenes.models import Opened, load_model
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage import checkpoint
 
 
 def figures_of(run: Opened, factor: float = 1.0) -> Measured:

@@ -16,7 +16,7 @@ from sundae_ns.api.files import load
 from sundae_ns.cli import main
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes.models import load_model
-from sundae_ns.storage.runs.checkpoint import read_field
+from sundae_ns.storage.formats import read_field
 
 
 class Packed(NamedTuple):

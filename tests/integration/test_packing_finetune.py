@@ -22,6 +22,7 @@ from sundae_ns.evaluation import psnr
 from sundae_ns.scenes import finetune as packing_finetune
 from sundae_ns.scenes.finetune import Through, TunedStep, finetune, rate_factor
 from sundae_ns.scenes.models import load_model, load_run
+from sundae_ns.storage import checkpoint
 from sundae_ns.storage.pack import (
     FINETUNED,
     PackConfig,
@@ -30,7 +31,6 @@ from sundae_ns.storage.pack import (
     read_scene,
     write_fitted,
 )
-from sundae_ns.storage.runs import checkpoint
 
 COARSE = PackConfig(
     position_bits=12,

@@ -11,7 +11,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 
 from sundae_ns.errors import BackendError
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage import checkpoint
 from sundae_ns.training.recorded import RecordedStep
 from sundae_ns.training.step import StepResult
 

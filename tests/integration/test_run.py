@@ -21,8 +21,8 @@ from PIL import Image
 from sundae_ns.cli import main
 from sundae_ns.cli.process import run_in_group
 from sundae_ns.errors import StorageError
-from sundae_ns.storage.kinds import kind_of
-from sundae_ns.storage.runs.folder import reserve
+from sundae_ns.storage.formats import kind_of
+from sundae_ns.storage.run_folder import reserve
 from sundae_ns.trainer import SundaeTrainer
 
 STEPS, STOP_AT = 40, 25

@@ -23,7 +23,7 @@ from sundae_ns.errors import CheckpointError, MemoryExhaustedError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.model import SundaeModel
-from sundae_ns.storage import MODEL_FRAME, write_ply
+from sundae_ns.storage.ply import MODEL_FRAME, write_ply
 
 
 def load(path: Any) -> dict[str, Any]:

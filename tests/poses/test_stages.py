@@ -18,8 +18,8 @@ from run_commands import write_video
 from sundae_ns.data.capture import check_transforms
 from sundae_ns.errors import DataError, StorageError
 from sundae_ns.poses import Request, find_poses, reconstruction
-from sundae_ns.storage import read_point_cloud
-from sundae_ns.storage.runs import folder as run_folder
+from sundae_ns.storage import run_folder
+from sundae_ns.storage.ply import read_point_cloud
 
 PHOTOS = 8
 

@@ -22,8 +22,8 @@ from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, DataError, PackError
 from sundae_ns.gaussians import from_points
 from sundae_ns.scenes.models import datamanager_of, describe_capture, load_run, model_of, stated_capture
+from sundae_ns.storage import checkpoint
 from sundae_ns.storage.pack import PackedScene
-from sundae_ns.storage.runs import checkpoint
 
 Json = dict[str, Any]
 

@@ -1,6 +1,6 @@
 import torch
 
-from sundae_ns.storage import Sizes, bytes_of, bytes_of_module, megabytes
+from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module, megabytes
 
 
 def test_primitives_count_as_fp32_for_any_dtype():

@@ -18,8 +18,8 @@ from PIL import Image
 
 from sundae_ns.errors import DataError, PackError, StorageError, reading, regular, writing
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage import replacing, write_ply, write_text
-from sundae_ns.storage.atomic import put_aside, write_files, write_image
+from sundae_ns.storage.atomic import put_aside, replacing, write_files, write_image, write_text
+from sundae_ns.storage.ply import write_ply
 
 resource = pytest.importorskip("resource", reason="Windows has none")
 
@@ -80,7 +80,7 @@ def test_files_that_belong_together_are_written_all_or_none(tmp_path: Path) -> N
 
 def test_what_killed_processes_left_is_removed_and_what_others_write_stays(tmp_path: Path) -> None:
     path = tmp_path / "[a].txt"
-    ready = "import sys, os\nfrom pathlib import Path\nfrom sundae_ns.storage import replacing\n"
+    ready = "import sys, os\nfrom pathlib import Path\nfrom sundae_ns.storage.atomic import replacing\n"
     waits = "with replacing(Path(sys.argv[1])) as f:\n    f.write_text('half')\n    print(f, flush=True)\n    input()\n"
     command = [sys.executable, "-c", ready + waits, str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:

@@ -9,9 +9,9 @@ import torch
 
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage import write_ply
-from sundae_ns.storage.kinds import kind_of, refuse
+from sundae_ns.storage.formats import kind_of, refuse
 from sundae_ns.storage.pack import PackedScene, write_scene
+from sundae_ns.storage.ply import write_ply
 
 
 @pytest.fixture

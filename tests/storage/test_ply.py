@@ -10,7 +10,7 @@ from plyfile import PlyData, PlyElement
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
-from sundae_ns.storage import is_nerfstudio_ply, read_ply, read_point_cloud, write_ply
+from sundae_ns.storage.ply import is_nerfstudio_ply, read_ply, read_point_cloud, write_ply
 
 
 def _field(n=7, degree=3, seed=0):

@@ -4,7 +4,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from sundae_ns.errors import DataError
-from sundae_ns.storage import MODEL_FRAME, is_nerfstudio_ply, read_point_cloud
+from sundae_ns.storage.ply import MODEL_FRAME, is_nerfstudio_ply, read_point_cloud
 
 XYZ = np.array([[0.5, -1.25, 2.0], [3.0, 4.0, -5.5]], np.float32)
 RGB = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)

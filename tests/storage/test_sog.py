@@ -19,7 +19,7 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage.morton import scene_order
+from sundae_ns.storage.coordinates import scene_order
 from sundae_ns.storage.sog import codebook, kmeans, palette, write_sog
 
 

@@ -11,8 +11,7 @@ from torch import Tensor
 from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
 from sundae_ns.rasterization.reference import evaluate_harmonics
-from sundae_ns.storage import similarity
-from sundae_ns.storage.transform import rotate_spherical_harmonics
+from sundae_ns.storage.coordinates import rotate_spherical_harmonics, similarity
 
 SCALE = 1.7
 SIZE = 24

@@ -15,8 +15,8 @@ from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rasterization.reference import harmonic_basis
-from sundae_ns.storage import is_nerfstudio_ply, read_ply, write_ply
-from sundae_ns.storage.viewers import ANTIALIASED, FORMATS, write_for_viewers
+from sundae_ns.storage.formats import ANTIALIASED, FORMATS, write_for_viewers
+from sundae_ns.storage.ply import is_nerfstudio_ply, read_ply, write_ply
 
 PROGRAM = shutil.which("splat-transform")
 other_program = pytest.mark.skipif(

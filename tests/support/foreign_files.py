@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sundae_ns.gaussians.parameters import SH_C0
-from sundae_ns.storage import write_ply
+from sundae_ns.storage.ply import write_ply
 
 _CHUNK = 256
 _STORED = Path(__file__).parents[1] / "storage" / "foreign"

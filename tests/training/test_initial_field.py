@@ -15,7 +15,8 @@ from torch import Tensor
 from sundae_ns.datamanager import DATASET_FRAME
 from sundae_ns.errors import CheckpointError
 from sundae_ns.model import SundaeModel
-from sundae_ns.storage import similarity, write_ply
+from sundae_ns.storage.coordinates import similarity
+from sundae_ns.storage.ply import write_ply
 from sundae_ns.training.initial_field import FEWEST_POINTS
 
 Build = Callable[..., SundaeModel]

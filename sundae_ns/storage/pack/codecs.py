@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES
-from sundae_ns.storage.morton import scene_order
+from sundae_ns.storage.coordinates import scene_order
 from sundae_ns.storage.pack import quantize
 from sundae_ns.storage.pack.config import STEPS, PackConfig
 from sundae_ns.storage.pack.container import Array, Coded, Floats

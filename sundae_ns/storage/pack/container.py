@@ -38,12 +38,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sundae_ns.errors import PackError, regular
-from sundae_ns.storage.kinds import PACKED
 
 FORMAT: dict[str, Any] = json.loads(resources.files(__package__).joinpath("format.json").read_text(encoding="utf-8"))
 """``limits`` of files, schemas of ``container``, ``header`` and ``model``, and ``sections`` by codec and part."""
 LIMITS: dict[str, int] = FORMAT["limits"]
 VERSION, MAX_HEADER, SPARE, MAX_RATIO = (LIMITS[name] for name in ("version", "header", "spare", "ratio"))
+MAGIC = b"\x89SUNDAE\n"
 PADDING = "padding"
 _PREAMBLE = struct.Struct("<8sII32s")
 _THREADS = 2
@@ -260,7 +260,7 @@ def _front(meta: Mapping[str, Any]) -> bytes:
         raise PackError(
             f"the header takes {len(header):,} bytes, but readers accept {MAX_HEADER:,}; give fewer cameras"
         )
-    return _PREAMBLE.pack(PACKED, VERSION, len(header), hashlib.sha256(header).digest()) + header
+    return _PREAMBLE.pack(MAGIC, VERSION, len(header), hashlib.sha256(header).digest()) + header
 
 
 def restated(content: bytes, entries: Mapping[str, Any]) -> bytes:
@@ -284,7 +284,7 @@ def read_header(path: Path) -> Header:
     with naming(path), regular(path).open("rb") as file:
         size = path.stat().st_size
         preamble = file.read(_PREAMBLE.size)
-        if preamble[: len(PACKED)] != PACKED:
+        if preamble[: len(MAGIC)] != MAGIC:
             raise PackError(f"{path} is not a packed scene; give a file that sundae pack wrote")
         if len(preamble) < _PREAMBLE.size:
             raise DamagedError("it ends before its header")

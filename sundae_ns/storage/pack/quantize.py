@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.gaussians.covariance import rotation_matrices
-from sundae_ns.storage.morton import interleave, separate
+from sundae_ns.storage.coordinates import interleave, separate
 from sundae_ns.storage.pack.container import Coded, Floats, Levels
 from sundae_ns.storage.pack.entropy import LARGEST
 

@@ -27,7 +27,7 @@ from sundae_ns.gaussians.parameters import FEATURES
 from sundae_ns.pruning import kept_count
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rendering.contribution import contribution
-from sundae_ns.storage.morton import scene_order
+from sundae_ns.storage.coordinates import scene_order
 from sundae_ns.storage.pack.scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.training.densification import Densification
 from sundae_ns.training.extension import Extension, TrainingRun

@@ -20,7 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.storage import megabytes, stored_bytes
+from sundae_ns.storage.accounting import megabytes, stored_bytes
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, from_values, mean_quality

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sundae_ns.errors import PackError
-from sundae_ns.storage.morton import interleave
+from sundae_ns.storage.coordinates import interleave
 from sundae_ns.storage.pack import entropy
 
 LARGEST = entropy.LARGEST

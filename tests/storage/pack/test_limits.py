@@ -16,7 +16,7 @@ import torch
 from fields import random_field
 
 from sundae_ns.errors import ConfigError, PackError
-from sundae_ns.storage import morton
+from sundae_ns.storage import coordinates
 from sundae_ns.storage.pack import PackConfig, PackedScene, container, read_scene, write_scene
 
 Json = dict[str, Any]
@@ -233,9 +233,9 @@ def test_scene_order_sorts_points_on_a_line() -> None:
     for axis in range(3):
         means = np.zeros((500, 3), np.float32)
         means[:, axis] = x
-        assert np.array_equal(morton.scene_order(means), np.argsort(x))
+        assert np.array_equal(coordinates.scene_order(means), np.argsort(x))
         means[:300, axis] = 0
-        ordered = means[morton.scene_order(means), axis]
+        ordered = means[coordinates.scene_order(means), axis]
         assert (np.diff(ordered) >= 0).all()
 
 

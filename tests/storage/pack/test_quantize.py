@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sundae_ns.gaussians.covariance import rotation_matrices
-from sundae_ns.storage import morton
+from sundae_ns.storage import coordinates
 from sundae_ns.storage.pack import quantize
 from sundae_ns.storage.pack.container import Floats
 
@@ -25,18 +25,18 @@ def ulp(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @hard
 def test_separate_inverts_interleave(kind: str, n: int, seed: int) -> None:
-    cells = np.random.default_rng(seed).integers(0, 2**morton.MAX_BITS, (n, 3)).astype(np.uint64)
-    codes = morton.interleave(cells)
+    cells = np.random.default_rng(seed).integers(0, 2**coordinates.MAX_BITS, (n, 3)).astype(np.uint64)
+    codes = coordinates.interleave(cells)
     for axis in range(3):
-        assert np.array_equal(morton.separate(codes, axis), cells[:, axis])
-    assert sorted(morton.scene_order(hard_values(kind, n, 3, seed))) == list(range(n))
+        assert np.array_equal(coordinates.separate(codes, axis), cells[:, axis])
+    assert sorted(coordinates.scene_order(hard_values(kind, n, 3, seed))) == list(range(n))
 
 
 def test_scene_order_keeps_neighbours_together_despite_a_far_primitive() -> None:
     means = np.random.default_rng(0).random((4096, 3)).astype(np.float32)
     means[7] = 1e6
-    ordered = np.delete(means, 7, axis=0)[morton.scene_order(np.delete(means, 7, axis=0))]
-    with_far = means[morton.scene_order(means)]
+    ordered = np.delete(means, 7, axis=0)[coordinates.scene_order(np.delete(means, 7, axis=0))]
+    with_far = means[coordinates.scene_order(means)]
     steps = [np.median(np.linalg.norm(np.diff(m, axis=0), axis=1)) for m in (means, ordered, with_far)]
     assert steps[1] < steps[0] / 5
     assert steps[2] < 1.5 * steps[1]
@@ -46,7 +46,7 @@ def test_scene_order_keeps_neighbours_together_despite_a_far_primitive() -> None
 def test_positions(kind: str, n: int, seed: int) -> None:
     bits, size = 4 + seed % 13, 16 + seed % 200
     x = hard_values(kind, n, 3, seed)
-    x = x[morton.scene_order(x)]
+    x = x[coordinates.scene_order(x)]
     packed, order = quantize.quantize_positions(x, bits, size)
     assert sorted(order) == list(range(n))
     found = quantize.dequantize_positions(packed, bits, size).astype(np.float64)
@@ -61,9 +61,9 @@ def test_positions(kind: str, n: int, seed: int) -> None:
 def test_a_far_primitive_does_not_increase_the_error_of_others() -> None:
     x = np.random.default_rng(0).random((5000, 3)).astype(np.float32)
     x[3] = 1e6
-    packed, order = quantize.quantize_positions(x[morton.scene_order(x)], 16, 1024)
+    packed, order = quantize.quantize_positions(x[coordinates.scene_order(x)], 16, 1024)
     found = quantize.dequantize_positions(packed, 16, 1024)
-    truth = x[morton.scene_order(x)][order]
+    truth = x[coordinates.scene_order(x)][order]
     assert np.quantile(np.abs(found - truth).max(axis=1), 0.79) < 1 / 65535 / 2 + 1e-7
 
 

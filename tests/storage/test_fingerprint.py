@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from harness.job import parse
-from sundae_ns.storage.runs.config_file import load_config
-from sundae_ns.storage.runs.fingerprint import LEFT_OUT, LENGTH, fingerprint
+from sundae_ns.storage.config_file import load_config
+from sundae_ns.storage.fingerprint import LEFT_OUT, LENGTH, fingerprint
 
 SUNDAE = ("sundae", "--data", "bonsai")
 COLMAP = ("colmap", "--colmap-path", "sparse/0", "--eval-mode", "interval")

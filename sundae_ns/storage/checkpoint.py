@@ -1,28 +1,35 @@
-"""Checkpoints: atomic writes, the state beside the tensors, checks before loading, and fields from other sources.
+"""Checkpoints: whole files, the state beside the tensors, the checks before loading, and states of random generators.
 
-Files are read weights-only, so that no code of theirs runs, and only after their checksums were verified.
+A checkpoint is a zip archive of ``torch.save``, as nerfstudio writes it:
+
+    data.pkl   {"step", "pipeline", "optimizers", "schedulers", "scalers", "random"}
+    data/N     bytes of tensor N, stored, not deflated
+
+``pipeline`` has the tensors by ``_model.gauss_params.NAME`` and ``_model.networks.head.NAME``, and
+``_model._extra_state``, see :func:`extra_state`. Files are read weights-only, so that no code of theirs runs, and only
+after their checksums were verified.
 """
 
 from __future__ import annotations
 
 import os
 import pickle
+import random
 import re
+import zipfile
 from collections.abc import Mapping
 from numbers import Integral
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, get_args
+from typing import Any, BinaryIO, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import CheckpointError, DataError, StorageError, one_line, regular
+from sundae_ns.errors import CheckpointError, StorageError, one_line, regular
 from sundae_ns.gaussians.field import Encoding, Field
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes
-from sundae_ns.storage.archive import damage_of, load_tensors
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.kinds import kind_of, kind_of_primitives, refuse
-from sundae_ns.storage.primitives import mended_of, read_primitives
 
 EXTRA_STATE = "_extra_state"
 FORMAT = 2
@@ -272,61 +279,6 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
             raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} primitives; give another")
 
 
-class FinishedField(NamedTuple):
-    """A field to start from or to look at."""
-
-    params: dict[str, Tensor]
-    """Finite, without features, float32 on the CPU, colours as harmonics."""
-    in_model_frame: bool
-    """Whether coordinates are those of nerfstudio's model (checkpoints, ``ns-export``), not the capture's (others)."""
-    dropped: int
-    """Number of primitives left out because they have no meaning (``gaussians.mend``)."""
-
-
-def read_field(path: Path) -> FinishedField:
-    """Read a finished field: a splatfacto or SUNDAE checkpoint (file or folder), a packed scene, or other primitives.
-
-    Args:
-        path: ``.ckpt`` file, a folder of them (the newest counts), a packed scene, or a file that
-            ``storage.primitives`` reads.
-
-    Raises:
-        CheckpointError: there is no such file, it holds no Gaussian field, or has another format.
-    """
-    if not path.exists():
-        raise CheckpointError(f"{path} does not exist; give a .ckpt file, the folder of them, or a .ply")
-    if kind_of_primitives(path) is not None:
-        try:
-            found = read_primitives(path)
-        except DataError as error:
-            raise CheckpointError(str(error)) from error
-        return FinishedField(dict(found.mended.field), found.in_model_frame, found.mended.dropped)
-    if kind_of(path) == "packed":
-        return _packed_field(path)
-    refuse(path)
-    if path.is_dir():
-        if not checkpoints(folder_of(path)):
-            raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
-        path, loaded = read_newest(path)
-    else:
-        loaded = read(path)
-    field = field_of(loaded, path)
-    usable = usable_of(field, path).as_harmonics()
-    return FinishedField(dict(usable), True, field.num_primitives - usable.num_primitives)
-
-
-def _packed_field(path: Path) -> FinishedField:
-    """The field of a packed scene; its head and features are left out."""
-    from sundae_ns.storage.pack import read_scene  # its decoder needs a compiler, which other files do not
-
-    packed = read_scene(path)
-    model, source = packed.meta.get("model"), packed.meta.get("source")
-    logits = isinstance(model, dict) and model.get("sh_degree") == 0
-    field = Field({name: packed.field[name] for name in SPLAT_NAMES}, "logits" if logits else "harmonics")
-    in_model_frame = not isinstance(source, dict) or source.get("model_frame") is not False
-    return FinishedField(dict(field.as_harmonics()), in_model_frame, 0)
-
-
 def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
     """The stored field of a checkpoint from :func:`read`, without features, float32 on the CPU.
 
@@ -341,20 +293,6 @@ def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
     for odd in odd_shapes(field):
         raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")
     return Field(field, _encoding(field, state.get(EXTRA_STATE)))
-
-
-def usable_of(field: Field, path: Path) -> Field:
-    """The primitives of a field from :func:`field_of` that have a meaning, with finite values; logs what was changed.
-
-    Raises:
-        CheckpointError: no primitive has a meaning.
-    """
-    usable = mended_of(field, path)
-    if not usable.num_primitives:
-        raise CheckpointError(
-            f"{path} holds {field.num_primitives:,} primitives, and none is finite; give another file"
-        )
-    return usable
 
 
 def model_state(loaded: Mapping[str, Any]) -> dict[str, Any]:
@@ -375,3 +313,77 @@ def _encoding(field: Mapping[str, Tensor], extra: Any) -> Encoding:
         if extra.get("encoding") == encoding:
             return encoding  # type: ignore[no-any-return]
     raise CheckpointError("the checkpoint does not say how it stores colours; give another")
+
+
+# ------------------------------------------------------------------------------------------ archives of any torch.save
+
+
+def damage_of(file: BinaryIO) -> str | None:
+    """Why a file is no whole archive of tensors; None if its checksums, which torch does not verify, are right."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            entries = archive.infolist()
+            packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
+            if packed or sum(entry.file_size for entry in entries) > os.fstat(file.fileno()).st_size:
+                return "it would unpack to more than its size"
+            broken = archive.testzip()
+            return None if broken is None else f"{broken} in it is damaged"
+    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
+        return getattr(error, "strerror", None) or one_line(error)
+
+
+def load_tensors(file: BinaryIO) -> Any:
+    """The tensors and plain values of an open archive without :func:`damage_of`, on the CPU.
+
+    Raises:
+        Exception: of many kinds, which all mean that it holds something else.
+    """
+    file.seek(0)
+    with _numpy_numbers_allowed():
+        loaded = torch.load(file, map_location="cpu", weights_only=True)
+    _check_tensors(loaded)
+    return loaded
+
+
+def _check_tensors(value: Any) -> None:
+    """Refuse sparse or quantized tensors, and tensors larger than their storage, whose copy would fill memory."""
+    if isinstance(value, Tensor):
+        if value.layout is not torch.strided or value.is_quantized or value.is_meta:
+            raise ValueError("it holds a tensor that is sparse, quantized or without values")
+        if value.numel() * value.element_size() > value.untyped_storage().nbytes():
+            raise ValueError("it holds a tensor that claims more than it has")
+    elif isinstance(value, (Mapping, list, tuple)):
+        for inner in value.values() if isinstance(value, Mapping) else value:
+            _check_tensors(inner)
+
+
+def _numpy_numbers_allowed() -> Any:
+    """A context in which torch reads the numpy floats that stock nerfstudio leaves in a scheduler's state."""
+    scalar: Any = np.float64(0.0).__reduce__()[0]
+    names = [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    types: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
+    return torch.serialization.safe_globals([scalar, *names, *types])
+
+
+# -------------------------------------------------------------------------------------------------- random generators
+
+
+def random_state() -> dict[str, Any]:
+    """State of all random generators that training uses, as plain numbers and tensors."""
+    kind, keys, position, has_gauss, gauss = np.random.get_state()
+    return {
+        "python": random.getstate(),
+        "numpy": (str(kind), [int(key) for key in keys], int(position), int(has_gauss), float(gauss)),
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+    }
+
+
+def set_random_state(state: Mapping[str, Any]) -> None:
+    """Counterpart of :func:`random_state`; CUDA generators are left alone if the number of devices differs."""
+    random.setstate(state["python"])
+    kind, keys, position, has_gauss, gauss = state["numpy"]
+    np.random.set_state((kind, np.array(keys, dtype=np.uint32), position, has_gauss, gauss))
+    torch.set_rng_state(state["torch"])
+    if len(state["cuda"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(list(state["cuda"]))

@@ -15,7 +15,8 @@ from fields import random_field
 import sundae_ns as sn
 from sundae_ns.cli import main
 from sundae_ns.errors import CheckpointError
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage import checkpoint
+from sundae_ns.storage.formats import read_field
 
 N = 20
 
@@ -54,7 +55,7 @@ def exported(run: Path) -> None:
 
 READERS: dict[str, Callable[[Path], object]] = {
     "load": sn.load,
-    "read_field": checkpoint.read_field,
+    "read_field": read_field,
     "export": exported,
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from enum import Enum
 from functools import cache
@@ -18,9 +18,9 @@ import yaml
 from yaml.constructor import ConstructorError
 
 from sundae_ns.errors import CheckpointError, reading, regular
-from sundae_ns.storage.kinds import refuse
-from sundae_ns.storage.runs.folder import config_of
+from sundae_ns.storage.formats import refuse
 
+_REMEDY = "give the folder of a finished run, or its config.yml"
 _PATHS = {"PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath"}
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
 
@@ -102,6 +102,40 @@ def find_capture(config: Any, folder: Path) -> None:
         datamanager.data = moved
 
 
+def config_of(run: Path) -> Path:
+    """Path of the ``config.yml`` of a run, given its folder or that file; it need not exist."""
+    return run / "config.yml" if run.is_dir() else run
+
+
+def find_config(path: Path) -> Path | None:
+    """The ``config.yml`` of a run, given it, the run's folder, the folder of its checkpoints, or one of these."""
+    folder = path if path.is_dir() else path.parent
+    folders = [folder, folder.parent] if folder.name == "nerfstudio_models" else [folder]
+    return next((each / "config.yml" for each in folders if (each / "config.yml").is_file()), None)
+
+
+def load_config(path: Path) -> Any:
+    """A run's ``config.yml`` as objects of nerfstudio, with the options that were saved.
+
+    Only classes of nerfstudio, of this package, of torch, and of installed plug-ins are known; nothing is called.
+
+    Raises:
+        CheckpointError: it cannot be read, is no configuration, or asks for something else.
+    """
+    config = _load(path, _ConfigLoader)
+    find_capture(config, path.absolute().parent)
+    return config
+
+
+def _load(path: Path, loader: type[yaml.SafeLoader]) -> Any:
+    kind = "a run's config.yml, or of another version"
+    with reading(path, kind, CheckpointError, mend=_REMEDY, missing=_REMEDY):
+        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
+
+
+# --------------------------------------------------------------------------------- plain values, which import no class
+
+
 class _ValueLoader(yaml.SafeLoader):
     """Makes plain values only: mappings for configurations, text for names, lists for tuples and calls."""
 
@@ -115,41 +149,42 @@ def _make_plain(loader: _ValueLoader, suffix: str, node: yaml.Node) -> Any:
 _ValueLoader.add_multi_constructor(_PYTHON, _make_plain)
 
 
-def load_config(path: Path) -> Any:
-    """A run's ``config.yml`` as objects of nerfstudio, with the options that were saved.
-
-    Only classes of nerfstudio, of this package, of torch, and of installed plug-ins are known; nothing is called.
-
-    Raises:
-        CheckpointError: it cannot be read, is no configuration, or asks for something else.
-    """
-    config = _load(path, lambda text: yaml.load(text, Loader=_ConfigLoader))
-    find_capture(config, path.absolute().parent)
-    return config
+def _value(path: Path, *keys: str) -> Any:
+    """A plain value of a ``config.yml``, or None; ``CheckpointError`` if the file cannot be read."""
+    value = _load(path, _ValueLoader)
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value
 
 
 def model_options(path: Path) -> dict[str, Any]:
-    """Options of the model in a run's ``config.yml``, as plain values; unlike :func:`load_config`, imports nothing.
-
-    Raises:
-        CheckpointError: it cannot be read, or is no configuration of a run.
-    """
-    found = _part(path, "pipeline", "model")
-    if found is None:
+    """Options of the model in a run's ``config.yml``; ``CheckpointError`` if it is no configuration of a run."""
+    options = _value(path, "pipeline", "model")
+    if not isinstance(options, dict):
         raise CheckpointError(f"{path} is not a run's config.yml; give the folder of a run")
-    return found
+    return options
 
 
 def parser_options(path: Path) -> dict[str, Any]:
     """As :func:`model_options`, those of the data parser; empty for a run without one."""
-    return _part(path, "pipeline", "datamanager", "dataparser") or {}
+    options = _value(path, "pipeline", "datamanager", "dataparser")
+    return options if isinstance(options, dict) else {}
 
 
-def _part(path: Path, *keys: str) -> dict[str, Any] | None:
-    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
-    for key in keys:
-        found = found.get(key) if isinstance(found, dict) else None
-    return found if isinstance(found, dict) else None
+def capture_and_source(path: Path) -> tuple[Path | None, Path | None]:
+    """Paths of a run's capture and of the checkpoints that it resumes; ``CheckpointError`` if it cannot be read."""
+    options = _value(path)
+    parts = (options.get(name) if isinstance(options, dict) else None for name in ("data", "load_dir"))
+    capture, source = (Path(*map(str, names)) if isinstance(names, list) and names else None for names in parts)
+    return capture, source
+
+
+def schedule_length(path: Path) -> int:
+    """Number of steps of a run's schedule; ``CheckpointError`` if it is no configuration of a run of ours."""
+    length = _value(path, "schedule_length")
+    if not isinstance(length, int):
+        raise CheckpointError(f"{path} states no length of its schedule; give a run of sundae")
+    return length
 
 
 def check_run(run: Path) -> None:
@@ -164,35 +199,3 @@ def check_run(run: Path) -> None:
         primitives="give the folder of a run; sundae prune and sundae export read such files",
     )
     model_options(config_of(run))
-
-
-def capture_and_source(path: Path) -> tuple[Path | None, Path | None]:
-    """Paths of a run's capture and of the checkpoints that it resumes, from its ``config.yml``; imports nothing.
-
-    Raises:
-        CheckpointError: it cannot be read, or is no configuration of a run.
-    """
-    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
-    found = found if isinstance(found, dict) else {}
-    paths = (found.get(name) for name in ("data", "load_dir"))
-    capture, source = (Path(*map(str, parts)) if isinstance(parts, list) and parts else None for parts in paths)
-    return capture, source
-
-
-def schedule_length(path: Path) -> int:
-    """Number of steps of a run's schedule, from its ``config.yml``; imports nothing.
-
-    Raises:
-        CheckpointError: it cannot be read, or is no configuration of a run of ours.
-    """
-    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
-    length = found.get("schedule_length") if isinstance(found, dict) else None
-    if not isinstance(length, int):
-        raise CheckpointError(f"{path} states no length of its schedule; give a run of sundae")
-    return length
-
-
-def _load(path: Path, parse: Callable[[str], Any]) -> Any:
-    mend = "give the folder of a finished run, or its config.yml"
-    with reading(path, "a run's config.yml, or of another version", CheckpointError, mend=mend, missing=mend):
-        return parse(regular(path).read_text(encoding="utf-8"))

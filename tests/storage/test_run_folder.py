@@ -10,17 +10,10 @@ from pathlib import Path
 import pytest
 
 from sundae_ns.errors import StorageError
-from sundae_ns.storage.runs.folder import (
-    files_of,
-    find_config,
-    new_name,
-    prunes_before,
-    prunes_of,
-    reserve,
-    take_records,
-)
+from sundae_ns.storage.config_file import find_config
+from sundae_ns.storage.run_folder import files_of, new_name, prunes_before, prunes_of, reserve, take_records
 
-HOLDER = "import sys, time; from pathlib import Path; from sundae_ns.storage.runs.folder import reserve; "
+HOLDER = "import sys, time; from pathlib import Path; from sundae_ns.storage.run_folder import reserve; "
 HOLDER += "reserve(Path(sys.argv[1])); print(flush=True); time.sleep(600)"
 
 

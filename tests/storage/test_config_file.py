@@ -16,7 +16,7 @@ from sundae_ns.api.packing import contents_of
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.scenes.models import load_model, load_run
-from sundae_ns.storage.runs.config_file import load_config, schedule_length
+from sundae_ns.storage.config_file import load_config, schedule_length
 
 METHODS = sorted(name for name in all_methods if name.startswith("sundae")) + ["splatfacto", "nerfacto"]
 

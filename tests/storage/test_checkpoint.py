@@ -15,8 +15,9 @@ from torch import Tensor
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import mending
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, sh_to_rgb
-from sundae_ns.storage import MODEL_FRAME, write_ply
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage import checkpoint
+from sundae_ns.storage.formats import read_field
+from sundae_ns.storage.ply import MODEL_FRAME, write_ply
 
 
 def field(n: int = 6, degree: int = 3) -> dict[str, Tensor]:
@@ -133,7 +134,7 @@ def test_stock_checkpoint_with_numpy_numbers(tmp_path: Path, prefix: str) -> Non
     params = stock_checkpoint(tmp_path / "step-000000001.ckpt", prefix)
     with pytest.raises(Exception, match="[Ww]eights.only"):
         torch.load(tmp_path / "step-000000001.ckpt", weights_only=True)
-    read, in_model_frame, _ = checkpoint.read_field(tmp_path / "step-000000001.ckpt")
+    read, in_model_frame, _ = read_field(tmp_path / "step-000000001.ckpt")
     assert in_model_frame
     assert tuple(read) == SPLAT_NAMES
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
@@ -164,7 +165,7 @@ def save_without_harmonics(folder: Path, extra: Any) -> None:
 def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path: Path, extra: Any, logits: bool) -> None:
     """Logits if the model was built at degree 0, harmonics if a search has lowered the degree."""
     save_without_harmonics(tmp_path, extra)
-    read, _, _ = checkpoint.read_field(tmp_path)
+    read, _, _ = read_field(tmp_path)
     stored = field()["features_dc"]
     expected = sh_to_rgb(read["features_dc"]).logit() if logits else read["features_dc"]
     torch.testing.assert_close(expected, stored)
@@ -186,7 +187,7 @@ def test_a_field_of_another_format_is_refused(tmp_path: Path, extra: Any, cause:
     """Its colours could be misread silently."""
     save_without_harmonics(tmp_path, extra)
     with pytest.raises(CheckpointError, match=cause) as caught:
-        checkpoint.read_field(tmp_path)
+        read_field(tmp_path)
     assert one_line(caught.value)
 
 
@@ -201,13 +202,13 @@ def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(
 
     monkeypatch.setattr(mending, "finite_mask", count)
     stored = stock_checkpoint(tmp_path / "step-000000001.ckpt", n=4)
-    assert torch.equal(checkpoint.read_field(tmp_path)[0]["means"], stored["means"])
+    assert torch.equal(read_field(tmp_path)[0]["means"], stored["means"])
     assert mended == [4]
     loaded = checkpoint.read(tmp_path / "step-000000001.ckpt")
     loaded["pipeline"]["_model.gauss_params.means"].fill_(torch.nan)
     torch.save(loaded, tmp_path / "step-000000002.ckpt")
-    with pytest.raises(CheckpointError, match=r"holds 4 primitives, and none is finite"):
-        checkpoint.read_field(tmp_path)
+    with pytest.raises(CheckpointError, match=r"has 4 primitives, and none is finite"):
+        read_field(tmp_path)
 
 
 @pytest.mark.parametrize("inside", [".", "nerfstudio_models"])
@@ -215,18 +216,18 @@ def test_newest_of_a_folder(tmp_path: Path, inside: str) -> None:
     (tmp_path / inside).mkdir(exist_ok=True)
     stock_checkpoint(tmp_path / inside / "step-000000999.ckpt", n=3)
     newest = stock_checkpoint(tmp_path / inside / "step-000029999.ckpt", n=4)
-    assert torch.equal(checkpoint.read_field(tmp_path)[0]["means"], newest["means"])
+    assert torch.equal(read_field(tmp_path)[0]["means"], newest["means"])
 
 
 @pytest.mark.parametrize(("comments", "in_model_frame"), [((), False), ((MODEL_FRAME,), True)])
 def test_ply(tmp_path: Path, comments: tuple[str, ...], in_model_frame: bool) -> None:
     params = field()
     write_ply(tmp_path / "a.ply", params, comments=list(comments))
-    read, in_frame, _ = checkpoint.read_field(tmp_path / "a.ply")
+    read, in_frame, _ = read_field(tmp_path / "a.ply")
     assert in_frame is in_model_frame
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
     renamed = (tmp_path / "a.ply").rename(tmp_path / "cloud")
-    assert torch.equal(checkpoint.read_field(renamed)[0]["means"], params["means"])
+    assert torch.equal(read_field(renamed)[0]["means"], params["means"])
 
 
 class Burglar:
@@ -243,13 +244,13 @@ def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
     stolen = tmp_path / "stolen"
     torch.save({"pipeline": {}, "extra": Burglar(stolen)}, tmp_path / "a.ckpt")
     with pytest.raises(CheckpointError, match="cannot be read"):
-        checkpoint.read_field(tmp_path / "a.ckpt")
+        read_field(tmp_path / "a.ckpt")
     assert not stolen.exists()
 
 
 def test_numpy_is_allowed_for_one_file_only(tmp_path: Path) -> None:
     stock_checkpoint(tmp_path / "a.ckpt")
-    checkpoint.read_field(tmp_path / "a.ckpt")
+    read_field(tmp_path / "a.ckpt")
     with pytest.raises(Exception, match="[Ww]eights.only"):
         torch.load(tmp_path / "a.ckpt", weights_only=True)
 
@@ -278,7 +279,7 @@ def test_a_file_without_a_field_is_refused(tmp_path: Path, wrong: str) -> None:
     path = tmp_path / "a.ckpt"
     make(path)
     with pytest.raises(CheckpointError, match=cause) as caught:
-        checkpoint.read_field(path)
+        read_field(path)
     assert one_line(caught.value)
 
 

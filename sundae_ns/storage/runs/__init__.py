@@ -1,1 +1,0 @@
-"""Files of a training run: checkpoints, its folder, and its ``config.yml``."""
