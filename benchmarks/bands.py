@@ -163,7 +163,6 @@ def bands(
     signal: Literal["positions", "attributes"] = "positions",
     gamma: float = 0.5,
     neighbors: int = 16,
-    bandwidth: Literal["robust", "literal"] = "robust",
     view: int | None = None,
     overwrite: Overwrite = False,
 ) -> int:
@@ -176,12 +175,11 @@ def bands(
         signal: graph signal to filter: positions, as in the paper, or position, colour, opacity and size.
         gamma: share of the kept primitives that the combined rule takes from the largest responses.
         neighbors: maximum number of neighbours of a primitive in the graph.
-        bandwidth: rule that sets radius and width of the graph's edge weights; literal is the paper's.
         view: index of the training view to draw; by default the one with the most primitives.
         overwrite: replace the files of an earlier command in the folder.
     """
     check_folder(out, reads=[run], overwrite=overwrite)
-    rule = PruneRule(signal=signal, gamma=gamma, num_neighbors=neighbors, bandwidth=bandwidth)
+    rule = PruneRule(signal=signal, gamma=gamma, num_neighbors=neighbors)
     return run_bands(run, out, shares=keep_ratio, rule=rule, view=view)
 
 
@@ -263,7 +261,6 @@ def run_bands(
         "isolated": int(graph.isolated.sum()),
         "signal": rule.signal,
         "num_neighbors": rule.num_neighbors,
-        "bandwidth": rule.bandwidth,
         "tau": graph.tau,
         "sigma": graph.sigma,
         "gamma": rule.gamma,

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import time
 from collections.abc import Callable
@@ -36,7 +37,6 @@ from torch import Tensor
 from sundae_ns.evaluation.timing import now
 from sundae_ns.filters import high_pass
 from sundae_ns.graphs import NeighborGraph, build_graph
-from sundae_ns.graphs.host_search import cores
 from sundae_ns.storage.formats import read_field
 
 NEIGHBORS = 16
@@ -207,9 +207,7 @@ def main() -> None:
         parser.error("there is no CUDA device here; sundae doctor says more")
     if options.repeats < 1 or options.sample < 0 or min(options.points) <= NEIGHBORS:
         parser.error(f"give at least one repeat and more than {NEIGHBORS} points")
-    threads = f"{cores()} threads"
-    if cores() != torch.get_num_threads():
-        threads += f" for neighbours, {torch.get_num_threads()} for torch"
+    threads = f"{os.cpu_count()} threads for neighbours, {torch.get_num_threads()} for torch"
     name = torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {threads}"
     for n in options.points:
         for distribution in (

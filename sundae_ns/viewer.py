@@ -34,7 +34,7 @@ from sundae_ns.rendering.outputs import FieldKey
 from sundae_ns.rendering.source import LocalField
 from sundae_ns.training.field_state import FieldState
 
-RuleName = Literal["as configured", "band: high", "band: low", "band: both", "opacity", "random"]
+RuleName = Literal["as configured", "band: high", "band: low", "band: both"]
 
 STEP = 0.01
 """Step of the slider, and its lowest share."""
@@ -72,12 +72,8 @@ def previewed_rule(configured: PruneRule, name: RuleName) -> PruneRule:
     """The rule of a name in the menu; everything that the name does not say is as configured.
 
     ``band: both`` is the paper's rule with the configured gamma, ``band: high`` and ``band: low`` are its two ends.
-    These, opacity and random do not merge.
+    These do not merge.
     """
-    if name == "opacity":
-        return replace(configured, score="opacity", selection="top", redistribution="none")
-    if name == "random":
-        return replace(configured, score="random", selection="sampled", redistribution="none")
     bands = {"band: high": 1.0, "band: low": 0.0, "band: both": configured.gamma}
     return band_rule(replace(configured, signal="positions"), bands[name]) if name in bands else configured
 

@@ -24,8 +24,6 @@ SHELL = ("model", "trainer")
 """Only rooms above may know these."""
 BARE = FLOORS[: FLOORS.index("training")]
 """Rooms that import neither nerfstudio nor gsplat when they are imported."""
-OLD_PATHS = ("pruning/config.py",)
-"""Modules that hold no code, only the old path of a class that the ``config.yml`` of earlier runs names."""
 MAX_MODULES = 7
 """Modules beside the folders in the package's root."""
 BUDGETS = ROOT / "tests" / "budgets.csv"
@@ -154,17 +152,9 @@ def test_rooms_import_only_lower_floors() -> None:
     found = {}
     for room, path in sources():
         wrong = violations(room, imports_of(path.read_text()))
-        if wrong and path.relative_to(ROOT / PACKAGE).as_posix() not in OLD_PATHS:
+        if wrong:
             found[str(path.relative_to(ROOT))] = wrong
     assert not found
-
-
-@pytest.mark.parametrize("name", OLD_PATHS)
-def test_old_paths_hold_no_code_and_are_imported_by_nobody(name: str) -> None:
-    body = ast.parse((ROOT / PACKAGE / name).read_text()).body
-    assert all(isinstance(node, (ast.Expr, ast.ImportFrom, ast.Assign)) for node in body)
-    module = f"{PACKAGE}.{name.removesuffix('.py').replace('/', '.')}"
-    assert not [path for path in modules().values() if module in set(imports_of(path.read_text()))]
 
 
 def test_no_module_is_on_a_circle() -> None:

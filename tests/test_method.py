@@ -73,11 +73,11 @@ def test_the_pages_state_when_training_stops() -> None:
 
 def test_the_checks_can_fail() -> None:
     with pytest.raises(AttributeError):
-        resolve("sundae_ns.filters.haar.no_such_filter")
+        resolve("sundae_ns.filters.filters.no_such_filter")
     with pytest.raises(AttributeError):
         resolve("sundae_ns.no_such_room.at_all")
     alone, named = "```math\na = b\n```\n\nNo function.\n", "```math\nc\n```\nBy `sundae_ns.x`.\n"
-    page = f"{alone}\n## Next\n\n`sundae_ns.filters.haar.high_pass`\n\n{named}"
+    page = f"{alone}\n## Next\n\n`sundae_ns.filters.filters.high_pass`\n\n{named}"
     assert lonely(page) == ["a = b"]
 
 

@@ -25,7 +25,7 @@ from sundae_ns.compensation import HeadConfig
 from sundae_ns.evaluation.count_curve import CurvePoint, expected_change
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.pruning import PruneRule, response
-from sundae_ns.pruning.cutting import FieldPruner
+from sundae_ns.pruning.decision import FieldPruner
 from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.pruning_config import PruningConfig
@@ -156,8 +156,7 @@ def test_exactly_the_share_is_shown(rule: RuleName, keep_ratio: float) -> None:
 
 PRUNES: list[dict[str, Any]] = [
     {},
-    {"score": "contribution", "redistribution": "none"},
-    {"score": "response-contribution", "selection": "sampled", "seed": 3},
+    {"redistribution": "none", "seed": 3},
     {"score": "response", "selection": "band", "signal": "positions", "edges": "centres", "redistribution": "none"},
 ]
 
@@ -191,17 +190,14 @@ def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
     model, _ = build()
     known = response(model.state.field, previewed_rule(model.config.pruning, "band: both"))
     masks = {rule: shown(model, rule, 0.2) for rule in RULES}
-    high, low, both, top = (masks[rule] for rule in ("band: high", "band: low", "band: both", "opacity"))
+    high, low, both = (masks[rule] for rule in ("band: high", "band: low", "band: both"))
     assert high is not None
     assert low is not None
     assert both is not None
-    assert top is not None
     assert known[high].min() >= known[~high].max()
     assert known[low].max() <= known[~low].min()
     assert torch.equal(both, (both & high) | (both & low))
     assert int((both & high).sum()) == int((both & low).sum()) == 9
-    opaque = model.opacities[:, 0]
-    assert opaque[top].min() >= opaque[~top].max()
     # The share of the slider counts, whatever budget the run had.
     for options in (
         {"keep_ratio": None, "max_bytes": 900},
@@ -297,10 +293,6 @@ def test_graph_and_views_are_used_once_a_field(calls: list[int]) -> None:
     # One graph with the configured edges and one with the paper's; the detail that counts depends on the share.
     assert calls == [N, N]
     assert views.asked == 3
-    model, views = build(score="contribution")
-    for keep_ratio in (0.1, 0.2, 0.3):
-        shown(model, "as configured", keep_ratio)
-    assert views.asked == 1
 
 
 def test_a_changed_field_is_scored_anew(calls: list[int]) -> None:
@@ -364,4 +356,4 @@ def test_a_rule_that_cannot_be_applied_shows_everything_and_says_so_once(capsys:
     del alone.viewer_controls.control.viewer
     assert shown(alone, "as configured", 0.5) is None
     assert "no training views" in " ".join(capsys.readouterr().out.split())
-    assert shown(alone, "random", 0.5) is not None
+    assert shown(alone, "band: low", 0.5) is not None

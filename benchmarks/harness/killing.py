@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import sundae_ns.pruning.cutting
+import sundae_ns.pruning.decision
 import sundae_ns.storage.atomic
 import sundae_ns.storage.checkpoint
 import sundae_ns.training.report
@@ -82,8 +82,8 @@ SAVES: dict[str, Place] = {
 }
 TRAINING: dict[str, Place] = {
     **SAVES,
-    "prune: deciding": lambda n: after(1, sundae_ns.pruning.cutting, "decide", at_once),
-    "prune: sliced": lambda n: after(1, sundae_ns.pruning.cutting, "keep", when_done),
+    "prune: deciding": lambda n: after(1, sundae_ns.pruning.decision, "decide", at_once),
+    "prune: sliced": lambda n: after(1, sundae_ns.pruning.decision, "keep", when_done),
     "prune: half recorded": lambda n: after(1, sundae_ns.training.report, "write_text", half_recorded),
 }
 TRIALS: dict[str, Place] = {

@@ -141,13 +141,12 @@ def own_kernels() -> Finding:
         return Finding(name, False, "need a CUDA device", "nothing; a CPU uses equivalent code")
     from sundae_ns.compensation import CompensationHead, HeadConfig, fused
     from sundae_ns.errors import BackendError
-    from sundae_ns.gpu import fused_loss, nvrtc
-    from sundae_ns.graphs import traversal
+    from sundae_ns.gpu import fused_loss
+    from sundae_ns.graphs import neighbors
 
     device = torch.device("cuda", 0)
-    options = (*traversal.OPTIONS, *traversal.definitions(torch.float32, 16))
     try:
-        nvrtc.Kernel(traversal.FILE, traversal.KERNEL, device, options, traversal.BLOCK)
+        neighbors.load_kernel(device, torch.float32, 16)
         fused_loss.loss_kernels(device)
         net = CompensationHead(HeadConfig()).net
         fused.head_kernels(device, torch.bfloat16, fused.head_options(net, True))

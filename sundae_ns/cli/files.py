@@ -185,10 +185,8 @@ def prune_file(
     keep: float | None = None,
     count: int | None = None,
     target_drop: float | None = None,
-    score: Literal[
-        "detail-contribution", "contribution", "response-contribution", "response", "opacity", "random"
-    ] = "detail-contribution",
-    selection: Literal["pairs", "systematic", "sampled", "band", "top"] = "pairs",
+    score: Literal["detail-contribution", "response"] = "detail-contribution",
+    selection: Literal["pairs", "systematic", "band"] = "pairs",
     merge: bool = True,
     signal: Literal["attributes", "positions"] = "attributes",
     gamma: float = 0.5,
@@ -211,12 +209,10 @@ def prune_file(
         count: number of primitives to keep, in place of a share.
         target_drop: keep as few as lose at most this PSNR, in dB, of a full field that shows its photos at 30 dB; by
             the images of held-out cameras.
-        score: importance of a primitive: what cameras see of it where there is detail, what they see of it, the same
-            times its high-pass response, the response alone, opacity, or a random number.
+        score: importance of a primitive: what cameras see of it where there is detail, or its high-pass response.
         selection: pairs merges the two primitives that differ least, weighted by score, until few enough are left.
-            Systematic and sampled draw at random by score, evenly through space or independently. Band keeps the
-            highest and lowest scores (the paper's rule, with score response, signal positions and no merge). Top keeps
-            the highest scores.
+            Systematic draws at random by score, evenly through space. Band keeps the highest and lowest scores (the
+            paper's rule, with score response, signal positions and no merge).
         merge: merge dropped primitives into the kept ones of their groups, or nearest along the neighbour graph.
         signal: graph signal to filter: position, colour, opacity and size, or positions only.
         gamma: share of the kept primitives that the band selection takes from the highest scores.

@@ -1,24 +1,27 @@
-"""The decision which primitives of a field to keep, and the field that it leaves. Both change nothing."""
+"""The decision which primitives of a field to keep, and its two uses: a new field, and a field in training."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
 
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.field import Field, as_field
 from sundae_ns.gaussians.mending import mend
+from sundae_ns.gaussians.parameters import num_primitives
+from sundae_ns.gaussians.relocation import grow
+from sundae_ns.gaussians.surgery import keep, per_primitive, rewrite
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning.edges import field_graph
-from sundae_ns.pruning.pairing import pair_labels
-from sundae_ns.pruning.redistribution import merged
+from sundae_ns.pruning.merge import field_graph, merged, pair_labels
 from sundae_ns.pruning.rule import PruneRule
-from sundae_ns.pruning.scores import response, score
-from sundae_ns.pruning.selection import neighbor_order, select_band, select_sampled, select_systematic, select_top
+from sundae_ns.pruning.scores import score
+from sundae_ns.pruning.selection import neighbor_order, select_band, select_systematic
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,14 +110,15 @@ def decide(
         graph = None
     elif graph is None:
         graph = field_graph(usable, rule)
-    magnitude = response(usable, rule, graph) if rule.uses_response else None
-    scores, labels = score(usable, rule, magnitude, contribution), None
+    scores, labels = score(usable, rule, graph, contribution), None
     if rule.selection == "pairs":
         assert graph is not None
         labels = pair_labels(usable, graph, scores, count)
         selected = labels == torch.arange(n_finite, device=labels.device)
+    elif rule.selection == "band":
+        selected = select_band(scores, count, rule.gamma)
     else:
-        selected = _select(scores, rule, count, usable["means"])
+        selected = select_systematic(scores, count, neighbor_order(usable["means"]), rule.seed)
     mask = finite.clone()
     mask[finite] = selected.to(mask.device)
     values = dict(usable.rows(selected.to(finite.device))) if mended.clamped else None
@@ -136,15 +140,6 @@ def decide(
     )
 
 
-def _select(values: Tensor, rule: PruneRule, count: int, points: Tensor) -> Tensor:
-    if rule.selection == "systematic":
-        return select_systematic(values, count, neighbor_order(points), rule.seed)
-    # Equal scores have no ends to take from.
-    if rule.selection == "sampled" or rule.score == "random":
-        return select_sampled(values, count, rule.seed)
-    return select_band(values, count, rule.gamma) if rule.selection == "band" else select_top(values, count)
-
-
 def diverged(n: int) -> DataError:
     """The error for a field of ``n`` primitives without a finite one."""
     if n == 0:
@@ -153,3 +148,75 @@ def diverged(n: int) -> DataError:
             "background; check the images, their masks and --pipeline.model.background-color"
         )
     return DataError(f"none of {n} primitives is finite: the training has diverged, go back to an earlier checkpoint")
+
+
+@dataclass(eq=False)
+class FieldPruner:
+    """Prunes a field in place, with its optimizers and running states."""
+
+    params: MutableMapping[str, Parameter]
+    """The field, name to parameter ``[N, ...]``; its parameters are replaced."""
+    optimizers: Mapping[str, Optimizer]
+    """By parameter name, one parameter each; others are left alone."""
+    states: Sequence[MutableMapping[str, Any]] = ()
+    """Running states on the same primitives; their tensors of N rows are sliced along."""
+
+    @property
+    def total(self) -> int:
+        """Number of primitives."""
+        return num_primitives(self.params)
+
+    def drop_nonfinite(self) -> int:
+        """Remove the primitives with a NaN, or an infinite parameter without a meaning; clamp the others (``mend``).
+
+        Call it before the contribution, which renders the field: one NaN spreads over the image.
+
+        Returns:
+            Number of removed primitives.
+
+        Raises:
+            DataError: no primitive is finite; the field is unchanged.
+        """
+        mended = mend(self.params)
+        if not mended.field.num_primitives:
+            raise diverged(mended.dropped)
+        if mended.dropped:
+            keep(self.params, self.optimizers, self.states, mended.mask)
+        if mended.clamped:
+            rewrite(self.params, self.optimizers, mended.field)
+        return mended.dropped
+
+    def drop(self, mask: Tensor, *, at_most: float) -> int:
+        """Remove the primitives under a mask, unless they are too many.
+
+        Args:
+            mask: bool ``[N]``.
+            at_most: largest share of the field that is removed, below 1.
+
+        Returns:
+            Number of removed primitives.
+        """
+        count = int(mask.sum())
+        if not 0 < count <= at_most * self.total:
+            return 0
+        keep(self.params, self.optimizers, self.states, ~mask)
+        return count
+
+    @torch.no_grad()
+    def cut(self, rule: PruneRule, count: int, contribution: Tensor | None = None) -> Decision:
+        """Decide, remove and merge; see :func:`sundae_ns.pruning.decide` for arguments and errors."""
+        decision = decide(self.params, rule, count, contribution)
+        keep(self.params, self.optimizers, self.states, decision.mask)
+        if decision.values is not None:
+            rewrite(self.params, self.optimizers, decision.values)
+        return decision
+
+    def add(self, count: int, least_opacity: float) -> None:
+        """Add ``count`` primitives on top of others, which share their opacity, so that no image changes.
+
+        Per-primitive statistics are dropped: call it once densification has ended.
+        """
+        n = num_primitives(self.params)
+        grow(self.params, self.optimizers, count, least_opacity)
+        for state in self.states:
+            state.update(dict.fromkeys(name for name, value in state.items() if per_primitive(value, n)))

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
+from torch import Tensor
+
 from sundae_ns.errors import ConfigError
-from sundae_ns.graphs.neighbors import MOST_EXTENT
+
+ScoreName = Literal["detail-contribution", "response"]
 
 
 @dataclass
@@ -14,20 +18,16 @@ class PruneRule:
     """How a prune ranks, selects and merges primitives.
 
     The defaults are those of ``sundae``: systematic draws in proportion to the contribution to pixels with detail, and
-    each dropped primitive merged into a kept one. The paper's rule is ``selection="band", score="response",
-    signal="positions", edges="centres", redistribution="none"``.
+    each dropped primitive merged into a kept one. :func:`band_rule` is the paper's.
     """
 
-    selection: Literal["sampled", "systematic", "pairs", "band", "top"] = "systematic"
-    """How scores select primitives: one draw in each stretch of space (systematic), independent draws (sampled), one
-    for each group of the pairs that differ least (pairs), the highest scores (top), or both ends of the ranking as in
-    the paper (band)."""
-    score: Literal["response-contribution", "detail-contribution", "response", "contribution", "opacity", "random"] = (
-        "detail-contribution"
-    )
-    """Importance of a primitive: its blending weight over the training views (contribution), the same with pixels
-    weighted by the detail that the kept primitives cannot show (detail-contribution), its high-pass response, alone or
-    times the contribution, its opacity, or the same for all (random)."""
+    selection: Literal["systematic", "pairs", "band"] = "systematic"
+    """How scores select primitives: one draw in each stretch of space (systematic), one for each group of the pairs
+    that differ least (pairs), or both ends of the ranking as in the paper (band)."""
+    score: ScoreName | Callable[[Mapping[str, Tensor]], Tensor] = "detail-contribution"
+    """Importance of a primitive: its blending weight over the training views, with pixels weighted by the detail that
+    the kept primitives cannot show (detail-contribution), or its high-pass response (response). Any other score is a
+    function of the parameters of N finite primitives that returns numbers ``[N]``, not negative."""
     signal: Literal["attributes", "positions"] = "attributes"
     """Signal of the response: position, colour, opacity and size (attributes), or positions alone as in the paper."""
     edges: Literal["centres", "appearance"] = "appearance"
@@ -39,46 +39,33 @@ class PruneRule:
     """Share of the kept primitives that the band selection takes from the high end, in [0, 1]."""
     num_neighbors: int = 16
     """Most neighbours of a primitive in the graph."""
-    graph_device: Literal["cpu", "field"] = "field"
-    """Where the graph is built and filtered: on the device of the field, or on the CPU."""
-    bandwidth: Literal["robust", "literal"] = "robust"
-    """Rule for the reach and the width of edges; the paper's literal rule gives an empty graph on most fields."""
-    tau: float | None = None
-    """Squared distance below which primitives are neighbours, in squared scene units; replaces the rule's."""
-    sigma: float | None = None
-    """Width of the edge weights in scene units; replaces the rule's."""
     seed: int = 0
     """Seed of random draws, which are the same on every device."""
 
     @property
     def uses_contribution(self) -> bool:
         """Whether score or merge need the blending weights over the training views."""
-        return self.score.endswith("contribution") or self.redistribution == "merge"
+        return self.uses_detail or self.redistribution == "merge"
 
     @property
     def uses_graph(self) -> bool:
         """Whether score, selection or merge need the neighbour graph."""
-        return self.uses_response or self.redistribution == "merge" or self.selection == "pairs"
-
-    @property
-    def refits(self) -> bool:
-        """Whether :func:`sundae_ns.prune` fits what is left to the images of the views; training does so by itself."""
-        return self.selection == "pairs" and self.redistribution == "merge"
+        return self.score == "response" or self.redistribution == "merge" or self.selection == "pairs"
 
     @property
     def uses_edge_weights(self) -> bool:
         """Whether score or merge need the weights of the graph's edges; pairs need only its neighbours."""
-        return self.uses_response or self.selection != "pairs"
-
-    @property
-    def uses_response(self) -> bool:
-        """Whether the score needs the high-pass response."""
-        return self.score.startswith("response")
+        return self.score == "response" or self.selection != "pairs"
 
     @property
     def uses_detail(self) -> bool:
         """Whether the contribution weights pixels by the detail that the kept primitives cannot show."""
         return self.score == "detail-contribution"
+
+    @property
+    def refits(self) -> bool:
+        """Whether :func:`sundae_ns.prune` fits what is left to the images of the views; training does so by itself."""
+        return self.selection == "pairs" and self.redistribution == "merge"
 
     def validate(self) -> None:
         """Check every option.
@@ -86,20 +73,14 @@ class PruneRule:
         Raises:
             ConfigError: names the first invalid option and its valid values.
         """
-        for name, kind in get_type_hints(type(self)).items():
-            value, choices = getattr(self, name), get_args(kind) if get_origin(kind) is Literal else ()
-            if choices and value not in choices:
+        for name, hint in get_type_hints(type(self)).items():
+            value, kinds = getattr(self, name), (hint, *get_args(hint))
+            choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+            if choices and value not in choices and not callable(value):
                 raise ConfigError(f"{name} is {value!r}: use one of {', '.join(choices)}")
         if not 0 <= self.gamma <= 1:
             raise ConfigError(f"gamma is {self.gamma}: use a share in [0, 1]")
         self.check_at_least(num_neighbors=1)
-        for name in ("tau", "sigma"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ConfigError(f"{name} is {value}: use a positive number, or leave it out for the bandwidth rule")
-        # An infinite tau joins all listed neighbours; the reach of a width must fit into float64.
-        if self.sigma is not None and self.sigma > MOST_EXTENT:
-            raise ConfigError(f"sigma is {self.sigma}: use a width of at most {MOST_EXTENT:g} scene units")
 
     def check_at_least(self, **limits: int) -> None:
         """Raise ``ConfigError`` for the first option, by name, that is set and lower than its limit."""
@@ -112,6 +93,24 @@ class PruneRule:
 def band_rule(rule: PruneRule, gamma: float) -> PruneRule:
     """The paper's rule: both ends of the response, a share ``gamma`` of the high end, and no merge.
 
-    Signal, number of neighbours and bandwidth are those of ``rule``.
+    Signal and number of neighbours are those of ``rule``; the paper's signal is positions.
     """
     return replace(rule, score="response", selection="band", gamma=gamma, edges="centres", redistribution="none")
+
+
+def check_share(share: float) -> None:
+    """Raise ``ConfigError`` for a share to keep that is not in (0, 1]."""
+    if not 0 < share <= 1:
+        raise ConfigError(f"keep_ratio is {share}: use a share in (0, 1], 0.1 to keep a tenth")
+
+
+def kept_count(share: float, n: int) -> int:
+    """Number of ``n`` primitives that a prune to a share keeps: ``round(share * n)``, at least 1.
+
+    The one place that turns a share into a count.
+
+    Raises:
+        ConfigError: the share is not in (0, 1].
+    """
+    check_share(share)
+    return max(1, round(share * n))

@@ -1,4 +1,4 @@
-"""Graph signals, their response, and scores: the importance of each primitive as one non-negative number."""
+"""Scores: what a primitive contributes to the detail of images, or the response of a graph filter to its attributes."""
 
 from __future__ import annotations
 
@@ -6,13 +6,44 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.filters import high_pass, response_magnitude
-from sundae_ns.gaussians.parameters import num_primitives, sh_to_rgb
+from sundae_ns.gaussians.field import as_field
+from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning.edges import field_graph, graph_inputs
+from sundae_ns.pruning.merge import field_graph
 from sundae_ns.pruning.rule import PruneRule
+
+
+@torch.no_grad()
+def score(
+    params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph | None, contribution: Tensor | None
+) -> Tensor:
+    """Score of each primitive by the rule, float64 ``[N]``.
+
+    The response enters as the norm ``|f_i| = sqrt(pi_i)``. Its ranking is that of ``pi_i``, and sampling in proportion
+    to the norm gives the least expected error (Chen et al., "Fast Resampling of Three-Dimensional Point Clouds via
+    Graphs", 2018). Without neighbours it is NaN, which every selection ranks last.
+
+    Args:
+        params: the field, all finite, N primitives.
+        graph: graph of the field, for the response; built if not given.
+        contribution: blending weights ``[N]``, for the score of that name.
+
+    Raises:
+        ConfigError: the score needs a contribution that is not given.
+    """
+    if callable(rule.score):
+        return rule.score(params).double()
+    if rule.score == "response":
+        return response(params, rule, graph).sqrt()
+    if contribution is None:
+        raise ConfigError(
+            f"score {rule.score!r} needs a pass over the training views and there are none: use response, or a function"
+        )
+    return torch.nan_to_num(contribution.double(), nan=0.0)
 
 
 @torch.no_grad()
@@ -30,55 +61,8 @@ def response(params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph
         DataError: only one primitive, or positions that are not finite.
     """
     graph = field_graph(params, rule) if graph is None else graph
-    inputs = graph_inputs(params, rule)
-    signal = attribute_signal(inputs) if rule.signal == "attributes" else inputs["means"].detach()
-    return response_magnitude(high_pass(graph, signal)).to(params["means"].device)
-
-
-@torch.no_grad()
-def score(
-    params: Mapping[str, Tensor], rule: PruneRule, magnitude: Tensor | None, contribution: Tensor | None
-) -> Tensor:
-    """Score of each primitive by the rule, float64 ``[N]``.
-
-    The response enters as the norm ``|f_i| = sqrt(pi_i)``. Its ranking is that of ``pi_i``, and sampling in proportion
-    to the norm gives the least expected error (Chen et al., "Fast Resampling of Three-Dimensional Point Clouds via
-    Graphs", 2018).
-
-    A primitive without neighbours has no response. Its ``response`` score is NaN, which every selection ranks last. For
-    ``response-contribution`` it gets the median response, so that its contribution decides: a large patch of sky stays
-    and a faint floater does not.
-
-    Args:
-        params: the field, all finite, N primitives.
-        magnitude: result of :func:`response` on the same field; needed by scores with a response.
-        contribution: blending weights ``[N]``; needed by scores with a contribution.
-
-    Raises:
-        ConfigError: the score needs a contribution that is not given.
-    """
-    n = num_primitives(params)
-    if rule.score == "opacity":
-        return torch.sigmoid(params["opacities"].detach().double()).reshape(n)
-    if rule.score == "random":
-        return torch.ones(n, dtype=torch.float64, device=params["means"].device)
-    if rule.score == "response":
-        assert magnitude is not None
-        return magnitude.double().sqrt()
-    if contribution is None:
-        raise ConfigError(
-            f"score {rule.score!r} needs a pass over the training views and there are none: "
-            "use response, opacity or random"
-        )
-    weights = torch.nan_to_num(contribution.double(), nan=0.0)
-    if not rule.uses_response:
-        return weights
-    assert magnitude is not None
-    norm = magnitude.double().sqrt()
-    known = norm[~norm.isnan()]
-    # On a graph without edges no response is known: one value for all leaves the choice to the contribution.
-    filling = known.median() if known.numel() else norm.new_tensor(1.0)
-    return weights * torch.where(norm.isnan(), filling, norm)
+    signal = attribute_signal(params) if rule.signal == "attributes" else params["means"].detach()
+    return response_magnitude(high_pass(graph, signal))
 
 
 def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
@@ -87,6 +71,7 @@ def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
     Each group is divided by its own spread, so that no group dominates the response. The channels of a group share one
     spread: in a flat field, the flat axis must not be scaled up to the others.
     """
+    params = as_field(params).as_harmonics()
     groups = (
         params["means"],
         sh_to_rgb(params["features_dc"]),
@@ -108,3 +93,39 @@ def _standardise(values: Tensor) -> Tensor:
     if spread == 0:
         spread = norms.mean()
     return centred / spread if spread > 0 else torch.zeros_like(centred)
+
+
+@torch.no_grad()
+def pixel_detail(image: Tensor, cells: float) -> Tensor:
+    """Local deviation of an image from its mean over a cell, as weights of the pixels.
+
+    A primitive covers a cell of about ``H W / cells`` pixels, and the deviation within a window of that size is the
+    detail that it cannot show. The squared error of n cells is least if their density is proportional to the gradient
+    (minimise ``int |grad f|^2 / density``), and in a smooth image the deviation is proportional to the gradient.
+
+    Args:
+        image: colours in [0, 1], any device ``[H, W, C]``.
+        cells: number of cells, positive.
+
+    Returns:
+        Weights of the pixels, positive with mean 1 ``[H, W]``; all 1 for a flat image.
+    """
+    height, width = image.shape[:2]
+    side = round((height * width / max(cells, 1.0)) ** 0.5)
+    # An odd window of at least 3 pixels; its half is the padding, and must not exceed the image.
+    half = max(1, min(side, height, width) // 2)
+    planes = image.detach().permute(2, 0, 1).nan_to_num()[None].double()
+
+    def local_mean(values: Tensor) -> Tensor:
+        # Rows, then columns: a square window of many pixels would take long.
+        for window, padding in (((2 * half + 1, 1), (half, 0)), ((1, 2 * half + 1), (0, half))):
+            values = avg_pool2d(values, window, stride=1, padding=padding, count_include_pad=False)
+        return values
+
+    variance = (local_mean(planes.square()) - local_mean(planes).square()).clamp_min(0).sum(dim=1)[0]
+    mean = variance.mean()
+    if not mean > 0:
+        return torch.ones_like(variance).to(image.dtype)
+    # A flat pixel has a weight too, a quarter of the root mean square: flat areas need some primitives.
+    weights = (variance + 0.25**2 * mean).sqrt()
+    return (weights / weights.mean()).to(image.dtype)

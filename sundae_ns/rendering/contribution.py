@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.pruning.detail import pixel_detail
+from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterization import blending_weights
 from sundae_ns.rendering.render import RenderSettings, draw, pass_options
 from sundae_ns.rendering.source import LocalField, TrainingView
@@ -37,7 +37,7 @@ def contribution(
         background: colour ``[3]``; fixed, so that the result does not depend on a random one.
         settings: how images are made.
         count: number of primitives that a prune will keep. If given, pixels are weighted by the detail that these
-            cannot show (:func:`sundae_ns.pruning.detail.pixel_detail`).
+            cannot show (:func:`sundae_ns.pruning.scores.pixel_detail`).
         console: shows a progress bar; None for none.
 
     Raises:

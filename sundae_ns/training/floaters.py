@@ -9,7 +9,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sundae_ns.pruning.cutting import FieldPruner
+from sundae_ns.pruning.decision import FieldPruner
 from sundae_ns.pruning.floaters import MOST, near_cameras
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState

@@ -12,7 +12,6 @@ from torch import Tensor
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.gaussians.parameters import rgb_to_logit, sh_to_rgb
-from sundae_ns.pruning import select_random
 from sundae_ns.storage.coordinates import similarity
 from sundae_ns.storage.formats import kind_of, read_field
 from sundae_ns.training.options import ModelOptions
@@ -97,7 +96,7 @@ def _sparse_field(
         xyz, rgb = random_points(options.num_random, options.random_scale)
     if cap is not None and len(xyz) > cap:
         warnings.append(f"{len(xyz):,} points are more than the cap; starting from {cap:,} of them")
-        chosen = select_random(len(xyz), cap, options.pruning.seed, xyz.device)
+        chosen = torch.randperm(len(xyz), generator=torch.Generator().manual_seed(options.pruning.seed))[:cap]
         xyz, rgb = xyz[chosen], rgb[chosen]
     params = from_points(xyz, rgb, sh_degree=options.sh_degree, num_features=num_features)
     return params, Start(tuple(warnings))

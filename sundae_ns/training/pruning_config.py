@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.pruning.rule import PruneRule
-from sundae_ns.pruning.selection import check_share
+from sundae_ns.pruning.rule import PruneRule, ScoreName, check_share
 
 USUAL_SHARE = 0.1
 """Share that a prune keeps unless it is told otherwise; also where trials cannot decide."""
@@ -21,6 +20,9 @@ class PruningConfig(PruneRule):
     :class:`sundae_ns.pruning.PruneRule` alone.
     """
 
+    score: ScoreName = "detail-contribution"
+    """Importance of a primitive: its blending weight over the training views, with pixels weighted by the detail that
+    the kept primitives cannot show (detail-contribution), or its high-pass response (response)."""
     mode: Literal["one-shot", "continuous", "off"] = "one-shot"
     """Prune once (one-shot, the paper's main strategy), periodically during densification for less peak memory
     (continuous), or never (off)."""
@@ -82,8 +84,6 @@ class PruningConfig(PruneRule):
         Raises:
             ConfigError: names the first invalid option and its valid values.
         """
-        if self.mode == "auto":  # type: ignore[comparison-overlap]
-            raise ConfigError("mode auto has gone: one-shot without keep_ratio lets trials decide; use that")
         super().validate()
         if self.keep_ratio is not None:
             check_share(self.keep_ratio)

@@ -1,6 +1,6 @@
 """Pruning schedules: when a field is pruned, and to how many primitives.
 
-A schedule decides, a :class:`sundae_ns.pruning.cutting.FieldPruner` prunes. The running state is a dict of integers,
+A schedule decides, a :class:`sundae_ns.pruning.decision.FieldPruner` prunes. The running state is a dict of integers,
 which checkpoints carry: a resumed run neither prunes twice nor forgets its peak.
 """
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sundae_ns.evaluation.timing import now
 from sundae_ns.pruning import PruneRule, kept_count
-from sundae_ns.pruning.cutting import FieldPruner
+from sundae_ns.pruning.decision import FieldPruner
 from sundae_ns.training.pruning_config import USUAL_SHARE, PruningConfig
 from sundae_ns.training.report import PruneReport
 

@@ -17,7 +17,7 @@ from sundae_ns.api.pruning import count_for_drop, refit
 from sundae_ns.gaussians import covariance
 from sundae_ns.gaussians.field import Encoding, Field
 from sundae_ns.gaussians.parameters import sh_to_rgb
-from sundae_ns.pruning import prune_field, redistribution
+from sundae_ns.pruning import merge, prune_field
 
 N = 1500
 
@@ -184,7 +184,7 @@ class Doubles(TorchDispatchMode):
 
 def test_values_between_are_computed_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of twenty million primitives, each number of an edge in float64 takes 2.6 GB."""
-    for part, name, size in ((covariance, "ROWS", 64), (redistribution, "ROWS", 64), (covariance, "PAIRS", 1024)):
+    for part, name, size in ((covariance, "ROWS", 64), (merge, "ROWS", 64), (covariance, "PAIRS", 1024)):
         monkeypatch.setattr(part, name, size)
     weights = torch.rand(N, generator=torch.Generator().manual_seed(0))
     with Doubles() as found:

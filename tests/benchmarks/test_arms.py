@@ -12,8 +12,7 @@ from harness.plan import Arm, Job, plan_scene
 from sundae_ns.errors import ConfigError
 
 DEFAULTS = [
-    *("sundae", "sundae-with-head", "band", "contribution", "random"),
-    *("sundae-no-head", "sundae-no-head-bytes", "band-no-head", "contribution-no-head", "random-no-head"),
+    *("sundae", "sundae-with-head", "band", "sundae-no-head", "sundae-no-head-bytes", "band-no-head"),
     *("sundae-fast", "sundae-auto", "splatfacto", "splatfacto-7k"),
 ]
 MINE = """
@@ -24,7 +23,7 @@ MINE = """
     pipeline.model.head.mode: off
 - name: listed
   options:
-    pipeline.model.pruning.score: contribution
+    pipeline.model.pruning.score: response
     --pipeline.model.use_scale_regularization: true
 - name: stock
   method: splatfacto
@@ -65,7 +64,7 @@ def test_a_file_of_arms(tmp_path: Path) -> None:
         "listed",
         None,
         {
-            "pipeline.model.pruning.score": ("contribution",),
+            "pipeline.model.pruning.score": ("response",),
             "pipeline.model.use-scale-regularization": ("True",),
         },
     )
@@ -115,15 +114,15 @@ def test_the_default_arms_are_a_file_like_any_other() -> None:
     arms = choose_arms([], "sundae")
     assert [arm.name for arm in arms] == DEFAULTS
     assert {arm.method for arm in arms} == {"sundae", "sundae-fast", "sundae-auto", "splatfacto"}
-    tiny = choose_arms(["random"], "sundae-tiny")
-    assert [(arm.name, arm.kind, arm.method) for arm in tiny] == [("random", "branch", "sundae-tiny")]
+    tiny = choose_arms(["band"], "sundae-tiny")
+    assert [(arm.name, arm.kind, arm.method) for arm in tiny] == [("band", "branch", "sundae-tiny")]
 
 
 def test_default_arms_and_those_of_a_file_together(tmp_path: Path) -> None:
     path = str(written(tmp_path, "- name: stock\n  method: splatfacto"))
-    assert [arm.name for arm in choose_arms(["random", path], "sundae")] == ["random", "stock"]
-    with pytest.raises(ConfigError, match="--arms has random twice; give each once"):
-        choose_arms(["random", "random"], "sundae")
+    assert [arm.name for arm in choose_arms(["band", path], "sundae")] == ["band", "stock"]
+    with pytest.raises(ConfigError, match="--arms has band twice; give each once"):
+        choose_arms(["band", "band"], "sundae")
     with pytest.raises(
         ConfigError, match=r"best is no arm; use some of sundae, .*, band, .*, or a file of arms \(.yaml\)"
     ):
@@ -136,13 +135,13 @@ def test_default_arms_and_those_of_a_file_together(tmp_path: Path) -> None:
         ("- {name: a, method: splatfact}", "arm a: ns-train has no method 'splatfact'; use splatfacto"),
         ("- {name: a, method: nerfacto}", "arm a: nerfacto has no Gaussians; use splatfacto or a method of"),
         (
-            "- {name: a, options: {pipeline.model.prunning.score: random}}",
-            "arm a: Unrecognized options: .*prunning.score, random; did you mean pipeline.model.pruning.score",
+            "- {name: a, options: {pipeline.model.prunning.score: response}}",
+            "arm a: Unrecognized options: .*prunning.score, response; did you mean pipeline.model.pruning.score",
         ),
         ("- {name: a, options: {pipeline.model.head: off}}", "options: --pipeline.model.head, off; did you"),
         (
-            "- {name: a, method: splatfacto, options: {pipeline.model.pruning.score: random}}",
-            "Unrecognized options: .*pruning.score, random; `ns-train splatfacto --help` lists its options",
+            "- {name: a, method: splatfacto, options: {pipeline.model.pruning.score: response}}",
+            "Unrecognized options: .*pruning.score, response; `ns-train splatfacto --help` lists its options",
         ),
         ("- {name: a, options: {pipeline.model.pruning.score: best}}", "arm a: invalid choice 'best' for argument"),
         (

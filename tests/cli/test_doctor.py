@@ -34,7 +34,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     """A CUDA device that only torch's answers simulate."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Imaginary 9000")
-    monkeypatch.setattr("sundae_ns.gpu.nvrtc.Kernel", lambda *_: None)
+    monkeypatch.setattr("sundae_ns.graphs.neighbors.Kernel", lambda *_: None)
     monkeypatch.setattr("sundae_ns.compensation.fused.head_kernels", lambda *_: {})
     monkeypatch.setattr("sundae_ns.gpu.fused_loss.loss_kernels", lambda *_: None)
 
@@ -99,7 +99,7 @@ def test_own_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
         raise BackendError("a CUDA kernel does not run (too old): update the driver")
 
     places = (
-        "sundae_ns.gpu.nvrtc.Kernel",
+        "sundae_ns.graphs.neighbors.Kernel",
         "sundae_ns.compensation.fused.head_kernels",
         "sundae_ns.gpu.fused_loss.loss_kernels",
     )

@@ -1,4 +1,4 @@
-"""Hard point sets for neighbour searches, and their neighbours by brute force."""
+"""Hard point sets for neighbour searches."""
 
 from __future__ import annotations
 
@@ -80,17 +80,3 @@ CLOUDS: dict[str, Cloud] = {
 def cloud(request: pytest.FixtureRequest) -> Cloud:
     """One distribution: maps a number N to its first N points, float64 ``[N, 3]``."""
     return CLOUDS[request.param]
-
-
-@pytest.fixture
-def truth() -> Callable[[Tensor, int], tuple[Tensor, Tensor]]:
-    """All pairs, ordered by squared distance in float64 and then by index: indices and distances ``[N, k]``."""
-
-    def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        x, y, z = (points.double()[:, None] - points.double()[None]).unbind(2)
-        squared = (x * x + y * y + z * z).fill_diagonal_(torch.inf)
-        ordered = squared.sort(dim=1, stable=True)
-        # numpy's root is correctly rounded; torch's need not be.
-        return ordered.indices[:, :k], torch.from_numpy(np.sqrt(ordered.values[:, :k].numpy())).to(points.dtype)
-
-    return nearest

@@ -1,110 +1,94 @@
-"""Neighbour search against brute force: clones, offsets, floaters, too few points."""
+"""Neighbour search against all pairs, on the CPU and by the kernel compiled for the CPU: clones, floaters, ties."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import ctypes
+import tracemalloc
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch import Tensor
 
 from sundae_ns.errors import BackendError, ConfigError, DataError
-from sundae_ns.graphs import host_search, knn, neighbors
-from sundae_ns.graphs.traversal import MAX_NEIGHBORS
+from sundae_ns.gpu import nvrtc
+from sundae_ns.gpu.nvrtc import Argument, Launch
+from sundae_ns.graphs import knn, neighbors
+from sundae_ns.graphs.neighbors import FILE, KERNEL, LEAF, MAX_NEIGHBORS, build_tree, kernel_options, search_tree
 
 
-def brute_force(points: torch.Tensor) -> torch.Tensor:
-    distances = (points.double()[:, None] - points.double()[None]).norm(dim=-1)
-    return distances.fill_diagonal_(torch.inf).sort(dim=1).values
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_knn_matches_brute_force(dtype: torch.dtype) -> None:
-    points = torch.randn(200, 3, generator=torch.Generator().manual_seed(0), dtype=dtype)
-    found = knn(points, 7)
-    assert found.indices.shape == found.distances.shape == (200, 7)
-    assert found.indices.dtype == torch.int64
-    assert found.distances.dtype == dtype
-    torch.testing.assert_close(found.distances, brute_force(points)[:, :7].to(dtype))
-    torch.testing.assert_close((points[:, None] - points[found.indices]).norm(dim=-1), found.distances)
-
-
-@given(st.lists(st.integers(0, 2), min_size=2, max_size=40), st.integers(1, 10))
-def test_knn_never_returns_self_or_duplicates(cells: list[int], k: int) -> None:
-    points = torch.tensor(cells, dtype=torch.float32)[:, None].expand(-1, 3)
-    k = min(k, len(cells) - 1)
-    found = knn(points, k)
-    assert not (found.indices == torch.arange(len(cells))[:, None]).any()
-    assert all(len(set(row)) == k for row in found.indices.tolist())
-    torch.testing.assert_close(found.distances, brute_force(points)[:, :k].float())
-
-
-def test_knn_survives_thousands_of_coincident_points() -> None:
-    points = torch.cat([torch.zeros(3000, 3), torch.ones(5, 3)])
-    found = knn(points, 8)
-    assert not (found.indices == torch.arange(3005)[:, None]).any()
-    assert (found.distances[:3000] == 0).all()
-    assert (found.distances[3000:, :4] == 0).all()
-    assert (found.distances[3000:, 4:] > 1.7).all()
-
-
-def test_one_far_floater_costs_the_others_no_precision() -> None:
-    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
-    alone = knn(points, 3)
-    with_floater = knn(torch.cat([points, torch.full((1, 3), 1e20)]), 3)
-    assert torch.equal(with_floater.indices[:50], alone.indices)
-    assert torch.equal(with_floater.distances[:50], alone.distances)
-
-
-@pytest.mark.parametrize(("n", "k"), [(0, 1), (1, 1), (5, 5), (5, 9)])
-def test_too_few_points_are_refused_with_the_count_that_works(n: int, k: int) -> None:
-    with pytest.raises(DataError, match=rf"{n} primitives cannot have {k} neighbours.*at most {max(n - 1, 0)}"):
-        knn(torch.zeros(n, 3), k)
-
-
-def test_wrong_input_is_refused() -> None:
-    with pytest.raises(ConfigError, match="at least 1"):
-        knn(torch.zeros(5, 3), 0)
-    with pytest.raises(DataError, match=r"\[5, 2\]"):
-        knn(torch.zeros(5, 2), 1)
-    with pytest.raises(DataError, match="2 of 5 positions are NaN"):
-        knn(torch.tensor([0.0, torch.nan, 1.0, torch.inf, 2.0])[:, None].expand(-1, 3), 1)
+def check(points: Tensor, indices: Tensor, distances: Tensor) -> None:
+    """Other points, each once, at the distances of the nearest ones, ascending; of one place the lowest indices."""
+    n, k = indices.shape
+    x, y, z = (points.double()[:, None] - points.double()[None]).unbind(2)
+    squared = (x * x + y * y + z * z).fill_diagonal_(torch.inf)
+    ordered = squared.sort(dim=1, stable=True)
+    expected = ordered.values[:, :k].sqrt().to(points.dtype)
+    torch.testing.assert_close(distances, expected, rtol=1e-6, atol=0)
+    assert (distances.diff(dim=1) >= 0).all()
+    assert (indices != torch.arange(n)[:, None]).all()
+    assert (indices.sort(dim=1).values.diff(dim=1) > 0).all()
+    torch.testing.assert_close(squared.gather(1, indices).sqrt().to(points.dtype), expected, rtol=1e-6, atol=0)
+    clones = ordered.values[:, :k] == 0
+    assert torch.equal(indices[clones], ordered.indices[:, :k][clones])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("n", "k"), [(700, 16), (130, 3), (40, 39), (2, 1)])
-def test_neighbours_are_ordered_by_distance_and_then_by_index(
-    cloud: Callable, truth: Callable, dtype: torch.dtype, n: int, k: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_hard_cloud(cloud: Callable, dtype: torch.dtype, n: int, k: int, monkeypatch: pytest.MonkeyPatch) -> None:
     points = cloud(n).to(dtype)
-    expected, expected_distances = truth(points, k)
-    for elements in (host_search.CHUNK_ELEMENTS, 100):
-        monkeypatch.setattr(host_search, "CHUNK_ELEMENTS", elements)
+    for chunk in (neighbors.CHUNK, 10):
+        monkeypatch.setattr(neighbors, "CHUNK", chunk)
         found = knn(points, k)
-        assert torch.equal(found.indices, expected)
-        assert torch.equal(found.distances, expected_distances)
+        assert found.indices.dtype == torch.int64
+        check(points, *found)
 
 
-@pytest.mark.parametrize("copies", [1, 3])
-@pytest.mark.parametrize("alike", [2, 50])
-def test_two_positions_of_one_hash_stay_apart(
-    monkeypatch: pytest.MonkeyPatch, truth: Callable, copies: int, alike: int
-) -> None:
-    points = torch.randn(50, 3).repeat(copies, 1)
-    hashed = host_search._hash
-    shared = np.sort(hashed(points.double().numpy().view(np.uint64)))[::copies][:alike]
-    # These look like clones until they are compared, also without a copy.
-    monkeypatch.setattr(host_search, "_hash", lambda bits: np.where(np.isin(h := hashed(bits), shared), 0, h))
-    assert torch.equal(knn(points, 6).indices, truth(points, 6)[0])
+@given(st.lists(st.integers(0, 2), min_size=2, max_size=40), st.integers(1, 10))
+def test_any_clones(cells: list[int], k: int) -> None:
+    points = torch.tensor(cells, dtype=torch.float32)[:, None].expand(-1, 3)
+    check(points, *knn(points, min(k, len(cells) - 1)))
 
 
-def test_positions_whose_squares_overflow_are_refused() -> None:
-    points = torch.zeros(5, 3, dtype=torch.float64)
-    points[0, 0] = 1e200
-    with pytest.raises(DataError, match="1e.150"):
-        knn(points, 2)
+@pytest.mark.parametrize("reach", [1e18, 1e20, 1e30, 1e38])
+def test_one_far_floater_costs_the_others_no_precision(reach: float) -> None:
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    alone, found = knn(points, 3), knn(torch.cat([points, torch.full((1, 3), reach)]), 3)
+    assert torch.equal(found.indices[:50], alone.indices)
+    assert torch.equal(found.distances[:50], alone.distances)
+
+
+@pytest.mark.parametrize("place", [torch.zeros, torch.rand])
+def test_memory_and_time_grow_with_points_also_of_clones(place: Callable) -> None:
+    def peak(n: int) -> int:
+        points = place(n, 3)
+        tracemalloc.start()
+        try:
+            assert knn(points, 16).indices.shape == (n, 16)
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    assert peak(80_000) < 6 * peak(20_000)
+
+
+@pytest.mark.parametrize(
+    ("points", "k", "error", "words"),
+    [
+        *((torch.zeros(n, 3), k, DataError, f"{n} primitives cannot have {k} .*at most {max(n - 1, 0)}")
+          for n, k in ((0, 1), (1, 1), (5, 5), (5, 9))),
+        (torch.zeros(5, 3), 0, ConfigError, "at least 1"),
+        (torch.zeros(5, 2), 1, DataError, r"\[5, 2\]"),
+        (torch.tensor([[0.0] * 3, [torch.nan] * 3, [torch.inf] * 3]), 1, DataError, "2 of 3 positions are NaN"),
+        (torch.full((5, 3), 1e200, dtype=torch.float64), 2, DataError, "1e.150"),
+    ],
+)  # fmt: skip
+def test_wrong_input_is_refused(points: Tensor, k: int, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        knn(points, k)
 
 
 def test_without_a_kernel_the_cpu_searches_and_logs_one_line(
@@ -118,15 +102,108 @@ def test_without_a_kernel_the_cpu_searches_and_logs_one_line(
     device = torch.device("cuda", 0)
     with caplog.at_level("WARNING"):
         assert [neighbors._kernel(device, torch.float32, 16) for _ in range(3)] == [None] * 3
-    assert [record.getMessage().count("\n") for record in caplog.records] == [0]
-    assert "search runs on the CPU" in caplog.text
-    assert "no compiler on board" in caplog.text
+        assert neighbors._kernel(device, torch.float32, MAX_NEIGHBORS + 1) is None
+    first, second = (record.getMessage() for record in caplog.records)
+    assert "search runs on the CPU" in first
+    assert "no compiler on board" in first
+    assert f"at most {MAX_NEIGHBORS} neighbours, not {MAX_NEIGHBORS + 1}" in second
     neighbors._kernel.cache_clear()
 
 
-def test_more_neighbours_than_the_kernel_supports_are_searched_on_the_cpu(caplog: pytest.LogCaptureFixture) -> None:
-    neighbors._kernel.cache_clear()
-    with caplog.at_level("WARNING"):
-        assert neighbors._kernel(torch.device("cuda", 0), torch.float32, MAX_NEIGHBORS + 1) is None
-    assert f"at most {MAX_NEIGHBORS} neighbours, not {MAX_NEIGHBORS + 1}" in caplog.text
-    neighbors._kernel.cache_clear()
+# ----------------------------------------------------------------------------------------------------------- the kernel
+
+
+# The kernel's source with a counter of visited points, and a loop over the threads.
+SHIM = """
+extern "C" long long visited;
+long long visited = 0;
+%s
+extern "C" void run(int threads, const REAL* points, const int* order, const REAL* boxes, const int* lowest, int n,
+                    int depth, double infinity, long long* indices, REAL* distances) {
+    blockDim.x = 128;
+    for (blockIdx.x = 0; blockIdx.x * 128 < threads; ++blockIdx.x)
+        for (threadIdx.x = 0; threadIdx.x < 128; ++threadIdx.x)
+            nearest(points, order, boxes, lowest, n, depth, infinity, indices, distances);
+}
+"""
+
+
+class Compile(Protocol):
+    """Compiles the kernel for a dtype and a number of neighbours; returns a launch on the CPU."""
+
+    def __call__(self, dtype: torch.dtype, k: int, visited: list[int] | None = None) -> Launch:
+        """Each launch appends the number of visited points to ``visited``."""
+
+
+@pytest.fixture(scope="module")
+def compiled(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Compile:
+    visit = "const double dx = points"
+    source = nvrtc.read_source(FILE)
+    assert source.count(visit) == 1
+    source = SHIM % source.replace(visit, "++visited; " + visit)
+
+    def compile_for(dtype: torch.dtype, k: int, visited: list[int] | None = None) -> Launch:
+        kernel = compile_for_cpu(source, ["-ffp-contract=off", *kernel_options(dtype, k)[1:]])
+        counter = ctypes.c_longlong.in_dll(kernel, "visited")
+
+        def launch(threads: int, arguments: Sequence[Argument]) -> None:
+            assert all(a.is_contiguous() for a in arguments if isinstance(a, Tensor))
+            values = [nvrtc._as_c(argument, torch.device("cpu")) for argument in arguments]
+            counter.value = 0
+            kernel.run(ctypes.c_int(threads), *values)
+            if visited is not None:
+                visited.append(counter.value)
+
+        return launch
+
+    return compile_for
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("n", "k"), [(700, 16), (130, 3), (40, 32)])
+def test_kernel_matches_all_pairs(compiled: Compile, cloud: Callable, dtype: torch.dtype, n: int, k: int) -> None:
+    points = cloud(n).to(dtype)
+    check(points, *search_tree(build_tree(points), k, compiled(dtype, k)))
+
+
+@pytest.mark.parametrize("n", [2, 15, 16, 17, 33, 63, 64, 65])
+def test_kernel_on_every_shape_of_small_tree(compiled: Compile, n: int) -> None:
+    points, k = torch.randn(n, 3), min(3, n - 1)
+    check(points, *search_tree(build_tree(points), k, compiled(torch.float32, k)))
+
+
+def test_tree_holds_every_point_once_in_tight_boxes(cloud: Callable) -> None:
+    for n in (1, 15, 1000):
+        tree = build_tree(cloud(n).float())
+        assert torch.equal(tree.order.long().sort().values, torch.arange(n))
+        assert torch.equal(tree.points, cloud(n).float()[tree.order.long()])
+        for node in range(1, 2 ** (tree.depth + 1)):
+            level = node.bit_length() - 1
+            begin, end = ((node - 2**level + i) * n // 2**level for i in (0, 1))
+            inside = tree.points[begin:end]
+            assert torch.equal(tree.boxes[node], torch.cat([inside.amin(0), inside.amax(0)]))
+            assert tree.lowest[node] == tree.order[begin:end].min()
+            assert level < tree.depth or n < 2 * LEAF or LEAF <= end - begin <= 2 * LEAF
+
+
+def test_thousands_of_clones_visit_no_more_points_than_others(compiled: Compile) -> None:
+    # Counts visited points, not seconds. Without the lowest index of each node, every clone would visit all others.
+    visited: list[int] = []
+    for points in (torch.zeros(20_000, 3), torch.randn(20_000, 3)):
+        search_tree(build_tree(points), 16, compiled(torch.float32, 16, visited))
+    clones, others = (count / 20_000 for count in visited)
+    assert clones < 2 * others  # measured 116 and 114 points per query
+
+
+def test_kernel_compiles_for_gpus_from_turing_to_hopper() -> None:
+    try:
+        nvrtc._library("nvrtc")
+    except BackendError as error:
+        pytest.skip(f"no NVRTC here: {error}")
+    cases = [("sm_75", torch.float32, 16), ("sm_90", torch.float64, 1), ("sm_90", torch.float32, MAX_NEIGHBORS)]
+    for architecture, dtype, k in cases:
+        code = nvrtc.compile_cubin(FILE, architecture, kernel_options(dtype, k))
+        assert code.startswith(b"\x7fELF")
+        assert KERNEL.encode() in code
+    with pytest.raises(BackendError, match="does not compile for sm_90.*REAL"):
+        nvrtc.compile_cubin(FILE, "sm_90")

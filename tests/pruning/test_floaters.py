@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from sundae_ns.pruning.cutting import FieldPruner
+from sundae_ns.pruning.decision import FieldPruner
 from sundae_ns.pruning.floaters import FREE, near_cameras
 
 

@@ -1,4 +1,4 @@
-"""Exact counts, order, ties and frequencies of the selections."""
+"""Selections: the two ends of a ranking, and systematic draws with their inclusion probabilities."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.pruning import PruneRule, kept_count, select_random
-from sundae_ns.pruning.selection import select_band, select_sampled, select_top
+from sundae_ns.errors import DataError
+from sundae_ns.pruning import kept_count
+from sundae_ns.pruning.selection import inclusion_probabilities, neighbor_order, select_band, select_systematic
 
 VALUES = st.one_of(st.floats(0, 1e30), st.sampled_from([0.0, 1.0, math.nan, math.inf, -math.inf, 1e-300]))
 SCORES = st.lists(VALUES, min_size=1, max_size=40).map(lambda v: torch.tensor(v, dtype=torch.float64))
@@ -22,130 +22,175 @@ def chosen(mask: Tensor) -> list[int]:
     return mask.nonzero().squeeze(1).tolist()
 
 
-@given(SCORES, st.floats(0, 1, exclude_min=True), st.floats(0, 1), st.integers(0, 2**31))
-def test_any_scores_keep_the_exact_count(score: Tensor, keep_ratio: float, gamma: float, seed: int) -> None:
+@given(SCORES, st.floats(0, 1, exclude_min=True), st.floats(0, 1))
+def test_any_scores_keep_the_exact_count(score: Tensor, keep_ratio: float, gamma: float) -> None:
     count = kept_count(keep_ratio, len(score))
     assert count == max(1, round(keep_ratio * len(score)))
-    for mask in (
-        select_top(score, count),
-        select_band(score, count, gamma),
-        select_sampled(score, count, seed),
-        select_random(len(score), count, seed),
-    ):
-        assert mask.dtype == torch.bool
-        assert mask.shape == score.shape
-        assert int(mask.sum()) == count
+    mask = select_band(score, count, gamma)
+    assert mask.dtype == torch.bool
+    assert mask.shape == score.shape
+    assert int(mask.sum()) == count
 
 
-@given(SCORES, st.data())
-def test_top_drops_nothing_above_what_it_keeps(score: Tensor, data: st.DataObject) -> None:
-    count = data.draw(st.integers(1, len(score)))
-    mask = select_top(score, count)
-    known = torch.nan_to_num(score, nan=-math.inf, posinf=math.inf, neginf=-math.inf)
-    if count < len(score):
-        assert known[mask].min() >= known[~mask].max()
-        assert not score[mask].isnan().any() or not (~score[~mask].isnan()).any()
-
-
-def test_ties_go_to_the_lower_index() -> None:
-    assert chosen(select_top(torch.tensor([1.0, 2, 2, 2, 0]), 2)) == [1, 2]
-    # Many, because an unstable sort of few elements can be stable by chance.
-    assert chosen(select_top(torch.arange(5000) % 3, 1500)) == list(range(2, 4500, 3))
-    assert chosen(select_band(torch.zeros(6), 4, 0.5)) == [0, 1, 2, 3]
-    assert chosen(select_band(torch.tensor([5.0, 1, 1, 1, 5]), 3, 1 / 3)) == [0, 1, 2]
-
-
-def test_nan_comes_last_and_infinity_first() -> None:
-    score = torch.tensor([math.nan, 1.0, math.inf, -math.inf, math.nan, 0.0])
-    assert chosen(select_top(score, 1)) == [2]
-    assert chosen(select_top(score, 4)) == [1, 2, 3, 5]
-    assert chosen(select_top(score, 5)) == [0, 1, 2, 3, 5]
-
-
-def test_band_takes_both_ends() -> None:
-    magnitude = torch.tensor([3.0, 0, 9, 1, 8, 2, 7, 4])
-    assert chosen(select_band(magnitude, 4, 0.5)) == [1, 2, 3, 4]
-    assert chosen(select_band(magnitude, 4, 1.0)) == [2, 4, 6, 7]
-    assert chosen(select_band(magnitude, 4, 0.0)) == [0, 1, 3, 5]
-    assert chosen(select_band(magnitude, 4, 0.25)) == [1, 2, 3, 5]
-
-
-def test_isolated_primitives_fill_neither_end_of_the_band() -> None:
-    magnitude = torch.tensor([math.nan, 3.0, math.nan, 1.0, 2.0, 4.0])
-    assert chosen(select_band(magnitude, 2, 0.5)) == [3, 5]
-    assert chosen(select_band(magnitude, 4, 0.5)) == [1, 3, 4, 5]
-    assert chosen(select_band(magnitude, 5, 0.0)) == [0, 1, 3, 4, 5]
-    assert chosen(select_band(magnitude, 5, 1.0)) == [0, 1, 3, 4, 5]
+@pytest.mark.parametrize(
+    ("magnitude", "count", "gamma", "kept"),
+    [
+        ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 0.5, [1, 2, 3, 4]),
+        ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 1.0, [2, 4, 6, 7]),
+        ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 0.0, [0, 1, 3, 5]),
+        ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 0.25, [1, 2, 3, 5]),
+        # Isolated primitives fill neither end.
+        ([math.nan, 3.0, math.nan, 1.0, 2.0, 4.0], 2, 0.5, [3, 5]),
+        ([math.nan, 3.0, math.nan, 1.0, 2.0, 4.0], 4, 0.5, [1, 3, 4, 5]),
+        ([math.nan, 3.0, math.nan, 1.0, 2.0, 4.0], 5, 0.0, [0, 1, 3, 4, 5]),
+        ([math.nan, 3.0, math.nan, 1.0, 2.0, 4.0], 5, 1.0, [0, 1, 3, 4, 5]),
+        # Ties go to the lower index; many, because an unstable sort of few elements can be stable by chance.
+        ([0.0] * 6, 4, 0.5, [0, 1, 2, 3]),
+        ([5.0, 1, 1, 1, 5], 3, 1 / 3, [0, 1, 2]),
+        ([i % 3.0 for i in range(5000)], 1500, 1.0, list(range(2, 4500, 3))),
+        ([1.0, math.inf, math.nan, 2.0, math.inf, 0.0], 3, 1 / 3, [0, 1, 5]),
+        ([math.nan, 1.0, math.inf, -math.inf, math.nan, 0.0], 5, 1.0, [0, 1, 2, 3, 5]),
+    ],
+)
+def test_band_by_hand(magnitude: list[float], count: int, gamma: float, kept: list[int]) -> None:
+    assert chosen(select_band(torch.tensor(magnitude), count, gamma)) == kept
 
 
 @given(st.permutations(range(12)), st.integers(1, 12), st.floats(0, 1))
 def test_band_is_the_two_ends_of_the_ranking(order: list[int], count: int, gamma: float) -> None:
     mask = select_band(torch.tensor(order, dtype=torch.float64), count, gamma)
     high = round(gamma * count)
-    expected = set(range(12 - high, 12)) | set(range(count - high))
-    assert {order[i] for i in chosen(mask)} == expected
+    assert {order[i] for i in chosen(mask)} == set(range(12 - high, 12)) | set(range(count - high))
 
 
-def test_sampled_frequencies_are_in_proportion() -> None:
-    score = torch.tensor([1.0, 2, 3, 4])
-    first = torch.stack([select_sampled(score, 1, seed) for seed in range(4000)]).double().mean(0)
-    torch.testing.assert_close(first, torch.tensor([0.1, 0.2, 0.3, 0.4]).double(), rtol=0, atol=0.03)
-    pairs = torch.stack([select_sampled(score, 2, seed) for seed in range(4000)]).double().mean(0)
-    p = score.double() / 10
-    expected = torch.stack([p[i] + sum(p[j] * p[i] / (1 - p[j]) for j in range(4) if j != i) for i in range(4)])
-    torch.testing.assert_close(pairs, expected, rtol=0, atol=0.03)
+def scores(n: int = 500) -> Tensor:
+    return torch.rand(n, generator=torch.Generator().manual_seed(0), dtype=torch.float64).pow(3) + 1e-3
 
 
-@pytest.mark.parametrize("scale", [1e-300, 1e-30, 1e300])
-def test_sampling_does_not_depend_on_the_scale(scale: float) -> None:
-    score = torch.rand(200, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.01
-    assert torch.equal(select_sampled(score * scale, 50, 7), select_sampled(score, 50, 7))
+def test_probabilities_are_in_proportion_up_to_1_and_sum_to_the_count() -> None:
+    values = scores()
+    probabilities = inclusion_probabilities(values, 200)
+    assert float(probabilities.sum()) == pytest.approx(200, abs=1e-9)
+    certain = probabilities == 1
+    assert 0 < int(certain.sum()) < 200
+    assert values[certain].min() > values[~certain].max()
+    ratio = probabilities[~certain] / values[~certain]
+    torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio))
+    # No primitive is certain without need.
+    assert float(probabilities[~certain].max()) < 1
 
 
-def test_sampling_survives_scores_of_every_size() -> None:
-    score = torch.logspace(-300, 300, 601, dtype=torch.float64)
-    mask = select_sampled(score, 100, 0)
-    assert min(chosen(mask)) > 490
+@pytest.mark.parametrize(
+    ("values", "count", "expected"),
+    [
+        ([1.0, 1, 1, 1], 2, [0.5, 0.5, 0.5, 0.5]),
+        ([1e300, 1e300, 1e-300], 2, [1, 1, 1e-300]),
+        ([5.0, 1, 1], 1, [5 / 7, 1 / 7, 1 / 7]),
+        ([5.0, 1, 1], 2, [1, 0.5, 0.5]),
+        ([3.0, 2, 1], 3, [1, 1, 1]),
+        ([7.0], 1, [1]),
+    ],
+)
+def test_probabilities_by_hand(values: list[float], count: int, expected: list[float]) -> None:
+    found = inclusion_probabilities(torch.tensor(values, dtype=torch.float64), count)
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64))
 
 
-def test_zero_scores_are_taken_only_after_positive_ones() -> None:
-    score = torch.tensor([0.0, 1e-30, math.nan, 5.0, 0.0, -1.0, 0.0])
-    assert chosen(select_sampled(score, 2, 0)) == [1, 3]
-    extra = {tuple(set(chosen(select_sampled(score, 3, seed))) - {1, 3}) for seed in range(60)}
-    assert extra == {(0,), (2,), (4,), (5,), (6,)}
+def test_draw_frequencies_match_the_probabilities() -> None:
+    values, order = scores(40), torch.randperm(40)
+    drawn = torch.stack([select_systematic(values, 12, order, seed) for seed in range(1000)]).double().mean(dim=0)
+    # Four standard deviations of a frequency over 1,000 draws are 0.063.
+    torch.testing.assert_close(drawn, inclusion_probabilities(values, 12), rtol=0, atol=0.063)
 
 
-def test_draws_depend_on_the_seed_and_not_on_the_global_generator() -> None:
-    score = torch.rand(300, generator=torch.Generator().manual_seed(0))
-    torch.manual_seed(1)
-    first = select_sampled(score, 30, 5)
-    torch.manual_seed(2)
-    assert torch.equal(select_sampled(score, 30, 5), first)
-    assert not torch.equal(select_sampled(score, 30, 6), first)
-    assert torch.equal(select_random(300, 30, 5), select_random(300, 30, 5))
+def test_every_stretch_keeps_its_expected_number() -> None:
+    values, order = scores(), torch.randperm(500)
+    probabilities = inclusion_probabilities(values, 100)[order]
+    for seed in range(20):
+        # Certain primitives are selected first and count in full.
+        kept = select_systematic(values, 100, order, seed)[order]
+        gap = (kept.double() - probabilities).cumsum(0)
+        assert float(gap.max() - gap.min()) < 2 + 1e-9  # between any two places
 
 
-def test_draws_are_pinned() -> None:
-    """Results with a seed stay reproducible from release to release."""
-    assert chosen(select_random(20, 5, 0)) == [6, 7, 9, 11, 17]
+def test_draws_are_spread_more_evenly_than_independent_ones() -> None:
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(1))
+    order, cell = neighbor_order(points), (points * 4).long() @ torch.tensor([16, 4, 1])
+    expected = torch.bincount(cell, minlength=64) / 10
+
+    def unevenness(mask: Tensor) -> float:
+        return float((torch.bincount(cell[mask], minlength=64) - expected).square().mean())
+
+    even = [unevenness(select_systematic(torch.ones(4000), 400, order, seed)) for seed in range(10)]
+    independent = [unevenness(torch.randperm(4000) < 400) for _ in range(10)]
+    assert max(even) < 0.5 * min(independent)  # measured 0.2
 
 
-@pytest.mark.parametrize("count", [0, 4, -1])
-def test_impossible_counts_are_refused(count: int) -> None:
-    with pytest.raises(DataError, match=f"cannot keep {count} of 3"):
-        select_top(torch.ones(3), count)
+@given(
+    st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=40),
+    st.integers(1, 40),
+    st.integers(0, 2**31),
+)
+def test_any_scores_keep_the_exact_count_and_unusable_ones_come_last(
+    values: list[float], count: int, seed: int
+) -> None:
+    count = min(count, len(values))
+    found = torch.tensor(values, dtype=torch.float64)
+    mask = select_systematic(found, count, torch.randperm(len(values)), seed)
+    assert int(mask.sum()) == count
+    infinite, usable = found == math.inf, found > 0
+    assert int((mask & infinite).sum()) == min(count, int(infinite.sum()))
+    assert int((mask & usable).sum()) == min(count, int(usable.sum()))
 
 
-def test_bad_options_are_refused() -> None:
-    with pytest.raises(ConfigError, match="gamma"):
-        PruneRule(gamma=1.5).validate()
-    with pytest.raises(DataError, match="one number per primitive"):
-        select_top(torch.ones(3, 2), 1)
+def test_scores_that_differ_by_1e300_lose_no_draw() -> None:
+    values = torch.tensor([1e-300] * 50 + [1e300] * 3, dtype=torch.float64)
+    for seed in range(50):
+        mask = select_systematic(values, 5, torch.arange(53), seed)
+        assert int(mask.sum()) == 5
+        assert mask[50:].all()
+
+
+def test_the_draw_follows_a_permutation_and_its_seed() -> None:
+    points, values = torch.rand(300, 3), scores(300)
+    mask = select_systematic(values, 60, neighbor_order(points), 5)
+    shuffle = torch.randperm(300)
+    shuffled = select_systematic(values[shuffle], 60, neighbor_order(points[shuffle]), 5)
+    assert torch.equal(shuffled, mask[shuffle])
+    assert not torch.equal(select_systematic(values, 60, neighbor_order(points), 6), mask)
+
+
+def test_the_order_walks_through_small_clusters_too() -> None:
+    generator = torch.Generator().manual_seed(0)
+    centers = torch.tensor([[0.0, 0, 0], [1e3, 0, 0], [0, 1e3, 0]])
+    points = (centers[:, None] + 1e-2 * torch.rand(3, 512, 3, generator=generator)).reshape(-1, 3)
+    order = neighbor_order(points)
+    assert sorted(order.tolist()) == list(range(1536))
+    steps = (points[order][1:] - points[order][:-1]).norm(dim=1)
+    # Steps between the three clusters, and within the few leaves that hold points of two: measured 15.
+    assert int((steps > 1).sum()) <= 32
+    # Among 512 points in a cube of 1e-2, neighbours are about 7e-4 apart, and random pairs 6.6e-3.
+    assert steps[steps < 1].mean() < 3.5e-3
+
+
+@pytest.mark.parametrize(
+    ("scores", "count", "order", "words"),
+    [
+        (torch.ones(3), 5, 3, "cannot keep 5 of 3"),
+        (torch.ones(3), 0, 3, "cannot keep 0 of 3"),
+        (torch.ones(3), 1, 2, r"\[3\] and their order \[2\]"),
+        (torch.ones(3, 2), 1, None, "one number per primitive"),
+        (torch.ones(3), -1, None, "cannot keep -1 of 3"),
+    ],
+)
+def test_invalid_input_is_refused(scores: Tensor, count: int, order: int | None, words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        _ = select_systematic(scores, count, torch.arange(order), 0) if order else select_band(scores, count, 0.5)
 
 
 @pytest.mark.gpu
 def test_masks_are_the_same_on_every_device() -> None:
-    score = torch.rand(1000, generator=torch.Generator().manual_seed(0))
-    for select in (lambda s: select_top(s, 99), lambda s: select_band(s, 99, 0.4), lambda s: select_sampled(s, 99, 3)):
+    score, order = torch.rand(1000, generator=torch.Generator().manual_seed(0)), torch.randperm(1000)
+    for select in (lambda s: select_band(s, 99, 0.4), lambda s: select_systematic(s, 99, order, 3)):
         assert select(score.cuda()).is_cuda
         assert torch.equal(select(score.cuda()).cpu(), select(score))

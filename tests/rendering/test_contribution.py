@@ -15,7 +15,7 @@ import sundae_ns as sn
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.model import SundaeModel
-from sundae_ns.pruning.detail import pixel_detail
+from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterization import blending_weights, rasterize
 from sundae_ns.rendering import LocalField, TrainingView, contribution
 from sundae_ns.rendering.render import pass_options

@@ -42,18 +42,6 @@ def test_options_of_later_versions_have_their_defaults(tmp_path: Path) -> None:
     assert found.max_num_iterations == TrainerConfig().max_num_iterations
 
 
-def test_the_class_paths_of_earlier_runs_still_open(tmp_path: Path) -> None:
-    """``PruningConfig`` has moved; its options have stood side by side from the first."""
-    config = copy.deepcopy(all_methods["sundae-paper"])
-    text, path = yaml.dump(config), tmp_path / "config.yml"
-    now, before = "sundae_ns.training.pruning_config.PruningConfig", "sundae_ns.pruning.config.PruningConfig"
-    assert now in text
-    path.write_text(text.replace(now, before))
-    for found in (load_config(path), yaml.load(path.read_text(), Loader=yaml.Loader)):  # ours, and nerfstudio's
-        assert found.pipeline.model.pruning == config.pipeline.model.pruning
-        assert yaml.dump(found) == text
-
-
 def test_a_run_of_an_early_python_3_11_opens(tmp_path: Path) -> None:
     """Before 3.11.4 a member of an enumeration was saved as an attribute of its class."""
     path = tmp_path / "config.yml"

@@ -11,7 +11,7 @@ from harness.plan import Job, done_file
 from sundae_ns.errors import SundaeError
 from sundae_ns.evaluation import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality
 
-PSNR = {"sundae-warm-up": 24.0, "sundae": 27.0, "random": 25.0, "splatfacto": 28.0}
+PSNR = {"sundae-warm-up": 24.0, "sundae": 27.0, "band": 25.0, "splatfacto": 28.0}
 
 
 class Runner:

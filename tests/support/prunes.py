@@ -1,14 +1,27 @@
-"""One prune to a share of a field."""
+"""Fields for prunes, and one prune to a share of a field."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from sundae_ns.gaussians import mend
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning import Decision, PruneRule, decide, kept_count
+from sundae_ns.pruning import Decision, PruneRule, band_rule, decide, kept_count
+
+PAPER = band_rule(PruneRule(signal="positions"), 0.5)
+
+
+def field(n: int = 60, means: Tensor | None = None, *, seed: int = 0, features: int = 0) -> dict[str, Tensor]:
+    """Normal parameters of degree 1, centres too unless they are given; with their dtype."""
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "features_rest": (3, 3)}
+    shapes |= {"opacities": (1,)} | ({"features": (features,)} if features else {})
+    n, dtype = (n, torch.float32) if means is None else (len(means), means.dtype)
+    made = {name: torch.randn(n, *shape, generator=generator).to(dtype) for name, shape in shapes.items()}
+    return made if means is None else {**made, "means": means}
 
 
 def decide_share(

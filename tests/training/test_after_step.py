@@ -28,7 +28,7 @@ def trainer_of(folder: Path | None = None) -> SimpleNamespace:
     return SimpleNamespace(last_step=2, base_dir=folder, config=config)
 
 
-@pytest.mark.parametrize("score", ["detail-contribution", "response-contribution", "opacity"])
+@pytest.mark.parametrize("score", ["detail-contribution", "response"])
 def test_prune_keeps_the_count_and_training_goes_on(
     build: Build, training_of: TrainingOf, score: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

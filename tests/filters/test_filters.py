@@ -1,12 +1,14 @@
-"""Filters against exact spectra, and their invariances."""
+"""Filters against exact spectra and dense algebra, and their invariances."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from sundae_ns.errors import DataError
-from sundae_ns.filters import haar, high_pass, low_pass, response_magnitude
+from sundae_ns.filters import Smoother, filters, high_pass, low_pass, response_magnitude
 from sundae_ns.graphs import NeighborGraph, build_graph
 
 
@@ -49,7 +51,7 @@ def test_shapes_dtypes_and_chunks_agree(monkeypatch: pytest.MonkeyPatch) -> None
     assert whole.dtype == torch.float64
     assert high_pass(graph, x.float()).dtype == torch.float32
     torch.testing.assert_close(high_pass(graph, x[:, 0]), whole[:, 0])
-    monkeypatch.setattr(haar, "CHUNK_ELEMENTS", 7 * 18)
+    monkeypatch.setattr(filters, "CHUNK_ELEMENTS", 7 * 18)
     assert torch.equal(high_pass(graph, x), whole)
 
 
@@ -79,21 +81,6 @@ def test_two_nodes_respond_with_their_difference() -> None:
     graph = build_graph(points, num_neighbors=1)
     assert high_pass(graph, points).tolist() == [[-2.0, 0, 0], [2.0, 0, 0]]
     assert response_magnitude(high_pass(graph, points)).tolist() == [4.0, 4.0]
-
-
-def test_invariances_of_the_position_response() -> None:
-    points = cloud()
-    rotation = torch.linalg.qr(cloud(3, seed=5)).Q
-    order = torch.randperm(60, generator=torch.Generator().manual_seed(3))
-
-    def magnitude(x: torch.Tensor) -> torch.Tensor:
-        return response_magnitude(high_pass(build_graph(x, num_neighbors=8), x))
-
-    base = magnitude(points)
-    same = {"rtol": 1e-9, "atol": 1e-12, "equal_nan": True}
-    torch.testing.assert_close(magnitude(points[order]), base[order], **same)
-    torch.testing.assert_close(magnitude(points @ rotation.T + 3.0), base, **same)
-    torch.testing.assert_close(magnitude(100 * points) / 100**2, base, **same)
 
 
 def test_float32_far_from_the_origin_keeps_its_digits() -> None:
@@ -127,3 +114,50 @@ def test_magnitudes_of_tiny_responses_do_not_vanish() -> None:
     assert magnitude[2].isnan()
     assert response_magnitude(torch.tensor([-3.0])).tolist() == [9.0]
     assert response_magnitude(torch.zeros(0, 3)).shape == (0,)
+
+
+# ----------------------------------------------------------------------------------------------------- the smooth part
+
+
+def laplacian(graph: NeighborGraph, strength: float) -> NDArray[np.float64]:
+    W = torch.zeros(graph.N, graph.N, dtype=torch.float64).scatter_add(1, graph.indices, graph.weights.double())
+    W = 0.5 * (W + W.T)
+    return (strength / W.sum(1).mean() * (torch.diag(W.sum(1)) - W)).numpy()
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.3, 8.0, 100.0])
+def test_it_solves_its_equation_for_the_known_nodes(strength: float) -> None:
+    graph, signal = build_graph(cloud(), num_neighbors=6), cloud(seed=1).numpy()
+    smoother, known = Smoother(graph, strength), np.arange(60) % 3 > 0
+    for mask in (np.ones(60, bool), known):  # one after the other: factors of other nodes must not be kept
+        signal[~mask] = np.nan  # never read
+        smooth = smoother(signal, mask)
+        system = np.diag(np.maximum(mask, 1e-9)) + laplacian(graph, strength)
+        np.testing.assert_allclose(system @ smooth, np.where(mask[:, None], signal, 0.0), atol=1e-9)
+        # What is left is a high-pass response: it changes no mean.
+        np.testing.assert_allclose((signal - smooth)[mask].sum(axis=0), 0.0, atol=1e-4)
+
+
+def test_a_constant_is_smooth_and_what_changes_from_node_to_node_is_not() -> None:
+    angle = torch.linspace(0, 2 * torch.pi, 61)[:60]
+    ring = torch.stack([angle.cos(), angle.sin(), torch.zeros(60)], dim=1)
+    smoother, known = Smoother(build_graph(ring, num_neighbors=4), 8.0), np.ones(60, bool)
+    slow, fast = np.sin(angle.numpy())[:, None], np.where(np.arange(60) % 2, 1.0, -1.0)[:, None]
+    np.testing.assert_allclose(smoother(np.full((60, 2), 3.7), known), 3.7)
+    assert np.abs(smoother(slow, known) - slow).max() < 0.1
+    assert np.abs(smoother(fast, known)).max() < 0.1
+
+
+def test_a_node_without_an_edge_keeps_its_value() -> None:
+    graph = build_graph(torch.cat([cloud(), torch.tensor([[1e3, 0, 0], [0, 1e3, 0]])]), num_neighbors=6)
+    assert graph.isolated.tolist()[-2:] == [True, True]
+    known = np.arange(62) < 61
+    smooth = Smoother(graph, 8.0)(np.full((62, 1), 2.0), known)
+    assert smooth[60] == pytest.approx(2.0)
+    assert smooth[61] == 0
+
+
+def test_a_graph_without_edges_changes_nothing() -> None:
+    graph = build_graph(cloud(5) * 1e3, num_neighbors=2, tau=0.0)
+    signal = cloud(5, seed=1).numpy()
+    np.testing.assert_allclose(Smoother(graph, 8.0)(signal, np.ones(5, bool)), signal)

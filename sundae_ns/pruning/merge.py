@@ -1,0 +1,304 @@
+"""The graph of a field, and the groups of primitives that one primitive replaces: pairs, or Voronoi cells.
+
+Edges weigh distance, or distance, overlap and colour. Pairs: the two primitives that differ least become one, again and
+again, until few enough are left. Cells: each dropped primitive joins the kept one that is nearest along the edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from sundae_ns.gaussians.covariance import chunks, covariances_of, lower_entries, outer_entries, overlap, pair_overlap
+from sundae_ns.gaussians.field import as_field
+from sundae_ns.gaussians.merging import merge
+from sundae_ns.gaussians.parameters import rgb_to_logit, sh_to_rgb
+from sundae_ns.graphs import NeighborGraph, build_graph
+from sundae_ns.pruning.rule import PruneRule
+
+LEAST_WIDTH = 0.25
+"""Width added to primitives when their overlap is measured, as a share of the graph's sigma: some are flat."""
+
+MOST_UNLIKE = 8.0
+"""Largest difference of colours that counts, in typical differences. Weights fall to e^-32 and stay positive; otherwise
+a primitive of an extreme colour would have no neighbour and could not be merged."""
+UNSEEN = 0.001
+"""Share of all weight that is dropped, not merged: the lightest primitives."""
+FLOOR = 1e-4
+"""Least weight in a merge, as a share of the mean: primitives that nothing sees merge by their likeness."""
+WIDTH = 0.01
+"""Variance added to each axis, as a share of the sum of all three: two parallel flat primitives are alike too."""
+PART = 0.5
+"""Share of the possible merges of a round that happen; the others wait for what the better ones leave."""
+MOST_ROUNDS = 256
+"""Most rounds; a field needs about 60. Thousands of clones that share their neighbours would need many more."""
+ROWS = 1 << 17
+"""Primitives whose edges are followed at once; they take about 100 MiB."""
+
+MOST_HOPS = 64
+"""Most edges between a dropped primitive and its kept one; keep ratios from 0.001 on need about a dozen."""
+
+
+@torch.no_grad()
+def field_graph(params: Mapping[str, Tensor], rule: PruneRule) -> NeighborGraph:
+    """Neighbour graph of a field, with the weights that the rule asks for.
+
+    With ``centres``, as in the paper, weights fall with distance. ``appearance`` multiplies them by the overlap of the
+    two primitives (Bhattacharyya) and by ``exp(-|c_i - c_j|^2 / (2 s^2))`` for their colours, s being the root mean
+    square difference over all edges. As in a bilateral filter, primitives on two sides of an image edge are hardly
+    neighbours.
+
+    A field of at most ``num_neighbors`` primitives has the graph of all pairs within reach.
+
+    Args:
+        params: the field, all finite, N primitives.
+
+    Raises:
+        DataError: only one primitive, or positions that are not finite.
+    """
+    params = as_field(params).as_harmonics()
+    means = params["means"].detach()
+    graph = build_graph(means, num_neighbors=min(rule.num_neighbors, max(len(means) - 1, 1)))
+    if rule.edges == "centres" or not rule.uses_edge_weights:
+        return graph
+    # In place: of a large field, each value per edge takes gigabytes.
+    weights = graph.weights.mul_(_color_affinity(sh_to_rgb(params["features_dc"].detach()), graph))
+    weights *= overlap(means, covariances_of(params), graph.indices, least_width=LEAST_WIDTH * graph.sigma)
+    return replace(graph, weights=weights, dw=weights.sum(dim=1))
+
+
+def _color_affinity(colors: Tensor, graph: NeighborGraph) -> Tensor:
+    squares = torch.empty_like(graph.weights)
+    total = torch.zeros((), dtype=torch.float64, device=squares.device)
+    for column, (neighbor, weight) in enumerate(zip(graph.indices.unbind(dim=1), graph.weights.unbind(dim=1))):
+        squares[:, column] = (colors - colors[neighbor]).square().sum(dim=1)
+        total += (squares[:, column] * (weight > 0)).sum(dtype=torch.float64)
+    typical = total / (graph.weights > 0).sum().clamp_min(1)
+    if not typical > 0:
+        return torch.ones_like(squares)
+    return squares.div_(typical.to(squares.dtype)).clamp_max_(MOST_UNLIKE**2).mul_(-0.5).exp_()
+
+
+@torch.no_grad()
+def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tensor, count: int) -> Tensor:
+    """Label of each primitive after pairs along the edges of the graph have merged until ``count`` groups are left.
+
+    Two groups of weights w and w' cost ``w w' / (w + w') (1 - overlap + |c - c'|^2)``: with the Bhattacharyya
+    coefficient of their Gaussians as overlap, how much their images change if one of the same moments replaces both
+    (Ward, 1963). A round merges pairs that cost less than any other pair of either group, the cheapest half of these.
+
+    Args:
+        params: the field, all finite, N primitives.
+        graph: its edges are the pairs, whatever their weights.
+        weight: of each primitive, such as its summed blending weight, not negative ``[N]``.
+        count: number of groups, 1 to N.
+
+    Returns:
+        Labels as :func:`sundae_ns.gaussians.merging.merge` takes them, int64, on the graph's device ``[N]``: the index
+        of a member, in each merge that of the heavier group; -1 for primitives that are dropped.
+    """
+    device, n = graph.indices.device, graph.N
+    values = as_field(params).as_harmonics()
+    w = weight.to(device).double().nan_to_num(0.0).clamp_min(0)
+    label = torch.arange(n, device=device)
+    order = torch.sort(w, stable=True).indices
+    light = order[w[order].cumsum(0) <= UNSEEN * w.sum()][: n - count]
+    label[light] = -1
+    left = n - len(light)
+    if left == count:
+        return label
+
+    groups = _Groups(values, w / w.mean().clamp_min(torch.finfo(torch.float64).tiny) + FLOOR, device)
+    first, second = label[:, None].expand_as(graph.indices).flatten(), label[graph.indices].flatten()
+    usable = (first >= 0) & (second >= 0)
+    pairs = _unique(first[usable], second[usable], n)
+    cost = groups.cost(*pairs)
+    for _ in range(MOST_ROUNDS):
+        if left == count or not len(cost):
+            break
+        chosen = _cheapest_of_both(pairs, cost, n)
+        chosen = chosen[: min(left - count, max(1, round(PART * len(chosen))))]
+        stays, goes = groups.join(pairs[0][chosen], pairs[1][chosen])
+        left -= len(chosen)
+        target = torch.arange(n, device=device)
+        target[goes] = stays
+        label = torch.where(label >= 0, target[label.clamp_min(0)], -1)
+        # Only pairs of a changed group change.
+        changed = torch.zeros(n, dtype=torch.bool, device=device)
+        changed[stays] = changed[goes] = True
+        moved = changed[pairs[0]] | changed[pairs[1]]
+        renewed = _unique(target[pairs[0][moved]], target[pairs[1][moved]], n)
+        cost = torch.cat([cost[~moved], groups.cost(*renewed)])
+        pairs = torch.cat([pairs[0][~moved], renewed[0]]), torch.cat([pairs[1][~moved], renewed[1]])
+    if left > count:  # of islands without a bridge, and of clones, the heaviest stay
+        heads = (label == torch.arange(n, device=device)).nonzero().squeeze(1)
+        lightest = heads[torch.sort(groups.weight[heads], stable=True).indices[: left - count]]
+        gone = torch.zeros(n, dtype=torch.bool, device=device)
+        gone[lightest] = True
+        label = torch.where((label >= 0) & ~gone[label.clamp_min(0)], label, -1)
+    return label
+
+
+class _Groups:
+    """Moments of the groups, each in the row that its label names, float64."""
+
+    def __init__(self, field: Mapping[str, Tensor], weight: Tensor, device: torch.device) -> None:
+        means = field["means"].detach().to(device).double()
+        self.weight = weight
+        self.mean = means - means.median(dim=0).values
+        scales, quats = (field[name].detach().to(device).double() for name in ("scales", "quats"))
+        self.entries = lower_entries(scales.exp(), quats)
+        self.entries[:, :3] += WIDTH * self.entries[:, :3].sum(dim=1, keepdim=True)
+        self.color = sh_to_rgb(field["features_dc"].detach().to(device).double()).clamp(0, 1)
+
+    def cost(self, first: Tensor, second: Tensor) -> Tensor:
+        """Cost of the merge of each pair ``[P]``."""
+        unlike = 1 - pair_overlap(self.mean, self.entries, first, second)
+        unlike += (self.color[first] - self.color[second]).square().sum(dim=1)
+        # Of equal pairs, as in a grid of equal points, a random one is the cheapest; else a round would merge few.
+        unlike += 1e-9 * ((first * 2_654_435_761 + second * 40_503) % 1_000_003) / 1_000_003
+        return unlike / (1 / self.weight[first] + 1 / self.weight[second])
+
+    def join(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+        """Merge pairs without a common group; returns the rows that stay and those that go."""
+        lighter = self.weight[first] < self.weight[second]
+        stays, goes = torch.where(lighter, second, first), torch.where(lighter, first, second)
+        total = self.weight[stays] + self.weight[goes]
+        share = (self.weight[goes] / total)[:, None]
+        offset = self.mean[goes] - self.mean[stays]
+        mixed = self.entries[stays] + share * (self.entries[goes] - self.entries[stays])
+        self.entries[stays] = mixed + share * (1 - share) * outer_entries(offset)
+        self.mean[stays] += share * offset
+        self.color[stays] += share * (self.color[goes] - self.color[stays])
+        self.weight[stays] = total
+        return stays, goes
+
+
+def _unique(first: Tensor, second: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    """Each pair of two different groups once, the lower index first."""
+    apart = first != second
+    first, second = first[apart], second[apart]
+    keys = torch.unique(torch.minimum(first, second) * n + torch.maximum(first, second))
+    return keys.div(n, rounding_mode="floor"), keys % n
+
+
+def _cheapest_of_both(pairs: tuple[Tensor, Tensor], cost: Tensor, n: int) -> Tensor:
+    """Indices of the pairs that cost less than all others of both of their groups, cheapest first."""
+    least = cost.new_full((n,), torch.inf)
+    for ends in pairs:
+        least.scatter_reduce_(0, ends, cost, "amin")
+    found = ((cost <= least[pairs[0]]) & (cost <= least[pairs[1]])).nonzero().squeeze(1)
+    found = found[torch.sort(cost[found], stable=True).indices]
+    # Pairs of exactly equal cost may share a group: the earlier one has it.
+    place = torch.arange(len(found), device=cost.device)
+    earliest = torch.full((n,), len(found), device=cost.device)
+    for ends in pairs:
+        earliest.scatter_reduce_(0, ends[found], place, "amin")
+    return found[(earliest[pairs[0][found]] == place) & (earliest[pairs[1][found]] == place)]
+
+
+@torch.no_grad()
+def voronoi_labels(graph: NeighborGraph, mask: Tensor) -> Tensor:
+    """Voronoi label of each primitive: the index of the nearest kept primitive along the edges of the graph.
+
+    The length of an edge is ``-log W_ij``, so edges between primitives of different appearance are long if the graph
+    weights by appearance. All edges are relaxed at once, hop by hop (Bellman and Ford). Among equally near kept
+    primitives the one found in fewer hops wins, then the one over the earlier neighbour.
+
+    Edges are followed from a primitive to its neighbours. Primitives that reach no kept one so follow edges in both
+    directions: a thousand clones share the same few neighbours, and all of these may be dropped.
+
+    Args:
+        mask: True for primitives to keep, bool, any device ``[N]``.
+
+    Returns:
+        Labels, int64, on the graph's device ``[N]``: its own index for a kept primitive; -1 for primitives that are
+        connected to no kept one.
+    """
+    device = graph.weights.device
+    mask = mask.to(device)
+    own = torch.arange(graph.N, device=device)
+    label = torch.where(mask, own, -1)
+    distance = torch.where(mask, 0.0, torch.inf).double()
+    changed = mask
+    for _ in range(MOST_HOPS):
+        found = [_nearer(graph, rows, changed, distance) for rows in chunks(graph.N, ROWS)]
+        rows, through, reached = (torch.cat(parts) for parts in zip(*found, strict=True))
+        if not len(rows):
+            break
+        label[rows] = label[through]
+        distance[rows] = reached
+        changed = torch.zeros_like(mask)
+        changed[rows] = True
+    return _label_either_way(graph, label, distance)
+
+
+def _nearer(graph: NeighborGraph, among: slice, changed: Tensor, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Primitives that one hop brings nearer to a kept one, the neighbours that lead there, and the new distances."""
+    # A distance can only shrink if that of a neighbour has shrunk.
+    rows = changed[graph.indices[among]].any(dim=1).nonzero().squeeze(1).add_(among.start)
+    near = graph.indices[rows]
+    reached, over = (distance[near] + _lengths(graph.weights[rows])).min(dim=1)
+    nearer = reached < distance[rows]
+    return rows[nearer], near.gather(1, over[:, None]).squeeze(1)[nearer], reached[nearer]
+
+
+def _lengths(weights: Tensor) -> Tensor:
+    """Lengths of edges, float64; infinite without an edge."""
+    return torch.where(weights > 0, -weights.double().log(), torch.inf).clamp_min_(0)
+
+
+def _label_either_way(graph: NeighborGraph, label: Tensor, distance: Tensor) -> Tensor:
+    """Label the primitives without a label, along edges in both directions."""
+    unlabelled = label < 0
+    rows, slots = ((unlabelled[:, None] | unlabelled[graph.indices]) & (graph.weights > 0)).nonzero(as_tuple=True)
+    ends, length = graph.indices[rows, slots], _lengths(graph.weights[rows, slots])
+    source, target, length = torch.cat([rows, ends]), torch.cat([ends, rows]), torch.cat([length, length])
+    wanted = unlabelled[target]
+    source, target, length = source[wanted], target[wanted], length[wanted]
+    label, distance = label.clone(), distance.clone()
+    for _ in range(MOST_HOPS):
+        over = distance[source] + length
+        reached = distance.scatter_reduce(0, target, over, "amin")
+        best = (over == reached[target]) & (over < distance[target])
+        if not bool(best.any()):
+            break
+        # The lowest index among equally near sources, on every device.
+        through = torch.full_like(label, graph.N).scatter_reduce_(0, target[best], source[best], "amin")
+        nearer = reached < distance
+        label[nearer] = label[through[nearer]]
+        distance = reached
+    return label
+
+
+@torch.no_grad()
+def merged(
+    params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, weight: Tensor, labels: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Merge the primitives of each Voronoi cell of the graph into its kept one; see :func:`voronoi_labels`, and
+    :func:`sundae_ns.gaussians.merging.merge` for the result.
+
+    A field that stores logits averages colours, not logits.
+
+    Args:
+        params: the field, all finite, N primitives.
+        mask: True for primitives to keep, bool ``[N]``.
+        weight: weight of each primitive in the merge, its summed blending weight over the training views ``[N]``.
+        labels: of groups that take the place of the Voronoi cells, int64 ``[N]``; -1 for primitives that are dropped.
+
+    Returns:
+        Parameters of the kept primitives ``[M, ...]``.
+    """
+    labels = voronoi_labels(graph, mask) if labels is None else labels
+    if as_field(params).encoding == "harmonics":
+        return merge(params, labels, weight)
+    own = params["features_dc"].detach()
+    colors = own.sigmoid()
+    values = merge({**params, "features_dc": colors}, labels, weight)
+    stay, mixed = mask.to(own.device), values["features_dc"]
+    # Unmerged colours keep their logits: a saturated colour does not survive the round trip.
+    values["features_dc"] = torch.where(mixed == colors[stay], own[stay], rgb_to_logit(mixed))
+    return values

@@ -1,0 +1,101 @@
+"""Signals, responses, scores, and the detail of images as weights of their pixels."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from prunes import PAPER, field
+
+from sundae_ns.errors import DataError
+from sundae_ns.gaussians.parameters import rgb_to_sh
+from sundae_ns.pruning import PruneRule, response
+from sundae_ns.pruning.scores import attribute_signal, pixel_detail, score
+
+
+def test_scores_by_hand() -> None:
+    params, weights = field(40), torch.arange(40.0).index_fill(0, torch.tensor([7]), torch.nan)
+    expected = torch.arange(40.0).double().index_fill(0, torch.tensor([7]), 0)  # NaN counts as 0
+    assert torch.equal(score(params, PruneRule(), None, weights), expected)
+    magnitude = response(params, PAPER)
+    torch.testing.assert_close(score(params, PAPER, None, None), magnitude.sqrt(), equal_nan=True)
+    opacity = score(params, PruneRule(score=lambda given: given["opacities"].sigmoid().flatten()), None, None)
+    torch.testing.assert_close(opacity, params["opacities"].sigmoid().flatten().double())
+
+
+def test_responses_follow_a_permutation_and_need_two_primitives() -> None:
+    params, order = field(600), torch.randperm(600)
+    shuffled = {key: value[order] for key, value in params.items()}
+    for rule in (PruneRule(score="response"), PAPER):
+        found, expected = response(shuffled, rule), response(params, rule)[order]
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=0, equal_nan=True)
+    with pytest.raises(DataError, match="1 primitives cannot have 1 neighbours"):
+        response(field(1), PAPER)
+
+
+def test_attribute_response_finds_the_colour_edge() -> None:
+    n = 400
+    params = field(n)
+    grid = torch.arange(20.0)
+    params["means"] = torch.cartesian_prod(grid, grid, torch.zeros(1))
+    left = params["means"][:, 0] < 10
+    params["features_dc"] = rgb_to_sh(torch.where(left, 0.2, 0.8)[:, None].expand(-1, 3)).clone()
+    params["scales"] = torch.zeros(n, 3)
+    params["opacities"] = torch.zeros(n, 1)
+    magnitude = response(params, PruneRule(num_neighbors=8, edges="centres"))
+    edge = (params["means"][:, 0] - 9.5).abs() < 1
+    assert magnitude[edge].min() > 10 * magnitude[~edge].max()
+
+
+def test_signals_have_no_unit_and_no_dominating_group() -> None:
+    params = field()
+    signal = attribute_signal(params)
+    assert signal.shape == (60, 10)
+    for group in (slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10)):
+        assert signal[:, group].norm(dim=1).median().item() == pytest.approx(1.0, rel=1e-5)
+    scaled = {**params, "means": 1000 * params["means"] + 5, "scales": params["scales"] + 3}
+    torch.testing.assert_close(attribute_signal(scaled), signal, rtol=1e-4, atol=1e-4)
+
+
+def test_constant_and_almost_constant_attributes_are_finite() -> None:
+    params = field()
+    params["scales"] = torch.full((60, 3), 2.0)
+    params["opacities"] = torch.zeros(60, 1)
+    params["opacities"][0] = 3.0
+    signal = attribute_signal(params)
+    assert signal.isfinite().all()
+    assert (signal[:, 7:] == 0).all()
+    assert signal[0, 6] > 0
+    assert (signal[1:, 6] == 0).all()
+
+
+def test_edges_weigh_more_than_flat_areas_and_flat_areas_more_than_0() -> None:
+    image = torch.zeros(64, 64, 3)
+    image[:, 32:] = 1
+    found = pixel_detail(image, 400)
+    assert found.shape == (64, 64)
+    assert float(found.mean()) == pytest.approx(1)
+    assert found[:, 31:33].min() > 10 * found[:, :20].max()
+    assert found.min() > 0
+
+
+def test_more_cells_are_smaller() -> None:
+    image = torch.zeros(64, 64, 3)
+    image[:, 32:] = 1
+    widths = [int((pixel_detail(image, cells)[0] > 1).sum()) for cells in (10, 100, 4096)]
+    assert widths == sorted(widths, reverse=True)
+    assert widths[0] > 2 * widths[-1]
+
+
+@pytest.mark.parametrize("cells", [0.0, 1.0, 1e9])
+@pytest.mark.parametrize("shape", [(1, 1, 3), (1, 50, 3), (7, 3, 1)])
+def test_any_image_and_number_of_cells_has_weights(cells: float, shape: tuple[int, int, int]) -> None:
+    for image in (torch.rand(shape), torch.full(shape, 0.5), torch.full(shape, torch.nan)):
+        found = pixel_detail(image, cells)
+        assert found.isfinite().all()
+        assert (found > 0).all()
+        assert float(found.mean()) == pytest.approx(1, rel=1e-5)
+
+
+def test_weights_do_not_depend_on_contrast() -> None:
+    image = torch.rand(32, 32, 3)
+    torch.testing.assert_close(pixel_detail(0.01 * image + 0.3, 50), pixel_detail(image, 50), rtol=1e-4, atol=1e-4)
