@@ -20,10 +20,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.data.advice import larger_model
-from sundae_ns.data.beside import unused_masks
 from sundae_ns.data.capture import check_image, undecodable
-from sundae_ns.data.orientation import TURNED, exif_orientation, turn, wrong_size
+from sundae_ns.data.layouts import larger_model, unused_masks
+from sundae_ns.data.photos import TURNED, exif_orientation, turn, wrong_size
 from sundae_ns.errors import ConfigError, DataError, SundaeError, one_line
 from sundae_ns.parsing import (
     LightNerfstudioParser,
@@ -321,10 +320,9 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             full = check_image(path)
             if [int(side * scale) for side in full] != expected:
                 orientation = exif_orientation(path)
-                full = full[::-1]
-                if orientation not in TURNED or [int(side * scale) for side in full] != expected:
-                    raise wrong_size(path, full[::-1], (expected[0], expected[1]), orientation)
-                dataset.turned[index] = orientation
+                if orientation not in TURNED or [int(side * scale) for side in full[::-1]] != expected:
+                    raise wrong_size(path, full, expected, orientation)
+                dataset.turned[index], full = orientation, full[::-1]
             if mask is not None and check_image(mask, mask=True) != full:
                 raise DataError(f"{mask} differs in size from its image {path.name}; make it {full[0]} x {full[1]} px")
         self._checked.append(dataset)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from sundae_ns.data.advice import how_to_make_one
+from sundae_ns.data.layouts import how_to_make_one
 from sundae_ns.errors import ConfigError, DataError
 
 Kind = Literal["branch", "whole"]

@@ -14,8 +14,8 @@ import torch
 from sundae_ns.api.scene import Scene
 from sundae_ns.data.camera_axes import OPENGL_TO_OPENCV
 from sundae_ns.data.capture import finite, matrix, read_json, rigid, side
-from sundae_ns.data.colmap import images_of
-from sundae_ns.data.lenses import kind_of_frame, size_of_first_image, with_focal_lengths
+from sundae_ns.data.colmap import read_images
+from sundae_ns.data.lenses import kind_of_frame, with_focal_lengths
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.rendering import View
@@ -79,8 +79,7 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
-    if "fl_x" not in content:
-        content = with_focal_lengths(content, size_of_first_image(content, path.parent))
+    content = with_focal_lengths(content, path.parent)
     transform, scale = _to_model(scene, content, path.name)
     views = []
     for i, entry in enumerate(frames):
@@ -108,7 +107,7 @@ def _of_colmap(model: Path, scene: Scene | None) -> list[View]:
     """Views of a COLMAP model, in its own coordinates or in those of a run trained on it."""
     transform, scale = _to_model(scene, {}, model.name)
     views = []
-    for image in images_of(model):
+    for image in read_images(model).values():
         quaternion, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
         rotation = rotation_matrices(quaternion[None])[0].T
         pose = torch.cat([rotation * rotation.new_tensor(OPENGL_TO_OPENCV), -(rotation @ translation)[:, None]], dim=1)

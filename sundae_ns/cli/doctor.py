@@ -194,7 +194,7 @@ def installed(name: str, place: str | None, purpose: str, package: str) -> Findi
 
 def photo_packages() -> list[Finding]:
     """Whether the packages of ``sundae poses`` are installed and can be loaded."""
-    from sundae_ns.poses.library import INSTALL
+    from sundae_ns.poses.reconstruct import INSTALL
 
     findings = []
     for name, module, purpose in (

@@ -51,7 +51,7 @@ def poses(
         raise StorageError(f"{out} lies in {photos}, which the command reads; choose another folder")
     with loading():
         from sundae_ns.poses import Request
-        from sundae_ns.poses.library import pycolmap
+        from sundae_ns.poses.reconstruct import pycolmap
 
         pycolmap()
     request = Request(photos, out, matching, frames, masks)
@@ -70,9 +70,8 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
         ConfigError: pycolmap is not installed, a number is out of range, or masks are given for a video.
         DataError: the photos or masks cannot be used.
     """
-    from sundae_ns.data.masks import masks_of
-    from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside
-    from sundae_ns.poses.library import check_installed
+    from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside, masks_of
+    from sundae_ns.poses.reconstruct import check_installed
     from sundae_ns.poses.video import SUFFIXES, is_video, video_size
 
     check_installed()

@@ -368,16 +368,14 @@ def run(
 
 def _check_input(photos: Path) -> None:
     """Raise ``DataError`` for a path that is neither a capture nor a folder that may hold photos, or a video."""
-    from sundae_ns.data.advice import no_transforms
-    from sundae_ns.data.layouts import ColmapLayout, is_model, is_posed, posed_layout
+    from sundae_ns.data.layouts import is_model, is_posed, no_transforms, posed_layout
 
     if not photos.exists():
         raise DataError(f"{photos} does not exist; give a folder of photos, a video, or a capture")
     if is_posed(photos):
         layout = posed_layout(photos)
         if layout is not None:
-            kind = "COLMAP" if isinstance(layout, ColmapLayout) else "Blender"
-            print(f"# capture in {kind} layout: {layout}", flush=True)
+            print(f"# capture in {layout.program} layout: {layout.description}", flush=True)
         return
     if (photos / "sparse").is_dir() or is_model(photos):
         raise no_transforms(photos)  # says how to use a capture in another layout

@@ -1,4 +1,4 @@
-"""Captures: checks of their files before a parser reads them, camera poses, and the demo's own capture."""
+"""Captures: checks of their files before a parser reads them, COLMAP models, photos, and the demo's own capture."""
 
 from sundae_ns.data.capture import check_image, check_transforms
 from sundae_ns.data.colmap import check_colmap

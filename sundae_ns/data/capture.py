@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -16,30 +18,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from sundae_ns.data.beside import beside
-from sundae_ns.data.lenses import (
-    DISTORTION,
-    FISHEYE624,
-    INTRINSICS,
-    kind_of_model,
-    lens_of,
-    size_of_first_image,
-    with_focal_lengths,
-)
+from sundae_ns.data.lenses import DISTORTION, FISHEYE624, INTRINSICS, kind_of_model, lens_of, with_focal_lengths
 from sundae_ns.errors import DataError, one_line, reading, regular
 
-_MAX_SIDE = 65535
-"""Longest side of an image, in pixels: JPEG's limit."""
-_LARGEST = 1e12
-"""Largest coordinate or focal length; its square must stay in the range of float32."""
-_PIXELS_PER_BYTE = 4096
-"""Pixels per byte that no image format reaches, even for one flat colour."""
-_SMALL_IMAGE = 1 << 20
-"""Images of up to this many pixels pass, for any size of the file."""
-_CROOKED = 0.1
-"""Error of lengths and of cosines above which three axes are no rotation."""
-_ROUNDED = 1e-3
-"""Error of the lengths of axes that is left as it is."""
+_MAX_SIDE = 65535  # pixels: JPEG's limit
+_LARGEST = 1e12  # its square must stay in the range of float32
 _ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 
@@ -70,8 +53,8 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
     Raises:
         DataError: it has another shape, an entry that is not finite, or is singular.
     """
-    whole = isinstance(value, list) and len(value) in rows
-    if not whole or not all(isinstance(row, list) and len(row) == 4 for row in value):
+    listed = isinstance(value, list) and len(value) in rows
+    if not listed or not all(isinstance(row, list) and len(row) == 4 for row in value):
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
     for entry in chain(*value):
         finite(entry, name, where)
@@ -89,25 +72,19 @@ def rigid(pose: np.ndarray, where: str) -> np.ndarray:
     """
     axes = pose[:3, :3]
     scale = abs(float(np.linalg.det(axes))) ** (1 / 3)
-    if np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() > _CROOKED:
+    if np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() > 0.1:
         raise DataError(f"{where}: transform_matrix is no camera pose, as its first three columns are not a rotation")
-    if abs(scale - 1) <= _ROUNDED:
+    if abs(scale - 1) <= 1e-3:  # rounded numbers
         return pose
     pose = pose.copy()
     pose[:3, :3] /= scale
     return pose
 
 
-def read_bytes(path: Path) -> bytes:
-    """Contents of a file; ``DataError`` if it cannot be read."""
-    with reading(path, "a file"):
-        return regular(path).read_bytes()
-
-
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object of a file; ``DataError`` if it cannot be read or holds none."""
     with reading(path, "JSON", mend="write it again"):
-        content = json.loads(read_bytes(path))
+        content = json.loads(regular(path).read_bytes())
     if not isinstance(content, dict):
         raise DataError(f"{path} does not hold a JSON object; give the transforms.json of a capture")
     return content
@@ -127,70 +104,79 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{path} lists no frames; a capture needs at least one image with its pose")
-    _check_angles(meta, path.name)
-    if "fl_x" not in meta:
-        meta = with_focal_lengths(meta, size_of_first_image(meta, path.parent))
-    shared = [name for name in INTRINSICS if name in meta]
-    _check_camera(meta, shared, path.name)
-    models = {kind_of_model(meta["camera_model"], path.name)} if "camera_model" in meta else set()
-    extras: dict[str, int] = {"mask_path": 0, "depth_file_path": 0}
-    names = set()
+    _check_entries(meta, path.name)
+    meta = with_focal_lengths(meta, path.parent)
+    kinds: Counter[str] = Counter()
     for index, frame in enumerate(frames):
         where = f"{path.name}, frame {index}"
         if not isinstance(frame, dict):
             raise DataError(f"{where}: it must be an object with file_path and transform_matrix")
-        name = _path(frame.get("file_path"), "file_path", where)
-        names.add(name)
-        where = f"{where} ({_short(name)})"
-        missing = [key for key in INTRINSICS if key not in shared and key not in frame]
+        where += f" ({_short(_path(frame.get('file_path'), 'file_path', where))})"
+        _check_entries({"transform_matrix": None, **frame}, where)
+        missing = [key for key in INTRINSICS if key not in meta and key not in frame]
         if missing:
             raise DataError(f"{where}: {', '.join(missing)} missing; give them in each frame, or for all at the top")
-        _check_camera(frame, [key for key in INTRINSICS if key in frame], where)
-        if "camera_model" in frame:
-            models.add(kind_of_model(frame["camera_model"], where))
-        rigid(matrix(frame.get("transform_matrix"), (4,), "transform_matrix", where), where)
-        for key in extras:
-            if key in frame:
-                _path(frame[key], key, where)
-                extras[key] += 1
-    for key, count in extras.items():
+        kinds[lens_of(meta, frame, where).kind] += 1
+    stated = {key: sum(key in frame for frame in frames) for key in ("mask_path", "depth_file_path")}
+    for key, count in stated.items():
         if count not in (0, len(frames)):
             raise DataError(f"{path.name}: {count} of {len(frames)} frames have a {key}; give it in all or in none")
-    if models == {FISHEYE624}:
-        _check_round_lens(meta, extras["mask_path"] > 0, path.name)
-    for index, frame in enumerate(frames):
-        lens_of(meta, frame, f"{path.name}, frame {index} ({_short(frame['file_path'])})")
-    _check_splits(meta, names, splits, path.name)
-    _check_frame_of_capture(meta, path.name)
+    if FISHEYE624 in kinds:
+        _check_round_lens(meta, kinds, stated["mask_path"] > 0, path.name)
+    _check_splits(meta, splits, path.name)
     return meta
 
 
-def _check_camera(entry: Mapping[str, Any], keys: Collection[str], where: str) -> None:
-    """Check the intrinsics ``keys`` of an entry, and its distortion."""
-    for key in keys:
-        if key in ("w", "h"):
-            side(entry[key], key, where)
-        else:
-            finite(entry[key], key, where, positive=key.startswith("fl"))
-    for key in DISTORTION:
-        if key in entry:
-            finite(entry[key], key, where)
-    if "distortion_params" in entry:
-        values = entry["distortion_params"]
-        if not isinstance(values, list) or len(values) not in (4, 6, 12):
-            raise DataError(f"{where}: distortion_params must be a list of 4, 6 or 12 numbers")
-        for value in values:
-            finite(value, "distortion_params", where)
+def _check_entries(entries: Mapping[str, Any], where: str) -> None:
+    """Check what the file or one of its frames states."""
+    for key, check in _CHECKS.items():
+        if key in entries:
+            check(entries[key], key, where)
 
 
-def _check_angles(meta: Mapping[str, Any], where: str) -> None:
-    for key in ("camera_angle_x", "camera_angle_y"):
-        if key in meta and not 0 < finite(meta[key], key, where) < math.pi:
-            raise DataError(f"{where}: {key} is {_short(meta[key])}; it must be an angle of view in radians, below pi")
+def _path(value: Any, name: str, where: str) -> str:
+    if not isinstance(value, str) or not value or "\0" in value:
+        raise DataError(f"{where}: {name} is {_short(value)}; it must be the path of a file")
+    return value
 
 
-def _check_round_lens(meta: Mapping[str, Any], masked: bool, where: str) -> None:
-    """Check the entries from which nerfstudio makes the masks of a FISHEYE624 camera."""
+def _angle(value: Any, name: str, where: str) -> None:
+    if not 0 < finite(value, name, where) < math.pi:
+        raise DataError(f"{where}: {name} is {_short(value)}; it must be an angle of view in radians, below pi")
+
+
+def _distortion(value: Any, name: str, where: str) -> None:
+    if not isinstance(value, list) or len(value) not in (4, 6, 12):
+        raise DataError(f"{where}: {name} must be a list of 4, 6 or 12 numbers")
+    for number in value:
+        finite(number, name, where)
+
+
+def _orientation(value: Any, name: str, where: str) -> None:
+    if value not in _ORIENTATIONS:
+        raise DataError(f"{where}: {name} is {_short(value)}; use one of {', '.join(_ORIENTATIONS)}")
+
+
+_CHECKS: dict[str, Callable[[Any, str, str], Any]] = {
+    **dict.fromkeys(("w", "h"), side),
+    **dict.fromkeys(("fl_x", "fl_y", "applied_scale"), partial(finite, positive=True)),
+    **dict.fromkeys(("cx", "cy", *DISTORTION), finite),
+    **dict.fromkeys(("camera_angle_x", "camera_angle_y"), _angle),
+    **dict.fromkeys(("mask_path", "depth_file_path", "ply_file_path"), _path),
+    "distortion_params": _distortion,
+    "camera_model": lambda value, _, where: kind_of_model(value, where),
+    "transform_matrix": lambda value, name, where: rigid(matrix(value, (4,), name, where), where),
+    "applied_transform": lambda value, name, where: matrix(value, (3,), name, where),
+    "orientation_override": _orientation,
+}
+"""The check of each entry of a file or of a frame, called with its value, its name and where it stands."""
+
+
+def _check_round_lens(meta: Mapping[str, Any], kinds: Counter[str], masked: bool, where: str) -> None:
+    """Check what a FISHEYE624 camera needs: nerfstudio makes its masks, and holds it with no other kind of lens."""
+    if len(kinds) > 1:
+        counts = ", ".join(f"{count} images with {kind}" for kind, count in sorted(kinds.items()))
+        raise DataError(f"{where}: FISHEYE624 cannot be mixed with other lenses ({counts}); undistort the images first")
     radius = meta.get("fisheye_crop_radius")
     if not isinstance(radius, float) or not 0 < radius < math.inf:
         raise DataError(
@@ -201,8 +187,9 @@ def _check_round_lens(meta: Mapping[str, Any], masked: bool, where: str) -> None
         raise DataError(f"{where}: nerfstudio makes the masks of a FISHEYE624 camera; remove mask_path")
 
 
-def _check_splits(meta: Mapping[str, Any], names: set[str], splits: Sequence[str], where: str) -> None:
+def _check_splits(meta: Mapping[str, Any], splits: Sequence[str], where: str) -> None:
     listed = [split for split in ("train", "val", "test") if f"{split}_filenames" in meta]
+    known = {str(Path(frame["file_path"])) for frame in meta["frames"]}
     for split in splits if listed else ():
         files = meta.get(f"{split}_filenames")
         if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
@@ -210,32 +197,11 @@ def _check_splits(meta: Mapping[str, Any], names: set[str], splits: Sequence[str
                 f"{where} lists images for {', '.join(listed)}, but none for {split}; add {split}_filenames as a list "
                 "of paths, or remove all such lists"
             )
-        known = {str(Path(name)) for name in names}
         unknown = [file for file in files if str(Path(file)) not in known]
         if unknown:
             raise DataError(
                 f"{where}: {split}_filenames has {_short(unknown[0])}, which no frame has as its file_path; correct it"
             )
-
-
-def _check_frame_of_capture(meta: Mapping[str, Any], where: str) -> None:
-    if "applied_transform" in meta:
-        matrix(meta["applied_transform"], (3,), "applied_transform", where)
-    if "applied_scale" in meta:
-        finite(meta["applied_scale"], "applied_scale", where, positive=True)
-    if meta.get("orientation_override", "up") not in _ORIENTATIONS:
-        raise DataError(
-            f"{where}: orientation_override is {_short(meta['orientation_override'])}; "
-            f"use one of {', '.join(_ORIENTATIONS)}"
-        )
-    if "ply_file_path" in meta:
-        _path(meta["ply_file_path"], "ply_file_path", where)
-
-
-def _path(value: Any, name: str, where: str) -> str:
-    if not isinstance(value, str) or not value or "\0" in value:
-        raise DataError(f"{where}: {name} is {_short(value)}; it must be the path of a file")
-    return value
 
 
 def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
@@ -259,7 +225,8 @@ def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
     if mode not in modes:
         wanted = "one channel of 8 bits" if mask else "RGB, RGBA or grey with 8 bits per channel"
         raise DataError(f"{path} has pixels of type {mode}; save it with {wanted}")
-    if size[0] * size[1] > max(_PIXELS_PER_BYTE * length, _SMALL_IMAGE):
+    # No format stores 4,096 pixels in a byte, even of one flat colour.
+    if size[0] * size[1] > max(4096 * length, 1 << 20):
         raise DataError(f"{path} claims {size[0]} x {size[1]} px in {length:,} bytes; it is incomplete, save it again")
     return size
 
@@ -269,7 +236,22 @@ def undecodable(path: Path, error: Exception) -> DataError:
     return DataError(f"{path} cannot be decoded ({one_line(error)}); repair it or remove the view")
 
 
+def beside(path: Path) -> str:
+    """A remark on a file that has the name of a missing one but for case or suffix: `` (there is x.PNG)``, or empty."""
+    wanted = (path.stem.lower(), path.name.lower())
+    names = [entry.name for entry in entries(path.parent) if entry.stem.lower() in wanted]
+    return "" if path.name in names or not names else f" (there is {names[0]})"
+
+
+def entries(folder: Path) -> list[Path]:
+    """Contents of a folder in their order, at most 10,000; empty if there is no such folder."""
+    try:
+        return sorted(folder.iterdir())[:10_000]
+    except OSError:
+        return []
+
+
 def _short(value: Any) -> str:
     """A value as one line of at most 80 characters, for an error message."""
-    shown = repr(value)
-    return shown if len(shown) <= 80 else shown[:77] + "..."
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from PIL import Image
+
 from sundae_ns.errors import DataError
 
 PERSPECTIVE, FISHEYE, FISHEYE624 = "OPENCV", "OPENCV_FISHEYE", "FISHEYE624"
@@ -18,48 +20,38 @@ PERSPECTIVE, FISHEYE, FISHEYE624 = "OPENCV", "OPENCV_FISHEYE", "FISHEYE624"
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Distortion of a ``transforms.json``, in the order of nerfstudio's ``distortion_params``."""
-
-_KINDS = {
-    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), PERSPECTIVE),
-    **dict.fromkeys(
-        ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"), FISHEYE
-    ),
-    "FISHEYE624": FISHEYE624,
+COLMAP_LENSES: dict[str, tuple[int, str | None, str, str]] = {
+    "SIMPLE_PINHOLE": (0, PERSPECTIVE, "f cx cy", ""),
+    "PINHOLE": (1, PERSPECTIVE, "fx fy cx cy", ""),
+    "SIMPLE_RADIAL": (2, PERSPECTIVE, "f cx cy k1", ""),
+    "RADIAL": (3, PERSPECTIVE, "f cx cy k1 k2", ""),
+    "OPENCV": (4, PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2", ""),
+    "OPENCV_FISHEYE": (5, FISHEYE, "fx fy cx cy k1 k2 k3 k4", ""),
+    "FULL_OPENCV": (6, PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "k4 k5 k6"),
+    "FOV": (7, None, "", ""),
+    "SIMPLE_RADIAL_FISHEYE": (8, FISHEYE, "f cx cy k1", ""),
+    "RADIAL_FISHEYE": (9, FISHEYE, "f cx cy k1 k2", ""),
+    "THIN_PRISM_FISHEYE": (10, FISHEYE, "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1", "p1 p2 sx1 sy1"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (11, None, "", ""),
+    "SIMPLE_DIVISION": (12, None, "", ""),
+    "DIVISION": (13, None, "", ""),
+    "SIMPLE_FISHEYE": (14, FISHEYE, "f cx cy", ""),
+    "FISHEYE": (15, FISHEYE, "fx fy cx cy", ""),
+    "EUCM": (16, None, "", ""),
+    "EQUIRECTANGULAR": (17, None, "", ""),
 }
-_CUT = (
-    "cut them into perspective images with `ns-process-data images --camera-type equirectangular --data PANORAMAS "
-    "--output-dir CAPTURE`, which finds new poses"
-)
-_EYES = "render or cut perspective images (cube faces) of one eye, each with its own pose"
-_REFUSED = {
-    "EQUIRECTANGULAR": f"the images are panoramas: {_CUT}",
-    "OMNIDIRECTIONALSTEREO": f"the images are stereo panoramas: {_EYES}",
-    "VR180": f"the images are half panoramas of stereo: {_EYES}",
+"""COLMAP's camera models: number, kind (None if there is none), parameters in their order, and those that must be 0."""
+_KINDS = {name: kind for name, (_, kind, _, zeros) in COLMAP_LENSES.items() if kind and not zeros}
+_KINDS[FISHEYE624] = FISHEYE624
+_ONE_EYE = "render or cut perspective images (cube faces) of one eye, each with its own pose"
+_REMEDIES = {
+    "EQUIRECTANGULAR": "the images are panoramas: cut them into perspective images with `ns-process-data images "
+    "--camera-type equirectangular --data PANORAMAS --output-dir CAPTURE`, which finds new poses",
+    "OMNIDIRECTIONALSTEREO": f"the images are stereo panoramas: {_ONE_EYE}",
+    "VR180": f"the images are half panoramas of stereo: {_ONE_EYE}",
     "ORTHOPHOTO": "an orthophoto has no focal length: train on the photos that it was made of",
 }
-COLMAP_LENSES: dict[str, tuple[int, str]] = {
-    "SIMPLE_PINHOLE": (0, "f cx cy"),
-    "PINHOLE": (1, "fx fy cx cy"),
-    "SIMPLE_RADIAL": (2, "f cx cy k1"),
-    "RADIAL": (3, "f cx cy k1 k2"),
-    "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2"),
-    "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4"),
-    "FULL_OPENCV": (6, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
-    "FOV": (7, "fx fy cx cy omega"),
-    "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1"),
-    "RADIAL_FISHEYE": (9, "f cx cy k1 k2"),
-    "THIN_PRISM_FISHEYE": (10, "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (11, "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3"),
-    "SIMPLE_DIVISION": (12, "f cx cy k"),
-    "DIVISION": (13, "fx fy cx cy k"),
-    "SIMPLE_FISHEYE": (14, "f cx cy"),
-    "FISHEYE": (15, "fx fy cx cy"),
-    "EUCM": (16, "fx fy cx cy alpha beta"),
-    "EQUIRECTANGULAR": (17, "w h"),
-}
-"""COLMAP's camera models: number, and parameters in their order."""
-_SPECIAL_CASES = {"FULL_OPENCV": (PERSPECTIVE, ("k4", "k5", "k6")), "THIN_PRISM_FISHEYE": (FISHEYE, ("p1", "p2"))}
-"""Models that equal one of nerfstudio's kinds where some parameters are zero."""
+"""Projections that no perspective image shows whole, by the start of their names, and what to do instead."""
 
 
 class Lens(NamedTuple):
@@ -75,11 +67,14 @@ def kind_of_model(model: Any, where: str) -> str:
     """The kind of lens of a ``camera_model``; ``DataError`` with the way out for other projections."""
     if isinstance(model, str) and model in _KINDS:
         return _KINDS[model]
-    help_ = next((text for name, text in _REFUSED.items() if isinstance(model, str) and model.startswith(name)), None)
-    if help_ is not None:
-        raise DataError(f"{where}: camera_model {model} is no lens that perspective images can be made of; {help_}")
-    shown = repr(model)[:80]
-    raise DataError(f"{where}: camera_model is {shown}; use one of {', '.join(_KINDS)}")
+    _refuse_projection(model, f"{where}: camera_model")
+    raise DataError(f"{where}: camera_model is {repr(model)[:80]}; use one of {', '.join(_KINDS)}")
+
+
+def _refuse_projection(model: Any, what: str) -> None:
+    for start, remedy in _REMEDIES.items():
+        if isinstance(model, str) and model.startswith(start):
+            raise DataError(f"{what} {model} is no lens that perspective images can be made of; {remedy}")
 
 
 def kind_of_frame(stated: Mapping[str, Any], where: str) -> str:
@@ -98,81 +93,21 @@ def lens_of(meta: Mapping[str, Any], frame: Mapping[str, Any], where: str) -> Le
     """
     stated = {**meta, **frame}
     kind = kind_of_frame(stated, where)
-    own = "distortion_params" in frame or not any(key in frame for key in DISTORTION)
-    values = stated.get("distortion_params") if own else None
+    of_frame = "distortion_params" not in frame and any(key in frame for key in DISTORTION)
+    values = None if of_frame else stated.get("distortion_params")
     if values is None:
-        values = [float(stated.get(key, 0.0)) for key in DISTORTION] if kind != FISHEYE624 else []
-    return Lens(kind, _in_order(kind, tuple(map(float, values)), where))
-
-
-def _in_order(kind: str, values: tuple[float, ...], where: str) -> tuple[float, ...]:
-    """Distortion with all of its numbers, checked."""
-    if kind == FISHEYE624:
-        if len(values) != 12:
-            raise DataError(f"{where}: a FISHEYE624 camera needs distortion_params of 12 numbers, not {len(values)}")
-        return values
-    if len(values) == 4 and (kind == FISHEYE or not any(values[2:])):
-        values += (0.0, 0.0)
-    elif len(values) == 4:
-        raise DataError(
-            f"{where}: four distortion_params may be k1, k2, p1, p2 or k1, k2, k3, k4; give them by these names instead"
-        )
-    if len(values) != 6:
-        raise DataError(f"{where}: {kind} needs distortion_params of 6 numbers (k1, k2, k3, k4, p1, p2)")
-    return values
-
-
-def with_focal_lengths(meta: Mapping[str, Any], size: tuple[int, int] | None) -> dict[str, Any]:
-    """A ``transforms.json`` that states angles of view, as Blender and instant-ngp do, with focal lengths in pixels.
-
-    Args:
-        meta: the file; one that states ``fl_x`` stays as it is.
-        size: width and height of an image, for a file that states neither.
-    """
-    angle: Any = meta.get("camera_angle_x")
-    frames = meta.get("frames")
-    known = "fl_x" in meta or (isinstance(frames, list) and any("fl_x" in f for f in frames if isinstance(f, dict)))
-    if known or not _is_angle(angle):
-        return dict(meta)
-    made = dict(meta)
-    if size is not None:
-        made.setdefault("w", size[0])
-        made.setdefault("h", size[1])
-    if not all(isinstance(made.get(key), (int, float)) for key in ("w", "h")):
-        return made
-    made["fl_x"] = made["w"] / 2 / math.tan(angle / 2)
-    upright: Any = meta.get("camera_angle_y")
-    made["fl_y"] = made["h"] / 2 / math.tan(upright / 2) if _is_angle(upright) else made["fl_x"]
-    made.setdefault("cx", made["w"] / 2)
-    made.setdefault("cy", made["h"] / 2)
-    return made
-
-
-def _is_angle(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.pi
-
-
-def own_intrinsics(meta: Mapping[str, Any]) -> dict[str, Any]:
-    """A ``transforms.json`` in which each frame states its own intrinsics, if any frame states some beside the file's.
-
-    nerfstudio takes the file's wherever it has some. A file whose frames state none keeps its values.
-    """
-    distortion = (*DISTORTION, "distortion_params")
-    shared = [key for key in (*INTRINSICS, *distortion) if key in meta]
-    distorted = [key for key in shared if key in distortion]
-    frames = meta["frames"]
-
-    def differs(frame: Mapping[str, Any]) -> bool:
-        return any(key in frame for key in (*shared, *(distortion if distorted else ())))
-
-    lenses = [lens_of(meta, frame, "transforms.json") for frame in frames]
-    sizes = {len(frame.get("distortion_params", meta.get("distortion_params", [0] * 6))) for frame in frames}
-    if not any(map(differs, frames)) and distorted != ["k4"] and 4 not in sizes:
-        return dict(meta)
-    for frame, lens in zip(frames, lenses, strict=True):
-        own = {key: meta[key] for key in INTRINSICS if key in meta}
-        frame.update({**own, **frame, "distortion_params": list(lens.distortion)})
-    return {key: value for key, value in meta.items() if key not in shared}
+        values = [stated.get(key, 0.0) for key in DISTORTION] if kind != FISHEYE624 else []
+    if kind != FISHEYE624 and len(values) == 4:
+        if kind != FISHEYE and any(values[2:]):
+            raise DataError(
+                f"{where}: four distortion_params may be k1, k2, p1, p2 or k1, k2, k3, k4; give them by these names "
+                "instead"
+            )
+        values = [*values, 0.0, 0.0]
+    count, names = (12, "") if kind == FISHEYE624 else (6, f" ({', '.join(DISTORTION)})")
+    if len(values) != count:
+        raise DataError(f"{where}: {kind} needs distortion_params of {count} numbers{names}, not {len(values)}")
+    return Lens(kind, tuple(map(float, values)))
 
 
 def colmap_lens(model: str, params: Sequence[float], where: str) -> tuple[tuple[float, float, float, float], Lens]:
@@ -181,40 +116,61 @@ def colmap_lens(model: str, params: Sequence[float], where: str) -> tuple[tuple[
     Raises:
         DataError: nerfstudio cannot undistort it; says what does.
     """
-    names = COLMAP_LENSES[model][1].split()
-    stated = dict(zip(names, map(float, params), strict=True))
-    kind = _KINDS.get(model)
-    if kind is None:
-        kind, zeros = _SPECIAL_CASES.get(model, (None, ()))
-        if kind is None or any(stated[name] for name in (*zeros, *(n for n in names if n.startswith("s")))):
-            raise DataError(f"{where}: {_colmap_help(model)}")
+    _, kind, names, zeros = COLMAP_LENSES[model]
+    stated = dict(zip(names.split(), map(float, params), strict=True))
+    if kind is None or any(stated[name] for name in zeros.split()):
+        raise unsupported(model, where)
     fx, fy = stated.get("fx", stated.get("f", 0.0)), stated.get("fy", stated.get("f", 0.0))
     return (fx, fy, stated["cx"], stated["cy"]), Lens(kind, tuple(stated.get(key, 0.0) for key in DISTORTION))
 
 
-def _colmap_help(model: str) -> str:
-    if model in _REFUSED:
-        return f"camera model {model} is no lens that perspective images can be made of; {_REFUSED[model]}"
-    return (
-        f"nerfstudio does not support camera model {model}; make undistorted images with `colmap image_undistorter` "
-        "and train on its output, or calibrate the capture with OPENCV"
+def unsupported(model: str, where: str) -> DataError:
+    """The error for a camera model of COLMAP that nerfstudio cannot undistort."""
+    _refuse_projection(model, f"{where}: camera model")
+    return DataError(
+        f"{where}: nerfstudio does not support camera model {model}; make undistorted images with `colmap "
+        "image_undistorter` and train on its output, or calibrate the capture with OPENCV"
     )
 
 
-def check_colmap_model(model: int | str, where: str) -> str:
+def colmap_model(model: int | str, where: str) -> str:
     """Name of a COLMAP camera model by its number or name; ``DataError`` with the way out if it cannot be read."""
-    for name, (number, _) in COLMAP_LENSES.items():
+    for name, (number, kind, _, _) in COLMAP_LENSES.items():
         if model in (name, number):
-            if name not in _KINDS and name not in _SPECIAL_CASES:
-                raise DataError(f"{where}: {_colmap_help(name)}")
+            if kind is None:
+                raise unsupported(name, where)
             return name
     raise DataError(f"{where}: camera model {model} is not known here; calibrate the capture with OPENCV")
 
 
+def with_focal_lengths(meta: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """A ``transforms.json`` that states angles of view, as Blender and instant-ngp do, with focal lengths in pixels.
+
+    One that states focal lengths stays as it is. The size of its first image in ``folder`` counts if it states none.
+    """
+    angle: Any = meta.get("camera_angle_x")
+    frames = meta.get("frames")
+    entries = [meta, *(frames if isinstance(frames, list) else [])]
+    if not _is_angle(angle) or any(isinstance(entry, dict) and "fl_x" in entry for entry in entries):
+        return meta
+    size = size_of_first_image(meta, folder) or (None, None)
+    width: Any = meta.get("w", size[0])
+    height: Any = meta.get("h", size[1])
+    if not isinstance(width, (int, float)) or not isinstance(height, (int, float)):
+        return meta
+    angle_y: Any = meta.get("camera_angle_y")
+    across = width / 2 / math.tan(angle / 2)
+    down = height / 2 / math.tan(angle_y / 2) if _is_angle(angle_y) else across
+    known = {"w": width, "h": height, "cx": width / 2, "cy": height / 2}
+    return {**known, **meta, "fl_x": across, "fl_y": down}
+
+
+def _is_angle(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.pi
+
+
 def size_of_first_image(meta: Mapping[str, Any], folder: Path) -> tuple[int, int] | None:
     """Width and height in pixels of the image of the first frame, by its header; None if there is none."""
-    from PIL import Image
-
     try:
         with Image.open(folder / meta["frames"][0]["file_path"]) as image:
             return image.size

@@ -1,4 +1,5 @@
-"""Photos before camera poses are found: what a folder holds, by the contents of its files."""
+"""Photos before camera poses are found: what a folder holds, by the contents of its files, their masks, and how they
+are turned."""
 
 from __future__ import annotations
 
@@ -10,6 +11,8 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from sundae_ns.data.capture import check_image, undecodable
@@ -17,20 +20,21 @@ from sundae_ns.errors import DataError, reading, regular
 
 HEIF = (".heic", ".heif")
 """Photos of phones, for which Pillow needs the package pillow-heif."""
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIF, ".cr2")
+RAW = ".cr2"
+"""Raw photos of Canon, which Pillow does not read."""
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIF, RAW)
 """Photos that are read."""
 LEAST_PHOTOS = 3
 """Number of photos with a pose that a scene needs, because nerfstudio holds out at least one for test."""
-AS_THEY_ARE = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
+TURNED = (5, 6, 7, 8)
+"""EXIF orientations that swap width and height."""
+_COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
 """Suffix for a format of Pillow that a capture may have; phones write MPO, a JPEG of several images."""
 _CONVERTED = ("TIFF", "WEBP", "BMP", "HEIF")
 """Formats of Pillow whose photos are saved as JPEG, or as PNG if they have an alpha channel."""
-RAW = ".cr2"
-"""Raw photos of Canon, which Pillow does not read."""
 _OTHERS = (".avif", ".jxl", ".dng", ".nef", ".arw", ".cr3", ".raf", ".orf", ".rw2", ".gif")
 """Photos of other formats, which are passed over."""
-_CONVERT = "convert them to JPEG (`magick mogrify -format jpg FILES`, or export them as JPEG)"
-MASKS = ("masks", "mask")
+_MASKS = ("masks", "mask")
 """Names of folders whose images are masks, not photos."""
 
 
@@ -61,12 +65,18 @@ def find_photos(folder: Path) -> list[Photo]:
     paths: list[Path] = []
     with reading(folder, "a folder of photos"):
         paths = sorted(path for path in _files(folder) if path.suffix.lower() in SUFFIXES)
-    _check_one_scene(folder, paths)
+    counts = Counter(path.parent for path in paths)
+    if len(counts) > 1 and folder not in counts:
+        listed = ", ".join(f"{one.relative_to(folder)}: {count:,}" for one, count in list(counts.items())[:3])
+        raise DataError(
+            f"{folder} holds {len(paths):,} photos in {len(counts)} folders ({listed}{', ...' * (len(counts) > 3)}); "
+            "give the folder of one scene, or move the photos of one scene into one folder"
+        )
     if not reads_heif():
         paths = [path for path in paths if path.suffix.lower() not in HEIF]
     photos = [photo_of(path) for path in paths]
-    if not paths and (others := _passed_over(folder)):
-        raise DataError(f"{folder} holds only photos that cannot be read ({_counted(others)}); {_mend(others)}")
+    if not paths and (remark := left_out(folder)):
+        raise DataError(f"{folder} holds no photos that can be read: {remark}")
     if not paths:
         raise DataError(f"{folder} holds no photos ({', '.join(SUFFIXES)}); give a folder of photos, or a capture")
     if len(paths) < LEAST_PHOTOS:
@@ -88,19 +98,21 @@ def reads_heif() -> bool:
 
 def left_out(folder: Path) -> str | None:
     """A remark on photos of other formats in a folder; None without any."""
-    others = _passed_over(folder)
-    if not others:
+    unread = _OTHERS if reads_heif() else (*_OTHERS, *HEIF)
+    counts = Counter(suffix for path in _files(folder) if (suffix := path.suffix.lower()) in unread)
+    if not counts:
         return None
-    return f"{_counted(others)} {'is' if sum(others.values()) == 1 else 'are'} left out; {_mend(others)}"
+    listed = " and ".join(f"{count} {suffix} file{'s' * (count > 1)}" for suffix, count in sorted(counts.items()))
+    remedy = "convert them to JPEG (`magick mogrify -format jpg FILES`, or export them as JPEG)"
+    if counts.keys() <= set(HEIF):
+        remedy = 'install pillow-heif with pip install "sundae_ns[photos]"'
+    return f"{listed} {'is' if counts.total() == 1 else 'are'} left out; {remedy}"
 
 
 def masks_beside(folder: Path) -> Path | None:
     """The first folder of masks in a folder of photos; None without one."""
-    for place, folders, _ in os.walk(folder):
-        for name in sorted(folders):
-            if name.lower() in MASKS:
-                return Path(place, name)
-    return None
+    found = (Path(parent, name) for parent, names, _ in os.walk(folder) for name in sorted(names))
+    return next((path for path in found if path.name.lower() in _MASKS), None)
 
 
 def upright(photo: Photo) -> Image.Image:
@@ -120,41 +132,13 @@ def upright(photo: Photo) -> Image.Image:
 
 def _files(folder: Path) -> Iterator[Path]:
     """Files of a folder and its subfolders that are neither hidden nor masks."""
-    for place, folders, files in os.walk(folder, onerror=_raise):
-        folders[:] = [name for name in folders if not name.startswith(".") and name.lower() not in MASKS]
-        yield from (Path(place, name) for name in files if not name.startswith("."))
 
+    def fail(error: OSError) -> None:
+        raise error
 
-def _check_one_scene(folder: Path, photos: Sequence[Path]) -> None:
-    """Raise ``DataError`` for photos that lie in several subfolders only, which are probably several scenes."""
-    counts = Counter(path.parent for path in photos)
-    if len(counts) < 2 or folder in counts:
-        return
-    shown = ", ".join(f"{place.relative_to(folder)}: {count:,}" for place, count in list(counts.items())[:3])
-    shown += ", ..." if len(counts) > 3 else ""
-    raise DataError(
-        f"{folder} holds {len(photos):,} photos in {len(counts)} folders ({shown}); "
-        "give the folder of one scene, or move the photos of one scene into one folder"
-    )
-
-
-def _passed_over(folder: Path) -> dict[str, int]:
-    """Numbers of photos of formats that are passed over, by suffix."""
-    unread = _OTHERS if reads_heif() else (*_OTHERS, *HEIF)
-    suffixes = (path.suffix.lower() for path in _files(folder))
-    return dict(Counter(suffix for suffix in suffixes if suffix in unread))
-
-
-def _mend(others: dict[str, int]) -> str:
-    return 'install pillow-heif with pip install "sundae_ns[photos]"' if set(others) <= set(HEIF) else _CONVERT
-
-
-def _counted(counts: dict[str, int]) -> str:
-    return " and ".join(f"{count} {suffix} file{'s' * (count > 1)}" for suffix, count in sorted(counts.items()))
-
-
-def _raise(error: OSError) -> None:
-    raise error
+    for parent, folders, files in os.walk(folder, onerror=fail):
+        folders[:] = [name for name in folders if not name.startswith(".") and name.lower() not in _MASKS]
+        yield from (Path(parent, name) for name in files if not name.startswith("."))
 
 
 def photo_of(path: Path) -> Photo:
@@ -169,14 +153,14 @@ def photo_of(path: Path) -> Photo:
         return Photo(path, ".jpg", (0, 0), False, (RAW,))
     check_image(path)
     with Image.open(path) as image:
-        found, size, alpha, exif = str(image.format), image.size, image.mode == "RGBA", image.getexif()
-        stated = exif.get(ExifTags.Base.Orientation, 1)
+        kind, size, alpha, exif = str(image.format), image.size, image.mode == "RGBA", image.getexif()
+        orientation = exif.get(ExifTags.Base.Orientation, 1)
         lens = _lens(exif)
-    if found not in (*AS_THEY_ARE, *_CONVERTED):
-        raise DataError(f"{path} is a {found} file by its contents; save it as JPEG or PNG, or remove it")
-    turned = stated in range(2, 9)
-    suffix = AS_THEY_ARE.get(found, ".png" if alpha else ".jpg")
-    return Photo(path, suffix, size[::-1] if stated in range(5, 9) else size, found in AS_THEY_ARE and not turned, lens)
+    if kind not in (*_COPIED, *_CONVERTED):
+        raise DataError(f"{path} is a {kind} file by its contents; save it as JPEG or PNG, or remove it")
+    suffix = _COPIED.get(kind, ".png" if alpha else ".jpg")
+    size = size[::-1] if orientation in TURNED else size
+    return Photo(path, suffix, size, kind in _COPIED and orientation not in range(2, 9), lens)
 
 
 def _lens(exif: Image.Exif) -> tuple[str, ...]:
@@ -187,3 +171,57 @@ def _lens(exif: Image.Exif) -> tuple[str, ...]:
         focal = inner.get(ExifTags.Base.FocalLength)
         return tuple(str(value).strip() for value in [*named, focal and f"{float(focal):.1f}"] if value)
     return ()
+
+
+def exif_orientation(path: Path) -> int:
+    """EXIF orientation of an image, from 1 (as stored) to 8; 1 if it states none."""
+    with suppress(Exception), Image.open(path) as image:  # decoders raise many kinds; a damaged entry is none
+        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+        return orientation if orientation in range(1, 9) else 1
+    return 1
+
+
+def turn(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+    """Stored pixels ``[H, W, C]`` as they are to be seen by their EXIF orientation."""
+    image = Image.fromarray(pixels)
+    image.getexif()[ExifTags.Base.Orientation] = orientation
+    return np.array(ImageOps.exif_transpose(image))
+
+
+def wrong_size(path: Path, size: Sequence[int], expected: Sequence[int], orientation: int) -> DataError:
+    """The error for an image whose size is not that of its camera."""
+    if orientation in TURNED:
+        remedy = "it is also turned by its EXIF entry: turn its pixels and remove the entry"
+    elif max(abs(a - b) for a, b in zip(size, expected, strict=True)) <= 1:
+        remedy = (
+            "it was rounded another way: give colmap --downscale-rounding-mode round (or ceil), or make the smaller "
+            "images again"
+        )
+    else:
+        remedy = "give each size its own camera, or resize the images"
+    return DataError(
+        f"{path.name} is {size[0]} x {size[1]} px but its camera says {expected[0]} x {expected[1]}; {remedy}"
+    )
+
+
+def masks_of(photos: Sequence[Photo], folder: Path) -> list[Path]:
+    """The mask of each photo: an image in ``folder`` with the photo's name, or with ``.png`` behind it or in its place.
+
+    Raises:
+        DataError: a photo has no mask, or one of another size, or one that may be turned otherwise.
+    """
+    masks = []
+    for path, _, wanted, _, _ in photos:
+        names = (path.name, f"{path.name}.png", f"{path.stem}.png", f"{path.stem}.jpg")
+        mask = next((folder / name for name in names if (folder / name).is_file()), None)
+        if mask is None:
+            raise DataError(f"{path} has no mask {path.stem}.png in {folder}; add it, white where pixels count")
+        size, orientation = check_image(mask, mask=True), exif_orientation(path)
+        # A mask of the upright size is upright; where both sizes are the same, nothing says so.
+        known = orientation in TURNED and size == wanted and size != size[::-1]
+        if orientation != 1 and not known:
+            raise DataError(f"{path} is turned by its EXIF entry, and its mask is not; save both upright")
+        if wanted not in (size, (0, 0)):
+            raise DataError(f"{mask} has {size[0]} x {size[1]} px and its photo {wanted[0]} x {wanted[1]}; scale it")
+        masks.append(mask)
+    return masks

@@ -1,4 +1,4 @@
-"""Checks of a capture before and after it is parsed: files, cameras, projections, and where the cloud lies."""
+"""Checks of a parsed capture: cameras, projections, and where the cloud lies."""
 
 from __future__ import annotations
 
@@ -7,66 +7,13 @@ from pathlib import Path
 
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import Tensor
 
 from sundae_ns.api.files import FRAME_FILE
-from sundae_ns.data.advice import no_model, no_transforms
-from sundae_ns.data.beside import beside
-from sundae_ns.data.capture import check_transforms, read_json
-from sundae_ns.data.colmap import check_colmap
-from sundae_ns.data.frame import STRAY, stray_cameras
+from sundae_ns.data.capture import read_json
 from sundae_ns.errors import DataError
-from sundae_ns.parsing.placing import TYPES
+from sundae_ns.parsing.placing import STRAY, TYPES, stray_cameras
 from sundae_ns.training.warning import warn
-
-LEAST_FOCAL, MOST_FOCAL = 0.01, 1000.0
-"""Shortest and longest focal length in widths of the image: views of 178 and of 0.06 degrees."""
-FARTHEST = 20
-"""Distance of a camera, in median distances, above which its pose is doubted."""
-_LOOKED_FOR = 2000
-"""Points of a cloud that are looked for in the views."""
-_MARGIN = 0.1
-"""Margin of an image in which points count as seen, as a share of its size."""
-_LEAST_SEEING = 0.5
-"""Share of the views that see points, if cloud and cameras are in the same coordinates."""
-
-
-def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, images: bool = True) -> None:
-    """Check a capture in nerfstudio's or COLMAP's layout before its parser reads it.
-
-    Args:
-        parser: configuration of the parser; captures of other parsers are not checked.
-        data: the capture: a folder, or a ``transforms.json``.
-        splits: splits that will be read.
-        images: whether the images will be needed; a viewer needs the cameras only.
-
-    Raises:
-        DataError: the first thing that cannot be used, and where it stands.
-    """
-    if not data.exists():
-        raise DataError(
-            f"{data} does not exist; give the folder of the capture with --data, or, for a command of nerfstudio that "
-            "has no --data, correct data in the run's config.yml"
-        )
-    if isinstance(parser, ColmapDataParserConfig):
-        if parser.load_3D_points and not any((data / parser.colmap_path).glob("points3D.*")):
-            parser.load_3D_points = False  # the model then warns, and starts from random points
-        if not (data / parser.colmap_path).is_dir():
-            raise no_model(data, parser.colmap_path)
-        folder = data / parser.images_path if images else None
-        check_colmap(data / parser.colmap_path, folder, points=parser.load_3D_points)
-    elif isinstance(parser, NerfstudioDataParserConfig):
-        path = data if data.suffix == ".json" else data / "transforms.json"
-        if not path.is_file():
-            raise no_transforms(data)
-        frames = check_transforms(path, splits=splits)["frames"]
-        if images and parser.downscale_factor in (None, 1):
-            first = path.parent / frames[0]["file_path"]  # nerfstudio looks at its size
-            if not first.exists():
-                raise DataError(f"{first} does not exist{beside(first)}; correct file_path in {path.name}")
 
 
 def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None = None) -> str | None:
@@ -98,7 +45,7 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
             "do); negate one column of its rotation"
         )
     shares = cameras.fx / cameras.width.clamp_min(1)
-    wrong = ((shares < LEAST_FOCAL) | (shares > MOST_FOCAL)).flatten()
+    wrong = ((shares < 0.01) | (shares > 1000)).flatten()  # views of 178 and of 0.06 degrees
     if wrong.any():
         at = _first(wrong)
         raise DataError(
@@ -115,7 +62,7 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     far = torch.from_numpy(stray_cameras(centres.double().numpy(), lambda: known))
     if not far.any() and usual > 0:
         reach = 0.0 if points is None or not len(points) else float((points - middle).norm(dim=1).median())
-        far = (distances > FARTHEST * usual) & (distances > STRAY * reach)
+        far = (distances > 20 * usual) & (distances > STRAY * reach)
     if far.any():
         first = _first(far)
         times = (
@@ -159,10 +106,11 @@ def check_projection(camera: Cameras) -> None:
 def views_of_points(points: Tensor, cameras: Cameras) -> Tensor:
     """For cameras ``[M]``, whether each sees one of points ``[N, 3]`` or more, bool ``[M]``.
 
-    Distortion is left out; images count with a margin of a tenth of their size on each side.
+    2,000 of the points are looked for. Distortion is left out; images count with a margin of a tenth of their size on
+    each side.
     """
-    points = points[torch.isfinite(points).all(dim=1)].cpu()
-    chosen = torch.linspace(0, max(len(points) - 1, 0), min(_LOOKED_FOR, len(points))).long()
+    points, margin = points[torch.isfinite(points).all(dim=1)].cpu(), 0.1
+    chosen = torch.linspace(0, max(len(points) - 1, 0), min(2000, len(points))).long()
     seen = []
     parts = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
     lenses = torch.cat([part.float() for part in parts], dim=-1).cpu()
@@ -170,7 +118,7 @@ def views_of_points(points: Tensor, cameras: Cameras) -> Tensor:
         x, y, z = ((points[chosen] - pose[:, 3]) @ pose[:, :3]).unbind(dim=1)
         across = (x * fx / -z + cx) / width
         down = (-y * fy / -z + cy) / height
-        inside = (across > -_MARGIN) & (across < 1 + _MARGIN) & (down > -_MARGIN) & (down < 1 + _MARGIN)
+        inside = (across > -margin) & (across < 1 + margin) & (down > -margin) & (down < 1 + margin)
         seen.append(((z < 0) & inside).any())
     return torch.stack(seen)
 
@@ -178,7 +126,7 @@ def views_of_points(points: Tensor, cameras: Cameras) -> Tensor:
 def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
     """Warn of a cloud ``[N, 3]`` that most views do not show: it and the cameras are in different coordinates."""
     seen = views_of_points(points, cameras)
-    if seen.float().mean() < _LEAST_SEEING:
+    if seen.float().mean() < 0.5:
         warn(
             f"{int((~seen).sum())} of {len(seen)} views show no point of the sparse cloud, so cloud and cameras are "
             "probably in different coordinates; export both together, or train without the cloud (remove ply_file_path)"

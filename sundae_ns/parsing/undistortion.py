@@ -21,11 +21,6 @@ from sundae_ns.errors import DataError, one_line
 
 Result = tuple[NDArray[Any], NDArray[Any], Any]
 """Intrinsics ``[3, 3]``, image ``[H, W, C]`` and mask."""
-WIDEST = 60.0
-"""Half the angle of view of the perspective image of a lens that sees too much for one, degrees."""
-_LEAST_SHARE = 0.1
-"""Focal length in widths of the image, of a view of 157 degrees; wider ones show a smear."""
-_MOST_SHARE = 1000.0
 
 
 def undistorting(paths: Sequence[Path]) -> Callable[..., Result]:
@@ -48,8 +43,8 @@ def undistorting(paths: Sequence[Path]) -> Callable[..., Result]:
                 f"{path.name} cannot be undistorted ({one_line(error)}); {_check(distortion_params)}"
             ) from error
         share = float(new[0, 0]) / max(result.shape[1], 1)
-        usable = np.isfinite(new).all() and _LEAST_SHARE <= share <= _MOST_SHARE and (result.any() or not image.any())
-        if usable:
+        # A view of more than 157 degrees (a share of 0.1) shows a smear.
+        if np.isfinite(new).all() and 0.1 <= share <= 1000 and (result.any() or not image.any()):
             return new, result, mask
         if int(camera.camera_type) != CameraType.FISHEYE.value or not _is_lens(distortion_params, intrinsics, image):
             raise DataError(f"{path.name} has a distortion that leaves no image; {_check(distortion_params)}")
@@ -63,15 +58,6 @@ def _check(distortion: Any) -> str:
     return f"check its k1 ... p2 ({values}), which are of coordinates in focal lengths, not in pixels"
 
 
-def _brown(x: NDArray[Any], y: NDArray[Any], distortion: Any) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Distorted coordinates, in focal lengths, by the model of Brown with k1 ... k4, p1, p2; as OpenCV's for k4 = 0."""
-    k1, k2, k3, k4, p1, p2 = map(float, distortion)
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    return across, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-
-
 def _of_brown(K: NDArray[Any], distortion: Any, image: NDArray[Any], mask: Any) -> Result | None:
     """The largest perspective image that a photo fills, by all four radial coefficients; OpenCV has three of them.
 
@@ -79,30 +65,30 @@ def _of_brown(K: NDArray[Any], distortion: Any, image: NDArray[Any], mask: Any) 
     """
     height, width = image.shape[:2]
     fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    k1, k2, k3, k4, p1, p2 = map(float, distortion)
     # OpenCV's pixels have whole numbers at their middles.
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-
-    def maps(zoom: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        x, y = _brown((u - cx) / (zoom * fx), (v - cy) / (zoom * fy), distortion)
-        return (x * fx + cx - 0.5).astype(np.float32), (y * fy + cy - 0.5).astype(np.float32)
-
-    def filled(zoom: float) -> bool:
-        across, down = maps(zoom)
-        inside = (across >= 0) & (across <= width - 1) & (down >= 0) & (down <= height - 1)
+    for zoom in np.geomspace(0.25, 3, 85):  # steps of 3%
+        x, y = (u - cx) / (zoom * fx), (v - cy) / (zoom * fy)
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+        across = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) * fx + cx - 0.5
+        down = (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) * fy + cy - 0.5
+        maps = across.astype(np.float32), down.astype(np.float32)
+        inside = (maps[0] >= 0) & (maps[0] <= width - 1) & (maps[1] >= 0) & (maps[1] <= height - 1)
         # Where the lens turns rays back, coordinates fall again.
-        return bool(inside.all() and (np.diff(across, axis=1) > 0).all() and (np.diff(down, axis=0) > 0).all())
+        if inside.all() and (np.diff(maps[0], axis=1) > 0).all() and (np.diff(maps[1], axis=0) > 0).all():
+            new = np.array([[zoom * fx, 0, cx], [0, zoom * fy, cy], [0, 0, 1]], dtype=np.float32)
+            image = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR)
+            mask = None if mask is None else torch.from_numpy(_remapped(mask, image.shape, maps)).bool()[..., None]
+            return new, image, mask
+    return None
 
-    zooms = np.geomspace(0.25, 3, 85)  # steps of 3%
-    fits = next((zoom for zoom in zooms if filled(zoom)), None)
-    if fits is None:
-        return None
-    chosen = maps(fits)
-    drawn = cv2.remap(image, *chosen, interpolation=cv2.INTER_LINEAR)
-    if mask is not None:
-        stored = mask.numpy().astype(np.uint8).reshape(height, width) * 255
-        mask = torch.from_numpy(cv2.remap(stored, *chosen, interpolation=cv2.INTER_LINEAR)).bool()[..., None]
-    new = np.array([[fits * fx, 0, cx], [0, fits * fy, cy], [0, 0, 1]], dtype=np.float32)
-    return new, drawn, mask
+
+def _remapped(mask: Any, shape: tuple[int, ...], maps: tuple[NDArray[Any], NDArray[Any]]) -> NDArray[np.uint8]:
+    """A mask ``[H, W, 1]`` at other pixels, from 0 to 255."""
+    stored = mask.numpy().astype(np.uint8).reshape(shape[:2]) * 255
+    return np.asarray(cv2.remap(stored, *maps, interpolation=cv2.INTER_LINEAR))
 
 
 def _is_lens(distortion: Any, K: NDArray[Any], image: NDArray[Any]) -> bool:
@@ -115,20 +101,18 @@ def _is_lens(distortion: Any, K: NDArray[Any], image: NDArray[Any]) -> bool:
 
 
 def _middle(K: NDArray[Any], distortion: Any, image: NDArray[Any], mask: Any) -> Result:
-    """The perspective image of the middle of a fisheye photo, to :data:`WIDEST` at the middles of its edges."""
+    """The perspective image of the middle of a fisheye photo, to 60 degrees at the middles of its edges."""
     height, width = image.shape[:2]
     # OpenCV's pixels have whole numbers at their middles.
     own = K.astype(np.float64)
     own[:2, 2] -= 0.5
     k = np.array(distortion[:4], dtype=np.float64)
-    angle = np.radians(WIDEST)
-    focal = max(width, height) / 2 / np.tan(angle)
+    focal = max(width, height) / 2 / np.tan(np.radians(60))
     new = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]])
     maps = cv2.fisheye.initUndistortRectifyMap(own, k, np.eye(3), new, (width, height), cv2.CV_32FC1)
     seen = (maps[0] > -0.5) & (maps[0] < width - 0.5) & (maps[1] > -0.5) & (maps[1] < height - 0.5)
     if mask is not None:
-        stored = mask.numpy().astype(np.uint8).reshape(height, width) * 255
-        seen &= cv2.remap(stored, *maps, interpolation=cv2.INTER_LINEAR) > 127
+        seen &= _remapped(mask, image.shape, maps) > 127
     drawn = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR)
     new[:2, 2] += 0.5
     whole = None if mask is None and seen.all() else torch.from_numpy(seen)[..., None]

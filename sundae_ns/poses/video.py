@@ -15,11 +15,6 @@ from sundae_ns.data.photos import LEAST_PHOTOS
 from sundae_ns.errors import DataError, regular, writing
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
-_JUDGED = 12
-"""Frames of a stretch whose sharpness is measured; the others between them are passed over."""
-_WIDTH = 960
-"""Width in pixels at which sharpness is measured."""
-_QUALITY = 97
 
 
 def is_video(path: Path) -> bool:
@@ -68,7 +63,7 @@ def write_frames(path: Path, folder: Path, count: int, advance: Callable[[int], 
             for frame in _sharpest(video, _length(video, path), count):
                 written += 1
                 name = partial / f"{written:05d}.jpg"
-                coded, content = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+                coded, content = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
                 if not coded:
                     raise DataError(f"frame {written} of {path} cannot be saved as JPEG; make the video smaller")
                 with name.open("wb") as file:
@@ -114,9 +109,9 @@ def _length(video: Any, path: Path) -> int:
 
 
 def _sharpest(video: Any, length: int, count: int) -> Iterator[np.ndarray]:
-    """The sharpest frame ``[H, W, 3]`` of each of ``count`` equal stretches of a video of ``length`` frames."""
+    """The sharpest of 12 frames ``[H, W, 3]`` of each of ``count`` equal stretches of a video of ``length`` frames."""
     count = min(count, length)
-    every = max(1, length // (count * _JUDGED))
+    every = max(1, length // (count * 12))
     best: tuple[float, np.ndarray] | None = None
     stretch, at = 0, 0
     while video.grab():
@@ -136,11 +131,11 @@ def _sharpest(video: Any, length: int, count: int) -> Iterator[np.ndarray]:
 
 
 def sharpness(frame: np.ndarray) -> float:
-    """Variance of the Laplacian of a frame ``[H, W, 3]`` uint8, at a common width."""
+    """Variance of the Laplacian of a frame ``[H, W, 3]`` uint8, at a width of at most 960 pixels."""
     import cv2
 
     grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    if grey.shape[1] > _WIDTH:
-        size = _WIDTH, max(1, grey.shape[0] * _WIDTH // grey.shape[1])
+    if grey.shape[1] > 960:
+        size = 960, max(1, grey.shape[0] * 960 // grey.shape[1])
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(grey, cv2.CV_64F).var())

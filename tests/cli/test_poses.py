@@ -16,7 +16,7 @@ from fake_colmap import FakeColmap
 from PIL import Image
 from run_commands import photo, write_video
 
-from sundae_ns.poses import reconstruction
+from sundae_ns.poses import reconstruct
 from sundae_ns.storage import run_folder
 
 PHOTOS = 6
@@ -194,5 +194,5 @@ def test_an_interrupt_ends_at_once_and_the_same_command_continues(
 
 def test_the_log_of_colmap_is_silent(colmap: FakeColmap) -> None:
     assert poses("photos", "-o", "capture") == 0
-    assert reconstruction.pycolmap() is colmap
+    assert reconstruct.pycolmap() is colmap
     assert colmap.logging.minloglevel == 3

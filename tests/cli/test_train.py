@@ -8,7 +8,6 @@ import re
 import shlex
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 import tyro
@@ -18,7 +17,6 @@ from PIL import Image
 from sundae_ns import method_configs
 from sundae_ns.cli import main
 from sundae_ns.cli.train import methods
-from sundae_ns.data import layouts
 from sundae_ns.storage.run_folder import LOCK, unfinished_run
 
 
@@ -107,23 +105,6 @@ def test_further_options_and_the_parser_of_a_capture(tmp_path: Path, ran: list[l
     assert ran[1].count("colmap") == 1, "the user's parser takes the place of ours"
     config = tyro.cli(type(usual), default=usual, args=ran[1][2 : ran[1].index("colmap")])
     assert config.pipeline.model.sh_degree == 1
-
-
-def test_a_colmap_model_is_read_once(tmp_path: Path, ran: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "images").mkdir()
-    Image.new("RGB", (20, 16), "grey").save(tmp_path / "images" / "0.png")
-    write_model(tmp_path / "sparse" / "0", ["0.png"], (20, 16))
-    read: list[Path] = []
-    images_of = layouts.images_of
-
-    def count(model: Path) -> Any:
-        read.append(model)
-        return images_of(model)
-
-    monkeypatch.setattr(layouts, "images_of", count)
-    with pytest.raises(Replaced):
-        main(["train", str(tmp_path)])
-    assert read == [tmp_path / "sparse" / "0"]
 
 
 def test_a_capture_of_blender_is_read_over_white(tmp_path: Path, ran: list[list[str]]) -> None:

@@ -1,15 +1,27 @@
-"""Captures in COLMAP's layout: the largest model with its images, as words of ns-train."""
+"""What a folder holds: the words of ns-train that read it, or the advice that fits it."""
 
 from __future__ import annotations
 
 import json
+import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from colmap_models import write_model
 from PIL import Image
 
-from sundae_ns.data.layouts import is_posed, posed_layout
+from sundae_ns.data import check_colmap
+from sundae_ns.data.capture import beside
+from sundae_ns.data.layouts import (
+    is_posed,
+    larger_model,
+    models_in,
+    no_model,
+    no_transforms,
+    posed_layout,
+    unused_masks,
+)
 from sundae_ns.errors import DataError
 
 
@@ -21,34 +33,30 @@ def photos(folder: Path, count: int = 3, size: tuple[int, int] = (20, 16)) -> li
     return names
 
 
+def model(folder: Path, images: int = 3) -> None:
+    write_model(folder, [f"{index}.png" for index in range(images)], (20, 16))
+
+
 @pytest.mark.parametrize(
-    ("model", "images", "words"),
+    ("place", "images", "words"),
     [
         ("sparse/0", "images", ["sparse/0"]),
         ("colmap/sparse/0", "images", ["colmap/sparse/0"]),
         ("sparse", "images", ["sparse"]),
         ("dense/sparse", "dense/images", ["dense/sparse", "--images-path", "dense/images"]),
         ("dense", "dense/images", ["dense", "--images-path", "dense/images"]),
-        ("dense/sparse/0", "images", ["dense/sparse/0"]),
         ("distorted/sparse/0", "input", ["distorted/sparse/0", "--images-path", "input"]),
         ("sparse/0", ".", ["sparse/0", "--images-path", "."]),
     ],
 )
-def test_a_model_and_its_images(tmp_path: Path, model: str, images: str, words: list[str]) -> None:
+def test_a_model_and_its_images(tmp_path: Path, place: str, images: str, words: list[str]) -> None:
     data = tmp_path / "my scene"
-    write_model(data / model, photos(data / images), (20, 16))
+    write_model(data / place, photos(data / images), (20, 16))
     assert is_posed(data)
     layout = posed_layout(data)
     assert layout is not None
     assert layout.words == ["colmap", "--colmap-path", *words, "--downscale-factor", "1"]
-
-
-def test_the_largest_of_several_models(tmp_path: Path) -> None:
-    names = photos(tmp_path / "images", 20)
-    for number, count in ((0, 3), (1, 20), (10, 7)):
-        write_model(tmp_path / "sparse" / str(number), names[:count], (20, 16))
-    layout = posed_layout(tmp_path)
-    assert str(layout) == "20 images in images, poses of sparse/1, the largest of 3 models"
+    assert shlex.split(str(no_transforms(data)).split("`")[1]) == layout.words, "the advice is what sundae train adds"
 
 
 @pytest.mark.parametrize(("made", "factor"), [([], 1), ([4], 1), ([2], 2), ([2, 4, 8], 4)])
@@ -60,13 +68,9 @@ def test_smaller_images_are_taken_where_there_are_some(tmp_path: Path, made: lis
     layout = posed_layout(tmp_path)
     assert layout is not None
     assert layout.downscale == factor
-
-
-def test_a_transforms_json_comes_first(tmp_path: Path) -> None:
-    write_model(tmp_path / "sparse" / "0", photos(tmp_path / "images"), (20, 16))
     (tmp_path / "transforms.json").write_text("{}")
     assert is_posed(tmp_path)
-    assert posed_layout(tmp_path) is None
+    assert posed_layout(tmp_path) is None, "a transforms.json comes first"
 
 
 def blender(data: Path, **changes: object) -> Path:
@@ -83,17 +87,11 @@ def test_a_capture_of_blender(tmp_path: Path) -> None:
     assert is_posed(data)
     layout = posed_layout(data)
     assert layout is not None
-    assert (layout.size, layout.downscale, str(layout)) == ((20, 16), 1, "2 training images, over white")
-    (data / "transforms.json").write_text("{}")
-    assert posed_layout(data) is None
-
-
-@pytest.mark.parametrize("missing", ["transforms_val.json", "transforms_test.json", "train/0.png"])
-def test_what_a_capture_of_blender_lacks_is_named(tmp_path: Path, missing: str) -> None:
-    data = blender(tmp_path / "lego")
-    (data / missing).unlink()
-    with pytest.raises(DataError, match=missing):
-        posed_layout(data)
+    assert (layout.size, layout.downscale, layout.description) == ((20, 16), 1, "2 training images, over white")
+    for missing in ("train/0.png", "transforms_val.json"):
+        (data / missing).unlink()
+        with pytest.raises(DataError, match=missing):
+            posed_layout(data)
 
 
 @pytest.mark.parametrize("frames", [[], 3, [{}], ["r_0"]])
@@ -102,16 +100,95 @@ def test_a_capture_of_blender_without_frames_is_refused(tmp_path: Path, frames: 
         posed_layout(blender(tmp_path / "lego", frames=frames))
 
 
-def test_a_folder_of_photos_has_no_poses(tmp_path: Path) -> None:
-    photos(tmp_path / "images")
-    assert not is_posed(tmp_path)
-    assert posed_layout(tmp_path) is None
-
-
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
-    write_model(tmp_path / "sparse" / "0", ["gone.png"], (20, 16))
-    with pytest.raises(DataError, match=r"no image gone\.png, which its model sparse/0 states, in images, input"):
+    model(tmp_path / "sparse" / "0", 1)
+    with pytest.raises(DataError, match=r"no image 0\.png, which its model sparse/0 states, in images, input"):
         posed_layout(tmp_path)
     (tmp_path / "sparse" / "0" / "images.bin").write_bytes(b"\0")
-    with pytest.raises(DataError, match=r"sparse/0: images\.bin ends early"):
+    with pytest.raises(DataError, match=r"sparse/0: .*images\.bin is not a complete images\.bin"):
         posed_layout(tmp_path)
+
+
+def _several(data: Path) -> None:
+    for number, count in ((0, 3), (1, 20), (10, 7)):
+        model(data / "sparse" / str(number), count)
+
+
+def _text(data: Path) -> None:
+    folder = data / "colmap" / "sparse" / "0"
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text("1 PINHOLE 20 16 18 18 10 8\n")
+    (folder / "images.txt").write_text("1 1 0 0 0 0 0 3 1 a.png\n\n")
+
+
+def _inner(data: Path) -> None:
+    (data / "room").mkdir()
+    (data / "room" / "transforms.json").write_text("{}")
+
+
+ADVICE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "several models": (_several, "add `colmap --colmap-path sparse/1` (the largest of 3 models, with 20 images)"),
+    "a model in sparse": (lambda data: model(data / "sparse"), "add `colmap --colmap-path sparse` to ns-train"),
+    "a text": (_text, "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
+    "a model alone": (model, "is a COLMAP model without its images"),
+    "Blender": (blender, "it is in Blender's layout (transforms_train.json): add `blender-data` to ns-train"),
+    "a folder further in": (_inner, "room has; give that folder"),
+    "another name": (lambda data: (data / "Transforms.json").touch(), "(there is Transforms.json); make a capture of"),
+    "nothing": (lambda _: None, "make a capture of images with `sundae poses "),
+}
+
+
+@pytest.mark.parametrize("kind", ADVICE)
+def test_advice_fits_what_a_folder_holds(tmp_path: Path, kind: str) -> None:
+    make, advice = ADVICE[kind]
+    make(tmp_path)
+    assert advice in str(no_transforms(tmp_path))
+    assert "\n" not in str(no_transforms(tmp_path))
+
+
+def test_a_larger_model_is_named(tmp_path: Path) -> None:
+    assert "(usually sparse/0)" in str(no_model(tmp_path, Path("colmap/sparse/0")))
+    _several(tmp_path)
+    (tmp_path / "sparse" / "10" / "images.bin").write_bytes(b"\0")
+    assert models_in(tmp_path) == {"sparse/0": 3, "sparse/1": 20, "sparse/10": 0}
+    remark = larger_model(tmp_path, Path("sparse/0"))
+    assert remark == "sparse/0 has 3 images and sparse/1 has 20; to train on those, give --colmap-path sparse/1"
+    assert larger_model(tmp_path, Path("sparse/1")) is None
+    assert larger_model(tmp_path, Path("elsewhere")) is None
+    assert "give `colmap --colmap-path sparse/1`" in str(no_model(tmp_path, Path("colmap/sparse/0")))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "present", "named"),
+    [
+        ("cameras.bin", ["Cameras.bin"], "Cameras.bin"),
+        ("x.png", ["x.png.png"], "x.png.png"),
+        ("x.jpg", ["x.JPG", "y.jpg"], "x.JPG"),
+        ("IMG_0001.JPG", ["img_0001.jpeg"], "img_0001.jpeg"),
+        ("frame_00001.png", ["frame_00002.png"], None),
+        ("x.png", ["x.png", "X.png"], None),
+    ],
+)
+def test_the_file_beside_a_missing_one(tmp_path: Path, wanted: str, present: list[str], named: str | None) -> None:
+    for name in present:
+        (tmp_path / name).touch()
+    assert beside(tmp_path / wanted) == ("" if named is None else f" (there is {named})")
+
+
+def test_masks_that_are_not_used(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    assert unused_masks(tmp_path) is None
+    (tmp_path / "masks" / "0.jpg.png").touch()
+    assert unused_masks(tmp_path) == "masks"
+
+
+@pytest.mark.parametrize(("name", "fits"), [("my photos (2)", True), ("-a;b&c", True), ("a$(touch P)", False)])
+def test_no_path_ends_a_word_of_a_shell(tmp_path: Path, name: str, fits: bool) -> None:
+    images = tmp_path / name / "images"
+    write_model(tmp_path / name / "sparse" / "0", photos(images, 1), (48, 48))
+    check_colmap(images.parent / "sparse" / "0", None)  # a viewer reads no image
+    if fits:
+        check_colmap(images.parent / "sparse" / "0", images)
+        return
+    with pytest.raises(DataError, match="has quotes, .* in its name; rename it"):
+        check_colmap(images.parent / "sparse" / "0", images)

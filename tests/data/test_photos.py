@@ -1,4 +1,4 @@
-"""Folders of photos: judged by what files hold, in one line, and without waiting for a pipe."""
+"""Folders of photos and their masks: judged by what files hold, in one line, and without waiting for a pipe."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from PIL import Image
 
 from sundae_ns.cli.poses import check_poses
 from sundae_ns.data import photos as module
-from sundae_ns.data.photos import find_photos, left_out, masks_beside
+from sundae_ns.data.photos import find_photos, left_out, masks_beside, masks_of, photo_of
 from sundae_ns.errors import DataError
-from sundae_ns.poses import library
+from sundae_ns.poses import reconstruct
 
 
 def photo(path: Path, kind: str = "png") -> Path:
@@ -56,12 +56,6 @@ def test_the_suffix_is_that_of_the_contents(tmp_path: Path, kind: str) -> None:
     for index, name in enumerate(("JPG", "jpeg", "png", "tif", "TIFF", "webp", "bmp")):
         photo(tmp_path / f"{index}.{name}", kind)
     assert {(photo.suffix, photo.as_it_is) for photo in find_photos(tmp_path)} == {KINDS[kind]}
-
-
-def test_formats_may_be_mixed(photos: Path) -> None:
-    photo(photos / "a.jpg", "jpeg")
-    photo(photos / "b.png", "jpeg")
-    assert [one.suffix for one in find_photos(photos)] == [".png", ".png", ".png", ".jpg", ".jpg"]
 
 
 def test_raw_photos(tmp_path: Path) -> None:
@@ -120,31 +114,30 @@ def test_a_folder_that_is_none(tmp_path: Path) -> None:
             find_photos(tmp_path / name)
 
 
-def test_photos_of_other_formats_are_named(photos: Path) -> None:
+@pytest.mark.parametrize(
+    ("names", "heif", "remark"),
+    [
+        (
+            ("a.AVIF", "sub/b.avif", "c.dng", ".d.avif"),
+            True,
+            "2 .avif files and 1 .dng file are left out; convert them",
+        ),
+        (("a.HEIC", "b.heic"), False, "2 .heic files are left out; install pillow-heif with pip install"),
+    ],
+)
+def test_photos_that_are_not_read_are_named(
+    photos: Path, monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...], heif: bool, remark: str
+) -> None:
+    monkeypatch.setattr(module, "reads_heif", lambda: heif)
     assert left_out(photos) is None
-    for name in ("a.AVIF", "sub/b.avif", "c.dng", ".hidden.avif"):
+    for name in names:
         (photos / name).parent.mkdir(exist_ok=True)
         (photos / name).touch()
-    remark = left_out(photos)
-    assert remark is not None
-    assert remark.startswith("2 .avif files and 1 .dng file are left out; convert them to JPEG")
-    for path in photos.glob("*.png"):
-        path.unlink()
-    with pytest.raises(
-        DataError, match=r"only photos that cannot be read \(2 \.avif files and 1 \.dng file\); convert"
-    ):
-        find_photos(photos)
-
-
-def test_heic_without_its_package(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "reads_heif", lambda: False)
-    (photos / "a.HEIC").touch()
-    (photos / "b.heic").touch()
     assert len(find_photos(photos)) == 3
-    assert left_out(photos) == '2 .heic files are left out; install pillow-heif with pip install "sundae_ns[photos]"'
+    assert str(left_out(photos)).startswith(remark)
     for path in photos.glob("*.png"):
         path.unlink()
-    with pytest.raises(DataError, match=r"only photos that cannot be read \(2 \.heic files\); install pillow-heif"):
+    with pytest.raises(DataError, match=f"holds no photos that can be read: {remark}"):
         find_photos(photos)
 
 
@@ -152,7 +145,7 @@ def test_poses_say_which_photos_they_leave_out(
     photos: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (photos / "a.dng").touch()
-    monkeypatch.setattr(library, "check_installed", lambda: None)
+    monkeypatch.setattr(reconstruct, "check_installed", lambda: None)
     check_poses(photos, 150, None)
     assert capsys.readouterr().out.startswith("# warning: 1 .dng file is left out")
 
@@ -175,3 +168,46 @@ def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path: Pat
 def test_photos_in_one_folder_further_in(tmp_path: Path) -> None:
     paths = [photo(tmp_path / "DCIM" / "100" / f"{index}.png") for index in range(3)]
     assert paths_of(tmp_path) == paths
+
+
+def saved(path: Path, mode: str, size: tuple[int, int] = (16, 12), orientation: int = 1) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.new(mode, size).save(path, exif=exif)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.jpg.png", "a.png"])
+def test_the_mask_of_a_photo(tmp_path: Path, name: str) -> None:
+    photo, mask = saved(tmp_path / "photos" / "a.jpg", "RGB"), saved(tmp_path / "masks" / name, "L")
+    assert masks_of([photo_of(photo)], mask.parent) == [mask]
+
+
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_the_mask_of_a_turned_photo_has_its_upright_size(tmp_path: Path, orientation: int) -> None:
+    photo = saved(tmp_path / "photos" / "a.jpg", "RGB", orientation=orientation)
+    mask = saved(tmp_path / "masks" / "a.png", "L", (12, 16))
+    assert masks_of([photo_of(photo)], mask.parent) == [mask]
+
+
+@pytest.mark.parametrize(("orientation", "size"), [(3, (16, 12)), (6, (12, 12))])
+def test_a_mask_that_may_be_turned_is_refused(tmp_path: Path, orientation: int, size: tuple[int, int]) -> None:
+    photo = saved(tmp_path / "photos" / "a.jpg", "RGB", size, orientation)
+    mask = saved(tmp_path / "masks" / "a.png", "L", size)
+    with pytest.raises(DataError, match="is turned by its EXIF entry"):
+        masks_of([photo_of(photo)], mask.parent)
+
+
+def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
+    photo, masks = saved(tmp_path / "a.jpg", "RGB"), tmp_path / "masks"
+    cases = [
+        (masks.mkdir, r"a\.jpg has no mask a\.png in"),
+        (lambda: saved(masks / "a.png", "L", (8, 6)), "has 8 x 6 px and its photo 16 x 12; scale it"),
+        (lambda: saved(masks / "a.png", "RGB"), "save it with one channel of 8 bits"),
+        (lambda: (saved(masks / "a.png", "L"), saved(photo, "RGB", orientation=6)), "is turned by its EXIF entry"),
+    ]
+    for make, cause in cases:
+        make()
+        with pytest.raises(DataError, match=cause):
+            masks_of([photo_of(photo)], masks)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
 
 from sundae_ns.api.views import views_of
-from sundae_ns.data.lenses import COLMAP_LENSES
+from sundae_ns.data.lenses import COLMAP_LENSES, lens_of
 from sundae_ns.errors import DataError
 from sundae_ns.parsing import check_projection
 
@@ -69,13 +70,6 @@ def test_other_projections_are_refused(
     assert "\n" not in str(caught.value)
     with pytest.raises(DataError, match=help_):
         views_of(capture)
-
-
-@pytest.mark.parametrize("flag", ["equirectangular", "latlong"])
-def test_panoramas_of_instant_ngp_are_refused(capture: Path, load: Load, edit: Edit, flag: str) -> None:
-    edit(capture, camera_model=None, **{flag: True})
-    with pytest.raises(DataError, match="the images are panoramas"):
-        load(capture)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in CameraType if kind != CameraType.PERSPECTIVE])
@@ -199,49 +193,32 @@ def test_the_lens_of_each_frame(capture: Path, load: Load, edit: Edit) -> None:
 # ------------------------------------------------------------------------------------------------- transforms.json
 
 
-def test_intrinsics_of_frames_come_before_those_of_the_file(capture: Path, load: Load, edit: Edit) -> None:
-    meta = meta_of(capture)
-    for index, frame in enumerate(meta["frames"]):
-        frame["fl_x"] = frame["fl_y"] = 20.0 + index
-        if index == 2:
-            frame.update(cx=11.0, k1=0.1)
-    edit(capture, frames=meta["frames"])
-    made = load(capture)
-    place = {Path(frame["file_path"]).name: index for index, frame in enumerate(meta["frames"])}
-    lenses = made.train_dataparser_outputs.cameras
-    for at, path in enumerate(made.train_dataset.image_filenames):
-        index = place[path.name]
-        assert float(lenses.fx[at]) == float(lenses.fy[at]) == 20.0 + index
-        assert float(lenses.cx[at]) == (11.0 if index == 2 else 12.0)
-        assert float(lenses.distortion_params[at, 0]) == pytest.approx(0.1 if index == 2 else 0.0)
+FOUR, TWELVE = [0.1, 0.02, 0.0, 0.0], [0.5] * 12
 
 
-@pytest.mark.parametrize("top", [{"k1": 0.1}, {"distortion_params": [0.1, 0, 0, 0, 0, 0]}])
-@pytest.mark.parametrize("own", [{"k1": 0.3}, {"distortion_params": [0.3, 0, 0, 0, 0, 0]}])
-def test_distortion_of_a_frame_comes_before_that_of_the_file(
-    capture: Path, load: Load, edit: Edit, top: dict[str, Any], own: dict[str, Any]
-) -> None:
-    frames = meta_of(capture)["frames"]
-    frames[0].update(own)
-    edit(capture, frames=frames, **{"k1": None, "k2": None, "p1": None, "p2": None, **top})
-    outputs = load(capture).train_dataparser_outputs
-    found = dict(
-        zip([path.name for path in outputs.image_filenames], outputs.cameras.distortion_params[:, 0], strict=True)
-    )
-    first = Path(frames[0]["file_path"]).name
-    assert float(found.pop(first)) == pytest.approx(0.3)
-    assert all(float(value) == pytest.approx(0.1) for value in found.values())
-
-
-def test_four_numbers_of_a_perspective_lens(capture: Path, load: Load, edit: Edit) -> None:
-    none: dict[str, Any] = dict.fromkeys(("k1", "k2", "p1", "p2"))
-    edit(capture, distortion_params=[0.1, 0.02, 0.0, 0.0], **none)
-    assert [round(float(v), 6) for v in load(capture).train_dataparser_outputs.cameras.distortion_params[0]] == [
-        0.1, 0.02, 0.0, 0.0, 0.0, 0.0,
-    ]  # fmt: skip
-    edit(capture, distortion_params=[0.1, 0.02, 0.001, 0.0])
-    with pytest.raises(DataError, match="may be k1, k2, p1, p2 or k1, k2, k3, k4; give them by these names"):
-        load(capture)
+@pytest.mark.parametrize(
+    ("top", "frame", "distortion"),
+    [
+        ({"k1": 0.1}, {"k1": 0.3}, (0.3, 0, 0, 0, 0, 0)),
+        ({"k1": 0.1}, {"distortion_params": [0.3, 0, 0, 0, 0, 0]}, (0.3, 0, 0, 0, 0, 0)),
+        ({"distortion_params": [0.1, 0, 0, 0, 0, 0]}, {"k1": 0.3}, (0.3, 0, 0, 0, 0, 0)),
+        ({"distortion_params": [0.1, 0, 0, 0, 0, 0]}, {}, (0.1, 0, 0, 0, 0, 0)),
+        ({"k1": 0.1}, {"k2": 0.3}, (0.1, 0.3, 0, 0, 0, 0)),
+        ({"distortion_params": FOUR}, {}, (0.1, 0.02, 0, 0, 0, 0)),
+        ({"distortion_params": TWELVE, "camera_model": "FISHEYE624"}, {}, (0.5,) * 12),
+        ({"latlong": True}, {}, "the images are panoramas"),
+        ({"equirectangular": True}, {}, "the images are panoramas"),
+        ({"distortion_params": [0.1, 0, 0.001, 0]}, {}, "may be k1, k2, p1, p2 or k1, k2, k3, k4; give them by these"),
+        ({"distortion_params": TWELVE}, {}, "OPENCV needs distortion_params of 6 numbers"),
+        ({"camera_model": "FISHEYE624"}, {}, "FISHEYE624 needs distortion_params of 12 numbers, not 0"),
+    ],
+)
+def test_the_lens_of_a_frame(top: dict[str, Any], frame: dict[str, Any], distortion: tuple[float, ...] | str) -> None:
+    if isinstance(distortion, str):
+        with pytest.raises(DataError, match=distortion):
+            lens_of(top, frame, "frame 0")
+    else:
+        assert lens_of(top, frame, "frame 0").distortion == distortion
 
 
 @pytest.mark.parametrize("place", ["top", "frames", "params"])
@@ -284,15 +261,6 @@ def test_four_radial_coefficients(
     assert across.max() < width - 0.99
     least = min(across.min(), down.min(), width - 1 - across.max(), height - 1 - down.max())
     assert least < 2
-
-
-def test_twelve_numbers_are_for_one_lens_only(capture: Path, load: Load, edit: Edit) -> None:
-    edit(capture, distortion_params=[0.0] * 12)
-    with pytest.raises(DataError, match="OPENCV needs distortion_params of 6 numbers"):
-        load(capture)
-    edit(capture, distortion_params=[0.0] * 6, camera_model="FISHEYE624", fisheye_crop_radius=7.0)
-    with pytest.raises(DataError, match="FISHEYE624 camera needs distortion_params of 12 numbers, not 6"):
-        load(capture)
 
 
 def test_an_angle_of_view_gives_the_focal_length(capture: Path, load: Load, edit: Edit) -> None:
@@ -393,3 +361,129 @@ def test_two_kinds_of_lenses_of_a_colmap_model(capture: Path, load: Load) -> Non
         plain = np.array(Image.open(path).convert("RGB"))
         expected = plain if kind == CameraType.PERSPECTIVE.value else undistorted(path, (0.02, 0.0, 0.0, 0.0))
         assert np.abs(image.numpy().astype(int) - expected.astype(int)).max() <= 1
+
+
+# ----------------------------------------------------------------------------------------------- other programs
+
+LENS = {"fl_x": 33.0, "fl_y": 33.5, "cx": 12.25, "cy": 11.75, "w": 24, "h": 24}
+
+
+def rewritten(data: Path, top: dict[str, Any], own: Callable[[int], dict[str, Any]]) -> None:
+    frames = json.loads((data / "transforms.json").read_text())["frames"]
+    kept = [{"file_path": f["file_path"], "transform_matrix": f["transform_matrix"]} for f in frames]
+    meta = {**top, "frames": [{**frame, **own(index)} for index, frame in enumerate(kept)]}
+    (data / "transforms.json").write_text(json.dumps(meta))
+
+
+AXES = [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]
+NO_DISTORTION = {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+WRITERS: dict[str, tuple[dict[str, Any], Callable[[int], dict[str, Any]]]] = {
+    "ns-process-data": (
+        {**LENS, "k1": 0.01, "k2": -0.01, "p1": 1e-4, "p2": 2e-4, "camera_model": "OPENCV", "applied_transform": AXES},
+        lambda index: {"colmap_im_id": index + 1},
+    ),
+    "ns-process-data, several cameras": (
+        {"applied_transform": AXES},
+        lambda index: {
+            **LENS,
+            **NO_DISTORTION,
+            "fl_x": 33.0 + index,
+            "cx": 12.0 + 0.1 * index,
+            "k1": 0.01 * index,
+            "camera_model": "OPENCV",
+            "colmap_im_id": index,
+        },
+    ),
+    "ns-process-data, a fisheye video": (
+        {**LENS, "k1": 0.03, "k2": 0.01, "k3": 0.0, "k4": 0.002, "camera_model": "OPENCV_FISHEYE"},
+        lambda index: {},
+    ),
+    "Polycam": (
+        {"camera_model": "OPENCV", "orientation_override": "none"},
+        lambda index: {**LENS, "fl_x": 33.0 + 0.1 * index},
+    ),
+    "Record3D": ({**LENS, "camera_model": "OPENCV", "k1": 0, "k2": 0, "p1": 0, "p2": 0}, lambda index: {}),
+    "Metashape": (
+        {"camera_model": "OPENCV", "applied_transform": AXES},
+        lambda index: {**LENS, "fl_y": 33.0, "k1": 0.02, "k2": -0.01, "k3": 0.001, "k4": 0.0, "p1": 1e-4, "p2": 1e-4},
+    ),
+    "Metashape, k4": (
+        {"camera_model": "OPENCV"},
+        lambda index: {**LENS, "k1": 0.02, "k2": -0.01, "k3": 0.001, "k4": 0.004, "p1": 1e-4, "p2": 1e-4},
+    ),
+    "RealityScan": (
+        {"camera_model": "OPENCV"},
+        lambda index: {**LENS, "k1": -0.05, "k2": 0.02, "k3": 0.0, "k4": 0.0, "p1": 0.0, "p2": 0.0},
+    ),
+    "instant-ngp": (
+        {
+            **LENS,
+            "camera_angle_x": 0.7,
+            "camera_angle_y": 0.7,
+            "k1": 0.01,
+            "k2": 0.0,
+            "p1": 0.0,
+            "p2": 0.0,
+            "is_fisheye": False,
+            "aabb_scale": 16,
+        },
+        lambda index: {"sharpness": 30.0 + index},
+    ),
+}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_files_of_other_programs(capture: Path, load: Load, writer: str) -> None:
+    top, own = WRITERS[writer]
+    rewritten(capture, top, own)
+    made = load(capture)
+    frames = json.loads((capture / "transforms.json").read_text())["frames"]
+    stated = {Path(frame["file_path"]).name: {**top, **frame} for frame in frames}
+    lens = made.train_dataparser_outputs.cameras
+    for at, path in enumerate(made.train_dataset.image_filenames):
+        entry = stated[path.name]
+        for name, values in (("fl_x", lens.fx), ("fl_y", lens.fy), ("cx", lens.cx), ("cy", lens.cy)):
+            assert float(values[at]) == pytest.approx(entry[name], rel=1e-6)
+        distortion = [entry.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+        assert lens.distortion_params[at].tolist() == pytest.approx(distortion, abs=1e-7)
+        fisheye = entry.get("camera_model") == "OPENCV_FISHEYE"
+        assert int(lens.camera_type[at]) == (CameraType.FISHEYE if fisheye else CameraType.PERSPECTIVE).value
+    for batch in made.cached_train:
+        assert batch["image"].float().std() > 1
+    # The capture turns and scales as a whole: distances between cameras keep their ratios.
+    found = torch.cdist(lens.camera_to_worlds[:, :, 3], lens.camera_to_worlds[:, :, 3])
+    centres = torch.tensor([stated[p.name]["transform_matrix"] for p in made.train_dataset.image_filenames])[:, :3, 3]
+    ratio = torch.cdist(centres, centres) * made.train_dataparser_outputs.dataparser_scale
+    torch.testing.assert_close(found, ratio, atol=1e-5, rtol=1e-4)
+
+
+def _rigs(model: Path) -> None:
+    """Files that COLMAP writes beside its model from 3.12 on."""
+    (model / "rigs.bin").write_bytes(struct.pack("<Q", 0))
+    (model / "frames.bin").write_bytes(struct.pack("<Q", 0))
+
+
+def _project(model: Path) -> None:
+    (model / "project.ini").write_text("log_to_stderr=false\n")
+
+
+LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "COLMAP 3.6": ("sparse/0", _project),
+    "COLMAP 3.12": ("sparse/0", _rigs),
+    "the undistorter": ("sparse", lambda _: None),
+    "ns-process-data": ("colmap/sparse/0", _project),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_models_of_colmap(capture: Path, load: Load, layout: str) -> None:
+    place, add = LAYOUTS[layout]
+    write_model(capture / place, names_of(capture), (24, 24), lenses=[(2, [33.0, 12.0, 12.0, 0.02])])
+    add(capture / place)
+    (capture / "transforms.json").unlink()
+    made = load(capture, colmap=place)
+    lens = made.train_dataparser_outputs.cameras
+    assert float(lens.fx[0]) == 33.0
+    assert float(lens.distortion_params[0, 0]) == pytest.approx(0.02)
+    assert len(made.train_dataset) + len(made.eval_dataset) == len(names_of(capture))
+    assert len(made.train_dataparser_outputs.metadata["points3D_xyz"]) == len(names_of(capture))

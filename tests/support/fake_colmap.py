@@ -33,7 +33,11 @@ class FakeColmap:
         return SimpleNamespace()
 
     ImageReaderOptions = FeatureExtractionOptions = FeatureMatchingOptions = ImportedPairingOptions = options
-    IncrementalPipelineOptions = options
+    IncrementalPipelineOptions = ExhaustivePairingOptions = options
+
+    def ExhaustivePairGenerator(self, options: Any, database: Any) -> Any:  # noqa: N802
+        numbers = [image.image_id for image in database.read_all_images()]
+        return SimpleNamespace(all_pairs=lambda: [(b, a) for b in numbers for a in numbers if a <= b])
 
     def _check(self, name: str) -> None:
         if self.fails == name:
@@ -54,7 +58,6 @@ class FakeColmap:
             num_keypoints=lambda: len(stored["features"]),
             read_all_cameras=lambda: [self._camera("OPENCV")],
             update_camera=lambda camera: self.write(path, {**stored, "kind": [camera.kind]}),
-            read_descriptors=lambda number: SimpleNamespace(data=np.full((5, 128), number, np.uint8)),
         )
 
     def open(self, path: Path) -> Any:

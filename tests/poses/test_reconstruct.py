@@ -1,9 +1,13 @@
-"""Stages from photos to a capture: each continues where a killed process has left it."""
+"""From photos to a capture: each stage continues where a killed process has left it."""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,8 +20,9 @@ from ray_tracing import write_still_life
 from run_commands import write_video
 
 from sundae_ns.data.capture import check_transforms
-from sundae_ns.errors import DataError, StorageError
-from sundae_ns.poses import Request, find_poses, reconstruction
+from sundae_ns.errors import ConfigError, DataError, StorageError
+from sundae_ns.poses import Request, find_poses, reconstruct
+from sundae_ns.poses.reconstruct import check_installed, pycolmap, threads
 from sundae_ns.storage import run_folder
 from sundae_ns.storage.ply import read_point_cloud
 
@@ -29,7 +34,7 @@ def colmap(monkeypatch: pytest.MonkeyPatch) -> FakeColmap:
     """A pycolmap with two threads."""
     made = FakeColmap()
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    monkeypatch.setattr(reconstruction, "pycolmap", lambda: made)
+    monkeypatch.setattr(reconstruct, "pycolmap", lambda: made)
     monkeypatch.setattr(run_folder, "_held", {})
     return made
 
@@ -76,14 +81,14 @@ def test_photos_become_a_capture(colmap: FakeColmap, photos: Path) -> None:
     assert read_point_cloud(capture / "sparse_pc.ply")[0].tolist() == [[1.0, 3.0, -2.0]]
     assert (capture / "colmap" / "sparse" / "0" / "images.json").is_file()
     assert sorted(path.name for path in photos.parent.iterdir()) == ["-my $(photos)", "capture"]
-    for stage, pairs in (("images", 8), ("features", 8), ("matches of pairs", 28), ("capture", 8)):
-        assert log.stages[stage] == [pairs, pairs]
+    for stage, parts in (("images", 8), ("features", 8), ("matches of pairs", 28), ("capture", 8)):
+        assert log.stages[stage] == [parts, parts]
     assert colmap.calls["models"] == ["OPENCV"]
 
 
 @pytest.mark.parametrize("stage", ["import", "features", "pairs", "models"])
 def test_a_stage_continues(colmap: FakeColmap, photos: Path, stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconstruction, "_PAIRS_AT_ONCE", 5)
+    monkeypatch.setattr(reconstruct, "_PAIRS_AT_ONCE", 5)
     colmap.fails = stage
     with pytest.raises(RuntimeError, match="ended early"):
         find_poses(request(photos), Log())
@@ -130,8 +135,7 @@ def test_simple_cameras_are_tried_while_photos_are_left_out(
 
 def test_images_that_see_hardly_a_point_have_no_pose(colmap: FakeColmap, photos: Path) -> None:
     colmap.blind = ("c1/frame_00002.jpg",)
-    found = find_poses(request(photos), Log())
-    assert found.photos.left_out == ("1.JPG",)
+    assert find_poses(request(photos), Log()).photos.left_out == ("1.JPG",)
     capture = photos.parent / "capture"
     assert not (capture / "images" / "frame_00002.jpg").exists()
     assert "frame_00002" not in (capture / "colmap" / "sparse" / "0" / "images.json").read_text()
@@ -143,14 +147,11 @@ def test_no_model(colmap: FakeColmap, photos: Path) -> None:
         find_poses(request(photos), Log())
 
 
-def test_frames_of_a_video_are_compared_with_their_neighbours(colmap: FakeColmap, tmp_path: Path) -> None:
+def test_frames_of_a_video(colmap: FakeColmap, tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", 90)
     log = Log()
-    found = find_poses(request(tmp_path / "a.mp4", frames=40), log)
+    assert find_poses(request(tmp_path / "a.mp4", frames=40), log).photos.total == 40
     assert log.stages["frames"] == [40, 40]
-    assert found.photos.total == 40
-    assert "c1/frame_00001.jpg c1/frame_00011.jpg" in colmap.calls["pairs"]
-    assert 300 < len(colmap.calls["pairs"]) < 40 * 39 // 2
 
 
 def test_masks_reach_the_capture(colmap: FakeColmap, photos: Path, tmp_path: Path) -> None:
@@ -174,6 +175,86 @@ def test_one_process_works_on_a_capture(colmap: FakeColmap, photos: Path, monkey
     with pytest.raises(StorageError, match="works in .*partial; wait for it, or choose another folder"):
         find_poses(request(photos), Log())
     del held
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> list[str]:
+    """A database of 60 images of a walk in a circle: each shares features with its neighbours."""
+    module = pytest.importorskip("pycolmap")
+    rng = np.random.default_rng(0)
+    ring = rng.integers(0, 256, (60, 40, 128), dtype=np.uint8)
+    names = [f"frame_{number:05d}.jpg" for number in range(60)]
+    with module.Database.open(tmp_path / "database.db") as database:
+        camera = module.Camera.create_from_model_name(1, "OPENCV", 50.0, 64, 48)
+        database.write_camera(camera)
+        for number, name in enumerate(names):
+            image = database.write_image(module.Image(name=name, camera_id=1))
+            seen = np.concatenate([ring[(number + step) % 60] for step in range(-4, 5)])
+            database.write_keypoints(image, rng.uniform(0, 48, (len(seen), 2)).astype(np.float32))
+            kind = module.FeatureExtractorType.SIFT
+            database.write_descriptors(image, module.FeatureDescriptors(type=kind, data=seen))
+    return names
+
+
+def pairs_of(work: Path, names: list[str], matching: str, video: bool = False) -> set[tuple[int, int]]:
+    pairs = reconstruct._pairs(work, names, matching, video)  # type: ignore[arg-type]
+    assert len(pairs) == len(set(pairs))
+    return {(names.index(a), names.index(b)) for a, b in pairs}
+
+
+def test_pairs_of_a_walk(tmp_path: Path, walk: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    every = pairs_of(tmp_path, walk, "auto")
+    assert every == {(a, b) for b in range(60) for a in range(b)}
+    along = pairs_of(tmp_path, walk, "auto", video=True)
+    assert {(10, 10 + step) for step in (1, 2, 5, 10, 16, 32)} <= along
+    assert {(0, 59), (1, 58)} <= along, "the walk ends where it began"
+    assert len(along) < 60 * 20
+    monkeypatch.setattr(reconstruct, "_ALIKE", 12)
+    monkeypatch.setattr(reconstruct, "_MOST_EXHAUSTIVE", 59)
+    similar = pairs_of(tmp_path, walk, "auto")
+    near = {(a, b) for a, b in every if min(b - a, 60 - b + a) <= 3}
+    assert near <= similar
+    assert len(similar) < 60 * 13
+
+
+def test_its_log_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakeColmap()
+    monkeypatch.setitem(sys.modules, "pycolmap", fake)  # type: ignore[arg-type]
+    assert pycolmap() is fake
+    assert fake.logging.minloglevel == 3
+
+
+def test_a_missing_package_and_a_broken_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    for load in (check_installed, pycolmap):
+        with pytest.raises(ConfigError, match=r"need pycolmap; install it with pip install \"sundae_ns\[photos\]\""):
+            load()
+    (tmp_path / "pycolmap.py").write_text("raise ImportError('libgomp.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pycolmap")
+    check_installed()
+    with pytest.raises(ConfigError, match=r"pycolmap cannot be loaded \(libgomp.*; install it again with"):
+        pycolmap()
+
+
+def test_a_process_that_is_told_to_end_prints_nothing(tmp_path: Path) -> None:
+    (tmp_path / "pycolmap.py").write_text(
+        "import signal, sys\nfrom types import SimpleNamespace as Names\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit('a stack of thirty lines'))\n"
+        "logging = Names(minloglevel=0, Level=Names(FATAL=Names(value=3)))\n"
+    )
+    code = "import os, signal\nfrom sundae_ns.poses.reconstruct import pycolmap\npycolmap()\n"
+    code += "os.kill(os.getpid(), signal.SIGTERM)"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
+
+
+@pytest.mark.parametrize(("stated", "count"), [("3", 3), ("0", None), ("", None), ("many", None)])
+def test_threads(monkeypatch: pytest.MonkeyPatch, stated: str, count: int | None) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", stated)
+    assert threads() == (count or os.cpu_count())
 
 
 def test_poses_of_a_still_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,415 @@
+"""Bad captures, loaded by the datamanager of training: transforms.json, COLMAP models, images; and unusual ones."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import re
+import shutil
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from colmap_models import write_model
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from PIL import Image
+from small_captures import HEIGHT, SIZE, VIEWS, WIDTH, bytes_of, load, meta_of, write_text_model
+
+from sundae_ns.compensation import HeadConfig
+from sundae_ns.data.colmap import check_colmap
+from sundae_ns.errors import DataError
+from sundae_ns.model import SundaeModelConfig
+
+Change = Callable[[dict[str, Any]], object]
+
+
+def rewrite(data: Path, change: Change) -> None:
+    meta = meta_of(data)
+    change(meta)
+    (data / "transforms.json").write_text(json.dumps(meta), encoding="utf-8")
+
+
+def as_text(data: Path) -> None:
+    shutil.rmtree(data / "sparse")
+    write_text_model(data / "sparse" / "0", sorted(path.name for path in (data / "images").iterdir()))
+
+
+FILES = (
+    "transforms.json",
+    *(f"sparse/0/{name}.{kind}" for name in ("cameras", "images", "points3D") for kind in ("bin", "txt")),
+)
+FILES += ("0.png", "0.jpg")
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.seeds(40)
+def test_corrupted_files(capture: Path, corrupted: Any, verdict: Any, file: str, seed: int) -> None:
+    path = capture / file
+    if path.suffix == ".txt":
+        as_text(capture)
+    elif file.startswith("0"):
+        old = meta_of(capture)["frames"][0]["file_path"]
+        with Image.open(capture / old) as image:
+            image.convert("RGB").save(path)
+        text = (capture / "transforms.json").read_text().replace(old, file)
+        (capture / "transforms.json").write_text(text)
+    path.write_bytes(corrupted(path.read_bytes(), seed))
+    verdict(lambda: load(capture, colmap=file.startswith("sparse")), bytes_of(capture))
+
+
+VALUES: tuple[Any, ...] = (
+    *(None, True, "", "word", "0", [], {}, [[]], 0, -1, 0.5, 1e-300, 1e30, 1e308, float("nan"), float("inf")),
+    *(10**400, [float("nan")] * 4, [[0.0] * 4] * 4, "../../x.png", "\0", "ünï cöde.png", [[1, 2], [3]]),
+)
+
+
+def places(value: Any) -> list[tuple[Any, Any]]:
+    """Every container of a parsed file, paired with each of its keys."""
+    keys: Any = value.keys() if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    return [(value, key) for key in keys] + [place for key in keys for place in places(value[key])]
+
+
+@pytest.mark.seeds(90)
+def test_strange_values_in_transforms(capture: Path, verdict: Any, seed: int) -> None:
+    rng = Random(seed)
+    meta = meta_of(capture)
+    holder, key = rng.choice([place for place in places(meta) if not isinstance(place[1], int) or rng.random() < 0.2])
+    if rng.random() < 0.25:
+        del holder[key]
+    else:
+        holder[key] = VALUES[seed % len(VALUES)]
+    (capture / "transforms.json").write_text(json.dumps(meta))
+    verdict(lambda: load(capture), bytes_of(capture))
+
+
+def _frame(**changes: Any) -> Change:
+    return lambda meta: meta["frames"][1].update(changes)
+
+
+def _top(**changes: Any) -> Change:
+    return lambda meta: meta.update(changes)
+
+
+def _pose(row: int, column: int, value: float) -> Change:
+    return lambda meta: meta["frames"][1]["transform_matrix"][row].__setitem__(column, value)
+
+
+def _round(**changes: Any) -> Change:
+    return _top(camera_model="FISHEYE624", distortion_params=[0.0] * 12, **changes)
+
+
+REFUSED: dict[str, tuple[Change, str]] = {
+    "NaN in a pose": (_pose(0, 3, float("nan")), r"frame 1 .*transform_matrix is nan; it must be finite"),
+    "infinity in a pose": (_pose(2, 1, float("inf")), "frame 1 .*finite"),
+    "a pose of zeros": (_frame(transform_matrix=[[0.0] * 4] * 4), "frame 1 .*singular"),
+    "a pose of 3 rows": (_frame(transform_matrix=[[1.0, 0, 0, 0]] * 3), "4 rows of 4"),
+    "no pose": (lambda meta: meta["frames"][1].pop("transform_matrix"), "4 rows of 4"),
+    "zero focal length": (_top(fl_x=0.0), "fl_x is 0.0; it must be positive"),
+    "negative focal length": (_top(fl_y=-3), "fl_y is -3; it must be positive"),
+    "focal length NaN": (_top(fl_x=float("nan")), "fl_x is nan"),
+    "no focal length": (lambda meta: meta.pop("fl_x"), "fl_x missing"),
+    "zero width": (_top(w=0), "w is 0; .*whole number of pixels"),
+    "a huge width": (_top(w=10**9), "w is 1000000000"),
+    "half a pixel": (_top(h=16.5), "h is 16.5"),
+    "no frames": (_top(frames=[]), "no frames"),
+    "frames that are numbers": (_top(frames=[1, 2]), "frame 0"),
+    "an unknown camera": (_top(camera_model="BRAIN"), "camera_model is 'BRAIN'; use one of SIMPLE_PINHOLE"),
+    "a round lens without a radius": (_round(), "fisheye_crop_radius is None; .*a positive number"),
+    "a round lens of a whole number": (_round(fisheye_crop_radius=7), "with a decimal point"),
+    "a round lens and masks": (
+        lambda meta: (
+            _round(fisheye_crop_radius=7.0)(meta),
+            [frame.update(mask_path="images/frame_00001.png") for frame in meta["frames"]],
+        ),
+        "remove mask_path",
+    ),
+    "distortion NaN": (_top(k1=float("nan")), "k1 is nan"),
+    "distortion of 3 numbers": (_top(distortion_params=[0, 0, 0]), "4, 6 or 12"),
+    "a split of other images": (_frame(file_path="images/none.png"), "which no frame has as its file_path"),
+    "a missing split": (_top(train_filenames=["images/a.png"], val_filenames=None), "train_filenames|val_filenames"),
+    "no list of test images": (lambda meta: [meta.pop(f"{s}_filenames", 0) for s in ("val", "test")], "none for val"),
+    "a mask for one": (_frame(mask_path="images/frame_00001.png"), "1 of .* frames have a mask_path"),
+    "a scale of zero": (_top(applied_scale=0), "applied_scale"),
+    "a frame of NaN": (_top(applied_transform=[[float("nan")] * 4] * 3), "applied_transform"),
+    "an unknown orientation": (_top(orientation_override="sideways"), "orientation_override"),
+    "a cloud that is a number": (_top(ply_file_path=3), "ply_file_path"),
+    "a missing cloud": (_top(ply_file_path="none.ply"), r"none\.ply does not exist"),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_transforms_are_refused_by_name(capture: Path, verdict: Any, kind: str) -> None:
+    change, cause = REFUSED[kind]
+    rewrite(capture, change)
+    error = verdict(lambda: load(capture), bytes_of(capture))
+    assert isinstance(error, DataError)
+    assert re.search(cause, str(error)), error
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[1, 2]", "[" * 200_000, '{"frames": ' + "9" * 5000 + "}", '{"frames": [', "\udcff"]
+)
+def test_other_contents_of_transforms_are_refused(capture: Path, verdict: Any, text: str) -> None:
+    (capture / "transforms.json").write_text(text, errors="surrogateescape")
+    assert verdict(lambda: load(capture), bytes_of(capture)) is not None
+
+
+def test_a_folder_without_a_capture_is_refused(verdict: Any, tmp_path: Path) -> None:
+    for data, colmap in ((tmp_path / "none", False), (tmp_path, False), (tmp_path, True)):
+        assert verdict(lambda data=data, colmap=colmap: load(data, colmap=colmap), 0) is not None
+
+
+def test_a_pipe_in_a_capture_is_refused_at_once(capture: Path, verdict: Any) -> None:
+    for path, colmap in ((capture / "transforms.json", False), (capture / "sparse" / "0" / "images.bin", True)):
+        path.unlink()
+        os.mkfifo(path)
+        assert "pipe" in str(verdict(lambda colmap=colmap: load(capture, colmap=colmap), bytes_of(capture)))
+
+
+def test_valid_models_are_read(capture: Path, verdict: Any) -> None:
+    assert verdict(lambda: load(capture, colmap=True), bytes_of(capture)) is None
+    binary = load(capture, colmap=True)
+    as_text(capture)
+    text = load(capture, colmap=True)
+    assert torch.equal(binary.train_dataset.cameras.camera_to_worlds, text.train_dataset.cameras.camera_to_worlds)
+    clouds = [made.train_dataset.metadata["points3D_xyz"] for made in (binary, text)]
+    torch.testing.assert_close(clouds[0], clouds[1], atol=1e-6, rtol=0)
+    (capture / "sparse" / "0" / "points3D.txt").unlink()
+    assert "points3D_xyz" not in load(capture, colmap=True).train_dataset.metadata
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
+def test_a_model_cut_short_anywhere_is_refused(tmp_path: Path, file: str, text: bool) -> None:
+    names = [f"{index}.png" for index in range(3)]
+    write_text_model(tmp_path, names) if text else write_model(tmp_path, names, SIZE)
+    path = tmp_path / f"{file}.{'txt' if text else 'bin'}"
+    content = path.read_bytes()
+    if text:  # as COLMAP does
+        rows = 1 if file == "cameras" else len(names)
+        content = f"# List of {file}\n# Number of {file[:6]}: {rows}, mean length: 2\n".encode() + content
+    # The last entry of a text may lose letters or observations.
+    end = content.rindex(b"2.png" if file == "images" else b"\n", 0, -1) if text else len(content)
+    check_colmap(tmp_path, None)
+    for length in range(end):
+        if text and length < content.find(b"mean"):
+            continue  # the count itself is cut
+        path.write_bytes(content[:length])
+        with pytest.raises(DataError):
+            check_colmap(tmp_path, None)
+
+
+def _patch(file: str, at: int, layout: str, *values: Any) -> Callable[[Path], object]:
+    def change(model: Path) -> None:
+        data, content = bytearray((model / file).read_bytes()), struct.pack(layout, *values)
+        data[at : at + len(content)] = content
+        (model / file).write_bytes(data)
+
+    return change
+
+
+def _twice(model: Path) -> None:
+    camera = (model / "cameras.bin").read_bytes()[8:]
+    (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + camera * 2)
+
+
+def _folder(file: str) -> Callable[[Path], object]:
+    return lambda model: ((model / file).unlink(missing_ok=True), (model / file).mkdir())
+
+
+_NAME = 8 + 64 + len("frame_00001.png") + 1  # offset of the first image's number of observations
+MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "2^63 cameras": (_patch("cameras.bin", 0, "<Q", 1 << 63), "is not a complete cameras.bin"),
+    "2^40 images": (_patch("images.bin", 0, "<Q", 1 << 40), "is not a complete images.bin"),
+    "2^30 observations": (_patch("images.bin", _NAME, "<Q", 1 << 30), "images.bin .*ends .* bytes early"),
+    "2^60 points": (_patch("points3D.bin", 0, "<Q", 1 << 60), "is not a complete points3D.bin"),
+    "a track of 2^31": (_patch("points3D.bin", 8 + 43, "<Q", 1 << 31), "is not a complete points3D.bin"),
+    "zero focal length": (_patch("cameras.bin", 8 + 24, "<d", 0.0), "camera 1: parameter fx is 0.0"),
+    "NaN focal length": (_patch("cameras.bin", 8 + 24, "<d", float("nan")), "parameter fx is nan"),
+    "zero width": (_patch("cameras.bin", 8 + 8, "<Q", 0), "width is 0"),
+    "another camera model": (_patch("cameras.bin", 8 + 4, "<i", 7), "not support camera model FOV"),
+    "an unknown camera model": (_patch("cameras.bin", 8 + 4, "<i", 99), "camera model 99 is not known here"),
+    "a zero quaternion": (_patch("images.bin", 8 + 4, "<4d", 0, 0, 0, 0), "image 1: its quaternion"),
+    "a NaN position": (_patch("images.bin", 8 + 36, "<d", float("nan")), "image 1: the pose is nan"),
+    "a missing camera": (_patch("images.bin", 8 + 60, "<i", 9), "camera 9 is not in the model"),
+    "a name for a shell": (_patch("images.bin", 8 + 64, "15s", b"$(reboot).png!!"), "has quotes, .*rename it"),
+    "an endless name": (_patch("images.bin", 8 + 64, "10000s", b"a" * 10**4), "is not a complete images.bin"),
+    "no images": (_patch("images.bin", 0, "<Q", 0), "has no images"),
+    "no points": (_patch("points3D.bin", 0, "<Q", 0), "has no points"),
+    "no file of images": (lambda model: (model / "images.bin").unlink(), "images.bin cannot be read"),
+    "no files": (shutil.rmtree, "is not a folder"),
+    "no file of cameras": (lambda model: (model / "cameras.bin").unlink(), "holds neither cameras.bin nor cameras.txt"),
+    "a camera twice": (_twice, "camera 1: it is listed twice"),
+    "a folder in the place of a file": (_folder("cameras.bin"), "cannot be read"),
+    "a folder in the place of a text": (_folder("cameras.txt"), "cannot be read"),
+    "invalid UTF-8": (lambda model: (model / "cameras.txt").write_bytes(b"1 PIN\xff\xfe"), "cameras.txt .*utf-8"),
+    "a pose of 6 numbers": (lambda model: _text(model, "1 1 0 0 0 0 0 1 a.png"), "images.txt .*6 numbers as its pose"),
+    "a missing image": (lambda model: next((model.parents[1] / "images").iterdir()).unlink(), "does not exist"),
+}
+
+
+def _text(model: Path, image: str) -> None:
+    as_text(model.parents[1])
+    (model / "images.txt").write_text(f"{image}\n\n")
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_models_are_refused_by_name(capture: Path, verdict: Any, kind: str) -> None:
+    change, cause = MODELS[kind]
+    change(capture / "sparse" / "0")
+    error = verdict(lambda: load(capture, colmap=True), bytes_of(capture))
+    assert isinstance(error, DataError)
+    assert re.search(cause, str(error)), error
+
+
+def test_a_text_may_have_spaces_in_names(capture: Path) -> None:
+    (capture / "images" / "an image.png").write_bytes(next((capture / "images").iterdir()).read_bytes())
+    as_text(capture)
+    assert "an image.png" in {path.name for path in load(capture, colmap=True).train_dataset.image_filenames}
+
+
+def bomb(width: int, height: int) -> Callable[[Path], object]:
+    """Write a PNG whose header claims more pixels than follow."""
+    content = b"\x89PNG\r\n\x1a\n"
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(b"\0" * 99)), (b"IEND", b"")):
+        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return lambda path: path.write_bytes(content)
+
+
+def _saved(kind: str, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Callable[[Path], object]:
+    return lambda path: Image.new(kind, size).save(path)
+
+
+IMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "16 bits": (_saved("I;16"), "pixels of type I;16"),
+    "a palette": (_saved("P"), "pixels of type P"),
+    "grey with alpha": (_saved("LA"), "pixels of type LA"),
+    "one pixel": (_saved("RGB", (1, 1)), "1 x 1 px but its camera says"),
+    "empty": (lambda path: path.write_bytes(b""), "not an image"),
+    "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
+    "missing": (lambda path: path.unlink(), "cannot be read|none"),
+    "a bomb": (bomb(30000, 30000), "claims|exceeds limit|30000"),
+    "a smaller bomb": (bomb(9000, 9000), "claims 9000 x 9000 px"),
+    "right header, no pixels": (bomb(WIDTH, HEIGHT), "cannot be decoded"),
+}
+
+
+@pytest.mark.parametrize("which", ["train", "test"])
+@pytest.mark.parametrize("kind", IMAGES)
+def test_images_are_refused_by_name(capture: Path, verdict: Any, kind: str, which: str) -> None:
+    make, cause = IMAGES[kind]
+    name = meta_of(capture)[f"{which}_filenames"][-1]  # nerfstudio opens the first
+    make(capture / name)
+    if (kind, which) == ("right header, no pixels", "test"):
+        return  # detected when the test views are decoded
+    error = verdict(lambda: load(capture), bytes_of(capture))
+    assert isinstance(error, DataError)
+    assert Path(name).name in str(error)
+    assert re.search(cause, str(error)), error
+
+
+def _each_image(change: Callable[[Image.Image], Image.Image]) -> Callable[[Path], object]:
+    def make(data: Path) -> None:
+        for path in (data / "images").iterdir():
+            with Image.open(path) as image:
+                changed = change(image)
+            changed.save(path)
+
+    return make
+
+
+def _one_pixel(data: Path) -> None:
+    _each_image(lambda image: image.resize((1, 1)))(data)
+    rewrite(data, _top(w=1, h=1, cx=0.5, cy=0.5))
+
+
+def _masks(data: Path) -> None:
+    (data / "masks").mkdir()
+    half = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    half[:, : WIDTH // 2] = 255
+    Image.fromarray(half).save(data / "masks" / "half.png")
+    rewrite(data, lambda meta: [frame.update(mask_path="masks/half.png") for frame in meta["frames"]])
+
+
+def _renamed(data: Path) -> None:
+    for path in list((data / "images").iterdir()):
+        path.rename(path.with_name("ünï cöde 像 " + path.name))
+    text = (data / "transforms.json").read_text().replace("images/", "images/ünï cöde 像 ")
+    (data / "transforms.json").write_text(text, encoding="utf-8")
+
+
+FINE: dict[str, Callable[[Path], object]] = {
+    "unchanged": lambda data: None,
+    "grey": _each_image(lambda image: image.convert("L")),
+    "with alpha": _each_image(lambda image: image.convert("RGBA")),
+    "one pixel": _one_pixel,
+    "masks": _masks,
+    "unicode and spaces in names": _renamed,
+    "no points": lambda data: rewrite(data, lambda meta: meta.pop("ply_file_path")),
+}
+
+
+def train_a_step(data: Path) -> None:
+    """Train one step with the head, and evaluate the test views."""
+    datamanager = load(data)
+    metadata = datamanager.train_dataset.metadata
+    points = metadata.get("points3D_xyz")
+    config = SundaeModelConfig(
+        head=HeadConfig(mode="residual", size="tiny"),
+        camera_optimizer=CameraOptimizerConfig(mode="off"),
+        sh_degree=1,
+        num_random=50,
+        num_downscales=0,
+    )
+    model = config.setup(
+        scene_box=datamanager.train_dataset.scene_box,
+        num_train_data=VIEWS,
+        metadata=metadata,
+        seed_points=None if points is None else (points, metadata["points3D_rgb"]),
+    )
+    model.train()
+    model.step = config.pruning.prune_at + 1
+    camera, batch = datamanager.next_train(0)
+    outputs = model(camera)
+    losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))
+    loss = torch.stack(list(losses.values())).sum()
+    loss.backward()
+    assert torch.isfinite(loss)
+    model.eval()
+    for camera, batch in datamanager.fixed_indices_eval_dataloader:
+        metrics, _ = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
+        assert np.isfinite(metrics["psnr"])
+
+
+@pytest.fixture(scope="module")
+def compiled(scene: Path) -> None:
+    """Compile the CPU rasteriser before its first use under limits of time and memory."""
+    train_a_step(scene)
+
+
+FOLDERS = ("scene", "a folder, with spaces", "ünï cöde 像")
+
+
+@pytest.mark.parametrize(("kind", "folder"), [*zip(FINE, itertools.cycle(FOLDERS))])
+def test_unusual_captures_train(compiled: None, capture: Path, verdict: Any, kind: str, folder: str) -> None:
+    data = capture.rename(capture.with_name(folder))
+    FINE[kind](data)
+    assert verdict(lambda: train_a_step(data), bytes_of(data)) is None
+
+
+def test_one_view_succeeds_or_fails_with_one_line(capture: Path, verdict: Any) -> None:
+    def one(meta: dict[str, Any]) -> None:
+        for split in ("train", "val", "test"):
+            meta.pop(f"{split}_filenames", None)
+        del meta["frames"][1:]
+
+    rewrite(capture, one)
+    verdict(lambda: load(capture), bytes_of(capture))
