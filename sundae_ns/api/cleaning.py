@@ -11,24 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sundae_ns.api.pruning import weights_in
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.virtual import of_unit_size
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians import mend
 from sundae_ns.graphs import knn
-from sundae_ns.rendering import LocalField, TrainingView, View, contribution
+from sundae_ns.rendering.views import View
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-NEIGHBORS = 16
-"""Nearest primitives that may support one."""
 REACH = 3.0
 """Two primitives touch if they are nearer than this many times the sum of their largest standard deviations."""
-LARGEST_SHARE, LARGEST = 1e-3, 30
-"""Most primitives of a group that floats: a share of all, and a number."""
-_SIDE = 512
-"""Longest side of the images that tell what views see, pixels."""
 
 
 def crop(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Scene:
@@ -121,18 +115,8 @@ def floater_mask(scene: Scene, views: Sequence[View], *, console: Console | None
     usable = dataclasses.replace(scene, field=mended.field)
     floats = _unsupported(usable)
     if views:
-        sized, seen = of_unit_size(usable, views)
-        small = [view.zoomed(min(_SIDE / max(view.width, view.height), 1.0)).to(scene.device) for view in seen]
-        weights = contribution(
-            LocalField(sized.field),
-            [TrainingView(view, None) for view in small],
-            scene.background,
-            scene.settings(head=False),
-            console=console,
-        )
-        if not bool((weights > 0).any()):
-            raise DataError(f"{len(views)} views see none of the primitives; give cameras that look at the scene")
-        floats |= weights <= 0
+        small = [view.zoomed(min(512 / max(view.width, view.height), 1.0)) for view in views]
+        floats |= weights_in(usable, small, console=console) <= 0
     found[mended.mask] = floats
     return found
 
@@ -145,12 +129,12 @@ def _unsupported(scene: Scene) -> Tensor:
     n = scene.num_primitives
     if n <= 1:
         return torch.zeros(n, dtype=torch.bool, device=scene.device)
-    near = knn(scene.field["means"].detach(), min(NEIGHBORS, n - 1))
+    near = knn(scene.field["means"].detach(), min(16, n - 1))
     reach = REACH * scene.field["scales"].detach().amax(dim=1).exp()
     touching = near.distances < reach[:, None] + reach[near.indices]
     rows = torch.arange(n, device=scene.device)[:, None].expand_as(touching)[touching].cpu().numpy()
     columns = near.indices[touching].cpu().numpy()
     graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(n, n))
     groups = connected_components(graph, directed=False)[1]
-    small = np.bincount(groups) <= max(1, min(LARGEST, int(LARGEST_SHARE * n)))
+    small = np.bincount(groups) <= max(1, min(30, n // 1000))
     return torch.from_numpy(small[groups]).to(scene.device)

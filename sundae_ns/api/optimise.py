@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 from torch import Tensor
@@ -16,7 +17,7 @@ def optimise(
     *,
     first: int = 0,
     on_step: Callable[[int], object] | None = None,
-) -> int:
+) -> bool:
     """Train, with learning rates that are a function of the step, so that a resumed training repeats them.
 
     Args:
@@ -28,7 +29,7 @@ def optimise(
         on_step: called after each step with the number of steps taken; False stops.
 
     Returns:
-        Number of steps taken.
+        Whether all steps were taken.
     """
     groups = [(name, group) for name, optimizer in optimizers.items() for group in optimizer.param_groups]
     for _, group in groups:
@@ -42,5 +43,13 @@ def optimise(
                 group["lr"] = rate
         step(i)
         if on_step is not None and on_step(i + 1) is False:
-            return i + 1
-    return max(first, steps)
+            return False
+    return True
+
+
+def rate_factor(step: int, steps: int) -> float:
+    """Share of the peak rate at a step: a short rise, because Adam has no moments yet, then half a cosine to 0."""
+    rise = max(round(0.05 * steps), 1)
+    if step < rise:
+        return (step + 1) / (rise + 1)
+    return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(steps - rise, 1)))

@@ -119,33 +119,45 @@ def prune_with_mask(
     weights = None
     if rule.uses_contribution and count < n:
         given = views if views is not None else scene.views or virtual_views(usable)
-        sized, cameras = of_unit_size(usable, given)
-        cameras = [view.to(scene.device) for view in cameras]
-        settings = scene.settings(head=False)
-        weights = contribution(
-            LocalField(sized.field),
-            [TrainingView(view, None) for view in cameras],
-            scene.background,
-            settings,
-            count=count if rule.uses_detail else None,
-            console=console,
-        )
-        if not bool((weights > 0).any()):
-            raise DataError(
-                f"{len(cameras)} views see none of {n:,} primitives; "
-                "give cameras that look at the scene, or export it again"
-            )
+        weights = weights_in(usable, given, count if rule.uses_detail else None, console)
     pruned = prune_field(mended.field, rule, count, weights)
     small = dataclasses.replace(scene, field=pruned.field)
     if weights is not None and rule.refits and fit:
-        size = size_of(usable)
+        size, (full, cameras) = size_of(usable), of_unit_size(usable, given)
+        cameras = [view.to(scene.device) for view in cameras]
         field = resized(small, 1 / size).field
-        fitted = refit(field, sized.field, cameras, settings, seed=rule.seed, console=console)
-        field = resized(dataclasses.replace(scene, field=fitted), size).field
-        small = dataclasses.replace(scene, field=field)
+        fitted = refit(field, full.field, cameras, scene.settings(head=False), seed=rule.seed, console=console)
+        small = dataclasses.replace(scene, field=resized(dataclasses.replace(scene, field=fitted), size).field)
     mask = mended.mask.clone()
     mask[mended.mask] = pruned.decision.mask
     return PrunedScene(small, mask, None if weights is None else float((weights > 0).float().mean()))
+
+
+def weights_in(scene: Scene, views: Sequence[View], count: int | None = None, console: Console | None = None) -> Tensor:
+    """Blending weight of each primitive of a finite scene, summed over the pixels of views ``[N]``.
+
+    Args:
+        count: weight pixels by the detail that so many primitives cannot show; None for no weights of pixels.
+        console: shows a progress bar; None for none.
+
+    Raises:
+        DataError: the views see none.
+    """
+    sized, cameras = of_unit_size(scene, views)
+    weights = contribution(
+        LocalField(sized.field),
+        [TrainingView(view.to(scene.device), None) for view in cameras],
+        scene.background,
+        scene.settings(head=False),
+        count=count,
+        console=console,
+    )
+    if not bool((weights > 0).any()):
+        raise DataError(
+            f"{len(cameras)} views see none of {scene.num_primitives:,} primitives; "
+            "give cameras that look at the scene, or export it again"
+        )
+    return weights
 
 
 @torch.no_grad()

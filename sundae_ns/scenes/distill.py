@@ -17,6 +17,7 @@ import torch
 from pytorch_msssim import SSIM
 from torch.nn import Parameter
 
+from sundae_ns.api.optimise import optimise, rate_factor
 from sundae_ns.api.pruning import prune_with_mask
 from sundae_ns.api.scene import Scene, measure, render
 from sundae_ns.api.virtual import VIEWS, by_device, of_unit_size, resized, size_of, split, virtual_views
@@ -27,7 +28,6 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.rendering import LocalField, View
-from sundae_ns.scenes.finetune import rate_factor
 from sundae_ns.storage.accounting import stored_bytes
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, weights_of
@@ -37,7 +37,6 @@ from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
 from sundae_ns.training.recorded import RecordedStep
 from sundae_ns.training.schedulers import sparse_factor
 from sundae_ns.training.step import StepInputs, TrainingStep
-from sundae_ns.training.trials.engine import TrialEngine
 from sundae_ns.training.trials.head import least_gain
 
 _log = logging.getLogger(__name__)
@@ -52,15 +51,10 @@ RATES = {
     FEATURES: 0.0025,
 }
 """Rates of Adam: those of a run right after its prune."""
-HEAD_RATE = 1e-3
-LAST_MEANS = 0.01
-"""Rate of the centres after the last step, as a share of the first."""
 STEPS = {"cpu": 3000, "cuda": 8000}
 """Steps by the device."""
-CAMERAS = 256
-"""Virtual cameras that the steps begin from."""
-HELD_OUT = 16
-"""Most cameras that no step sees."""
+CAMERAS, HELD_OUT = 256, 16
+"""Virtual cameras that the steps begin from, and most cameras that no step sees."""
 SHIFT, TURN = 0.05, 0.1
 """How far a camera of a step is from one of these: as a share of its distance from the middle of all, and radians."""
 TRIAL = 0.1
@@ -149,20 +143,12 @@ class Distillation:
             name: FusedAdamConfig(lr=RATES[name], eps=1e-15).setup([value]) for name, value in trained.items()
         }
         if self._head_config is not None:
-            adam = NetworkAdamConfig(lr=HEAD_RATE, eps=1e-8, weight_decay=0.15)
+            adam = NetworkAdamConfig(lr=1e-3, eps=1e-8, weight_decay=0.15)
             optimizers["compensation"] = adam.setup(networks["head"].parameters())
-        for optimizer in optimizers.values():
-            for group in optimizer.param_groups:
-                group["initial_lr"] = group["lr"]
         state = FieldState(Field(trained, field.encoding), networks, optimizers, pruning={"num_prunes": 1})
         focals = [view.focal for view in self.cameras]
         state.trained_focal = (min(focals), max(focals))
         return state
-
-    @property
-    def has_head(self) -> bool:
-        """Whether the scene has a head now."""
-        return self.state.head_enabled
 
     def train(self, after_step: Callable[[int, int], bool]) -> bool:
         """Decide on the head, if that is due, and train the steps that are left.
@@ -177,55 +163,64 @@ class Distillation:
             MemoryExhaustedError: the GPU's memory is full.
         """
         trial = max(round(TRIAL * self.steps), 1) if self._head_config is not None and self.gain is None else 0
-        done, total = 0, self.steps + 2 * trial
+        total = self.steps + 2 * trial
+
+        def on_step(done: int) -> bool:
+            self.step = done
+            if self.steps - done < AVERAGED * self.steps and done % AVERAGED_EVERY == 0:
+                self._mean.count_in(weights_of(self.state))
+            return after_step(2 * trial + done, total) or done == self.steps
+
         with naming_full_memory(lambda: self.state.field.num_primitives):
-            if trial:
-                engine, quality = TrialEngine(), []
-                engine.keep("start", self.state, head=True)
-                for candidate in (False, True):
-                    engine.enable_head(self.state, candidate)
-                    for i in range(trial):
-                        self._train_step(i, trial)
-                        done += 1
-                        if not after_step(done, total):
-                            return False
-                    quality.append(self.quality())
-                    engine.go_back("start", self.state)
-                self._decide(quality)
-            while self.step < self.steps:
-                self._train_step(self.step, self.steps)
-                self.step += 1
-                if self.steps - self.step < AVERAGED * self.steps and self.step % AVERAGED_EVERY == 0:
-                    self._mean.count_in(weights_of(self.state))
-                done += 1
-                if not after_step(total - self.steps + self.step, total) and self.step < self.steps:
-                    return False
+            if trial and not self._try_head(trial, lambda done: after_step(done, total)):
+                return False
+            if not self._optimise(self.steps, self.step, on_step):
+                return False
         self._mean.replace(weights_of(self.state))
         return True
 
-    def _decide(self, quality: Sequence[float]) -> None:
+    def _optimise(self, steps: int, first: int, on_step: Callable[[int], bool]) -> bool:
+        """Train; step ``i`` of ``steps`` is a function of both, so that a resumed training repeats it."""
+        sparse = sparse_factor(self.state.field.num_primitives)
+
+        def factor(name: str, i: int) -> float:
+            if name == "means":
+                return sparse * 0.01 ** (i / steps)
+            return rate_factor(i, steps) if name == "compensation" else 1.0
+
+        return optimise(self._train_step, self.state.optimizers, steps, factor, first=first, on_step=on_step)
+
+    def _try_head(self, steps: int, on_step: Callable[[int], bool]) -> bool:
+        """Train without and with the head from the same start, and keep the head if it pays; False if interrupted."""
         assert self._head_config is not None
+        state, quality = self.state, []
+        start = state.snapshot(head=True)
+        for trial, starts_at in enumerate((math.inf, -math.inf)):
+            state.head_starts_at = starts_at
+
+            def on_trial_step(done: int, before: int = trial * steps) -> bool:
+                return on_step(before + done)
+
+            if not self._optimise(steps, 0, on_trial_step):
+                return False
+            quality.append(self.quality())
+            state.restore(start)
         self.gain = quality[1] - quality[0]
-        plain = {name: value for name, value in self.state.field.items() if name != FEATURES}
-        ratio = stored_bytes(self.state.field, self._head_config) / stored_bytes(plain, None)
+        plain = {name: value for name, value in state.field.items() if name != FEATURES}
+        ratio = stored_bytes(state.field, self._head_config) / stored_bytes(plain, None)
         if not self.gain >= least_gain(math.log2(ratio)):
             self._remove_head()
+        return True
 
     def _remove_head(self) -> None:
         self.state.remove_head()
         self._head_config = None
 
-    def _train_step(self, i: int, steps: int) -> None:
-        """Step ``i`` of ``steps``; a function of both, so that a resumed training repeats it."""
+    def _train_step(self, i: int) -> None:
         state = self.state
         view = self._camera(i)
         # A teacher of nerfstudio's model may have been trained over random backgrounds; the student sees the shown one.
         target = render(self._teacher, view).rgb
-        sparse = sparse_factor(state.field.num_primitives)
-        factors = {"means": sparse * LAST_MEANS ** (i / steps), "compensation": rate_factor(i, steps)}
-        for name, optimizer in state.optimizers.items():
-            for group in optimizer.param_groups:
-                group["lr"] = group["initial_lr"] * factors.get(name, 1.0)
         state.step = i + 1  # a head is enabled in the steps after its start
         inputs = StepInputs(view, target, None, self._teacher.background)
         settings = state.render_settings(self._settings.backend, antialiased=self._teacher.antialiased, training=True)
@@ -318,12 +313,12 @@ class Distillation:
         except Exception as error:  # torch raises errors of many kinds for a damaged file
             raise CheckpointError(refused) from error
         if self.state.head is not None:
-            TrialEngine().enable_head(self.state, enabled=True)
+            self.state.head_starts_at = -math.inf
 
     def _options(self) -> Mapping[str, Any]:
         """What a resumed training must share."""
-        shape = [self._teacher.num_primitives, self.state.field.num_primitives, len(self.cameras)]
-        return {"steps": self.steps, "seed": self._seed, "counts": shape}
+        counts = [self._teacher.num_primitives, self.state.field.num_primitives, len(self.cameras)]
+        return {"steps": self.steps, "seed": self._seed, "counts": counts}
 
 
 def distill(

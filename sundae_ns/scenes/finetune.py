@@ -8,8 +8,7 @@ straight-through estimator of Bengio, Leonard and Courville, 2013). So losses an
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from sundae_ns.api.optimise import optimise, rate_factor
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
@@ -44,16 +44,6 @@ RATES = {
 training they hardly move."""
 RATE = 0.025
 """Loss for each bit per stored number: about what a bit less costs in quality at the steps of ``FINETUNED``."""
-RISE = 0.05
-"""Share of the steps in which rates rise, because Adam has no moments yet. Then they fall to 0."""
-
-
-def rate_factor(step: int, steps: int) -> float:
-    """Share of the peak rate at a step from 0 to ``steps`` - 1: a short rise, then half a cosine."""
-    rise = max(round(RISE * steps), 1)
-    if step < rise:
-        return (step + 1) / (rise + 1)
-    return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(steps - rise, 1)))
 
 
 def finetune(
@@ -107,20 +97,21 @@ def finetune(
     head = Through.of(weights, codecs.rounded_head)
     numbers = sum(value.numel() for value in (*field.exact.values(), *head.exact.values()))
     optimizer = _optimizer(field.exact, head.exact)
-    highest = [float(group["lr"]) for group in optimizer.param_groups]
-    step = TunedStep(model, codecs, field, head, optimizer, rate / numbers)
+    tuned = TunedStep(model, codecs, field, head, optimizer, rate / numbers)
+
+    def step(i: int) -> None:
+        at = opened.steps + i
+        if weights:
+            model.step = at  # chooses the window of a large image
+        camera, batch = pipeline.datamanager.next_train(at)
+        result = tuned(model.step_inputs(camera, batch), model.render_settings(training=True))
+        if progress is not None:
+            progress(result.loss)
+
     generators = [torch.cuda.current_device()] if model.device.type == "cuda" else []
     with naming_full_memory(lambda: model.num_points), torch.random.fork_rng(generators):
         torch.manual_seed(opened.seed or 0)  # of random backgrounds
-        for i in range(steps):
-            _set_rates(optimizer, [peak * rate_factor(i, steps) for peak in highest])
-            at = opened.steps + i
-            if weights:
-                model.step = at  # chooses the window of a large image
-            camera, batch = pipeline.datamanager.next_train(at)
-            result = step(model.step_inputs(camera, batch), model.render_settings(training=True))
-            if progress is not None:
-                progress(result.loss)
+        optimise(step, {"pack": optimizer}, steps, lambda _, i: rate_factor(i, steps))
     source = {**scene.meta.get("source", {}), "finetuned": steps}
     trained = replace(
         scene,
@@ -144,15 +135,6 @@ def _optimizer(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> torch
         for group in groups:
             group["lr"] = torch.tensor(group["lr"], device=group["params"][0].device)
     return torch.optim.Adam(groups, fused=on_cuda, capturable=on_cuda)
-
-
-def _set_rates(optimizer: torch.optim.Optimizer, rates: Iterable[float]) -> None:
-    """Set the rate of each group, in place where a recording reads it."""
-    for group, rate in zip(optimizer.param_groups, rates, strict=True):
-        if isinstance(group["lr"], Tensor):
-            group["lr"].fill_(rate)
-        else:
-            group["lr"] = rate
 
 
 class Through(NamedTuple):
