@@ -23,7 +23,6 @@ from sundae_ns.storage.atomic import write_bytes
 from sundae_ns.storage.config_file import find_config, model_options, parser_options
 from sundae_ns.storage.formats import FORMATS, ViewerFile, kind_of, kind_of_primitives
 
-_HEAD = "networks.head."
 SUFFIXES = (*FORMATS, ".sundae", ".html")
 """Suffixes of the files that :func:`save` writes."""
 FRAME_FILE = "dataparser_transforms.json"
@@ -124,13 +123,8 @@ def packed_file(path: Path) -> tuple[Scene, bytes]:
 
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:
     """Write base colours in a format of other viewers; returns what was left out or clamped. See :func:`save`."""
-    return formats.write_for_viewers(
-        path,
-        scene.field,
-        antialiased=scene.antialiased,
-        upright=upright,
-        in_model_frame=scene.in_model_frame,
-    )
+    facts = {"antialiased": scene.antialiased, "in_model_frame": scene.in_model_frame}
+    return formats.write_for_viewers(path, scene.field, upright=upright, **facts)
 
 
 def _of_run(path: Path) -> Scene:
@@ -155,9 +149,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
     extra = state.get(checkpoint.EXTRA_STATE)
     extra = extra if isinstance(extra, Mapping) else {}
     focal = extra.get("trained_focal")
-    # Earlier versions did not state whether the head is enabled, but only what it was trained on.
-    enabled = extra.get("head_enabled", focal is not None)
-    head = _head_of(state, options, source) if enabled else None
+    head = _head_of(state, options, source) if extra.get("head_enabled") else None
     if head is not None:
         field[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
     degree, interval = field.sh_degree, options.get("sh_degree_interval")
@@ -187,7 +179,8 @@ def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path)
     Raises:
         CheckpointError: its weights fit no known size.
     """
-    weights = {name.removeprefix(_HEAD): value for name, value in state.items() if name.startswith(_HEAD)}
+    prefix = "networks.head."
+    weights = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
     features = state.get(f"gauss_params.{FEATURES}")
     if not weights or not isinstance(features, Tensor):
         return None

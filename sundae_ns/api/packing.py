@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -10,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.views import Direction, is_frame, is_number, unit
+from sundae_ns.api.views import Direction, is_frame, unit
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.gaussians import FEATURES, mend
@@ -24,10 +26,6 @@ from sundae_ns.storage.pack.container import FORMAT, fault
 
 _MODEL: dict[str, Any] = FORMAT["model"]
 _PROPERTIES: dict[str, Any] = FORMAT["header"]["properties"]
-_HEAD_OPTIONS: list[str] = _MODEL["properties"]["head"]["required"]
-"""Options of a head that a packed scene states."""
-_CARRIED = ("source", "frame", "capture")
-"""Entries of the header that a scene carries along."""
 
 
 def scene_of(packed: PackedScene) -> Scene:
@@ -43,7 +41,7 @@ def scene_of(packed: PackedScene) -> Scene:
     degree, focal = int(stated["sh_degree"]), stated.get("trained_focal")
     if packed.field["features_rest"].shape[1] > (degree + 1) ** 2 - 1:
         raise refusal("a lower SH degree than it has")
-    meta = {name: packed.meta[name] for name in _CARRIED if packed.meta.get(name) is not None}
+    meta = {name: packed.meta[name] for name in ("source", "frame", "capture") if packed.meta.get(name) is not None}
     if not is_frame(meta.get("frame")):
         meta.pop("frame", None)
     source = meta.get("source")
@@ -71,7 +69,8 @@ def contents_of(scene: Scene) -> PackedScene:
     scene = replace(scene, field=mend(scene.field).field)
     head = {} if scene.head is None else dict(scene.head.state_dict())
     field = {name: value.detach() for name, value in scene.field.items() if name != FEATURES or head}
-    options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in _HEAD_OPTIONS}
+    stated = _MODEL["properties"]["head"]["required"]
+    options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in stated}
     # Degree 0 stands for logits.
     degree = 0 if scene.field.encoding == "logits" else max(scene.field.sh_degree, 1)
     model = {
@@ -110,24 +109,16 @@ def stated_start(scene: Scene) -> dict[str, Any]:
             "size": [view.width, view.height],
         }
     for name, value in stated.items():
-        if not all(map(is_number, _numbers(value))) or fault(value, _PROPERTIES[name]) is not None:
+        if {"NaN", "Infinity"} & set(re.findall(r"\w+", json.dumps(value))) or fault(value, _PROPERTIES[name]):
             named = "start view" if name == "start" else "up axis"
             raise ConfigError(f"the {named} of the scene has values that readers refuse; give another one")
     return stated
 
 
-def _numbers(value: Any) -> list[Any]:
-    if isinstance(value, (dict, list)):
-        return [
-            number for inner in (value.values() if isinstance(value, dict) else value) for number in _numbers(inner)
-        ]
-    return [value]
-
-
 def start_of(stated: Mapping[str, Any]) -> tuple[Direction | None, View | None]:
     """Up axis and start view of JSON values; None for one that is missing, or that the schema refuses."""
-    good = {name: stated[name] for name in ("up", "start") if name in stated}
-    good = {name: value for name, value in good.items() if fault(value, _PROPERTIES[name]) is None}
+    names = [name for name in ("up", "start") if name in stated and fault(stated[name], _PROPERTIES[name]) is None]
+    good = {name: stated[name] for name in names}
     view = None
     if "start" in good:
         start = good["start"]

@@ -155,9 +155,7 @@ def _camera_path(content: dict[str, Any], where: str) -> list[View]:
 
 def is_frame(stated: Any) -> bool:
     """Whether a value states a transform ``[3 or 4, 4]`` and a scale, from a capture's coordinates to a model's."""
-    if not isinstance(stated, dict) or not is_number(stated.get("scale")):
-        return False
-    rows = stated.get("transform")
+    rows = stated.get("transform") if isinstance(stated, dict) and is_number(stated.get("scale")) else None
     if not isinstance(rows, list) or len(rows) not in (3, 4):
         return False
     return all(isinstance(row, list) and len(row) == 4 and all(map(is_number, row)) for row in rows)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import logging
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -100,13 +98,6 @@ def test_a_large_page_is_shown_with_a_warning(
     shown = sn.show(scene)
     assert frame_of(shown._repr_html_())["srcdoc"] == shown.page
     assert re.search(r"a page of 0\.[2-9] MB; prune the scene first, or save it as scene.html", caplog.text)
-
-
-def test_it_needs_no_notebook() -> None:
-    code = "import sys; sys.modules['IPython'] = None; import torch, sundae_ns as sn; "
-    code += "print(sn.show(sn.Scene.from_points(torch.rand(9, 3), torch.rand(9, 3)))._repr_html_()[:16])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout == '<iframe srcdoc="\n', done.stderr
 
 
 @pytest.mark.browser

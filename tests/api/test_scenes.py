@@ -65,15 +65,6 @@ def test_packed_scenes_are_packed_again(name: str, tmp_path: Path) -> None:
     assert sn.measure(again, found, found.views, head=False).psnr > 30
 
 
-def test_frames_of_files(tmp_path: Path) -> None:
-    """A scene of a run says in a .ply that it is in the coordinates of nerfstudio's model; others do not."""
-    for in_model_frame in (True, False):
-        for suffix in (".ply", ".sundae"):
-            path = tmp_path / f"{in_model_frame}{suffix}"
-            sn.save(sn.Scene(scene().field, in_model_frame=in_model_frame), path)
-            assert sn.load(path).in_model_frame == in_model_frame
-
-
 @pytest.mark.parametrize(
     ("name", "content", "error", "message"),
     [
@@ -139,11 +130,6 @@ def test_saving_refuses_what_it_cannot(tmp_path: Path) -> None:
     assert sn.load(tmp_path / "new" / "folder" / "a.ply").num_primitives == scene().num_primitives
 
 
-def test_a_page_holds_the_scene(tmp_path: Path) -> None:
-    sn.save(scene(), tmp_path / "a.html")
-    assert (tmp_path / "a.html").read_text().startswith("<!doctype html>")
-
-
 # -------------------------------------------------------------------------------------------------------------- images
 
 
@@ -167,16 +153,6 @@ def test_a_head_with_recorded_frames_moves_to_another_device(tmp_path: Path) -> 
     assert {value.device.type for value in moved.head.parameters()} == {"meta"}
     assert found.device.type == next(found.head.parameters()).device.type == "cpu"
     assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_scenes_are_values() -> None:
-    """Nothing changes the scene that it is given."""
-    truth = scene()
-    before = {name: value.clone() for name, value in truth.field.items()}
-    small = sn.prune(truth, keep=0.5, views=views())
-    sn.render(small, views()[0])
-    assert all(torch.equal(truth.field[name], value) for name, value in before.items())
-    assert truth.to("cpu") is truth
 
 
 # ------------------------------------------------------------------------------------------------------------- pruning

@@ -17,7 +17,7 @@ from sundae_ns.api.scene import Quality
 from sundae_ns.cli import main
 from sundae_ns.errors import PackError
 from sundae_ns.scenes.models import load_run
-from sundae_ns.scenes.targets import COARSEST, Judge, Search, Try, fewest_bytes, is_worth, least_drop, scaled
+from sundae_ns.scenes.targets import COARSEST, Judge, Search, Try, fewest_bytes, least_drop, scaled
 from sundae_ns.storage.pack import (
     FINETUNED,
     Codecs,
@@ -25,7 +25,6 @@ from sundae_ns.storage.pack import (
     PackedScene,
     fit_scene,
     pack_bytes,
-    read_header,
     read_scene,
 )
 from sundae_ns.storage.pack.quantize import Transform
@@ -180,33 +179,12 @@ def test_a_fine_tune_that_does_not_help_is_left_out(tiny: Any, tuned: Tuned) -> 
         assert least_drop([plain, bad], limit).scene is not tuned.scene
 
 
-def test_the_finest_steps_may_lose_more_than_those_of_the_training(tuned: Tuned) -> None:
-    """A larger target of bytes then takes the pack of the fine-tune, and one of quality finds it too."""
-    search = tuned.search(lambda config: 0.1 if config.harmonics_step < FINETUNED["harmonics_step"] else 0.02)
-    assert search.smaller_than(2 * tuned.bytes).bytes == tuned.bytes
-    assert search.better_than(0.05).bytes <= tuned.bytes
-
-
 def test_coarser_steps_that_take_more_bytes_are_not_taken(tuned: Tuned) -> None:
     class Growing(Search):
         def at(self, power: float) -> Try:
             return Try(self.scene, tuned.codecs, round(100 + 10 * power))
 
     assert Growing(tuned.scene, tuned.codecs, lambda: Stated(lambda _: 0.0)).better_than(0.1).bytes == 100  # type: ignore[arg-type, return-value]
-
-
-def test_a_target_that_a_fine_tune_meets_costs_no_bytes(
-    tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = [tiny.folder, "--finetune", 4]
-    alone = packed(capsys, *words, "-o", tmp_path / "a.sundae")
-    lost = max(alone["psnr"][0] - alone["psnr"][1], 0.0) + 0.001
-    found = packed(capsys, *words, "-o", tmp_path / "b.sundae", "--target-drop", lost)
-    assert found["bytes"] <= alone["bytes"]
-    assert found["psnr"][1] >= alone["psnr"][0] - lost
-    found = packed(capsys, *words, "-o", tmp_path / "c.sundae", "--target-bytes", alone["bytes"])
-    assert found["bytes"] <= alone["bytes"]
-    assert found["psnr"][1] >= alone["psnr"][1]
 
 
 def test_targets_that_cannot_be_met(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -234,27 +212,6 @@ def test_a_fine_tune_that_loses_says_so(tiny: Any, tmp_path: Path, capsys: pytes
     assert plain["psnr"][1] < plain["psnr"][0] + 0.1
 
 
-def test_a_doubling_of_the_bytes_is_worth_four_tenths_of_a_decibel() -> None:
-    """As trials ask; the figures are of fine-tunes on a GPU."""
-    assert is_worth(29.91, 3_507_009, 30.0, 5_939_489)
-    assert not is_worth(29.65, 3_507_009, 30.0, 5_939_489)
-    assert is_worth(29.61, 100, 30.0, 200)
-    assert not is_worth(29.59, 100, 30.0, 200)
-    assert not is_worth(30.1, 200, 30.0, 100)
-
-
-def test_a_fine_tune_that_loses_less_than_its_bytes_are_worth_says_nothing(
-    tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Here it loses more than the pack without it, but little."""
-    words = ["pack", str(tiny.folder), "-o", str(tmp_path / "a.sundae"), "--finetune", "4"]
-    with pytest.raises(SystemExit, match="0"):
-        main(words)
-    shown = capsys.readouterr()
-    assert "dB, SSIM" in shown.out
-    assert "the fine-tune" not in shown.err
-
-
 def test_a_pack_without_its_capture_says_that_it_is_not_measured(
     tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -266,21 +223,6 @@ def test_a_pack_without_its_capture_says_that_it_is_not_measured(
     shown = capsys.readouterr()
     assert "PSNR" not in shown.out
     assert re.match(r"the quality is not measured: the capture .*elsewhere is missing; give its folder", shown.err)
-
-
-def test_a_target_after_a_fine_tune(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """So few steps may not be worth it: it then says that it packed without them, and never loses more than that."""
-    file = tmp_path / "a.sundae"
-    limit = int(0.8 * packed(capsys, tiny.folder, "-o", tmp_path / "plain.sundae")["bytes"])
-    plain = packed(capsys, tiny.folder, "-o", tmp_path / "b.sundae", "--target-bytes", limit)
-    with pytest.raises(SystemExit, match="0"):
-        main(["pack", str(tiny.folder), "-o", str(file), "--finetune", "3", "--target-bytes", str(limit), "--json"])
-    shown = capsys.readouterr()
-    found = json.loads(shown.out)
-    assert 0.9 * limit < found["bytes"] <= limit
-    assert found["psnr"][1] >= plain["psnr"][1]
-    tuned = read_header(file).meta["source"].get("finetuned")
-    assert tuned == (None if "packed without it" in shown.err else 3)
 
 
 def test_steps_grow_together() -> None:

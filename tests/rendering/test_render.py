@@ -152,16 +152,6 @@ def test_residual_head_starts_at_the_base_and_features_head_does_not_need_it(bui
     assert torch.equal(first["rgb"], second["rgb"])
 
 
-@torch.no_grad()
-def test_viewer_may_switch_modes_between_frames(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
-    model = perturb(build()).eval()
-    expected = model.get_outputs_for_camera(camera())["rgb"]
-    model.train()
-    model.get_outputs(camera())
-    model.eval()
-    assert torch.equal(model.get_outputs_for_camera(camera())["rgb"], expected)
-
-
 @pytest.mark.parametrize("mode", ["residual", "features"])
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 @torch.no_grad()
@@ -220,13 +210,6 @@ def test_other_scales_get_the_correction_of_the_trained_one(
     near = model.get_outputs(at_focal(camera, 10.05))
     model.state.trained_focal = None
     assert torch.equal(near["rgb"], model.get_outputs(at_focal(camera, 10.05))["rgb"])
-
-
-def test_thumbnails_are_base_colours(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
-    model = perturb(build(background_color="black")).eval()
-    model.state.trained_focal = (300.0, 300.0)
-    outputs = model.get_outputs(camera())
-    assert torch.equal(outputs["rgb"], outputs["base_rgb"])
 
 
 def test_the_head_remembers_its_scale(build: Build, training_of: TrainingOf) -> None:
