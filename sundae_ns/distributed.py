@@ -41,7 +41,7 @@ from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.surgery import change_parameter, per_primitive
 from sundae_ns.rasterization.reference import BLUR, FOV_MARGIN, camera_center
-from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, LocalField, colors_from
+from sundae_ns.rendering.render import NEAR_PLANE, ColorSettings, LocalField, colors_from
 from sundae_ns.rendering.views import View
 from sundae_ns.training.densification import COUNTED, start_counting
 from sundae_ns.training.extension import Extension

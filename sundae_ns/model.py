@@ -29,11 +29,8 @@ from sundae_ns.evaluation.count_curve import CurvePoint
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.parsing import check_projection
 from sundae_ns.rasterization import Backend, select_backend
-from sundae_ns.rendering.contribution import contribution
-from sundae_ns.rendering.outputs import Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs
-from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, RenderSettings
-from sundae_ns.rendering.replay import FrameReplay
-from sundae_ns.rendering.source import LocalField, StepResolution
+from sundae_ns.rendering.frames import FrameReplay, Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs
+from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, LocalField, RenderSettings, StepResolution, contribution
 from sundae_ns.rendering.views import View, crop_image, view_of
 from sundae_ns.storage import checkpoint
 from sundae_ns.training.build import build
@@ -242,7 +239,7 @@ class SundaeModel(SplatfactoModel):
 
         Returns:
             ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``window``, the
-            part that the images show, or None. See ``rendering.outputs.late_outputs`` for those outside of training.
+            part that the images show, or None. See ``rendering.frames.late_outputs`` for those outside of training.
         """
         with naming_full_memory(lambda: self.num_points):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)

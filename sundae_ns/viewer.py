@@ -30,8 +30,8 @@ from sundae_ns.evaluation.count_curve import CurvePoint, expected_change
 from sundae_ns.gaussians import mend
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import Pruned, PruneRule, band_rule, field_graph, kept_count, prune_field
-from sundae_ns.rendering.outputs import FieldKey
-from sundae_ns.rendering.source import LocalField
+from sundae_ns.rendering.frames import FieldKey
+from sundae_ns.rendering.render import LocalField
 from sundae_ns.training.field_state import FieldState
 
 RuleName = Literal["as configured", "band: high", "band: low", "band: both"]

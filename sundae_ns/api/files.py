@@ -17,7 +17,7 @@ from sundae_ns.compensation.head import SIZES
 from sundae_ns.data.capture import read_json
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, writing
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.rendering.source import degree_in_use
+from sundae_ns.rendering.render import degree_in_use
 from sundae_ns.storage import checkpoint, formats
 from sundae_ns.storage.atomic import write_bytes
 from sundae_ns.storage.config_file import find_config, model_options, parser_options

@@ -18,8 +18,7 @@ from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.gaussians import FEATURES, mend
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rasterization.reference import harmonic_basis
-from sundae_ns.rendering.render import render_view
-from sundae_ns.rendering.source import LocalField
+from sundae_ns.rendering.render import LocalField, render_view
 from sundae_ns.rendering.views import View
 from sundae_ns.storage.pack import PackedScene, Sensitivity, fit_scene, pack_bytes
 from sundae_ns.storage.pack.container import FORMAT, fault

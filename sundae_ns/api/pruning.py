@@ -20,9 +20,7 @@ from sundae_ns.gaussians import mend
 from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning import PruneRule, kept_count, prune_field
 from sundae_ns.rasterization import rasterize_views
-from sundae_ns.rendering.contribution import contribution
-from sundae_ns.rendering.render import RenderSettings, pass_options
-from sundae_ns.rendering.source import LocalField, TrainingView
+from sundae_ns.rendering.render import LocalField, RenderSettings, TrainingView, contribution, pass_options
 from sundae_ns.rendering.views import View
 
 REFIT_STEPS, REFIT_VIEWS = {"cpu": 64, "cuda": 128}, 4

@@ -19,8 +19,7 @@ from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.rasterization import BackendName, select_backend
-from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, RenderSettings, render_view
-from sundae_ns.rendering.source import LocalField
+from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, LocalField, RenderSettings, render_view
 from sundae_ns.rendering.views import View
 
 Camera = TypeVar("Camera")

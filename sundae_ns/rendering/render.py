@@ -1,23 +1,120 @@
-"""From a field to the images of a view: colours, one splatting pass, and the head's correction."""
+"""From a field to the images of a view: colours, one splatting pass, the head's correction, and what views see."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, ScalePlan, plan, resize
+from sundae_ns.errors import DataError
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.rasterization import Rasterization, rasterize
+from sundae_ns.gaussians.field import Field
+from sundae_ns.pruning.scores import pixel_detail
+from sundae_ns.rasterization import Backend, Rasterization, blending_weights, harmonic_colors, rasterize
 from sundae_ns.rasterization.types import check_memory
-from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, LocalField
 from sundae_ns.rendering.views import View
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 SHOWN_BACKGROUNDS = {"random": (0.1490, 0.1647, 0.2157), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 """Backgrounds of images that are not trained on, by the option ``background_color``; for random the viewer's."""
+NEAR_PLANE = 0.01
+"""Distance of the near plane, world units."""
+
+
+class StepResolution(NamedTuple):
+    """Form of the training images at one step: a function of the step and the options."""
+
+    step: int
+    """Training step."""
+    downscale: int
+    """Divisor of the sides of the images."""
+    window_pixels: int
+    """Most pixels of an image; larger images are trained on by a random window. 0 for no limit."""
+    mirror: bool = False
+    """Whether half of the steps see their image in a mirror."""
+
+
+class TrainingView(NamedTuple):
+    """A training view for passes that do not train."""
+
+    view: View
+    """The camera."""
+    mask: Tensor | None
+    """Pixels that count, bool ``[H, W, 1]``; None for all."""
+
+
+@dataclass(frozen=True)
+class ColorSettings:
+    """How stored colours become colours seen from a camera."""
+
+    backend: Backend
+    active_sh_degree: int | None = None
+    """Highest SH degree in use; None for the degree of the field."""
+
+
+def colors_from(params: Mapping[str, Tensor], field: Field, center: Tensor, settings: ColorSettings) -> Tensor:
+    """Colours of primitives as seen from a place.
+
+    Args:
+        params: ``means`` ``[M, 3]``, ``features_dc`` and ``features_rest`` of the primitives.
+        field: the field that they belong to, for its encoding.
+        center: camera centre ``[3]``, or one for each primitive ``[M, 3]``; world units.
+        settings: backend and SH degree.
+
+    Returns:
+        ``[M, 3]``, at least 0.
+    """
+    if field.encoding == "logits":
+        return params["features_dc"].sigmoid()
+    degree = degree_in_use(field.sh_degree, settings.active_sh_degree)
+    coefficients = params["features_dc"], params["features_rest"]
+    return harmonic_colors(degree, params["means"], center, *coefficients, backend=settings.backend)
+
+
+def degree_in_use(sh_degree: int, active: int | None) -> int:
+    """The SH degree that colours are evaluated at: ``active``, at most the field's own; None for the field's own."""
+    return sh_degree if active is None else min(active, sh_degree)
+
+
+class LocalField:
+    """The primitives of one process.
+
+    Args:
+        field: the primitives.
+        whole: False for a part, whose tensors are new each time.
+    """
+
+    def __init__(self, field: Field, *, whole: bool = True) -> None:
+        self.field = field
+        self.replayable = whole
+        """Whether frames may be recorded: the tensors stay where they are."""
+
+    @property
+    def total(self) -> int:
+        """Number of primitives of the whole field."""
+        return self.field.num_primitives
+
+    def primitives(
+        self, view: View, settings: ColorSettings, *, features: bool, colors: bool = True
+    ) -> dict[str, Tensor]:
+        """Parameters of the primitives that the view may see ``[M, ...]``, with ``colors`` from its camera ``[M, 3]``.
+
+        Args:
+            view: the camera.
+            settings: how colours are evaluated.
+            features: whether feature vectors are needed.
+            colors: whether colours are needed.
+        """
+        primitives = dict(self.field)
+        if colors:
+            primitives["colors"] = colors_from(self.field, self.field, view.center, settings)
+        return primitives
 
 
 @dataclass(frozen=True)
@@ -164,3 +261,71 @@ def render_view(
     if not settings.training:
         images["rgb"] = images["rgb"].clamp(0.0, 1.0)
     return images, splatted
+
+
+@torch.no_grad()
+def contribution(
+    source: LocalField,
+    views: Sequence[TrainingView],
+    background: Tensor,
+    settings: RenderSettings,
+    count: int | None = None,
+    *,
+    console: Console | None = None,
+) -> Tensor:
+    """Blending weight of each primitive, summed over the pixels of all views ``[N]``.
+
+    Args:
+        source: of the primitives.
+        views: the training views.
+        background: colour ``[3]``; fixed, so that the result does not depend on a random one.
+        settings: how images are made.
+        count: number of primitives that a prune will keep. If given, pixels are weighted by the detail that these
+            cannot show (:func:`sundae_ns.pruning.scores.pixel_detail`).
+        console: shows a progress bar; None for none.
+
+    Raises:
+        DataError: a mask has another size than its view.
+    """
+    total = torch.zeros(source.field.num_primitives, device=source.field["means"].device)
+    shown: Iterable[TrainingView] = views
+    if console is not None:
+        from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
+
+        shown = track(views, "Contribution of primitives", transient=True, console=console)
+    for view, mask in shown:
+        if mask is not None and tuple(mask.shape) != (view.height, view.width, 1):
+            raise DataError(
+                f"a mask is {list(mask.shape)} but its view is {view.width} x {view.height} px; "
+                "give masks the size of their images"
+            )
+        primitives = source.primitives(view, settings, features=False, colors=count is not None)
+        pixels = None if mask is None else mask[..., 0].to(total)
+        if count is None:
+            total += blending_weights(pixels=pixels, **pass_options(primitives, view, settings))
+        else:
+            share = count / source.total
+            total += _detail_weights(primitives, view, background.to(total.device), settings, share, pixels)
+    return total
+
+
+def _detail_weights(
+    primitives: Mapping[str, Tensor],
+    view: View,
+    background: Tensor,
+    settings: RenderSettings,
+    share: float,
+    pixels: Tensor | None,
+) -> Tensor:
+    """Blending weights ``[M]`` over pixels weighted by their detail, and by ``pixels`` ``[H, W]``."""
+    # As in blending_weights, but one pass gives the image and the weights: the gradient of the first channel.
+    fixed = {name: value.detach() for name, value in primitives.items()}
+    fixed["colors"].requires_grad_()
+    with torch.enable_grad():
+        images, splatted = draw(fixed, view, background, settings.without_head(), depth=False)
+    # A prune keeps the same share of the visible primitives as of all.
+    detail = pixel_detail(images["base_rgb"], share * float((splatted.radii > 0).sum()))
+    pixels = detail if pixels is None else detail * pixels
+    with torch.enable_grad():
+        blended = (splatted.colors[..., 0] * pixels).sum()
+    return torch.autograd.grad(blended, fixed["colors"])[0][:, 0]

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
-from sundae_ns.rendering.render import RenderSettings
-from sundae_ns.rendering.source import LocalField, TrainingView
+from sundae_ns.rendering.render import LocalField, RenderSettings, TrainingView
 from sundae_ns.rendering.views import View
 from sundae_ns.training.field_state import FieldState
 

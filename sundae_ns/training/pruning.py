@@ -10,7 +10,7 @@ from torch import Tensor
 from sundae_ns.errors import SundaeError
 from sundae_ns.evaluation import peak_memory
 from sundae_ns.pruning.decision import FieldPruner
-from sundae_ns.rendering.contribution import contribution
+from sundae_ns.rendering.render import contribution
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.report import write_report

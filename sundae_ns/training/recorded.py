@@ -17,8 +17,7 @@ from sundae_ns.compensation import CompensationHead
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.fused_adam import Update, adam_step
 from sundae_ns.rasterization import Capacity
-from sundae_ns.rendering.render import RenderSettings
-from sundae_ns.rendering.source import LocalField, degree_in_use
+from sundae_ns.rendering.render import LocalField, RenderSettings, degree_in_use
 from sundae_ns.training.buffers import MOMENTS, Buffers, start_moments, trained_parameters
 from sundae_ns.training.densification import COUNTED, count_view, start_counting
 from sundae_ns.training.field_state import FieldState

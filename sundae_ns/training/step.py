@@ -16,8 +16,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import Window, training_window
 from sundae_ns.rasterization import Rasterization
-from sundae_ns.rendering.render import RenderSettings, render_view
-from sundae_ns.rendering.source import LocalField, StepResolution
+from sundae_ns.rendering.render import LocalField, RenderSettings, StepResolution, render_view
 from sundae_ns.rendering.views import View
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.losses import StepLosses

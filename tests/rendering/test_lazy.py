@@ -8,7 +8,7 @@ from threading import Barrier, Thread
 import pytest
 import torch
 
-from sundae_ns.rendering.outputs import Later, LazyOutputs
+from sundae_ns.rendering.frames import Later, LazyOutputs
 
 
 @pytest.fixture

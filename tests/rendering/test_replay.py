@@ -21,8 +21,8 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.cuda_graphs import RECORD_AT
 from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization import Capacity, RecordableGsplat
-from sundae_ns.rendering import LocalField, RenderSettings, View, render_view, replay
-from sundae_ns.rendering.replay import FrameReplay
+from sundae_ns.rendering import LocalField, RenderSettings, View, frames, render_view
+from sundae_ns.rendering.frames import FrameReplay
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -53,7 +53,7 @@ class Recorder:
 
         def show(view: View, background: Tensor) -> dict[str, Tensor]:
             shown.update(render_view(source, view, background, settings, depth=False)[0])
-            return {name: shown[name] for name in replay.REPLAYED}
+            return {name: shown[name] for name in frames.REPLAYED}
 
         return SimpleNamespace(show=show, capacity=capacity or 120)
 
@@ -65,9 +65,9 @@ class Recorder:
 @pytest.fixture
 def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     found = Recorder()
-    monkeypatch.setattr(replay, "_record", found.record)
-    monkeypatch.setattr(replay, "_replay", found.play)
-    monkeypatch.setattr(replay, "_recordable", lambda source, settings: source.replayable)
+    monkeypatch.setattr(frames, "_record", found.record)
+    monkeypatch.setattr(frames, "_replay", found.play)
+    monkeypatch.setattr(frames, "_recordable", lambda source, settings: source.replayable)
     return found
 
 
@@ -124,7 +124,7 @@ def test_a_view_of_more_pairs_than_there_is_room_for_is_recorded_again(
         model.get_outputs_for_camera(camera())
     recorder.needed = 121
     outputs = model.get_outputs_for_camera(camera())
-    assert recorder.recorded == [None, int(replay.SPARE_CAPACITY * 121)]
+    assert recorder.recorded == [None, int(frames.SPARE_CAPACITY * 121)]
     assert outputs["rgb"].shape == (32, 40, 3)
     recorder.needed = 150
     model.get_outputs_for_camera(camera())
@@ -145,7 +145,7 @@ def test_one_thread_plays_at_a_time(
         inside[0] -= 1
         return made
 
-    monkeypatch.setattr(replay, "_replay", slowly)
+    monkeypatch.setattr(frames, "_replay", slowly)
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(lambda _: model.get_outputs_for_camera(camera())["rgb"], range(12)))
     assert (most[0], recorder.played) == (1, 10)
@@ -194,7 +194,7 @@ def test_nothing_is_recorded_on_a_cpu_or_in_training(
     def refuse(*_: Any, **__: Any) -> None:
         raise AssertionError("recorded")
 
-    monkeypatch.setattr(replay, "_record", refuse)
+    monkeypatch.setattr(frames, "_record", refuse)
     model = perturb(build()).eval()
     for _ in range(2 * RECORD_AT):
         model.get_outputs_for_camera(camera())
@@ -202,11 +202,11 @@ def test_nothing_is_recorded_on_a_cpu_or_in_training(
     settings = model.render_settings(training=False)
     settings = replace(settings, backend=SimpleNamespace(name="gsplat"))  # type: ignore[arg-type]
     with torch.no_grad():
-        assert replay._recordable(source, settings)
-        assert not replay._recordable(empty, settings)
-        assert not replay._recordable(source, replace(settings, training=True))
-        assert not replay._recordable(LocalField(source.field, whole=False), settings)
-    assert not replay._recordable(source, settings)  # with gradients
+        assert frames._recordable(source, settings)
+        assert not frames._recordable(empty, settings)
+        assert not frames._recordable(source, replace(settings, training=True))
+        assert not frames._recordable(LocalField(source.field, whole=False), settings)
+    assert not frames._recordable(source, settings)  # with gradients
 
 
 # ------------------------------------------------------------------------------------------------------------- on a GPU
@@ -216,7 +216,7 @@ def eager(model: SundaeModel, camera: Cameras) -> dict[str, Tensor]:
     model._replay = FrameReplay()
     outputs = model.get_outputs_for_camera(camera)
     assert len(model._replay._frames) == 0
-    return {name: outputs[name] for name in replay.REPLAYED}
+    return {name: outputs[name] for name in frames.REPLAYED}
 
 
 @pytest.mark.gpu

@@ -26,7 +26,7 @@ from sundae_ns.evaluation.count_curve import CURVE, CurvePoint, curve_table
 from sundae_ns.gaussians.parameters import FEATURES
 from sundae_ns.pruning import kept_count
 from sundae_ns.pruning.decision import FieldPruner
-from sundae_ns.rendering.contribution import contribution
+from sundae_ns.rendering.render import contribution
 from sundae_ns.storage.coordinates import scene_order
 from sundae_ns.storage.pack.scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.training.densification import Densification
