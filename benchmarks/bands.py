@@ -29,7 +29,7 @@ from harness.points import (
 from harness.script import run_script
 from sundae_ns.cli.outputs import Overwrite, check_folder
 from sundae_ns.errors import ConfigError, DataError, SundaeError
-from sundae_ns.gaussians.parameters import sh_to_rgb
+from sundae_ns.gaussians.gaussians import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import PruneRule, band_rule, check_share, decide, field_graph, kept_count, response
 from sundae_ns.storage.atomic import replacing, write_text, writing

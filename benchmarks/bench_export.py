@@ -26,7 +26,7 @@ from torch.nn.functional import avg_pool2d
 
 from sundae_ns.api.files import load, save
 from sundae_ns.evaluation import psnr
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.scenes.models import Opened, load_model
 from sundae_ns.storage.formats import ANTIALIASED

@@ -38,7 +38,7 @@ from torch.distributed.nn.functional import all_to_all_single
 
 from sundae_ns.errors import NOTHING_SAVED, ConfigError, passed_on
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.gaussians.surgery import change_parameter, per_primitive
 from sundae_ns.rasterization.reference import BLUR, FOV_MARGIN, camera_center
 from sundae_ns.rendering.render import NEAR_PLANE, ColorSettings, LocalField, colors_from

@@ -16,7 +16,7 @@ from sundae_ns.api.views import Direction, is_frame, unit
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.gaussians import FEATURES, mend
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.rasterization.reference import harmonic_basis
 from sundae_ns.rendering.render import LocalField, render_view
 from sundae_ns.rendering.views import View

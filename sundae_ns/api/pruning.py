@@ -17,7 +17,7 @@ from sundae_ns.api.scene import Scene, measure
 from sundae_ns.api.virtual import by_device, of_unit_size, resized, size_of, split, virtual_views
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians import mend
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.pruning import PruneRule, kept_count, prune_field
 from sundae_ns.rasterization import rasterize_views
 from sundae_ns.rendering.render import LocalField, RenderSettings, TrainingView, contribution, pass_options

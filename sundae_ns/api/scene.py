@@ -16,7 +16,7 @@ from sundae_ns.compensation import CompensationHead
 from sundae_ns.errors import DataError
 from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.gaussians import from_points
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.rasterization import BackendName, select_backend
 from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, LocalField, RenderSettings, render_view
@@ -35,7 +35,7 @@ class Scene:
     """
 
     field: Field
-    """The primitives: tensors ``[N, ...]`` by name, see :mod:`sundae_ns.gaussians.parameters`; any device."""
+    """The primitives: tensors ``[N, ...]`` by name, see :mod:`sundae_ns.gaussians.gaussians`; any device."""
     head: CompensationHead | None = None
     """The compensation head, on the device of the field; None without one."""
     background_color: Background = "black"

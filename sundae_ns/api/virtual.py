@@ -15,7 +15,7 @@ from sundae_ns.data.camera_axes import world_to_camera
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians import mend
 from sundae_ns.gaussians.covariance import chunks
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.rasterization import rasterize_views
 from sundae_ns.rendering import View
 from sundae_ns.rendering.render import pass_options

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.parameters import rgb_to_sh
+from sundae_ns.gaussians.gaussians import rgb_to_sh
 from sundae_ns.graphs import knn
 
 INITIAL_OPACITY = 0.1
@@ -40,7 +40,7 @@ def from_points(
         num_features: length F of the feature vectors; 0 for none.
 
     Returns:
-        The field by parameter name (see ``gaussians.parameters``), float32, on the device of ``points``.
+        The field by parameter name (see ``gaussians.gaussians``), float32, on the device of ``points``.
 
     Raises:
         DataError: no point is finite.

@@ -12,11 +12,8 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.gaussians.field import Field, as_field
-from sundae_ns.gaussians.mending import mend
-from sundae_ns.gaussians.parameters import num_primitives
-from sundae_ns.gaussians.relocation import grow
-from sundae_ns.gaussians.surgery import keep, per_primitive, rewrite
+from sundae_ns.gaussians.gaussians import Field, as_field, mend, num_primitives
+from sundae_ns.gaussians.surgery import grow, keep, per_primitive, rewrite
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning.merge import field_graph, merged, pair_labels
 from sundae_ns.pruning.rule import PruneRule

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from sundae_ns.gaussians.covariance import chunks, covariances_of, lower_entries, outer_entries, overlap, pair_overlap
-from sundae_ns.gaussians.field import as_field
+from sundae_ns.gaussians.gaussians import as_field, rgb_to_logit, sh_to_rgb
 from sundae_ns.gaussians.merging import merge
-from sundae_ns.gaussians.parameters import rgb_to_logit, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph, build_graph
 from sundae_ns.pruning.rule import PruneRule
 

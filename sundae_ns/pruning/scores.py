@@ -10,8 +10,7 @@ from torch.nn.functional import avg_pool2d
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.filters import high_pass, response_magnitude
-from sundae_ns.gaussians.field import as_field
-from sundae_ns.gaussians.parameters import sh_to_rgb
+from sundae_ns.gaussians.gaussians import as_field, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning.merge import field_graph
 from sundae_ns.pruning.rule import PruneRule

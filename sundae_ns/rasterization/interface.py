@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import BackendError, ConfigError, DataError
-from sundae_ns.gaussians.parameters import MAX_SH_DEGREE
+from sundae_ns.gaussians.gaussians import MAX_SH_DEGREE
 from sundae_ns.rasterization.gsplat_backend import GsplatBackend, RecordableGsplat
 from sundae_ns.rasterization.reference import ReferenceBackend
 from sundae_ns.rasterization.types import Backend, Inputs, Rasterization, check_memory, constant

@@ -21,7 +21,7 @@ from torch import Tensor
 from sundae_ns.errors import BackendError, DataError
 from sundae_ns.evaluation import display
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.gpu.cuda_graphs import GraphCache, record, warm_up
 from sundae_ns.pruning import PruneRule, response
 from sundae_ns.rasterization import Capacity, RecordableGsplat

@@ -12,7 +12,7 @@ from torch import Tensor
 from sundae_ns.compensation import CompensationHead, ScalePlan, plan, resize
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterization import Backend, Rasterization, blending_weights, harmonic_colors, rasterize
 from sundae_ns.rasterization.types import check_memory

@@ -27,8 +27,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, StorageError, one_line, regular
-from sundae_ns.gaussians.field import Encoding, Field
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES, Encoding, Field, odd_shapes
 from sundae_ns.storage.atomic import replacing
 
 EXTRA_STATE = "_extra_state"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.gaussians.covariance import quaternions
-from sundae_ns.gaussians.parameters import sh_degree
+from sundae_ns.gaussians.gaussians import sh_degree
 from sundae_ns.rasterization.reference import harmonic_basis
 
 MAX_BITS = 21

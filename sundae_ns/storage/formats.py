@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, regular
-from sundae_ns.gaussians.field import Field
-from sundae_ns.gaussians.mending import Mended, mend
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, sh_degree_of
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES, Field, Mended, mend, sh_degree_of
 from sundae_ns.storage import checkpoint
 from sundae_ns.storage.coordinates import similarity
 from sundae_ns.storage.gltf import read_glb, write_glb
@@ -257,7 +255,7 @@ def write_for_viewers(
 
     Args:
         path: its folder must exist.
-        params: the field; see :mod:`sundae_ns.gaussians.parameters`. A :class:`Field` says how it stores colours.
+        params: the field; see :mod:`sundae_ns.gaussians.gaussians`. A :class:`Field` says how it stores colours.
         antialiased: mark the scene as trained with antialiasing.
         upright: rotate the scene from nerfstudio's axes to those of a 3DGS .ply, so that viewers show it upright;
             a .glb is in any case.

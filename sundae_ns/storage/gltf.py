@@ -29,7 +29,7 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError, reading, regular
 from sundae_ns.gaussians.covariance import rotation_matrices
-from sundae_ns.gaussians.parameters import SH_C0, sh_degree
+from sundae_ns.gaussians.gaussians import SH_C0, sh_degree
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.coordinates import similarity
 from sundae_ns.storage.ply import LEAST_OPACITY, check_field
@@ -69,7 +69,7 @@ def write_glb(
 
     Args:
         path: the file; its folder must exist.
-        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are not
+        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.gaussians`. ``features`` are not
             written.
         antialiased: mark the scene as trained with antialiasing, for :func:`read_glb`.
         in_model_frame: the field is in the coordinates of nerfstudio's model.

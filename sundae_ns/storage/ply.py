@@ -32,7 +32,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sundae_ns.errors import DataError, SundaeError, reading, regular
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, rgb_to_sh, sh_degree_of, sh_to_rgb
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES, num_primitives, odd_shapes, rgb_to_sh, sh_degree_of, sh_to_rgb
 from sundae_ns.storage.atomic import replacing
 
 MODEL_FRAME = "Coordinates: nerfstudio model"
@@ -92,7 +92,7 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
 
     Args:
         path: the file; its folder must exist.
-        params: a field; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are not written. Values that are not
+        params: a field; see :mod:`sundae_ns.gaussians.gaussians`. ``features`` are not written. Values that are not
             finite are written unchanged: drop such primitives first (``finite_mask``), because viewers do not.
         comments: lines for the header: :data:`MODEL_FRAME` for the field of a nerfstudio model, ``SplatRenderMode:
             mip`` for an antialiased scene.
@@ -271,7 +271,7 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     """Read a binary 3DGS .ply, with SH coefficients or with colours, or a compressed one; ignores other properties.
 
     Returns:
-        A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU. The SH degree
+        A field by the names of :data:`sundae_ns.gaussians.gaussians.SPLAT_NAMES`, float32 on the CPU. The SH degree
         follows from the number of ``f_rest_*``; without any, ``features_rest`` is ``[N, 0, 3]``. Values may be
         infinite, where that is how the file states an opacity of 1; see ``gaussians.mend``.
 

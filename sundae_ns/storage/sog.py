@@ -56,7 +56,7 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
 
     Args:
         path: the file; its folder must exist.
-        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are not
+        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.gaussians`. ``features`` are not
             written, and the order of primitives changes.
         antialiased: mark the scene as trained with antialiasing.
 
@@ -123,7 +123,7 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
         path: the bundle, the folder, or its ``meta.json``.
 
     Returns:
-        A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU, in the file's
+        A field by the names of :data:`sundae_ns.gaussians.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
         coordinates; and whether it is marked as trained with antialiasing.
 
     Raises:

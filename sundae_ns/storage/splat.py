@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.errors import DataError, reading, regular
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes, rgb_to_sh
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES, odd_shapes, rgb_to_sh
 from sundae_ns.storage.checkpoint import damage_of, load_tensors
 from sundae_ns.storage.ply import LEAST_OPACITY
 
@@ -69,7 +69,7 @@ def read_splat(path: Path) -> dict[str, Tensor]:
     """Read a .splat, which has no view-dependent colours.
 
     Returns:
-        A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU, in the file's
+        A field by the names of :data:`sundae_ns.gaussians.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
         coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.mend``.
 
     Raises:

@@ -69,7 +69,7 @@ def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
 
     Args:
         path: the file; its folder must exist.
-        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are not
+        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.gaussians`. ``features`` are not
             written.
         antialiased: mark the scene as trained with antialiasing.
 
@@ -99,7 +99,7 @@ def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
     """Read a .spz of version 1 to 4.
 
     Returns:
-        A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU, in the file's
+        A field by the names of :data:`sundae_ns.gaussians.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
         coordinates; and whether it is marked as trained with antialiasing.
 
     Raises:

@@ -8,7 +8,7 @@ import torch
 
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.errors import ConfigError
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.training.averaging import Averaging
 from sundae_ns.training.dense_start import DenseStart
 from sundae_ns.training.densification import Densification, make_strategy

@@ -15,7 +15,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.gaussians.surgery import Snapshot, module_snapshot, restore, restore_module, snapshot
 from sundae_ns.rasterization import Backend
 from sundae_ns.rendering.render import RenderSettings

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
-from sundae_ns.gaussians.parameters import rgb_to_logit, sh_to_rgb
+from sundae_ns.gaussians.gaussians import rgb_to_logit, sh_to_rgb
 from sundae_ns.storage.coordinates import similarity
 from sundae_ns.storage.formats import kind_of, read_field
 from sundae_ns.training.options import ModelOptions

@@ -12,7 +12,7 @@ from torch import Tensor
 import sundae_ns as sn
 from sundae_ns.api.cleaning import crop_mask, floater_mask, within
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 
 VIEWS = tuple(sn.View.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=96, height=72) for x in (-2.0, 0.0, 2.0))
 

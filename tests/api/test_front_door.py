@@ -17,7 +17,7 @@ from short_prunes import SHORT
 
 import sundae_ns as sn
 from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.storage.ply import write_ply
 
 ROOT = Path(__file__).parents[2]

@@ -15,8 +15,7 @@ import sundae_ns as sn
 from sundae_ns.api import pruning as module
 from sundae_ns.api.pruning import count_for_drop, refit
 from sundae_ns.gaussians import covariance
-from sundae_ns.gaussians.field import Encoding, Field
-from sundae_ns.gaussians.parameters import sh_to_rgb
+from sundae_ns.gaussians.gaussians import Encoding, Field, sh_to_rgb
 from sundae_ns.pruning import merge, prune_field
 
 N = 1500

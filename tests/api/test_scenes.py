@@ -14,7 +14,7 @@ from packed_scenes import KINDS, write_kind
 
 import sundae_ns as sn
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, PackError
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 
 
 def scene(n: int = 200, degree: int = 2) -> sn.Scene:

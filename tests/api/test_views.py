@@ -18,7 +18,7 @@ from sundae_ns.api import virtual
 from sundae_ns.api.pruning import prune_with_mask
 from sundae_ns.api.views import is_frame, read_cameras
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 
 FRAME = {"transform_matrix": [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]}
 LENS = {"fl_x": 50, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48}

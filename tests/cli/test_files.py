@@ -26,7 +26,7 @@ from torch import Tensor
 import sundae_ns as sn
 from sundae_ns.api import pruning
 from sundae_ns.gaussians import from_points
-from sundae_ns.gaussians.parameters import SH_C0, SPLAT_NAMES
+from sundae_ns.gaussians.gaussians import SH_C0, SPLAT_NAMES
 from sundae_ns.storage.formats import read_primitives, write_for_viewers
 from sundae_ns.storage.pack import PackedScene, read_scene, write_scene
 from sundae_ns.storage.ply import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply

@@ -22,7 +22,7 @@ from torch.nn import Parameter, ParameterDict
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.distributed import BatchOptimizers, Ranks, ShardedField, _summed, may_be_seen
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.gaussians.surgery import keep
 from sundae_ns.rasterization import rasterize, select_backend
 from sundae_ns.rasterization.reference import project

@@ -7,8 +7,8 @@ import torch
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians import from_points, initial_features, random_points
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES, sh_to_rgb
 from sundae_ns.gaussians.initialization import INITIAL_OPACITY, random_quaternions
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, sh_to_rgb
 
 
 def cloud(n: int = 50) -> tuple[torch.Tensor, torch.Tensor]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sundae_ns.gaussians import from_points, mend
 from sundae_ns.gaussians.covariance import rotation_matrices
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.pruning import PruneRule, prune_field
 from sundae_ns.pruning.decision import FieldPruner
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.gaussians import from_points
-from sundae_ns.gaussians.parameters import MAX_SH_DEGREE, SPLAT_NAMES, odd_shapes, sh_degree_of
+from sundae_ns.gaussians.gaussians import MAX_SH_DEGREE, SPLAT_NAMES, odd_shapes, sh_degree_of
 
 
 def field(degree: int) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from sundae_ns.gaussians.relocation import MAX_COPIES, draw_sources, grow, split_evenly
+from sundae_ns.gaussians.surgery import MAX_COPIES, draw_sources, grow, split_evenly
 
 FIELD = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
 

@@ -15,7 +15,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from PIL import Image
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES
 from sundae_ns.storage.ply import is_nerfstudio_ply, read_ply
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, MemoryExhaustedError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage.ply import MODEL_FRAME, write_ply

@@ -7,8 +7,7 @@ from typing import Any
 
 import torch
 
-from sundae_ns.gaussians.field import Field
-from sundae_ns.gaussians.parameters import sh_to_rgb
+from sundae_ns.gaussians.gaussians import Field, sh_to_rgb
 from sundae_ns.model import SundaeModel
 from sundae_ns.pruning import decide
 

@@ -19,7 +19,7 @@ import sundae_ns.pruning.decision
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians import mend
 from sundae_ns.gaussians.covariance import covariances, quaternions, rotation_matrices
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.pruning import (
     Decision,
     FieldPruner,

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians import from_points
-from sundae_ns.gaussians.field import Field
-from sundae_ns.gaussians.parameters import rgb_to_sh, sh_to_rgb
+from sundae_ns.gaussians.gaussians import Field, rgb_to_sh, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph, build_graph
 from sundae_ns.pruning import PruneRule, field_graph, merge, prune_field
 from sundae_ns.pruning.merge import pair_labels, voronoi_labels

@@ -7,7 +7,7 @@ import torch
 from prunes import PAPER, field
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.parameters import rgb_to_sh
+from sundae_ns.gaussians.gaussians import rgb_to_sh
 from sundae_ns.pruning import PruneRule, response
 from sundae_ns.pruning.scores import attribute_signal, pixel_detail, score
 

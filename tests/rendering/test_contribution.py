@@ -13,7 +13,7 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.model import SundaeModel
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterization import blending_weights, rasterize

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import Window, resize
 from sundae_ns.errors import MemoryExhaustedError
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.method_configs import sundae
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import LocalField, render_view

@@ -17,7 +17,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.gpu.cuda_graphs import RECORD_AT
 from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization import Capacity, RecordableGsplat

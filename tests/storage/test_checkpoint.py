@@ -13,8 +13,8 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.gaussians import mending
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, sh_to_rgb
+from sundae_ns.gaussians import gaussians
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES, finite_mask, sh_to_rgb
 from sundae_ns.storage import checkpoint
 from sundae_ns.storage.formats import read_field
 from sundae_ns.storage.ply import MODEL_FRAME, write_ply
@@ -200,7 +200,7 @@ def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(
         mended.append(len(params["means"]))
         return finite_mask(params)
 
-    monkeypatch.setattr(mending, "finite_mask", count)
+    monkeypatch.setattr(gaussians, "finite_mask", count)
     stored = stock_checkpoint(tmp_path / "step-000000001.ckpt", n=4)
     assert torch.equal(read_field(tmp_path)[0]["means"], stored["means"])
     assert mended == [4]

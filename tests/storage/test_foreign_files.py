@@ -20,7 +20,7 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES
 from sundae_ns.storage.formats import kind_of, read_primitives, unread
 from sundae_ns.storage.ply import ply_comments, read_ply, read_point_cloud, write_ply
 from sundae_ns.storage.sog import write_sog

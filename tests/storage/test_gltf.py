@@ -17,8 +17,7 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.errors import DataError, SundaeError
-from sundae_ns.gaussians.field import Field
-from sundae_ns.gaussians.parameters import SPLAT_NAMES
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES, Field
 from sundae_ns.storage.gltf import EXTENSION, read_glb, semantics, write_glb
 
 THEIRS = Path(__file__).parent / "foreign" / "splat_transform.glb"

@@ -14,7 +14,7 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.errors import DataError, SundaeError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES
 from sundae_ns.storage.splat import read_ksplat
 
 SECTION = 4096  # offset of the first section's header

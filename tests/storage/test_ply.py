@@ -9,7 +9,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES
+from sundae_ns.gaussians.gaussians import SPLAT_NAMES
 from sundae_ns.storage.ply import is_nerfstudio_ply, read_ply, read_point_cloud, write_ply
 
 

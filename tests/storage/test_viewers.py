@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians import from_points
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.rasterization.reference import harmonic_basis
 from sundae_ns.storage.formats import ANTIALIASED, FORMATS, write_for_viewers
 from sundae_ns.storage.ply import is_nerfstudio_ply, read_ply, write_ply

@@ -11,7 +11,7 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from sundae_ns.gaussians.parameters import SH_C0
+from sundae_ns.gaussians.gaussians import SH_C0
 from sundae_ns.storage.ply import write_ply
 
 _CHUNK = 256

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.gaussians.parameters import sh_to_rgb
+from sundae_ns.gaussians.gaussians import sh_to_rgb
 from sundae_ns.model import SundaeModel
 from sundae_ns.training import dense_start
 

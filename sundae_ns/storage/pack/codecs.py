@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import PackError
-from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES
+from sundae_ns.gaussians.gaussians import FEATURES, SPLAT_NAMES
 from sundae_ns.storage.coordinates import scene_order
 from sundae_ns.storage.pack import quantize
 from sundae_ns.storage.pack.config import STEPS, PackConfig

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.errors import PackError
-from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives
+from sundae_ns.gaussians.gaussians import FEATURES, SPLAT_NAMES, finite_mask, num_primitives
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.pack import container, entropy, quantize
 from sundae_ns.storage.pack.codecs import Codecs, Sensitivity, as_matrix, fit_codecs
@@ -42,7 +42,7 @@ class PackedScene:
     """All that is needed to render a scene."""
 
     field: dict[str, Tensor]
-    """See :mod:`sundae_ns.gaussians.parameters`; float32 on the CPU."""
+    """See :mod:`sundae_ns.gaussians.gaussians`; float32 on the CPU."""
     head: dict[str, Tensor] = default(default_factory=dict)
     """State of the head; empty without a head."""
     cameras: dict[str, Tensor] | None = None

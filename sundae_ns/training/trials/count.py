@@ -23,7 +23,7 @@ from torch import Tensor
 
 from sundae_ns.errors import PackError
 from sundae_ns.evaluation.count_curve import CURVE, CurvePoint, curve_table
-from sundae_ns.gaussians.parameters import FEATURES
+from sundae_ns.gaussians.gaussians import FEATURES
 from sundae_ns.pruning import kept_count
 from sundae_ns.pruning.decision import FieldPruner
 from sundae_ns.rendering.render import contribution

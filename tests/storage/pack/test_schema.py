@@ -11,7 +11,7 @@ import pytest
 
 from sundae_ns.api.scene import Background
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.gaussians.parameters import MAX_SH_DEGREE
+from sundae_ns.gaussians.gaussians import MAX_SH_DEGREE
 from sundae_ns.storage.pack.container import FORMAT, LIMITS, fault, fits, in_range, parsed
 
 SCHEMAS = ("container", "header", "model")
