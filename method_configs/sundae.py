@@ -21,14 +21,6 @@ from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedulers import PruneAwareDecayConfig
 
 
-def _adam(lr: float, eps: float = 1e-15) -> FusedAdamConfig:
-    return FusedAdamConfig(lr=lr, eps=eps)
-
-
-def _constant(lr: float) -> dict[str, Any]:
-    return {"optimizer": _adam(lr), "scheduler": None}
-
-
 def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
     """Optimizers for a run: splatfacto's rates, and rates of features and head.
 
@@ -38,56 +30,51 @@ def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
         steps: length of the run, at which decaying rates reach their final value.
         plain: leave out what is not in the paper: this restart, and weight decay of the head.
     """
-    return {
-        "means": {
-            "optimizer": _adam(1.6e-4),
-            "scheduler": PruneAwareDecayConfig(lr_final=1.6e-6, max_steps=steps, lr_restart=None if plain else 1.6e-4),
-        },
-        "features_dc": _constant(0.0025),
-        "features_rest": _constant(0.0025 / 20),
-        "opacities": _constant(0.05),
-        "scales": _constant(0.005),
-        "quats": _constant(0.001),
-        "features": _constant(0.0025),
-        "compensation": {
-            # The usual eps: with the tiny one of 3DGS, weights with almost no gradient would take full steps.
-            "optimizer": NetworkAdamConfig(lr=1e-3, eps=1e-8, weight_decay=0.0 if plain else 0.15),
-            "scheduler": PruneAwareDecayConfig(
-                lr_final=1e-5,
-                max_steps=steps,
-                lr_restart=1e-3,
-                hold_until_prune=True,
-                warmup_steps=min(500, steps // 12),
-                shape="cosine",
-            ),
-        },
-        "camera_opt": {
-            "optimizer": _adam(1e-4),
-            "scheduler": PruneAwareDecayConfig(lr_final=5e-7, max_steps=steps),
-        },
+    rates = {"means": 1.6e-4, "features_dc": 0.0025, "features_rest": 0.0025 / 20, "opacities": 0.05, "scales": 0.005}
+    rates |= {"quats": 0.001, "features": 0.0025, "camera_opt": 1e-4}
+    groups: dict[str, Any] = {
+        name: {"optimizer": FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None} for name, rate in rates.items()
     }
+    restart = None if plain else rates["means"]
+    groups["means"]["scheduler"] = PruneAwareDecayConfig(lr_final=1.6e-6, max_steps=steps, lr_restart=restart)
+    groups["camera_opt"]["scheduler"] = PruneAwareDecayConfig(lr_final=5e-7, max_steps=steps)
+    rise = min(500, steps // 12)
+    groups["compensation"] = {
+        # The usual eps: with the tiny one of 3DGS, weights with almost no gradient would take full steps.
+        "optimizer": NetworkAdamConfig(lr=1e-3, eps=1e-8, weight_decay=0.0 if plain else 0.15),
+        "scheduler": PruneAwareDecayConfig(
+            lr_final=1e-5, max_steps=steps, lr_restart=1e-3, hold_until_prune=True, warmup_steps=rise, shape="cosine"
+        ),
+    }
+    return groups
 
 
 def method(
     name: str,
     description: str,
-    *,
     pruning: PruningConfig,
+    *,
     head: HeadConfig | None = None,
     steps: int = 30000,
     plain_optimizers: bool = False,
+    trainer: dict[str, Any] | None = None,
     **model: Any,
 ) -> MethodSpecification:
-    """One method: its name and line in ``ns-train --help``, its length, and options of the model."""
+    """One method: its name and line in ``ns-train --help``, its length, and options of trainer and model."""
+    cuda = torch.cuda.is_available()
+    camera_optimizer = CameraOptimizerConfig(mode="off")
+    options: dict[str, Any] = {
+        "steps_per_eval_image": 500,
+        "steps_per_eval_batch": 0,
+        "steps_per_save": 2000,
+        "steps_per_eval_all_images": 5000,
+        "vis": "viewer",
+    }
     config = SundaeTrainerConfig(
         method_name=name,
-        steps_per_eval_image=500,
-        steps_per_eval_batch=0,
-        steps_per_save=2000,
-        steps_per_eval_all_images=5000,
         max_num_iterations=steps,
         mixed_precision=False,
-        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        machine=MachineConfig(device_type="cuda" if cuda else "cpu"),
         pipeline=VanillaPipelineConfig(
             datamanager=SundaeDatamanagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True),
@@ -95,59 +82,46 @@ def method(
                 robust_frame=True,
             ),
             model=SundaeModelConfig(
-                pruning=pruning,
-                head=head or HeadConfig(),
-                camera_optimizer=CameraOptimizerConfig(mode="off"),
-                **model,
+                pruning=pruning, head=head or HeadConfig(), camera_optimizer=camera_optimizer, **model
             ),
         ),
         logging=LoggingConfig(
-            # TensorBoard waits for the GPU to read the figures of a step.
-            steps_per_log=100 if torch.cuda.is_available() else 10,
+            steps_per_log=100 if cuda else 10,  # TensorBoard waits for the GPU to read the figures of a step
             local_writer=LocalWriterConfig(_target=ProgressWriter, enable=True),
         ),
         optimizers=optimizers(steps, plain=plain_optimizers),
         # A training ends by itself, so that the next command runs; ns-viewer shows the run afterwards.
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, quit_on_train_completion=True),
-        vis="viewer",
+        **options | (trainer or {}),
     )
     return MethodSpecification(config=config, description=description)
 
 
 def _keep(percent: int) -> MethodSpecification:
     description = f"SUNDAE that keeps {percent}% of the primitives, with a head where it pays."
-    return method(f"sundae-{percent}", description, pruning=PruningConfig(keep_ratio=percent / 100))
+    return method(f"sundae-{percent}", description, PruningConfig(keep_ratio=percent / 100))
 
+
+# The paper's ratios; --pipeline.model.pruning.keep-ratio takes any other.
+sundae_1, sundae_30, sundae_50, sundae_80, sundae_100 = map(_keep, (1, 30, 50, 80, 100))
 
 sundae = method(
     "sundae",
-    "SUNDAE: spectrally pruned Gaussian field with neural compensation, as small as held-out training views allow.",
-    pruning=PruningConfig(keep_ratio=None),
+    "SUNDAE: graph-merged Gaussians with neural compensation, as small as held-out training views allow.",
+    PruningConfig(keep_ratio=None),
 )
-# The paper's shares; --pipeline.model.pruning.keep-ratio takes any other.
-sundae_1 = _keep(1)
-sundae_30 = _keep(30)
-sundae_50 = _keep(50)
-sundae_80 = _keep(80)
-sundae_100 = _keep(100)
 
 sundae_continuous = method(
     "sundae-continuous",
     "SUNDAE with continuous pruning during densification: a lower peak of memory, an optional cap and final number.",
-    pruning=PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
+    PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
     stop_split_at=15000,
-)
-
-sundae_auto = method(
-    "sundae-auto",
-    "Another name of sundae.",
-    pruning=PruningConfig(keep_ratio=None),
 )
 
 sundae_fast = method(
     "sundae-fast",
     "SUNDAE in the shortest time: 18,000 steps, pruned after a third of them.",
-    pruning=PruningConfig(keep_ratio=0.1, prune_at=6000),
+    PruningConfig(keep_ratio=0.1, prune_at=6000),
     steps=18000,
     warmup_length=300,
     refine_every=60,
@@ -161,7 +135,7 @@ sundae_fast = method(
 sundae_paper = method(
     "sundae-paper",
     "SUNDAE as the paper's text has it: band rule on positions, feature splatting, 30 MB U-Net, 60,000 steps.",
-    pruning=PruningConfig(
+    PruningConfig(
         keep_ratio=0.1,
         prune_at=15000,
         selection="band",
@@ -189,9 +163,10 @@ sundae_paper = method(
 sundae_tiny = method(
     "sundae-tiny",
     "SUNDAE for a first look: small scenes, a few minutes on a CPU.",
-    pruning=PruningConfig(keep_ratio=0.25, prune_at=600),
+    PruningConfig(keep_ratio=0.25, prune_at=600),
     head=HeadConfig(mode="residual", size="tiny", pixel_unshuffle=1, num_features=5),
     steps=1200,
+    trainer={"vis": "tensorboard", "steps_per_save": 400, "steps_per_eval_all_images": 10000},
     num_downscales=0,
     sh_degree=2,
     sh_degree_interval=200,
@@ -203,6 +178,3 @@ sundae_tiny = method(
     cull_alpha_thresh=0.02,
     dense_start_views=0,
 )
-sundae_tiny.config.vis = "tensorboard"
-sundae_tiny.config.steps_per_save = 400
-sundae_tiny.config.steps_per_eval_all_images = 10000

@@ -34,8 +34,6 @@ QUALITIES: dict[Quality, list[str]] = {
 }
 """Options of ns-train for each quality; a draft has fewer steps."""
 DRAFT_STEPS = 3000
-DECIDES = ("sundae", "sundae-auto")
-"""Methods whose trials decide the number of primitives."""
 MEGABYTE = 1_000_000
 BUSY = "works in {}; wait for it, or choose another folder"
 
@@ -210,7 +208,7 @@ class Project:
         if self.quality == "draft" and self.steps is not None:
             raise ConfigError(f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality")
         for name, given in (("--max-mb", self.max_mb is not None), ("--quality best", self.quality == "best")):
-            if given and (self.keep is not None or self.method not in DECIDES):
+            if given and (self.keep is not None or self.method != "sundae"):
                 raise ConfigError(
                     f"{name} needs a method that decides the number of primitives; leave out --keep and --method"
                 )

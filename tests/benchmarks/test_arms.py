@@ -113,7 +113,7 @@ def test_the_default_arms_are_a_file_like_any_other() -> None:
     assert [entry.name for entry in read_entries(DEFAULT_FILE)] == DEFAULTS
     arms = choose_arms([], "sundae")
     assert [arm.name for arm in arms] == DEFAULTS
-    assert {arm.method for arm in arms} == {"sundae", "sundae-fast", "sundae-auto", "splatfacto"}
+    assert {arm.method for arm in arms} == {"sundae", "sundae-fast", "splatfacto"}
     tiny = choose_arms(["band"], "sundae-tiny")
     assert [(arm.name, arm.kind, arm.method) for arm in tiny] == [("band", "branch", "sundae-tiny")]
 

@@ -22,7 +22,6 @@ METHODS = {
     "sundae-50": 0.5,
     "sundae-80": 0.8,
     "sundae-100": 1.0,
-    "sundae-auto": None,
     "sundae-continuous": 0.5,
     "sundae-fast": 0.1,
     "sundae-paper": 0.1,
@@ -36,25 +35,24 @@ def ours() -> dict[str, MethodSpecification]:
 
 
 def test_every_method_is_registered_under_its_own_name() -> None:
-    found = ours()
-    assert set(found) == set(METHODS)
-    for name, specification in found.items():
-        assert isinstance(specification, MethodSpecification)
-        assert specification.config.method_name == name
-        assert specification.description
-
-
-def test_nerfstudio_lists_them() -> None:
     from nerfstudio.configs.method_configs import all_descriptions, all_methods
 
+    assert set(ours()) == set(METHODS)
     assert set(METHODS) <= set(all_methods)
     assert set(METHODS) <= set(all_descriptions)
 
 
+RULE = ("score", "selection", "redistribution", "edges", "signal")
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_configuration(name: str) -> None:
-    config = ours()[name].config
-    model = config.pipeline.model
+    method = ours()[name]
+    assert isinstance(method, MethodSpecification)
+    assert method.description
+    config = method.config
+    assert config.method_name == name
+    model, paper = config.pipeline.model, name == "sundae-paper"
     assert model._target is SundaeModel
     assert config.pipeline.datamanager._target is SundaeDatamanager
     model.pruning.validate()
@@ -62,33 +60,15 @@ def test_configuration(name: str) -> None:
     assert model.pruning.keep_ratio == METHODS[name]
     if model.pruning.mode == "one-shot":
         assert model.pruning.prune_at < config.max_num_iterations
+    rule = tuple(getattr(model.pruning, option) for option in RULE)
+    default = ("detail-contribution", "systematic", "merge", "appearance", "attributes")
+    assert rule == (("response", "band", "none", "centres", "positions") if paper else default)
+    modes = {"sundae-paper": "features", "sundae-tiny": "residual"}
+    assert model.head.mode == modes.get(name, HeadConfig().mode)
+    assert model.photo_gains == ("off" if paper else "auto")
     groups = {"means", "scales", "quats", "features_dc", "features_rest", "opacities", "features", "compensation"}
     assert groups <= set(config.optimizers)
     assert yaml.load(yaml.dump(config), Loader=yaml.Loader) == config
-
-
-PRUNING = ("score", "selection", "redistribution", "edges", "signal")
-"""What a rule is made of, in the order of docs/options.md."""
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_rule_of_pruning(name: str) -> None:
-    pruning = ours()[name].config.pipeline.model.pruning
-    default = ("detail-contribution", "systematic", "merge", "appearance", "attributes")
-    paper = ("response", "band", "none", "centres", "positions")
-    expected = paper if name == "sundae-paper" else default
-    assert tuple(getattr(pruning, option) for option in PRUNING) == expected
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_the_head_is_undecided_unless_a_method_says_otherwise(name: str) -> None:
-    modes = {"sundae-paper": "features", "sundae-tiny": "residual"}
-    assert ours()[name].config.pipeline.model.head.mode == modes.get(name, HeadConfig().mode)
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_photos_are_evened_out_where_they_differ_but_not_in_the_papers_method(name: str) -> None:
-    assert ours()[name].config.pipeline.model.photo_gains == ("off" if name == "sundae-paper" else "auto")
 
 
 def test_methods_share_no_objects() -> None:

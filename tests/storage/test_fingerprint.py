@@ -133,7 +133,7 @@ def test_options_that_decide_a_result_change_it(words: str) -> None:
     assert of(*words.split()) != of()
 
 
-@pytest.mark.parametrize("method", ["sundae", "sundae-auto", "splatfacto"])
+@pytest.mark.parametrize("method", ["sundae", "splatfacto"])
 def test_a_saved_configuration_keeps_it(tmp_path: Path, method: str) -> None:
     config = parse((method, "--data", str(tmp_path)))
     path = tmp_path / "config.yml"
@@ -144,7 +144,6 @@ def test_a_saved_configuration_keeps_it(tmp_path: Path, method: str) -> None:
 def test_methods_differ() -> None:
     found = [of(base=(method, "--data", "x")) for method in ("sundae", "sundae-30", "sundae-fast", "splatfacto")]
     assert len(set(found)) == len(found)
-    assert of(base=("sundae-auto", "--data", "x")) == found[0], "another name, the same method"
 
 
 def test_options_that_are_left_out_exist() -> None:

@@ -179,7 +179,7 @@ def test_tables_of_other_kinds() -> None:
     assert rows["head"] == "after 13,000, if trials favour it"
     assert dict(schedule_table(all_methods["sundae-tiny"]))["head"] == "after 600"
     assert dict(schedule_table(all_methods["sundae-continuous"]))["prune"] == "2,000 to 15,000, every 2,000"
-    deciding = deepcopy(all_methods["sundae-auto"])
+    deciding = deepcopy(all_methods["sundae"])
     assert dict(schedule_table(deciding))["prune"] == "after 12,000, to as many as trials choose"
     deciding.pipeline.model.warm_start = "field.ply"
     assert dict(schedule_table(deciding))["prune"] == "at once"
