@@ -26,7 +26,7 @@ from sundae_ns.compensation import CompensationHead, HeadConfig, Window
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager, view_index
 from sundae_ns.evaluation import Lpips, psnr, quality_of
 from sundae_ns.evaluation.count_curve import CurvePoint
-from sundae_ns.gpu.memory import naming_full_memory
+from sundae_ns.gpu.kernels import naming_full_memory
 from sundae_ns.parsing import check_projection
 from sundae_ns.rasterization import Backend, select_backend
 from sundae_ns.rendering.frames import FrameReplay, Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs

@@ -26,7 +26,7 @@ from torch import Tensor
 from sundae_ns import distributed
 from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, StorageError, SundaeError, one_line
-from sundae_ns.gpu.memory import naming_full_memory
+from sundae_ns.gpu.kernels import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.parsing import other_frame
 from sundae_ns.storage import checkpoint, run_folder

@@ -20,8 +20,8 @@ import torch
 from filelock import FileLock
 
 from sundae_ns.errors import BackendError
-from sundae_ns.gpu import nvrtc
-from sundae_ns.gpu.nvrtc import Argument, Launch
+from sundae_ns.gpu import kernels
+from sundae_ns.gpu.kernels import Argument, Launch
 
 CompileKernels = Callable[..., dict[str, Launch]]
 Once = Callable[[str, Callable[[Path], None]], Path]
@@ -169,14 +169,14 @@ def compile_for_cpu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., c
 
 @pytest.fixture(scope="session")
 def load_on_cpu(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKernels:
-    """As ``nvrtc.load_kernels``, but for the CPU."""
+    """As ``kernels.load_kernels``, but for the CPU."""
 
     def compile_them(file: str, names: Sequence[str], options: Sequence[str], *_: object) -> dict[str, Launch]:
-        loaded = compile_for_cpu(nvrtc.read_source(file), options)
+        loaded = compile_for_cpu(kernels.read_source(file), options)
 
         def launch_of(name: str) -> Launch:
             def launch(threads: int, arguments: Sequence[Argument]) -> None:
-                values = [nvrtc._as_c(a, torch.device("cpu")) for a in arguments]
+                values = [kernels._as_c(a, torch.device("cpu")) for a in arguments]
                 # More threads than requested, as whole blocks have.
                 for block in range(threads + 3):
                     loaded.at(block)
@@ -191,9 +191,9 @@ def load_on_cpu(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKernels:
 
 @pytest.fixture(scope="session")
 def compile_for_gpu() -> Callable[..., bytes]:
-    """As ``nvrtc.compile_cubin``; skip where the compiler is missing."""
+    """As ``kernels.compile_cubin``; skip where the compiler is missing."""
     try:
-        nvrtc._library("nvrtc")
+        kernels._library("nvrtc")
     except BackendError as error:
         pytest.skip(f"no NVRTC here: {error}")
-    return nvrtc.compile_cubin
+    return kernels.compile_cubin

@@ -17,7 +17,7 @@ from sundae_ns.errors import DataError
 from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.gaussians import Field
-from sundae_ns.gpu.memory import naming_full_memory
+from sundae_ns.gpu.kernels import naming_full_memory
 from sundae_ns.rasterization import BackendName, select_backend
 from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, LocalField, RenderSettings, render_view
 from sundae_ns.rendering.views import View

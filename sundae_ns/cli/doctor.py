@@ -141,13 +141,13 @@ def own_kernels() -> Finding:
         return Finding(name, False, "need a CUDA device", "nothing; a CPU uses equivalent code")
     from sundae_ns.compensation import CompensationHead, HeadConfig, fused
     from sundae_ns.errors import BackendError
-    from sundae_ns.gpu import fused_loss
+    from sundae_ns.gpu import loss
     from sundae_ns.graphs import neighbors
 
     device = torch.device("cuda", 0)
     try:
         neighbors.load_kernel(device, torch.float32, 16)
-        fused_loss.loss_kernels(device)
+        loss.loss_kernels(device)
         net = CompensationHead(HeadConfig()).net
         fused.head_kernels(device, torch.bfloat16, fused.head_options(net, True))
     except BackendError as error:

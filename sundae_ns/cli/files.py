@@ -226,7 +226,7 @@ def prune_file(
     from sundae_ns.api.cleaning import kept, within
     from sundae_ns.api.virtual import virtual_views
     from sundae_ns.errors import ConfigError
-    from sundae_ns.gpu.memory import naming_full_memory
+    from sundae_ns.gpu.kernels import naming_full_memory
     from sundae_ns.pruning import PruneRule
     from sundae_ns.rasterization import fastest_device
     from sundae_ns.storage.ply import keep_vertices

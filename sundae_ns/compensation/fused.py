@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from sundae_ns.compensation.unet import SLOPE, UNet
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu.cuda_graphs import GraphCache, is_recording, record, warm_up
-from sundae_ns.gpu.nvrtc import Argument, Launch, load_kernels
+from sundae_ns.gpu.kernels import Argument, Launch, load_kernels
 
 _log = logging.getLogger(__name__)
 

@@ -33,7 +33,7 @@ from sundae_ns.compensation.fused import (
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, is_recording, record, warm_up
-from sundae_ns.gpu.nvrtc import Argument
+from sundae_ns.gpu.kernels import Argument
 
 MOST_WORKERS = 2**17
 """Threads that sum a gradient over the pixels; fewer leave the GPU idle, and more wait for each other to add."""

@@ -15,7 +15,7 @@ from pytorch_msssim import ssim as _windowed_ssim
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.gpu.fused_loss import SSIM_WINDOW
+from sundae_ns.gpu.loss import SSIM_WINDOW
 
 MOST_PSNR = 100.0
 """Highest PSNR that a decision or a fit of colours gives, dB; 8-bit images carry no more."""

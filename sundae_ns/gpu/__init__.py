@@ -1,1 +1,1 @@
-"""GPU tools beside gsplat: kernels compiled at run time, recorded CUDA graphs, the fused loss."""
+"""GPU tools beside gsplat: kernels compiled at run time, CUDA graphs, and the kernels of loss, Adam and plane sweep."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.errors import BackendError, ConfigError, DataError
-from sundae_ns.gpu.nvrtc import Kernel, Launch
+from sundae_ns.gpu.kernels import Kernel, Launch
 
 MOST_EXTENT = 1e150
 """Largest coordinate whose squared distances float64 can hold."""

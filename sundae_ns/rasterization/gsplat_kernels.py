@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import SundaeError
-from sundae_ns.gpu.nvrtc import Argument, Launch, load_kernels
+from sundae_ns.gpu.kernels import Argument, Launch, load_kernels
 from sundae_ns.rasterization.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 TILE = 16

@@ -25,7 +25,7 @@ from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError, reading
 from sundae_ns.gaussians import FEATURES, initial_features, mend
 from sundae_ns.gaussians.gaussians import Field
-from sundae_ns.gpu.memory import naming_full_memory
+from sundae_ns.gpu.kernels import naming_full_memory
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.rendering import LocalField, View
 from sundae_ns.storage.accounting import stored_bytes

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from sundae_ns.api.optimise import optimise, rate_factor
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
-from sundae_ns.gpu.memory import naming_full_memory
+from sundae_ns.gpu.kernels import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization import Capacity
 from sundae_ns.rendering.render import RenderSettings

@@ -9,9 +9,9 @@ import torch
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-from sundae_ns.gpu.fused_loss import SSIM_WINDOW, fused_loss, loss_kernels
-from sundae_ns.gpu.nvrtc import kernels_where_possible
-from sundae_ns.rasterization import numba_problem
+from sundae_ns.gpu.kernels import kernels_where_possible
+from sundae_ns.gpu.loss import SSIM_WINDOW, fused_loss, loss_kernels
+from sundae_ns.training.cpu_loss import ssim_loss
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.options import ModelOptions
 
@@ -80,8 +80,8 @@ def image_losses(
 ) -> tuple[Tensor, Tensor | None]:
     """``lambda_1 L1 + lambda_2 (1 - SSIM)`` of the paper for an image, and the L1 loss of its base colours.
 
-    In float32 one kernel computes both (:mod:`sundae_ns.gpu.fused_loss`), or on a CPU one compiled loop
-    (:mod:`sundae_ns.training.cpu_loss`). Images smaller than the window of SSIM are compared by L1 alone.
+    In float32 one kernel computes both (:mod:`sundae_ns.gpu.loss`), and on a CPU SSIM is
+    OpenCV's (:mod:`sundae_ns.training.cpu_loss`). Images smaller than the window of SSIM are compared by L1 alone.
 
     Args:
         image: rendered image ``[H, W, 3]``, differentiable.
@@ -112,13 +112,11 @@ def _losses(
     if weight > 0 and large and single:
         if image.is_cuda and kernels_where_possible(loss_kernels, image.device, "SSIM runs as slower convolutions"):
             return fused_loss(image, target, weight, base, l1_weight=l1_weight)
-        if image.device.type == "cpu" and numba_problem() is None:
-            from sundae_ns.training.cpu_loss import compiled_loss  # imports numba
-
-            return compiled_loss(image, target, weight, base, l1_weight)
     of_base = None if base is None else (base - target).abs().mean()
     if weight == 0 or not large:
         return (image - target).abs().mean(), of_base
+    if single and image.device.type == "cpu":
+        return l1_weight * (image - target).abs().mean() + weight * ssim_loss(image, target), of_base
     return convolved_loss(image, target, ssim, weight, l1_weight), of_base
 
 

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, normalize, pad
 
-from sundae_ns.gpu.fused_sweep import WINDOW, FusedCorrelations, Patches, sweep_kernels
-from sundae_ns.gpu.nvrtc import Launch, kernels_where_possible
+from sundae_ns.gpu.kernels import Launch, kernels_where_possible
+from sundae_ns.gpu.sweep import WINDOW, FusedCorrelations, Patches, sweep_kernels
 from sundae_ns.rendering.views import View
 from sundae_ns.training.extension import Photo
 

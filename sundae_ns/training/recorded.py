@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.gaussians.gaussians import Field
-from sundae_ns.gpu.fused_adam import Update, adam_step
+from sundae_ns.gpu.adam import Update, adam_step
 from sundae_ns.rasterization import Capacity
 from sundae_ns.rendering.render import LocalField, RenderSettings, degree_in_use
 from sundae_ns.training.buffers import MOMENTS, Buffers, start_moments, trained_parameters

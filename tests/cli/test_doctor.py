@@ -36,7 +36,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Imaginary 9000")
     monkeypatch.setattr("sundae_ns.graphs.neighbors.Kernel", lambda *_: None)
     monkeypatch.setattr("sundae_ns.compensation.fused.head_kernels", lambda *_: {})
-    monkeypatch.setattr("sundae_ns.gpu.fused_loss.loss_kernels", lambda *_: None)
+    monkeypatch.setattr("sundae_ns.gpu.loss.loss_kernels", lambda *_: None)
 
 
 def _kernels(monkeypatch: pytest.MonkeyPatch, problem: str | None) -> None:
@@ -101,7 +101,7 @@ def test_own_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     places = (
         "sundae_ns.graphs.neighbors.Kernel",
         "sundae_ns.compensation.fused.head_kernels",
-        "sundae_ns.gpu.fused_loss.loss_kernels",
+        "sundae_ns.gpu.loss.loss_kernels",
     )
     for place in places:
         with monkeypatch.context() as patch:

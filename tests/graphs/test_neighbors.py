@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sundae_ns.errors import BackendError, ConfigError, DataError
-from sundae_ns.gpu import nvrtc
-from sundae_ns.gpu.nvrtc import Argument, Launch
+from sundae_ns.gpu import kernels
+from sundae_ns.gpu.kernels import Argument, Launch
 from sundae_ns.graphs import knn, neighbors
 from sundae_ns.graphs.neighbors import FILE, KERNEL, LEAF, MAX_NEIGHBORS, build_tree, kernel_options, search_tree
 
@@ -138,7 +138,7 @@ class Compile(Protocol):
 @pytest.fixture(scope="module")
 def compiled(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Compile:
     visit = "const double dx = points"
-    source = nvrtc.read_source(FILE)
+    source = kernels.read_source(FILE)
     assert source.count(visit) == 1
     source = SHIM % source.replace(visit, "++visited; " + visit)
 
@@ -148,7 +148,7 @@ def compiled(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Compile:
 
         def launch(threads: int, arguments: Sequence[Argument]) -> None:
             assert all(a.is_contiguous() for a in arguments if isinstance(a, Tensor))
-            values = [nvrtc._as_c(argument, torch.device("cpu")) for argument in arguments]
+            values = [kernels._as_c(argument, torch.device("cpu")) for argument in arguments]
             counter.value = 0
             kernel.run(ctypes.c_int(threads), *values)
             if visited is not None:
@@ -197,13 +197,13 @@ def test_thousands_of_clones_visit_no_more_points_than_others(compiled: Compile)
 
 def test_kernel_compiles_for_gpus_from_turing_to_hopper() -> None:
     try:
-        nvrtc._library("nvrtc")
+        kernels._library("nvrtc")
     except BackendError as error:
         pytest.skip(f"no NVRTC here: {error}")
     cases = [("sm_75", torch.float32, 16), ("sm_90", torch.float64, 1), ("sm_90", torch.float32, MAX_NEIGHBORS)]
     for architecture, dtype, k in cases:
-        code = nvrtc.compile_cubin(FILE, architecture, kernel_options(dtype, k))
+        code = kernels.compile_cubin(FILE, architecture, kernel_options(dtype, k))
         assert code.startswith(b"\x7fELF")
         assert KERNEL.encode() in code
     with pytest.raises(BackendError, match="does not compile for sm_90.*REAL"):
-        nvrtc.compile_cubin(FILE, "sm_90")
+        kernels.compile_cubin(FILE, "sm_90")

@@ -1,10 +1,8 @@
 """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, L1 of its base colours, and gradients: one GPU kernel each.
 
-Built from convolutions, SSIM reads and writes the image dozens of times. Here a block of threads keeps a tile of both
-images in shared memory, and filters it there by rows and columns. It writes only three derivatives, which the backward
-pass filters once more.
-
-The source is plain C++ except for the thread indices, so the tests compile the same source for the CPU.
+Built from convolutions, SSIM reads and writes the image dozens of times. In ``csrc/loss.cu`` a block of threads keeps a
+tile of both images in shared memory, and filters it there by rows and columns. It writes only three derivatives, which
+the backward pass filters once more.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import DataError, SundaeError
-from sundae_ns.gpu.nvrtc import Launch, load_kernels
+from sundae_ns.gpu.kernels import Launch, load_kernels
 
 SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window, pixels (Wang et al. 2004)."""
@@ -24,18 +22,14 @@ SSIM_WINDOW = 11
 SIGMA = 1.5
 """Standard deviation of the window, pixels."""
 
-TILE_WIDTH, TILE_HEIGHT = 32, 16
-THREADS = 256
-
+_TILE_WIDTH, _TILE_HEIGHT, _THREADS = 32, 16, 256
 
 _window = [math.exp(-((k - SSIM_WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(SSIM_WINDOW)]
 _WEIGHTS = ",".join(f"{weight / sum(_window):.9e}f" for weight in _window)
 
 OPTIONS = (
     f"-DWINDOW={SSIM_WINDOW}",
-    f"-DTILE_WIDTH={TILE_WIDTH}",
-    f"-DTILE_HEIGHT={TILE_HEIGHT}",
-    f"-DTHREADS={THREADS}",
+    *(f"-DTILE_WIDTH={_TILE_WIDTH}", f"-DTILE_HEIGHT={_TILE_HEIGHT}", f"-DTHREADS={_THREADS}"),
     f"-DWEIGHTS={_WEIGHTS}",
 )
 """Compiler options of ``loss.cu``."""
@@ -47,15 +41,11 @@ def loss_kernels(device: torch.device) -> dict[str, Launch]:
     Raises:
         BackendError: the kernels cannot be compiled or loaded.
     """
-    return load_kernels("loss.cu", ("compare", "compare_backward"), OPTIONS, device, THREADS)
+    return load_kernels("loss.cu", ("compare", "compare_backward"), OPTIONS, device, _THREADS)
 
 
 def fused_loss(
-    image: Tensor,
-    target: Tensor,
-    weight: float,
-    base: Tensor | None = None,
-    l1_weight: float | None = None,
+    image: Tensor, target: Tensor, weight: float, base: Tensor | None = None, l1_weight: float | None = None
 ) -> tuple[Tensor, Tensor | None]:
     """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, and L1 of its base colours; differentiable scalars.
 
@@ -89,7 +79,7 @@ def fused_loss(
 def _threads(image: Tensor) -> int:
     """Number of threads: one block per tile."""
     height, width = image.shape[:2]
-    return -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT) * THREADS
+    return -(-width // _TILE_WIDTH) * -(-height // _TILE_HEIGHT) * _THREADS
 
 
 class _Loss(torch.autograd.Function):
@@ -102,7 +92,7 @@ class _Loss(torch.autograd.Function):
         height, width, channels = image.shape
         windows = (height - SSIM_WINDOW + 1) * (width - SSIM_WINDOW + 1) * channels
         derivatives = image.new_empty(3 * windows) if any(ctx.needs_input_grad) else None
-        losses = image.new_empty(_threads(image) // THREADS)
+        losses = image.new_empty(_threads(image) // _THREADS)
         base_losses = None if base is None else torch.empty_like(losses)
         scales = (weights[0] / image.numel(), weights[1] / windows, 1 / image.numel())
         arguments = [height, width, image, base, target, *scales, derivatives, losses, base_losses]

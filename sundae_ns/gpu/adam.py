@@ -1,6 +1,6 @@
 """Adam with the learning rates in memory, so that a CUDA graph can record it; one kernel for a parameter.
 
-torch's fused Adam gives each block of threads 65,536 numbers. A pruned field has a few such pieces for a parameter, and
+torch's fused Adam gives each block of threads 65,536 numbers. A pruned scene has a few such pieces for a parameter, and
 most of the GPU waits; here a block has 1,024.
 """
 
@@ -13,28 +13,22 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sundae_ns.gpu.nvrtc import load_kernels
+from sundae_ns.gpu.kernels import load_kernels
 
-THREADS = 256
-PER_THREAD = 4
+_THREADS, _PER_THREAD = 256, 4
 
-
-OPTIONS = (f"-DPER_THREAD={PER_THREAD}",)
+OPTIONS = (f"-DPER_THREAD={_PER_THREAD}",)
 """Compiler options of ``adam.cu``."""
 
 
 class Update(NamedTuple):
     """What a step of Adam changes of one parameter, and its gradient. The first four have one shape and layout."""
 
-    value: Tensor
-    """The parameter, float32."""
+    value: Tensor  # the parameter, float32
     gradient: Tensor
-    mean: Tensor
-    """Running mean of gradients (``exp_avg``)."""
-    square: Tensor
-    """Running mean of their squares (``exp_avg_sq``)."""
-    step: Tensor
-    """Number of updates so far ``[]``."""
+    mean: Tensor  # running mean of gradients (``exp_avg``)
+    square: Tensor  # running mean of their squares (``exp_avg_sq``)
+    step: Tensor  # number of updates so far []
 
 
 @torch.no_grad()
@@ -46,14 +40,14 @@ def adam_step(groups: Sequence[tuple[Mapping[str, Any], Sequence[Update]]], rate
         rates: learning rates of the groups ``[G]``.
         skip: not 0 to change nothing, float ``[]``; None for 0.
     """
-    steps = [one.step for _, updates in groups for one in updates]
+    steps = [update.step for _, updates in groups for update in updates]
     torch._foreach_add_(steps, 1)
     for rate, (options, updates) in zip(rates, groups, strict=True):
+        beta1, beta2 = options["betas"]
         if len(updates) == 1 and updates[0].value.is_cuda and options["weight_decay"] == 0:
-            adam(updates[0], rate, skip, betas=options["betas"], eps=options["eps"])
+            adam(updates[0], rate, skip, betas=(beta1, beta2), eps=options["eps"])
         elif updates:
-            values, gradients, means, squares, counts = ([one[column] for one in updates] for column in range(5))
-            beta1, beta2 = options["betas"]
+            values, gradients, means, squares, counts = map(list, zip(*updates, strict=True))
             update = torch._fused_adamw_ if options.get("decoupled_weight_decay") else torch._fused_adam_
             update(
                 *(values, gradients, means, squares, [], counts),
@@ -84,7 +78,7 @@ def adam(update: Update, rate: Tensor, skip: Tensor | None, *, betas: tuple[floa
     Raises:
         BackendError: the kernel cannot be compiled or loaded.
     """
-    launch = load_kernels("adam.cu", ("adam",), OPTIONS, update.value.device, THREADS)["adam"]
+    launch = load_kernels("adam.cu", ("adam",), OPTIONS, update.value.device, _THREADS)["adam"]
     logs = [math.log(beta) if beta > 0 else -math.inf for beta in betas]
     count = update.value.numel()
-    launch(-(-count // PER_THREAD), [count, *update, rate, skip, *betas, *logs, eps])
+    launch(-(-count // _PER_THREAD), [count, *update, rate, skip, *betas, *logs, eps])

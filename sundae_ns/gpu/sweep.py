@@ -1,9 +1,7 @@
 """Correlations between the patches of one image and those of other images warped through planes, in one GPU kernel.
 
-PyTorch's operations write and read the warped image of a plane dozens of times. Here a block of threads samples another
-image for one tile and one plane into shared memory, and sums the patches there by rows and columns.
-
-The source is plain C++ except for the thread indices, so the tests compile the same source for the CPU.
+PyTorch's operations write and read the warped image of a plane dozens of times. In ``csrc/sweep.cu`` a block of threads
+samples another image for one tile and one plane into shared memory, and sums the patches there by rows and columns.
 """
 
 from __future__ import annotations
@@ -15,16 +13,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sundae_ns.gpu.nvrtc import Launch, load_kernels
+from sundae_ns.gpu.kernels import Launch, load_kernels
 
 WINDOW = 7
 """Side of the square patches, pixels."""
 
-TILE_WIDTH, TILE_HEIGHT = 32, 16
-THREADS = 256
+_TILE_WIDTH, _TILE_HEIGHT, _THREADS = 32, 16, 256
 
-
-OPTIONS = (f"-DWINDOW={WINDOW}", f"-DTILE_WIDTH={TILE_WIDTH}", f"-DTILE_HEIGHT={TILE_HEIGHT}")
+OPTIONS = (f"-DWINDOW={WINDOW}", f"-DTILE_WIDTH={_TILE_WIDTH}", f"-DTILE_HEIGHT={_TILE_HEIGHT}")
 """Compiler options of ``sweep.cu``."""
 
 
@@ -45,7 +41,7 @@ def sweep_kernels(device: torch.device) -> dict[str, Launch]:
     Raises:
         BackendError: the kernel cannot be compiled or loaded.
     """
-    return load_kernels("sweep.cu", ("correlate",), OPTIONS, device, THREADS)
+    return load_kernels("sweep.cu", ("correlate",), OPTIONS, device, _THREADS)
 
 
 class FusedCorrelations:
@@ -91,9 +87,9 @@ class FusedCorrelations:
             s: inverse distances of the planes ``[S]``.
         """
         height, width = facing.shape
-        tiles = -(-height // TILE_HEIGHT) * -(-width // TILE_WIDTH)
+        tiles = -(-height // _TILE_HEIGHT) * -(-width // _TILE_WIDTH)
         scores = facing.new_empty(len(s), height, width)
         numbers = (height, width, len(s), self._num_others, *self._limits)
         arrays = (*self._patches, facing.contiguous(), s.contiguous(), *self._others, scores)
-        self._launch(len(s) * tiles * THREADS, (*numbers, *arrays))
+        self._launch(len(s) * tiles * _THREADS, (*numbers, *arrays))
         return scores

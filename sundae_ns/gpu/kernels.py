@@ -1,4 +1,4 @@
-"""CUDA kernels compiled at run time by NVRTC and launched through the driver, through their C interfaces.
+"""CUDA kernels of ``sundae_ns/csrc``, compiled at run time by NVRTC and launched through the driver's C interface.
 
 Both libraries come with a CUDA build of torch and its driver; neither nvcc nor a CUDA toolkit is needed.
 """
@@ -9,14 +9,15 @@ import ctypes
 import functools
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from ctypes import byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_void_p
 from importlib import resources
 
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import BackendError
+from sundae_ns.errors import BackendError, out_of_memory
 
 Argument = Tensor | int | float | None
 Launch = Callable[[int, Sequence[Argument]], None]
@@ -44,22 +45,27 @@ def compile_cubin(file: str, architecture: str, options: Sequence[str] = ()) -> 
         BackendError: NVRTC is missing, or the source does not compile.
     """
     nvrtc = _library("nvrtc")
-    program, source = c_void_p(), read_source(file).encode()
-    _check_nvrtc(nvrtc, nvrtc.nvrtcCreateProgram(byref(program), source, file.encode(), 0, None, None))
+    nvrtc.nvrtcGetErrorString.restype = c_char_p
+    program, size = c_void_p(), c_size_t()
+
+    def check(result: int) -> None:
+        if result != 0:
+            text = nvrtc.nvrtcGetErrorString(result).decode()
+            raise BackendError(f"NVRTC fails ({text}): install torch with its CUDA packages")
+
+    check(nvrtc.nvrtcCreateProgram(byref(program), read_source(file).encode(), file.encode(), 0, None, None))
     try:
         flags = [f"--gpu-architecture={architecture}".encode(), *(option.encode() for option in options)]
         result = nvrtc.nvrtcCompileProgram(program, len(flags), (c_char_p * len(flags))(*flags))
         if result != 0:
-            size = c_size_t()
-            _check_nvrtc(nvrtc, nvrtc.nvrtcGetProgramLogSize(program, byref(size)))
+            check(nvrtc.nvrtcGetProgramLogSize(program, byref(size)))
             log = ctypes.create_string_buffer(size.value)
-            _check_nvrtc(nvrtc, nvrtc.nvrtcGetProgramLog(program, log))
-            reason = " ".join(log.value.decode(errors="replace").split()) or _nvrtc_text(nvrtc, result)
-            raise BackendError(f"a CUDA kernel does not compile for {architecture} ({reason}): update torch")
-        size = c_size_t()
-        _check_nvrtc(nvrtc, nvrtc.nvrtcGetCUBINSize(program, byref(size)))
+            check(nvrtc.nvrtcGetProgramLog(program, log))
+            text = " ".join(log.value.decode(errors="replace").split()) or nvrtc.nvrtcGetErrorString(result).decode()
+            raise BackendError(f"a CUDA kernel does not compile for {architecture} ({text}): update torch")
+        check(nvrtc.nvrtcGetCUBINSize(program, byref(size)))
         code = ctypes.create_string_buffer(size.value)
-        _check_nvrtc(nvrtc, nvrtc.nvrtcGetCUBIN(program, code))
+        check(nvrtc.nvrtcGetCUBIN(program, code))
         return code.raw
     finally:
         nvrtc.nvrtcDestroyProgram(byref(program))
@@ -75,9 +81,7 @@ class Kernel:
     """
 
     def __init__(self, file: str, name: str, device: torch.device, options: Sequence[str] = (), block: int = 128):
-        self._driver = _library("cuda")
-        self._device = device
-        self._block = block
+        self._driver, self._device, self._block = _library("cuda"), device, block
         self._function, self._context = c_void_p(), c_void_p()
         module = _module(file, tuple(options), device)
         with torch.cuda.device(device):
@@ -123,12 +127,9 @@ def load_kernels(
 def kernels_where_possible(
     load: Callable[[torch.device], dict[str, Launch]], device: torch.device, instead: str
 ) -> dict[str, Launch] | None:
-    """Kernels of a device; None, with one line in the log, where they cannot be compiled or loaded.
+    """Kernels of a CUDA device from ``load``; None, and one line in the log, where they cannot be compiled or loaded.
 
-    Args:
-        load: gives the kernels by name.
-        device: a CUDA device.
-        instead: what happens without them.
+    ``instead`` says what happens without them.
     """
     try:
         return load(device)
@@ -179,11 +180,16 @@ def _library(name: str) -> ctypes.CDLL:
         raise BackendError(f"{file} cannot be loaded ({error}): install torch with its CUDA packages") from error
 
 
-def _nvrtc_text(nvrtc: ctypes.CDLL, result: int) -> str:
-    nvrtc.nvrtcGetErrorString.restype = c_char_p
-    return nvrtc.nvrtcGetErrorString(result).decode()
+@contextmanager
+def naming_full_memory(num_primitives: Callable[[], int]) -> Iterator[None]:
+    """Turn CUDA's error of full memory inside the block into one that names the number of Gaussians and a remedy.
 
+    ``num_primitives`` counts the Gaussians; it is called on an error only.
 
-def _check_nvrtc(nvrtc: ctypes.CDLL, result: int) -> None:
-    if result != 0:
-        raise BackendError(f"NVRTC fails ({_nvrtc_text(nvrtc, result)}): install torch with its CUDA packages")
+    Raises:
+        MemoryExhaustedError: the memory of the GPU is full.
+    """
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError as error:
+        raise out_of_memory(error, num_primitives()) from error
