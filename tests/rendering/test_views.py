@@ -1,14 +1,110 @@
-"""Views against nerfstudio's own matrices, and with a pose that learns."""
+"""Views of nerfstudio's cameras: their matrices, their resolution in training, and windows of their images."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
 
 from sundae_ns.gaussians.covariance import rotation_matrices
-from sundae_ns.rendering.views import view_of
+from sundae_ns.model import SundaeModel
+from sundae_ns.rendering import StepResolution
+from sundae_ns.rendering.views import view_of, zoomed
+
+Build = Callable[..., SundaeModel]
+Perturb = Callable[[SundaeModel], SundaeModel]
+MakeCamera = Callable[..., Cameras]
+MakeBatch = Callable[..., dict[str, Tensor]]
+TrainingOf = Callable[[SundaeModel], Any]
+
+
+@torch.no_grad()
+def test_a_primitive_lands_where_the_pinhole_says(build: Build, camera: MakeCamera) -> None:
+    xyz = torch.tensor([[0.55, 0.35, 0.0]])
+    model = build(seed_points=(xyz, torch.zeros(1, 3, dtype=torch.uint8))).eval()
+    model.gauss_params["scales"].data.fill_(-5)
+    alpha = model.get_outputs_for_camera(camera())["accumulation"][..., 0]
+    row, column = divmod(int(alpha.argmax()), 40)
+    # In front of the camera by 3; x to the right, y up, pixel centres at one half.
+    assert (column, row) == (int(20 + 30 * 0.55 / 3), int(16 - 30 * 0.25 / 3))
+
+
+@pytest.mark.parametrize("factor", [0.01, 0.4, 1.0, 1.37])
+@torch.no_grad()
+def test_a_zoomed_camera_has_the_zoomed_view(build: Build, camera: MakeCamera, factor: float) -> None:
+    """Of a picture whose sides are rounded by unlike shares."""
+    model, given = build().eval(), camera(41, 33)
+    expected, found = model.view_of(given).zoomed(factor), model.view_of(zoomed(given, factor))
+    assert (found.width, found.height) == (expected.width, expected.height)
+    torch.testing.assert_close(found.K, expected.K)
+    # The same is seen from edge to edge.
+    sides = torch.tensor([[found.width], [found.height], [1.0]])
+    torch.testing.assert_close(found.K / sides, model.view_of(given).K / torch.tensor([[41.0], [33.0], [1.0]]))
+    assert torch.equal(found.viewmat, expected.viewmat)
+    # What is given stays as it is.
+    assert (int(given.width), int(given.height), float(given.fx), float(given.cy)) == (41, 33, 30.0, 16.5)
+
+
+@pytest.mark.parametrize(("step", "mirrored"), [(10, True), (11, False)])
+def test_a_window_is_a_part_of_the_whole_picture(
+    build: Build,
+    perturb: Perturb,
+    camera: MakeCamera,
+    batch: MakeBatch,
+    monkeypatch: pytest.MonkeyPatch,
+    step: int,
+    mirrored: bool,
+) -> None:
+    """Pictures, truth and mask of a window are what the whole picture shows there, or its mirror image."""
+    whole, cut = (perturb(build(head={"max_train_pixels": limit}, background_color="black")) for limit in (0, 600))
+    with torch.no_grad():
+        # Rasterisers clamp how they linearise large primitives far outside of the picture, and a window is a picture.
+        whole.gauss_params["scales"] -= 2
+    cut.load_state_dict(whole.state_dict())
+    masked = {**batch(), "mask": torch.rand(32, 40, 1, generator=torch.Generator().manual_seed(4)) > 0.5}
+    for model in (whole, cut):
+        model.train()
+        model.step = step
+    monkeypatch.setattr(whole, "resolution", lambda step: StepResolution(step, 1, 0))
+    outputs = {model: model.get_outputs(camera()) for model in (whole, cut)}
+    window = outputs[cut]["window"]
+    assert outputs[whole]["window"] is None
+    assert window.width * window.height <= 600
+    assert window.mirrored == mirrored
+
+    def part(image: Tensor) -> Tensor:
+        seen = image[window.top : window.top + window.height, window.left : window.left + window.width]
+        return seen.flip(1) if mirrored else seen
+
+    for name in ("base_rgb", "accumulation"):
+        torch.testing.assert_close(outputs[cut][name], part(outputs[whole][name]), atol=1e-5, rtol=0)
+    truth = part(whole.truth(masked, outputs[whole]))
+    assert torch.equal(cut.truth(masked, outputs[cut]), truth)
+    losses = cut.get_loss_dict(outputs[cut], masked, {})
+    expected = ((outputs[cut]["base_rgb"] - truth).abs() * part(masked["mask"])).mean()
+    torch.testing.assert_close(losses["base_loss"], cut.config.base_loss_weight * expected)
+
+
+def test_windows_wait_for_the_head_and_for_densification(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = build(head={"max_train_pixels": 600})
+    assert not model.state.head_enabled
+    assert model.resolution(0) == StepResolution(0, 1, 0)
+    perturb(model)
+    assert model.resolution(0) == StepResolution(0, 1, 600, mirror=True)
+    assert model.eval().get_outputs(camera())["rgb"].shape == (32, 40, 3)  # what is shown is whole
+    early = perturb(
+        build(head={"max_train_pixels": 600, "start_at": 0}, pruning={"mode": "continuous", "start": 5, "stop": 50})
+    )
+    assert early.state.head_enabled
+    assert early.resolution(0) == StepResolution(0, 1, 0)  # densification takes its statistics from whole pictures
+    paper = perturb(build(head={"mode": "features"}))
+    assert not paper.resolution(0).mirror
 
 
 def made(seed: int, count: int = 3) -> Cameras:

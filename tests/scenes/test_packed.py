@@ -21,7 +21,15 @@ from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, DataError, PackError
 from sundae_ns.gaussians import from_points
-from sundae_ns.scenes.models import datamanager_of, describe_capture, load_run, model_of, stated_capture
+from sundae_ns.scenes.models import (
+    _kept,
+    _seconds,
+    datamanager_of,
+    describe_capture,
+    load_run,
+    model_of,
+    stated_capture,
+)
 from sundae_ns.storage import checkpoint
 from sundae_ns.storage.pack import PackedScene
 
@@ -282,3 +290,24 @@ def test_runs_that_cannot_be_packed(tmp_path: Path) -> None:
     (run / "nerfstudio_models" / "step-000000030.ckpt").write_bytes(b"PK")
     with pytest.raises(CheckpointError, match="no whole checkpoint"):
         contents_of(load_run(run, max_cameras=0))
+
+
+@pytest.mark.parametrize(
+    ("prunes", "kept"),
+    [
+        ([{"before": 200, "after": 60}], 0.3),  # one-shot
+        ([{"before": 100, "after": 50}, {"before": 80, "after": 40}], 0.25),  # continuous: the field grows in between
+        ([], None),
+        ([{"before": 100, "after": 50}, {"after": 40}], None),
+        ([{"before": 0, "after": 0}], None),
+        ([{"before": "many", "after": 1}], None),
+    ],
+)
+def test_the_share_is_the_kept_over_all_prunes(prunes: list[dict[str, Any]], kept: float | None) -> None:
+    assert _kept(prunes) == (None if kept is None else pytest.approx(kept))
+
+
+def test_seconds_are_summed() -> None:
+    assert _seconds([{"seconds": 1}, {"seconds": 0.5}]) == 1.5
+    assert _seconds([{"seconds": 1}, {}]) is None
+    assert _seconds([]) is None
