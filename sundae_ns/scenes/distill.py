@@ -112,11 +112,11 @@ class Distillation:
         """Number of steps to train."""
         seen = self.cameras[: by_device(VIEWS, teacher.device)]
         cut = prune_with_mask(self._teacher, keep, count, seen, None, progress=progress, fit=False)
-        self._config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
+        config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
         self._head_config = None
         if head:
-            small = teacher.device.type == "cpu"
-            tiny = {"size": "tiny", "pixel_unshuffle": 1, "num_features": 5} if small else {}
+            on_cpu = teacher.device.type == "cpu"
+            tiny = {"size": "tiny", "pixel_unshuffle": 1, "num_features": 5} if on_cpu else {}
             self._head_config = HeadConfig(mode="residual", **tiny)  # type: ignore[arg-type]
         self.state = self._start(cut.scene.field)
         self.step = 0
@@ -124,7 +124,7 @@ class Distillation:
         self.gain: float | None = None
         """PSNR that the head gained in its trial, dB; None before it, and without one."""
         self._mean = RunningMean()
-        self._losses = StepLosses(self._config, SSIM(data_range=1.0, size_average=True, channel=3), 0)
+        self._losses = StepLosses(config, SSIM(data_range=1.0, size_average=True, channel=3), 0)
         self._settings = self._teacher.settings(head=False)
         self._recorded = RecordedStep(self._losses) if self._settings.backend.name == "gsplat" else None
 
@@ -290,30 +290,30 @@ class Distillation:
         Raises:
             CheckpointError: it is damaged, or was written with other options or for another scene.
         """
-        refused = f"{path} is damaged, or of another scene or other options; remove it to start anew"
+        state = self.state
         try:
             with reading(path, "a checkpoint", CheckpointError):
-                saved = torch.load(path, map_location=self.state.device, weights_only=True)
+                saved = torch.load(path, map_location=state.device, weights_only=True)
             if saved["options"] != self._options():
-                raise CheckpointError(refused)
+                raise ValueError("other options")
             self.step, self.gain = int(saved["step"]), saved["gain"]
             if saved["head"] is None:
                 self._remove_head()
-            elif self.state.head is not None:
-                self.state.head.load_state_dict(saved["head"])
-            for name, value in saved["field"].items():
-                if value.shape != self.state.field[name].shape:
-                    raise CheckpointError(refused)
-                self.state.field[name].data.copy_(value)
-            for name, optimizer in self.state.optimizers.items():
+            elif state.head is not None:
+                state.head.load_state_dict(saved["head"])
+            for name, value in state.field.items():
+                if value.shape != saved["field"][name].shape:
+                    raise ValueError("another scene")
+                value.data.copy_(saved["field"][name])
+            for name, optimizer in state.optimizers.items():
                 optimizer.load_state_dict(saved["optimizers"][name])
-            self._mean = RunningMean.of(saved["mean"], self.state.device)
-        except CheckpointError:
-            raise
+            self._mean = RunningMean.of(saved["mean"], state.device)
         except Exception as error:  # torch raises errors of many kinds for a damaged file
-            raise CheckpointError(refused) from error
-        if self.state.head is not None:
-            self.state.head_starts_at = -math.inf
+            raise CheckpointError(
+                f"{path} is damaged, or of another scene or other options; remove it to start anew"
+            ) from error
+        if state.head is not None:
+            state.head_starts_at = -math.inf
 
     def _options(self) -> Mapping[str, Any]:
         """What a resumed training must share."""

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.optim import Optimizer
 
 from sundae_ns.api.optimise import optimise, rate_factor
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
@@ -97,7 +98,7 @@ def finetune(
     head = Through.of(weights, codecs.rounded_head)
     numbers = sum(value.numel() for value in (*field.exact.values(), *head.exact.values()))
     optimizer = _optimizer(field.exact, head.exact)
-    tuned = TunedStep(model, codecs, field, head, optimizer, rate / numbers)
+    tuned = TunedStep(model, codecs, (field, head), optimizer, rate / numbers)
 
     def step(i: int) -> None:
         at = opened.steps + i
@@ -122,7 +123,7 @@ def finetune(
     return trained, codecs.to(torch.device("cpu"))
 
 
-def _optimizer(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> torch.optim.Optimizer:
+def _optimizer(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Optimizer:
     groups: list[dict[str, Any]] = [
         {"params": [value], "lr": RATES[name], "eps": 1e-15} for name, value in field.items()
     ]
@@ -175,37 +176,18 @@ class Through(NamedTuple):
 
 
 class TunedStep:
-    """Steps of a fine-tune.
-
-    Args:
-        model: shows the rounded values; its other parameters do not change.
-        codecs: round the values, on the model's device.
-        field: its parameters.
-        head: those of its head; empty without one.
-        optimizer: Adam of the exact values; on CUDA with rates in memory.
-        rate: loss for each bit.
-    """
+    """Steps of a fine-tune of the parts of a model, by an optimizer of their exact values; ``rate`` is for each bit."""
 
     def __init__(
-        self,
-        model: SundaeModel,
-        codecs: Codecs,
-        field: Through,
-        head: Through,
-        optimizer: torch.optim.Optimizer,
-        rate: float,
+        self, model: SundaeModel, codecs: Codecs, parts: tuple[Through, Through], optimizer: Optimizer, rate: float
     ) -> None:
-        self._model, self._codecs, self._field, self._head = model, codecs, field, head
+        self._model, self._codecs, self._parts = model, codecs, parts
         self._optimizer, self._rate = optimizer, rate
         self._can_record = model.device.type == "cuda" and model.backend.name == "gsplat"
         self._recordings = StepRecordings()
 
     def __call__(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
-        """Train on one image.
-
-        Raises:
-            torch.cuda.OutOfMemoryError: the GPU's memory is full.
-        """
+        """Train on one image; ``torch.cuda.OutOfMemoryError`` if the GPU's memory is full."""
         if self._can_record:
             kind = (inputs.view.width, inputs.view.height, inputs.mask is not None)
             try:
@@ -217,8 +199,8 @@ class TunedStep:
 
     def _run(self, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None) -> StepResult:
         """One step; all of its work is recorded."""
-        self._field.show()
-        self._head.show()
+        for part in self._parts:
+            part.show()
         loss, _, result = self._model.training_step(inputs, settings)
         self._set_gradients(loss)
         # torch's Adam reads this name: it changes nothing where it is 1.
@@ -227,15 +209,15 @@ class TunedStep:
         return result
 
     def _set_gradients(self, loss: Tensor) -> None:
-        both = (self._field, self._head)
-        at_rounded = _gradients(loss, [part.shown for part in both])
+        field, head = self._parts
+        at_rounded = _gradients(loss, [part.shown for part in self._parts])
         of_rate: list[dict[str, Tensor | None]] = [{}, {}]
         if self._rate > 0:
             with torch.enable_grad():
-                bits = estimated_bits(self._codecs, self._field.exact, self._head.exact)
+                bits = estimated_bits(self._codecs, field.exact, head.exact)
                 total = self._rate * torch.stack(list(bits.values())).sum()
-            of_rate = _gradients(total, [part.exact for part in both])
-        for part, gradients, others in zip(both, at_rounded, of_rate, strict=True):
+            of_rate = _gradients(total, [part.exact for part in self._parts])
+        for part, gradients, others in zip(self._parts, at_rounded, of_rate, strict=True):
             part.set_gradients(gradients, others)
 
 
