@@ -27,7 +27,7 @@ from harness.points import (
     write_points,
 )
 from harness.script import run_script
-from sundae_ns.cli.outputs import Overwrite, check_folder
+from sundae_ns.cli.options import Flag, check_folder
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians.gaussians import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
@@ -164,7 +164,7 @@ def bands(
     gamma: float = 0.5,
     neighbors: int = 16,
     view: int | None = None,
-    overwrite: Overwrite = False,
+    overwrite: Flag = False,
 ) -> int:
     """Write point clouds, images and ``bands.json`` of a field; the exit code.
 

@@ -149,7 +149,7 @@ def main() -> None:
         if options.demo_steps:
             sundae = folder / "clean" / "bin" / "sundae"
             text = run(sundae, "demo", folder / "demo", "--steps", options.demo_steps, cwd=folder)
-            expect("PSNR" in text and (folder / "demo" / "comparison.png").exists(), f"sundae demo printed {text}")
+            expect("PSNR" in text and (folder / "demo" / "scene.html").exists(), f"sundae demo printed {text}")
         if options.keep is not None:
             options.keep.mkdir(parents=True, exist_ok=True)
             for path in (sdist, wheel):

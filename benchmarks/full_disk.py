@@ -124,7 +124,7 @@ def commands(run: Path, ply: Path, packed: Path, disk: Path) -> dict[str, list[o
         "export, a folder": ["export", packed, "-o", disk / "page"],
         "render .png": ["render", packed, "--view", "0", "-o", disk / "a.png"],
         "render .mp4": ["render", packed, "-o", disk / "a.mp4"],
-        "report": ["report", run, "--repeats", "0", "-o", disk / "report", "--video", disk / "report" / "a.mp4"],
+        "report": ["report", run, "--repeats", "0", "-o", disk / "report"],
     }
 
 

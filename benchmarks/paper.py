@@ -24,7 +24,7 @@ from harness.results import Result, group, mean_of, percent, quality_page, sprea
 from harness.run import Options, Runner, check_out, compare
 from harness.script import run_script
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.evaluation.document import METRICS, number, table
+from sundae_ns.evaluation.measured import METRICS, number, table
 
 DATASETS: Mapping[str, Mapping[str, int]] = {
     "Mip-NeRF 360": {"bicycle": 4, "bonsai": 2, "counter": 2, "garden": 4, "kitchen": 2, "room": 2, "stump": 4},

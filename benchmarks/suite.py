@@ -24,8 +24,7 @@ from harness.results import Result, group, mean_of, percent, quality_page, sprea
 from harness.run import Options, Runner, check_out, compare, first_jobs
 from harness.script import run_script
 from sundae_ns.errors import DataError
-from sundae_ns.evaluation.document import METRICS, number, table
-from sundae_ns.evaluation.measured import MEGABYTE
+from sundae_ns.evaluation.measured import MEGABYTE, METRICS, number, table
 from sundae_ns.storage.pack import FINETUNE_STEPS
 
 ARMS = (

@@ -23,7 +23,7 @@ from harness.results import spread
 from harness.stored import MB, METHODS, lines_of
 from harness.take_over import take_over
 from harness.today import EARLIER, SHARE, is_of_today
-from sundae_ns.evaluation.document import number, table
+from sundae_ns.evaluation.measured import number, table
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))

@@ -15,8 +15,6 @@ FILES = {"partial", "content", "file", "buffer", "poster", "bundle"}
 ELSEWHERE = {
     "cli/demo.py": ["open(out / 'measure.log', 'w', encoding='utf-8')"],  # a log is read while it is written
     "cli/process.py": ["open(log, 'w', encoding='utf-8')"],
-    "cli/distill.py": ["saving.save(result, out)"],
-    "cli/files.py": ["saving.save(small, out)"],  # the public function, which renames
     "data/masks.py": ["scaled.save(folder / f'{image.stem}.png')"],  # in a folder that is renamed
     "evaluation/video.py": ["av.open(str(path), 'w', format='mp4', options={'movflags': 'faststart'})"],  # in cli/
     # In folders that are renamed, and a list that COLMAP reads at once.

@@ -31,7 +31,7 @@ from harness.script import run_script
 from sundae_ns.api.files import load
 from sundae_ns.api.packing import contents_of
 from sundae_ns.errors import BackendError, CheckpointError, PackError, SundaeError
-from sundae_ns.evaluation import Lpips, Measured, lpips_weights_available
+from sundae_ns.evaluation import Lpips, Measured, lpips_weights
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.scenes.finetune import finetune
 from sundae_ns.scenes.measure import measure_scene
@@ -201,7 +201,7 @@ def _measured(job: Job, config: TrainerConfig, command: str) -> tuple[Opened, Me
     del trainer, save
     _forget()
     opened = load_model(folder)
-    lpips = Lpips(download=False) if lpips_weights_available() else None
+    lpips = Lpips() if lpips_weights()[1].is_file() else None
     measured = measure_scene(opened, label=job.key, lpips=lpips, command=command)
     measured = replace(measured, scene=job.scene, variant=job.arm, seed=job.seed, train_s=seconds, peak_vram_mib=peak)
     return opened, measured if job.keep_ratio is None else replace(measured, keep_ratio=job.keep_ratio)

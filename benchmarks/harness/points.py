@@ -16,12 +16,13 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.evaluation.plots import PALETTE
 from sundae_ns.storage.atomic import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+"""Okabe and Ito's colours, which people with colour-vision deficiency can tell apart."""
 BACKGROUND = (246, 246, 244)
 """Colour behind the points: lighter than most captures, but darker than white objects."""
 _COVERED = 0.6

@@ -11,7 +11,6 @@ of benchmarks/results is replaced once all commands that write to it have ended 
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 import sys
@@ -28,11 +27,10 @@ from rich.progress import track
 from harness.plan import job_folder
 from harness.run import STOPPED
 from harness.script import run_script
-from harness.stored import METHODS, RESULTS
-from sundae_ns.cli.outputs import check_folder
+from harness.stored import RESULTS
+from sundae_ns.cli.options import check_folder
 from sundae_ns.cli.process import run_logged
 from sundae_ns.errors import DataError, SundaeError
-from sundae_ns.evaluation.jod import jod_available
 from sundae_ns.storage.atomic import write_text
 
 FOLDER = Path(__file__).parents[1]
@@ -52,8 +50,6 @@ class Step(NamedTuple):
     words: tuple[str, ...]
     table: str = ""
     """File of results that it writes to, if any."""
-    label: str = ""
-    """Name of what it measures; then the file takes the JSON lines of its output."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,22 +64,20 @@ class RecordOptions:
     """only list the commands, and which are done."""
 
 
-def steps_of(captures: Sequence[Path], out: Path, *, others: bool, films: bool) -> list[Step]:
+def steps_of(captures: Sequence[Path], out: Path, *, others: bool) -> list[Step]:
     """The commands, each after those that it needs.
 
     Args:
         captures: their folders.
         out: folder for the runs.
         others: let splat-transform take part.
-        films: measure JOD.
     """
     folder, steps = str(captures[0].parent), []
     theirs = ("--splat-transform", "splat-transform") if others else ()
 
-    def add(name: str, script: str, *words: object, table: str = "", label: str = "") -> None:
-        program = ("-m", script) if script.startswith("harness.") else (str(FOLDER / script),)
-        to = ("-o", out / "results" / table) if table and not label else ()
-        steps.append(Step(name, (sys.executable, *program, *map(str, (*words, *to))), table, label))
+    def add(name: str, script: str, *words: object, table: str = "") -> None:
+        to = ("-o", out / "results" / table) if table else ()
+        steps.append(Step(name, (sys.executable, str(FOLDER / script), *map(str, (*words, *to))), table))
 
     def folder_of(capture: Path, arm: str, share: str = "") -> Path:
         place = out / ("default" if arm == "sundae-auto" else "others")
@@ -94,22 +88,12 @@ def steps_of(captures: Sequence[Path], out: Path, *, others: bool, films: bool) 
     for capture in captures:
         stock = folder_of(capture, "splatfacto") / "splatfacto/splatfacto/run"
         ours = folder_of(capture, "sundae-auto") / "sundae-auto/sundae-auto/run"
-        with_head = folder_of(capture, "sundae-with-head", "10pct-")
         shares = ("--arms", "sundae", "--keep-ratios", *SHARES, "--seeds", SEEDS[0])
         add(f"{capture.name}-curve", "quality.py", capture, "-o", out / "curve" / capture.name, *shares)
         for run in (stock, ours):
             name = f"{capture.name}-formats-{run.parent.name}"
             add(name, "bench_formats.py", run, *theirs, table="formats.csv")
         add(f"{capture.name}-prune", "prune_without_photos.py", stock, *theirs, table="prune.csv")
-        run, label = with_head / "sundae-with-head/sundae/run", f"{capture.name}, {METHODS['sundae-with-head']}"
-        flicker = ("flicker.py", "--load-config", run, "--json")
-        add(f"{capture.name}-flicker", *flicker, table="flicker.jsonl", label=label)
-        if films:
-            full, program = out / "full" / f"{capture.name}.sundae", Path(sys.executable).with_name("sundae")
-            words = (str(program), "pack", str(stock), "-o", str(full), "--overwrite")
-            steps.append(Step(f"{capture.name}-full", words))
-            small = with_head / "tuned.sundae"
-            add(f"{capture.name}-films", "harness.films", small, full, capture, table="films.jsonl")
         timed = ("--arms", *TIMED, "--curve", *LOOKED)
         add(f"{capture.name}-seconds", "bench_training.py", capture, *timed, table="training_time.jsonl")
     for name in ("default", "others", *(f"curve/{capture.name}" for capture in captures)):
@@ -130,38 +114,33 @@ def record(options: RecordOptions, run: Callable[..., None] = run_logged, consol
         raise DataError(f"{options.folder} holds no capture; give the folder that holds the captures")
     out = options.out.resolve()
     check_folder(out, reads=captures, overwrite=True)
-    steps = steps_of(captures, out, others=shutil.which("splat-transform") is not None, films=jod_available())
+    steps = steps_of(captures, out, others=shutil.which("splat-transform") is not None)
     done = {step.name for step in steps if (out / "done" / step.name).is_file()}
     if options.list:
         for step in steps:
             state = "done" if step.name in done else "    "
             console.print(f"{state}  {shlex.join(step.words)}", markup=False, highlight=False, soft_wrap=True)
         return 0
-    for name in ("done", "logs", "full", "results"):
+    for name in ("done", "logs", "results"):
         (out / name).mkdir(parents=True, exist_ok=True)
     for step in track(steps, "Record", console=console):
         if step.name in done:
             continue
-        lines: list[str] = []
         try:
-            run(step.words, out / "logs" / f"{step.name}.log", lines.append)
+            run(step.words, out / "logs" / f"{step.name}.log")
         except KeyboardInterrupt:
             return STOPPED
         except SundaeError as error:
             reason = str(error).strip().splitlines()[-1]
             console.print(f"[red]{step.name} failed: {escape(reason)}", highlight=False, soft_wrap=True)
             continue
-        if step.label:
-            rows = [{**json.loads(line), "config": step.label} for line in lines if line.startswith("{")]
-            with (out / "results" / step.table).open("a", encoding="utf-8") as file:
-                file.writelines(json.dumps(row) + "\n" for row in rows)
         write_text(out / "done" / step.name, shlex.join(step.words) + "\n")
         done.add(step.name)
     left = [step for step in steps if step.name not in done]
     for table in sorted({step.table for step in steps if step.table} - {step.table for step in left}):
         write_text(RESULTS / table, (out / "results" / table).read_text(encoding="utf-8"))
     for script in ("tables.py", "plot.py"):
-        run((sys.executable, str(FOLDER / script)), out / "logs" / f"{script}.log", lambda line: None)
+        run((sys.executable, str(FOLDER / script)), out / "logs" / f"{script}.log")
     return int(bool(left))
 
 

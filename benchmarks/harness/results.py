@@ -11,8 +11,7 @@ from typing import Any
 from harness.plan import Arm
 from sundae_ns.errors import DataError
 from sundae_ns.evaluation import csv_text
-from sundae_ns.evaluation.document import METRICS, number, table
-from sundae_ns.evaluation.measured import MEGABYTE
+from sundae_ns.evaluation.measured import MEGABYTE, METRICS, number, table
 from sundae_ns.storage.atomic import write_text
 
 Result = Mapping[str, Any]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import importlib
 import os
 import sys
 import warnings
@@ -11,22 +12,6 @@ from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from typing import NoReturn
 
-import tyro
-
-from sundae_ns.cli.bench import bench
-from sundae_ns.cli.curve import curve
-from sundae_ns.cli.demo import demo
-from sundae_ns.cli.distill import distill_file
-from sundae_ns.cli.evaluate import evaluate
-from sundae_ns.cli.files import export, prune_file
-from sundae_ns.cli.packing import pack
-from sundae_ns.cli.poses import poses
-from sundae_ns.cli.process import loading
-from sundae_ns.cli.render import render_file
-from sundae_ns.cli.report import report
-from sundae_ns.cli.run import run
-from sundae_ns.cli.train import train
-from sundae_ns.cli.view import view
 from sundae_ns.errors import ConfigError, SundaeError, writing
 
 ENVIRONMENT = {
@@ -38,43 +23,26 @@ ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": str(2**28),
 }
 """Variables of threads and memory; those that the user has set stay."""
-
-
-def doctor(compile: bool = False) -> int:  # noqa: A002
-    """Check this machine, and print the command that installs or repairs each missing part.
-
-    Args:
-        compile: build gsplat's CUDA kernels if they are not built yet; this takes minutes and needs nvcc.
-    """
-    with loading():
-        from sundae_ns.cli.doctor import run_doctor
-
-    return run_doctor(compile_kernels=compile)
-
-
-COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
-    "run": (run, "photos or a video to a packed scene, its report and its web page; resumes"),
-    "poses": (poses, "camera poses of photos or of a video: a capture to train on; resumes"),
-    "train": (train, "train by ns-train, with short options"),
-    "prune": (prune_file, "make any splat scene smaller, without its photos"),
-    "distill": (distill_file, "prune, then train on the full scene's own images, without photos"),
-    "pack": (pack, "pack a scene into one file; says what that costs"),
-    "export": (export, "write a scene as a web page, .ply, .spz, .sog or .glb"),
-    "view": (view, "show a scene with its head in the browser"),
-    "render": (render_file, "render a scene to an image, or to a film along a smooth path"),
-    "report": (report, "measure and compare finished runs: quality, speed, size"),
-    "curve": (curve, "how many primitives a run needs: the curve by which it has chosen"),
-    "eval": (evaluate, "evaluate a run as ns-eval does, without running its config.yml"),
-    "bench": (bench, "time the frames of a run"),
-    "demo": (demo, "train and evaluate the embedded capture; takes minutes on a CPU"),
-    "doctor": (doctor, "check this machine, and say how to repair it"),
+COMMANDS = {
+    "run": "photos or a video to a packed scene, its report and its web page; resumes",
+    "poses": "camera poses of photos or of a video: a capture to train on; resumes",
+    "train": "train by ns-train, with short options",
+    "prune": "make any splat scene smaller, without its photos",
+    "distill": "prune, then train on the full scene's own images, without photos",
+    "pack": "pack a scene into one file; says what that costs",
+    "export": "write a scene as a web page, .ply, .spz, .sog or .glb",
+    "view": "show a scene with its head in the browser",
+    "render": "render a scene to an image, or to a film along a smooth path",
+    "report": "measure and compare finished runs: quality, speed, size",
+    "demo": "train and evaluate the embedded capture; takes minutes on a CPU",
+    "doctor": "check this machine, and say how to repair it",
 }
-"""Commands with their lines in ``sundae --help``, which fits one screen."""
+"""Commands with their lines in ``sundae --help``. Each is the function of its name in the module of its name."""
 
 
 def _help() -> str:
     lines = ["usage: sundae COMMAND ...", "", "Small 3D Gaussian scenes by pruning and a compensation head.", ""]
-    lines += [f"  {name:<8} {line}" for name, (_, line) in COMMANDS.items()]
+    lines += [f"  {name:<8} {line}" for name, line in COMMANDS.items()]
     return "\n".join([*lines, "", "sundae COMMAND --help shows the options of a command."])
 
 
@@ -85,10 +53,15 @@ def _dispatch(words: Sequence[str]) -> int:
         return 0
     if not words:
         raise ConfigError("no command is given; sundae --help lists them")
-    if words[0] not in COMMANDS:
-        near = get_close_matches(words[0], COMMANDS, n=1)
-        raise ConfigError(f"there is no command {words[0]}; {f'use {near[0]}' if near else 'sundae --help lists them'}")
-    return tyro.cli(COMMANDS[words[0]][0], prog=f"sundae {words[0]}", args=words[1:])
+    name = words[0]
+    if name not in COMMANDS:
+        near = get_close_matches(name, COMMANDS, n=1)
+        raise ConfigError(f"there is no command {name}; {f'use {near[0]}' if near else 'sundae --help lists them'}")
+    import tyro
+
+    # Only the module of this command: some import torch, which takes a second.
+    command = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
+    return tyro.cli(command, prog=f"sundae {name}", args=words[1:])
 
 
 def exit_with(command: Callable[[], int], name: str) -> NoReturn:

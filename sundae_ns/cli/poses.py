@@ -8,29 +8,39 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import tyro
 
-from sundae_ns.cli.process import loading, quoted
+from sundae_ns.cli.options import Out, Source, check_least
+from sundae_ns.cli.process import quoted
 from sundae_ns.errors import ConfigError, DataError, StorageError, SundaeError, one_line
 
-if TYPE_CHECKING:
-    from sundae_ns.poses import Found, Placed
-
-Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 FRAMES = 150
 """Default number of frames of a video."""
-_MOST_NAMES = 3
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """How poses are found."""
+
+    matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
+    """photos that are compared: all pairs, neighbours in time and similar ones (for a video), or similar ones; by
+    default what suits their number."""
+    frames: int = FRAMES
+    """number of frames of a video; the sharpest of each stretch."""
+    masks: Path | None = None
+    """folder with a mask for each photo, under its name; training leaves out what is black. By default one named masks
+    beside the photos."""
 
 
 def poses(
-    photos: Annotated[Path, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    matching: Matching = "auto",
-    frames: int = FRAMES,
-    masks: Path | None = None,
+    photos: Source,
+    out: Out,
+    options: Annotated[PoseOptions, tyro.conf.arg(name="")] = PoseOptions(),  # noqa: B008
 ) -> int:
     """Find the camera poses of photos, and write a capture: images at several sizes, transforms.json, points, masks.
 
@@ -39,24 +49,33 @@ def poses(
     Args:
         photos: folder of photos, or a video.
         out: folder of the capture; it must not exist yet.
-        matching: photos that are compared: all pairs, neighbours in time and similar ones (for a video), or similar
-            ones; by default what suits their number.
-        frames: number of frames of a video; the sharpest of each stretch.
-        masks: folder with a mask for each photo, under its name; by default one named masks beside the photos.
     """
-    masks = check_poses(photos, frames, masks)
+    masks = check_poses(photos, options.frames, options.masks)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StorageError(f"{out} exists; choose another folder, or remove it")
     if photos.is_dir() and out.resolve().is_relative_to(photos.resolve()):
         raise StorageError(f"{out} lies in {photos}, which the command reads; choose another folder")
-    with loading():
-        from sundae_ns.poses import Request
-        from sundae_ns.poses.reconstruct import pycolmap
+    from sundae_ns.poses import Request, find_poses
+    from sundae_ns.poses.reconstruct import pycolmap
 
-        pycolmap()
-    request = Request(photos, out, matching, frames, masks)
-    found = _interruptible(lambda: _find(request), request.work)
-    _print(out, found)
+    pycolmap()
+    request = Request(photos, out, options.matching, options.frames, masks)
+    found = _interruptible(lambda: find_poses(request, _report), request.work)
+    placed = found.photos
+    cameras = "1 camera" if found.cameras == 1 else f"{found.cameras} cameras"
+    print(
+        f"{out}: {len(placed.placed):,} of {placed.total:,} photos have a pose, of {cameras}; mean reprojection error "
+        f"{found.error:.2f} px"
+    )
+    if len(found.models) > 1:
+        others = ", ".join(f"{count:,}" for count in found.models[1:])
+        print(f"# this is the largest of {len(found.models)} models that do not join; others have {others} photos")
+    if found.masks is not None:
+        print(f"# masks: {found.masks}")
+    if placed.left_out:
+        names = ", ".join([*placed.left_out[:3], *(["..."] if len(placed.left_out) > 3 else [])])
+        mark = "" if placed.enough else "warning: "
+        print(f"# {mark}without a pose: {names}; to add them, {placed.again}", flush=True)
     return 0
 
 
@@ -77,8 +96,7 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
     check_installed()
     if not photos.exists():
         raise DataError(f"{photos} does not exist; give a folder of photos, or a video")
-    if frames < LEAST_PHOTOS:
-        raise ConfigError(f"frames is {frames}; give at least {LEAST_PHOTOS}")
+    check_least(frames=(frames, LEAST_PHOTOS))
     if masks is not None and not masks.is_dir():
         raise DataError(f"{masks} is no folder of masks; give one with an image for each photo")
     if is_video(photos):
@@ -105,20 +123,6 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
     return masks
 
 
-def too_few(capture: Path, placed: Placed) -> DataError:
-    """The error for a capture in which too few photos have a pose."""
-    return DataError(
-        f"COLMAP placed {len(placed.placed)} of {placed.total} photos; {placed.again}, and start in another folder, or "
-        f"train on these with `sundae run {quoted(capture)} -o OTHER`"
-    )
-
-
-def _find(request: object) -> Found:
-    from sundae_ns.poses import find_poses
-
-    return find_poses(request, _report)  # type: ignore[arg-type]
-
-
 @contextmanager
 def _report(stage: str, total: int) -> Iterator[Callable[[int], None]]:
     """A bar on a terminal while a stage runs, and a line at its end."""
@@ -139,16 +143,16 @@ def _report(stage: str, total: int) -> Iterator[Callable[[int], None]]:
     print(f"{stage}: {done:,} of {total:,}, {time.monotonic() - begun:.0f} s", flush=True)
 
 
-def _interruptible(work: Callable[[], Found], folder: Path) -> Found:
+def _interruptible(work: Callable[[], T], folder: Path) -> T:
     """Run in a thread: COLMAP's functions return to Python only after minutes, and an interrupt ends them at once."""
-    found: list[Found] = []
-    failed: list[BaseException] = []
+    results: list[T] = []
+    errors: list[BaseException] = []
 
     def run() -> None:
         try:
-            found.append(work())
+            results.append(work())
         except BaseException as error:
-            failed.append(error)
+            errors.append(error)
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
@@ -159,28 +163,9 @@ def _interruptible(work: Callable[[], Found], folder: Path) -> Found:
         cursor = "\x1b[?25h\x1b[2K\r" if sys.stderr.isatty() else ""  # a bar hides it
         print(f"{cursor}sundae: interrupted; the same command continues here", file=sys.stderr, flush=True)
         os._exit(130)
-    if not failed:
-        return found[0]
-    if isinstance(failed[0], (SundaeError, OSError)):
-        raise failed[0]
-    raise DataError(
-        f"COLMAP failed ({one_line(failed[0])}); remove {quoted(folder)} and start again, or report it"
-    ) from failed[0]
-
-
-def _print(out: Path, found: Found) -> None:
-    photos = found.photos
-    cameras = "1 camera" if found.cameras == 1 else f"{found.cameras} cameras"
-    print(
-        f"{out}: {len(photos.placed):,} of {photos.total:,} photos have a pose, of {cameras}; mean reprojection error "
-        f"{found.error:.2f} px"
-    )
-    if len(found.models) > 1:
-        others = ", ".join(f"{count:,}" for count in found.models[1:])
-        print(f"# this is the largest of {len(found.models)} models that do not join; others have {others} photos")
-    if found.masks is not None:
-        print(f"# masks: {found.masks}")
-    if photos.left_out:
-        shown = ", ".join(photos.left_out[:_MOST_NAMES]) + (", ..." if len(photos.left_out) > _MOST_NAMES else "")
-        mark = "" if photos.enough else "warning: "
-        print(f"# {mark}without a pose: {shown}; to add them, {photos.again}", flush=True)
+    if results:
+        return results[0]
+    if isinstance(errors[0], (SundaeError, OSError)):
+        raise errors[0]
+    cause = one_line(errors[0])
+    raise DataError(f"COLMAP failed ({cause}); remove {quoted(folder)} and start again, or report it") from errors[0]

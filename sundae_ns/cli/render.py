@@ -3,33 +3,38 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from PIL import Image
+from rich.console import Console
+from rich.progress import track
 
-from sundae_ns.cli.outputs import Overwrite, check_file
-
-if TYPE_CHECKING:
-    from PIL import Image
-
-    from sundae_ns.rendering import View
+from sundae_ns.api.files import load
+from sundae_ns.api.film import film_views
+from sundae_ns.api.scene import image_of
+from sundae_ns.api.scene import render as render_view
+from sundae_ns.api.views import CameraFile, read_cameras, view_in_front, with_start
+from sundae_ns.cli.options import Direction, Flag, Out, Source, check_file
+from sundae_ns.errors import ConfigError
+from sundae_ns.evaluation.video import write_video
+from sundae_ns.rasterization import fastest_device
+from sundae_ns.rendering import View
+from sundae_ns.storage.atomic import replacing, write_image
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
-FRAMES_PER_SECOND = 24
 SECONDS = 12.0
 
 
-def render_file(
-    scene: Annotated[Path, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+def render(
+    scene: Source,
+    out: Out,
     camera: Path | None = None,
     view: int | None = None,
     head: bool = True,
     width: int | None = None,
     seconds: float | None = None,
     fps: float | None = None,
-    up: tuple[float, float, float] | None = None,
-    overwrite: Overwrite = False,
+    up: Direction | None = None,
+    overwrite: Flag = False,
 ) -> int:
     """Render a scene to an image, or along a path to a video.
 
@@ -48,24 +53,12 @@ def render_file(
         up: direction that is upwards, for example 0 -1 0; by default that of the scene, else of its cameras, else z.
         overwrite: replace an existing file, once the new one is complete.
     """
-    from rich.console import Console
-    from rich.progress import track
-
-    from sundae_ns.api.files import load
-    from sundae_ns.api.film import film_views
-    from sundae_ns.api.scene import image_of, render
-    from sundae_ns.api.views import CameraFile, read_cameras, view_in_front, with_start
-    from sundae_ns.errors import ConfigError
-    from sundae_ns.evaluation.video import write_video
-    from sundae_ns.rasterization import fastest_device
-    from sundae_ns.storage.atomic import replacing, write_image
-
     suffix = out.suffix.lower()
-    if suffix not in (*IMAGES, ".mp4"):
+    video = suffix == ".mp4"
+    if not video and suffix not in IMAGES:
         raise ConfigError(f"{out} is neither an image nor a video; name it {', '.join(IMAGES)} or .mp4")
     if width is not None and width < 2:
         raise ConfigError(f"width is {width}; give 2 pixels or more")
-    video = suffix == ".mp4"
     if seconds is not None and (camera is not None or not video):
         raise ConfigError("--seconds is the length of a film without --camera; leave it out")
     if fps is not None and not (video and 0 < fps <= 240):
@@ -75,10 +68,10 @@ def render_file(
     if camera is not None:
         cameras = read_cameras(camera, opened)
     elif video:
-        fps = fps or FRAMES_PER_SECOND
-        length = SECONDS if seconds is None else seconds
+        fps = fps or 24
         with Console(stderr=True).status("Finding a path"):
-            cameras = CameraFile(film_views(opened, seconds=length, frames_per_second=fps), fps)
+            views = film_views(opened, seconds=SECONDS if seconds is None else seconds, frames_per_second=fps)
+        cameras = CameraFile(views, fps)
     elif view is None and opened.start is not None:
         cameras = CameraFile([opened.start], None)
     else:
@@ -87,31 +80,25 @@ def render_file(
     opened = opened.to(fastest_device())
 
     def rendered(view: View) -> Image.Image:
-        return image_of(render(opened, view, head=head).rgb)
+        return image_of(render_view(opened, view, head=head).rgb)
 
     if video:
-        shown = track(views, "Rendering", transient=True, console=Console(stderr=True))
-        speed = fps or cameras.frames_per_second or FRAMES_PER_SECOND
+        frames = track(views, "Rendering", transient=True, console=Console(stderr=True))
+        speed = fps or cameras.frames_per_second or 24
         with replacing(out) as partial:
-            count = write_video(partial, (rendered(each) for each in shown), frames_per_second=speed)
+            count = write_video(partial, map(rendered, frames), frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
-    chosen = _chosen(views, view)
-    write_image(out, rendered(chosen))
-    print(f"{out}: {chosen.width} x {chosen.height} px")
-    return 0
-
-
-def _chosen(views: list[View], index: int | None) -> View:
-    from sundae_ns.errors import ConfigError
-
-    if index is None and len(views) > 1:
+    if view is None and len(views) > 1:
         raise ConfigError(
             f"there are {len(views)} cameras; choose one with --view 0 to {len(views) - 1}, or write an .mp4"
         )
-    if not 0 <= (index or 0) < len(views):
-        raise ConfigError(f"there is no camera {index}; give --view 0 to {len(views) - 1}")
-    return views[index or 0]
+    if not 0 <= (view or 0) < len(views):
+        raise ConfigError(f"there is no camera {view}; give --view 0 to {len(views) - 1}")
+    chosen = views[view or 0]
+    write_image(out, rendered(chosen))
+    print(f"{out}: {chosen.width} x {chosen.height} px")
+    return 0
 
 
 def _resized(view: View, width: int | None, *, even: bool) -> View:

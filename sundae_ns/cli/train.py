@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from itertools import pairwise
 from pathlib import Path
@@ -11,13 +12,61 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.process import run_in_group, word
+from sundae_ns.cli.options import Flag, Out, Source, check_least
+from sundae_ns.cli.process import run_command, word
+from sundae_ns.data.layouts import posed_layout
 from sundae_ns.errors import STOPPED, ConfigError, DataError
+from sundae_ns.storage.run_folder import new_name, unfinished_run
 
 PACKED = "scene.sundae"
 """Name of the packed scene in the folder of its run."""
-LENGTHS = ("--max-num-iterations", "--schedule-length", "--finetune-steps")
-"""Options of ns-train that say when a training ends."""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What is trained."""
+
+    method: str = "sundae"
+    """one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU."""
+    keep: float | None = None
+    """share of the primitives to keep, in (0, 1]; by default as many as the scene needs, or that of the method."""
+    steps: int | None = None
+    """number of training steps; by default that of the method."""
+
+    def check(self, capture: Path) -> None:
+        """Check the options; of the capture, only that it exists.
+
+        Raises:
+            ConfigError: there is no such method, or a number is out of range.
+            DataError: the capture does not exist.
+        """
+        if not capture.exists():
+            raise DataError(f"{capture} does not exist; give the folder of a capture")
+        if self.method not in methods():
+            raise ConfigError(f"{self.method} is no method of sundae; use one of {', '.join(methods())}")
+        if self.keep is not None and not 0 < self.keep <= 1:
+            raise ConfigError(f"keep is {self.keep}; give a share in (0, 1]")
+        check_least(steps=(self.steps, 1))
+
+    def words(self, capture: Path, out: Path, more: Sequence[str] = ()) -> list[str]:
+        """The words of ``ns-train``.
+
+        Args:
+            capture: its folder.
+            out: folder of runs.
+            more: further words of ns-train; a parser of captures may stand among them.
+
+        Raises:
+            DataError: the capture is in COLMAP's or Blender's layout and damaged.
+        """
+        words = ["ns-train", self.method, "--data", word(capture), "--output-dir", word(out)]
+        if self.keep is not None:
+            words += ["--pipeline.model.pruning.keep-ratio", f"{self.keep:g}"]
+        if self.steps is not None:
+            words += ["--max-num-iterations", str(self.steps)]
+        layout = None if any(map(_is_parser, more)) else posed_layout(capture)
+        # The parser and its options come last.
+        return [*words, *more] if layout is None else [*words, *layout.options, *more, *layout.words]
 
 
 def methods() -> list[str]:
@@ -27,13 +76,11 @@ def methods() -> list[str]:
 
 
 def train(
-    capture: Annotated[Path, tyro.conf.Positional],
+    capture: Source,
     further: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs"),
-    method: str = "sundae",
-    keep: float | None = None,
-    steps: int | None = None,
-    resume: bool = False,
+    out: Out = Path("outputs"),
+    resume: Flag = False,
+    options: Annotated[TrainOptions, tyro.conf.arg(name="")] = TrainOptions(),  # noqa: B008
 ) -> int:
     """Print a command of ns-train and run it; then pack the scene into scene.sundae in the run's folder.
 
@@ -44,71 +91,67 @@ def train(
             Blender's transforms_train.json.
         further: behind --, any options of ns-train, as in sundae train CAPTURE -- --pipeline.model.sh-degree 2
         out: folder of runs.
-        method: one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU.
-        keep: share of the primitives to keep, in (0, 1]; by default as many as the scene needs, or
-            that of the method.
-        steps: number of training steps; by default that of the method.
         resume: train the remaining steps of the newest unfinished run of this method on this capture.
     """
-    from sundae_ns.storage.run_folder import new_name, unfinished_run
-
     if further and not (further[0].startswith("-") or _is_parser(further[0])):
         raise ConfigError(f"{further[0]} is no option; options of ns-train follow a --")
-    if resume and steps is not None:
+    if resume and options.steps is not None:
         raise ConfigError("a resumed run trains its remaining steps; leave out --steps or --resume")
-    check(capture, method, keep, steps)
-    unfinished, more = unfinished_run(out, method, capture), list(further)
+    options.check(capture)
+    unfinished, more = unfinished_run(out, options.method, capture), list(further)
     if resume and unfinished is None:
-        raise ConfigError(f"{out} has no unfinished run of {method} on {capture}; leave out --resume")
+        raise ConfigError(f"{out} has no unfinished run of {options.method} on {capture}; leave out --resume")
     given = _value_of("--timestamp", more)
     name = given or new_name()
-    if unfinished is not None and resume:
-        folder = unfinished[0]
-        name = folder.name
+    if resume and unfinished is not None:
+        folder, name = unfinished.folder, unfinished.folder.name
         more[:0] = [f"--experiment-name={folder.parent.parent.name}", "--timestamp", name]
         more[:0] = ["--load-dir", word(folder / "nerfstudio_models")]
     elif given is None:
         more[:0] = ["--timestamp", name]
     tunes = has_gpu()
-    if tunes and not any(_value_of(option, further) for option in LENGTHS):
+    lengths = ("--max-num-iterations", "--schedule-length", "--finetune-steps")
+    if tunes and not any(_value_of(option, further) for option in lengths):
         more[:0] = finetune_words()
-    words = command(capture, out, method, keep, steps, more)  # refuses a damaged capture before it speaks of runs
-    if unfinished is not None and not resume and not (unfinished.folder / PACKED).exists():
-        folder, done, length = unfinished
+    words = options.words(capture, out, more)  # refuses a damaged capture before it speaks of runs
+    if not resume and unfinished is not None and not (unfinished.folder / PACKED).exists():
         again = ["sundae", "train", word(capture), "--resume"]
         again += ["-o", word(out)] if out != Path("outputs") else []
-        again += ["--method", method] if method != "sundae" else []
-        print(f"# {folder} ended after {done:,} of {length:,} steps; this is a new run. To resume the other:")
+        again += ["--method", options.method] if options.method != "sundae" else []
+        steps = f"{unfinished.step:,} of {unfinished.length:,} steps"
+        print(f"# {unfinished.folder} ended after {steps}; this is a new run. To resume the other:")
         print(f"#     {shlex.join(again)}")
-    print(shlex.join(words), flush=True)
-    code = run_in_group(words)
+    code = run_command(words)
     # Options of ns-train may have put the run elsewhere; then its last line names the command that packs it.
-    run = next((path.parent for path in out.glob(f"*/{method}/{name}/config.yml")), None)
-    return code if code or run is None else _pack(run, tunes=tunes)
+    run = next((path.parent for path in out.glob(f"*/{options.method}/{name}/config.yml")), None)
+    if code or run is None:
+        return code
+    stale = ["--overwrite"] if (run / PACKED).exists() else []  # of the steps before a resume
+    return pack_run(run, run / PACKED, *stale, finetune=tunes)
 
 
-def _pack(run: Path, *, tunes: bool) -> int:
-    """Pack a finished run, without a fine-tune where that fails; the exit code."""
-    more = ["--overwrite"] if (run / PACKED).exists() else []  # of the steps before a resume
-    for finetune in (True, False) if tunes else (False,):
-        words = pack_command(run, run / PACKED, *more, finetune=finetune)
-        print(shlex.join(words), flush=True)
-        code = run_in_group(words, saves=False)
-        if not code or code in STOPPED:
-            break
-    return code
+def pack_run(run: Path, out: Path, *more: str, finetune: bool) -> int:
+    """Pack a finished run, with further words of ``sundae pack``; the exit code.
 
-
-def pack_command(run: Path, out: Path, *more: str, finetune: bool) -> list[str]:
-    """The words of the command that packs a run, with further words, and with a fine-tune if asked for."""
+    Args:
+        run: its folder.
+        out: file to write.
+        more: further words.
+        finetune: fine-tune the pack; one that fails, for example because the GPU's memory is full, is left out.
+    """
     from sundae_ns.storage.pack import FINETUNE_STEPS
 
     words = ["sundae", "pack", word(run), "-o", word(out), *more]
-    return [*words, "--finetune", str(FINETUNE_STEPS)] if finetune else words
+    if finetune:
+        code = run_command([*words, "--finetune", str(FINETUNE_STEPS)])
+        if not code or code in STOPPED:
+            return code
+        print(f"# the fine-tune ended with {code}; packing without it:")
+    return run_command(words)
 
 
 def finetune_words() -> list[str]:
-    """Words of ns-train that leave the last steps to the fine-tune of :func:`pack_command`."""
+    """Words of ns-train that leave the last steps to the fine-tune of :func:`pack_run`."""
     from sundae_ns.storage.pack import FINETUNE_STEPS
 
     return ["--finetune-steps", str(FINETUNE_STEPS)]
@@ -129,46 +172,6 @@ def _value_of(option: str, words: Sequence[str]) -> str | None:
         if given is not None and given.startswith(f"{option}="):
             return given.partition("=")[2]
     return None
-
-
-def check(capture: Path, method: str, keep: float | None, steps: int | None) -> None:
-    """Check the options of :func:`train`; of the capture, only that it exists.
-
-    Raises:
-        ConfigError: there is no such method, or a number is out of range.
-        DataError: the capture does not exist.
-    """
-    if not capture.exists():
-        raise DataError(f"{capture} does not exist; give the folder of a capture")
-    if method not in methods():
-        raise ConfigError(f"{method} is no method of sundae; use one of {', '.join(methods())}")
-    if keep is not None and not 0 < keep <= 1:
-        raise ConfigError(f"keep is {keep}; give a share in (0, 1]")
-    if steps is not None and steps < 1:
-        raise ConfigError(f"steps is {steps}; give at least 1")
-
-
-def command(
-    capture: Path, out: Path, method: str, keep: float | None, steps: int | None, more: Sequence[str] = ()
-) -> list[str]:
-    """The words of the command; options as in :func:`train`, checked by :func:`check`.
-
-    Args:
-        more: further words of ns-train; a parser of captures may stand among them.
-
-    Raises:
-        DataError: the capture is in COLMAP's or Blender's layout and damaged.
-    """
-    from sundae_ns.data.layouts import posed_layout
-
-    layout = None if any(_is_parser(one) for one in more) else posed_layout(capture)
-    words = ["ns-train", method, "--data", word(capture), "--output-dir", word(out)]
-    if keep is not None:
-        words += ["--pipeline.model.pruning.keep-ratio", f"{keep:g}"]
-    if steps is not None:
-        words += ["--max-num-iterations", str(steps)]
-    # The parser and its options come last.
-    return [*words, *more] if layout is None else [*words, *layout.options, *more, *layout.words]
 
 
 def _is_parser(word: str) -> bool:

@@ -6,16 +6,15 @@ import sys
 import webbrowser
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
-from sundae_ns.cli.files import open_packed_file
+from sundae_ns.api.page import page_of
+from sundae_ns.cli.inputs import open_packed
+from sundae_ns.cli.options import Source
 from sundae_ns.errors import ConfigError
 
 IDLE_SECONDS = 15.0
 """A connection that sends or takes nothing for so long is closed."""
-_PIECE = 1 << 16
 
 
 class _Server(ThreadingHTTPServer):
@@ -57,8 +56,8 @@ def serve(page: str, port: int) -> ThreadingHTTPServer:
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
             # The time limit holds for each call, so a slow connection gets the page in pieces.
-            for start in range(0, len(body), _PIECE):
-                self.wfile.write(body[start : start + _PIECE])
+            for start in range(0, len(body), 1 << 16):
+                self.wfile.write(body[start : start + (1 << 16)])
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002
             """Stay silent."""
@@ -76,9 +75,7 @@ def _hosts(port: int) -> set[str]:
     return {f"{name}:{port}" for name in names} | (set(names) if port == 80 else set())
 
 
-def view(
-    scene: Annotated[Path, tyro.conf.Positional], port: int = 0, open_browser: bool = True, data: Path | None = None
-) -> int:
+def view(scene: Source, port: int = 0, open_browser: bool = True, data: Path | None = None) -> int:
     """Show a scene with its head in the browser, until Ctrl-C.
 
     Serves the page of sundae export on 127.0.0.1 and opens it. From another machine, forward the port to the same
@@ -91,9 +88,7 @@ def view(
         open_browser: open the default browser; otherwise only print the address.
         data: folder of the capture of a run, if it moved.
     """
-    from sundae_ns.api.page import page_of
-
-    page = page_of(*open_packed_file(scene, data), title=scene.resolve().stem)
+    page = page_of(*open_packed(scene, data), title=scene.resolve().stem)
     with serve(page, port) as server:
         address = f"http://127.0.0.1:{server.server_port}/"
         print(f"{scene} is shown at {address} until Ctrl-C", flush=True)

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.evaluation.document import table
-from sundae_ns.evaluation.measured import MEGABYTE
+from sundae_ns.evaluation.measured import MEGABYTE, table
 
 CURVE = "curve.json"
 """Name of the record in the folder of a run."""

@@ -1,31 +1,44 @@
-"""The measurements of one field: each configuration of rendering it has its own time and its own error."""
+"""The measurements of finished fields, and the table of a report: on the terminal, as Markdown and as CSV."""
 
 from __future__ import annotations
 
+import csv
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from io import StringIO
 from statistics import fmean
 from typing import Any
+
+from sundae_ns.evaluation.metrics import ViewQuality
 
 HEAD_ON, HEAD_OFF = "head on", "head off"
 MEGABYTE = 1e6
 """Bytes in the MB of tables and plots."""
-
-
-@dataclass(frozen=True)
-class ViewQuality:
-    """Metrics of one test view; None is a metric that was not measured."""
-
-    psnr: float
-    """dB."""
-    ssim: float
-    """pytorch_msssim's variant, without padding; NaN for images smaller than its window."""
-    flip: float | None = None
-    lpips: float | None = None
-    psnr_fitted: float | None = None
-    """dB, after the affine map of colours that fits best (:func:`sundae_ns.evaluation.metrics.fitted_psnr`)."""
-    jod: float | None = None
-    """Visibility of the difference, 10 for none (:func:`sundae_ns.evaluation.jod.jod`)."""
+METRICS = (("psnr", 2), ("ssim", 4), ("psnr_fitted", 2), ("flip", 4), ("lpips", 4))
+"""Metrics in the order of a table's columns, with their number of decimals."""
+EXPLANATIONS = (
+    "Each row is one configuration of rendering a field. Its time and its metrics come from the same calls.",
+    "Metrics are means over the test views. PSNR is over all pixels and channels; fitted, it is taken after the "
+    "affine map of colours that brings the image nearest to its photo, so that changing light counts less. SSIM is "
+    "pytorch_msssim's (11 x 11 window, no padding), FLIP is LDR-FLIP at 67 pixels per degree, and LPIPS names its net.",
+    "Higher PSNR and SSIM are better; lower FLIP, LPIPS, ms and MB are better.",
+    "ms per frame is the median over the test views, synchronised with the device.",
+    "MB are 1e6 bytes in fp32 of all that the configuration needs: no network or features if the head is off. "
+    "For a packed scene it is the whole file.",
+    "With the head off, the same field shows its base colours, although it was trained with a head. To train a field "
+    "without a head is another run, with --pipeline.model.head.mode off.",
+)
+"""Sentences on the figures of a report's table."""
+COLUMNS = (
+    *("scene", "method", "variant", "keep_ratio", "seed", "steps", "primitives"),
+    *("psnr", "ssim", "psnr_base", "ssim_base", "psnr_fitted", "lpips", "lpips_net"),
+    *("bytes_primitives", "bytes_head", "bytes_total", "ms_frame", "ms_splat", "ms_head"),
+    *("train_s", "prune_s", "peak_primitives", "peak_vram_mib", "gpu", "resolution", "fingerprint", "command"),
+)
+"""Columns of the CSV. Metrics are means over the test views, ``*_base`` without the head; ``bytes_*`` are bytes,
+``ms_*`` milliseconds per frame, ``*_s`` seconds, and ``peak_vram_mib`` is the peak that torch allocated during
+training, MiB; ``fingerprint`` stands for the options of the run."""
 
 
 @dataclass(frozen=True)
@@ -124,3 +137,59 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [without_nan(inner) for inner in value]
     return value
+
+
+def number(value: float | None, digits: int) -> str:
+    """A number with ``digits`` decimals; a dash for None and NaN."""
+    return "-" if value is None or value != value else f"{value:,.{digits}f}"
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, words: int = 2) -> list[str]:
+    """Lines of a Markdown table; the first ``words`` columns are aligned left, the others right."""
+    rule = ["---" if i < words else "---:" for i in range(len(heads))]
+    return ["| " + " | ".join(cells).replace("\n", " ") + " |" for cells in (heads, rule, *rows)]
+
+
+def heads_of(runs: Sequence[Measured]) -> list[str]:
+    """Heads of the table of the runs of a report; LPIPS names the nets that the runs have."""
+    nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})
+    heads = ["run", "rendered with", "primitives", "MB", "ms per frame", "PSNR, dB", "SSIM", "fitted, dB", "FLIP"]
+    return [*heads, f"LPIPS ({', '.join(nets)})" if nets else "LPIPS"]
+
+
+def rows_of(runs: Sequence[Measured]) -> list[list[str]]:
+    """Cells of each configuration of the runs below :func:`heads_of`."""
+    return [
+        [
+            run.label,
+            configuration.name if run.has_head else "no head",
+            number(run.primitives, 0),
+            number(configuration.bytes / MEGABYTE, 2),
+            number(configuration.ms, 2),
+            *(number(configuration.mean(metric), digits) for metric, digits in METRICS),
+        ]
+        for run in runs
+        for configuration in run.configurations
+    ]
+
+
+def markdown(scenes: Mapping[str, Sequence[Measured]], notes: Sequence[str]) -> str:
+    """The table of each scene, and what was left out, as a Markdown page."""
+    heads = heads_of([run for runs in scenes.values() for run in runs])
+    parts = [f"# {scene}\n\n" + "\n".join(table(heads, rows_of(runs))) for scene, runs in scenes.items()]
+    return "\n\n".join([*parts, *(f"- Left out: {note}" for note in notes)]) + "\n"
+
+
+def csv_text(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Runs of :meth:`Measured.as_json` as CSV; an empty cell means not measured."""
+    buffer = StringIO()
+    writer = csv.DictWriter(buffer, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for run in runs:
+        full, base = run["configurations"][0], run["configurations"][-1]
+        # Each time stands beside the metrics of its own renderings.
+        own = {"ms_frame": full["ms"], "ms_splat": base["ms"], **full["mean"]}
+        own |= {"psnr_base": base["mean"]["psnr"], "ssim_base": base["mean"]["ssim"]}
+        own["lpips_net"] = run["lpips_net"] if own["lpips"] is not None else ""
+        writer.writerow({**run, **own})
+    return buffer.getvalue()

@@ -1,42 +1,32 @@
-"""Measurements of a finished scene: quality, bytes and synchronised times, and its images beside the photographs."""
+"""Measurements of a finished scene: quality, bytes and synchronised times."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from statistics import median
-from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sundae_ns.compensation import resize
-from sundae_ns.errors import BackendError, ConfigError
 from sundae_ns.evaluation import (
     HEAD_OFF,
     HEAD_ON,
-    ComparisonRow,
     Configuration,
     Lpips,
     Measured,
     ViewQuality,
     median_ms,
     quality_of,
-    without_nan,
 )
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
-from sundae_ns.rendering import compensate, draw, scale_plan, zoomed
-from sundae_ns.scenes.models import Opened, load_model
+from sundae_ns.rendering import compensate, draw, scale_plan
+from sundae_ns.scenes.models import Opened
 from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module
-
-MOST_ZOOM = 1000
-"""Factor on the sides of an image beyond which no memory holds it."""
 
 
 @dataclass(frozen=True)
@@ -105,42 +95,6 @@ def sizes(model: SundaeModel) -> Sizes:
     return Sizes(bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head))
 
 
-@contextmanager
-def rendered_as(run: Opened, *, factor: float = 1.0, precision: str | None = None) -> Iterator[Opened]:
-    """The run with images of another size, and inside the block with another arithmetic of its head.
-
-    Args:
-        run: a finished scene.
-        factor: on the sides of the images; the true images are resized alike.
-        precision: of the head, one of ``PRECISIONS``; by default the run's own, and fp32 on a CPU.
-
-    Raises:
-        ConfigError: the factor is not above zero or too large.
-        BackendError: half precision is asked for on a CPU.
-    """
-    if not 0 < factor < MOST_ZOOM:
-        raise ConfigError(f"images cannot be {factor} times as large; give a factor above 0 and below {MOST_ZOOM}")
-    model, head = run.model, run.model.head
-    if model.device.type == "cpu" and precision not in (None, "fp32"):
-        raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
-    cameras, truths = [zoomed(camera, factor) for camera in run.cameras], []
-    for camera, truth in zip(cameras, run.truths, strict=True):
-        size = int(camera.height), int(camera.width)
-        truths.append(truth if truth.shape[:2] == size else resize(truth, *size))
-    shown = replace(run, cameras=cameras, truths=truths)
-    if head is None:
-        yield shown
-        return
-    before: Any = head.config
-    changed = replace(before, precision=precision or _precision(model))
-    changed.validate()
-    head.config = changed
-    try:
-        yield shown
-    finally:
-        head.config = before
-
-
 @torch.no_grad()
 def measure_scene(
     opened: Opened,
@@ -161,7 +115,7 @@ def measure_scene(
         opened: the scene.
         label: its name in tables.
         lpips: LPIPS; None leaves it out.
-        visible: whether to compute FLIP and JOD, which take seconds for an image, if their packages are installed.
+        visible: whether to compute FLIP, if its package is installed.
         warmup: untimed renders of each view.
         repeats: timed renders of each view; 0 leaves times out.
         progress: called after each view.
@@ -217,70 +171,6 @@ def measure_scene(
         fingerprint=opened.fingerprint,
         command=command,
     )
-
-
-def evaluation(run: Path, *, data: Path | None = None) -> dict[str, Any]:
-    """Metrics of a run on its test views, as ns-eval writes them; None stands for a figure that is not finite.
-
-    Args:
-        run: folder of a run of sundae or splatfacto, or its ``config.yml``. No code in it runs.
-        data: the capture, if it has moved.
-
-    Raises:
-        CheckpointError: the run is of another method, or has no whole checkpoint.
-        DataError: its capture is missing, or cannot be used, or has no test views.
-    """
-    opened = load_model(run, data)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "std_mean", UserWarning)  # of a single view, which has no deviation
-        results = opened.pipeline.get_average_eval_image_metrics(get_std=True)
-    plain: dict[str, Any] = without_nan(
-        {
-            "experiment_name": opened.variant,
-            "method_name": opened.method,
-            "checkpoint": str(opened.source / "nerfstudio_models" / f"step-{opened.steps - 1:09d}.ckpt"),
-            "results": results,
-        }
-    )
-    return plain
-
-
-def comparison_of(model: SundaeModel, camera: Cameras, truth: Tensor, title: str) -> ComparisonRow:
-    """True image, base colours and complete rendering of one view."""
-    outputs = model.get_outputs_for_camera(camera)
-    return ComparisonRow(truth, outputs["base_rgb"], outputs["rgb"], title)
-
-
-def largest_view(opened: Opened) -> tuple[int, int]:
-    """Largest width and largest height of the training and test views, in pixels."""
-    _ = opened.datamanager.cached_train  # undistortion, which comes with loading, changes the cameras
-    cameras = [opened.datamanager.train_dataset.cameras, *opened.cameras]
-    return max(int(each.width.max()) for each in cameras), max(int(each.height.max()) for each in cameras)
-
-
-@torch.no_grad()
-def walk(opened: Opened) -> Iterator[ComparisonRow]:
-    """Render the views in the order of their file names; titles name the file, and whether it was held out for test.
-
-    Raises:
-        DataError: an image cannot be decoded.
-    """
-    model, manager = opened.model, opened.datamanager
-    outputs = {"background": model._get_background_color()}
-
-    def training_view(index: int) -> tuple[Cameras, Tensor]:
-        truth = model.truth(manager.cached_train[index], outputs)
-        # After its image, whose undistortion changes the camera.
-        return manager.train_dataset.cameras[index : index + 1].to(model.device), truth
-
-    order = sorted(
-        (path, held_out, index)
-        for held_out, dataset in enumerate((manager.train_dataset, manager.eval_dataset))
-        for index, path in enumerate(dataset.image_filenames)
-    )
-    for path, held_out, index in order:
-        camera, truth = (opened.cameras[index], opened.truths[index]) if held_out else training_view(index)
-        yield comparison_of(model, camera, truth, f"{path.name}, {'test' if held_out else 'training'} view")
 
 
 def _precision(model: SundaeModel) -> str:

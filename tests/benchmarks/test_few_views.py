@@ -1,4 +1,4 @@
-"""Captures of few views, and films between neighbouring cameras."""
+"""Captures of few views."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from PIL import Image
 
-from harness import few_views, films
-from sundae_ns.rendering.views import View
+from harness import few_views
 
 SIZE, PHOTOS = 16, 10
 
@@ -54,13 +52,3 @@ def test_a_capture_of_few_views_knows_what_they_see_and_nothing_else(
     missing = {int(name) + 1 for name in left_out}
     assert set(points) == {k for k in range(1, PHOTOS) if not {k, k + 1} & missing}
     assert 0 < len(points) < PHOTOS - 1
-
-
-def test_a_film_begins_at_one_camera_and_goes_towards_the_other() -> None:
-    there = torch.eye(4)
-    there[0, 3] = -2.0
-    views = [View(pose, torch.eye(3), SIZE, SIZE, 1.0) for pose in (torch.eye(4), there)]
-    torch.testing.assert_close(films.moved(views, (0, 1), 0.0).viewmat, views[0].viewmat)
-    halfway = films.moved(views, (0, 1), 0.5).viewmat
-    torch.testing.assert_close(halfway[:3, 3], torch.tensor([-1.0, 0, 0]))
-    torch.testing.assert_close(halfway[:3, :3], torch.eye(3))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -24,7 +23,6 @@ def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RecordOptions:
     (tmp_path / "results").mkdir()
     monkeypatch.setattr(module, "RESULTS", tmp_path / "results")
     monkeypatch.setattr(module.shutil, "which", lambda name: None)
-    monkeypatch.setattr(module, "jod_available", lambda: True)
     return RecordOptions(folder=tmp_path / "captures", out=tmp_path / "out")
 
 
@@ -35,29 +33,26 @@ class Programs:
         self.ran: list[str] = []
         self.broken, self.at = broken, at
 
-    def __call__(self, words: Sequence[str], log: Path, on_line: Callable[[str], object]) -> None:
+    def __call__(self, words: Sequence[str], log: Path) -> None:
         self.ran.append(log.stem)
         if words[-2] == "-o":
             with Path(words[-1]).open("a") as file:
                 file.write(f"{log.stem}\n")
-        on_line("Loading\n")
-        on_line(f'{{"log": "{log.stem}"}}\n')
         if self.broken is not None and log.stem == self.at:
             raise self.broken
 
 
 def test_commands_are_those_of_the_scripts(tmp_path: Path) -> None:
-    steps = steps_of([tmp_path / "captures" / "a"], tmp_path, others=True, films=True)
+    steps = steps_of([tmp_path / "captures" / "a"], tmp_path, others=True)
     assert len({step.name for step in steps}) == len(steps)
     for step in steps:
-        program = step.words[1]
-        assert Path(program).is_file() or program in ("-m", "pack"), step
+        assert Path(step.words[1]).is_file(), step
     (formats,) = (step for step in steps if step.name == "a-formats-splatfacto")
     assert formats.words[2] == str(tmp_path / "others/jobs/a-splatfacto-s42/splatfacto/splatfacto/run")
     assert formats.words[3:5] == ("--splat-transform", "splat-transform")
     (few,) = (step for step in steps if step.name == "a-curve")
     assert few.words[:2] == (sys.executable, str(FOLDER / "quality.py"))
-    assert "--splat-transform" not in str(steps_of([tmp_path / "a"], tmp_path, others=False, films=False))
+    assert "--splat-transform" not in str(steps_of([tmp_path / "a"], tmp_path, others=False))
 
 
 def test_what_is_done_is_not_run_again(options: RecordOptions) -> None:
@@ -73,25 +68,22 @@ def test_what_is_done_is_not_run_again(options: RecordOptions) -> None:
     assert record(options, nothing) == 0
     assert nothing.ran == ["tables.py", "plot.py"]
     results = options.folder.parent / "results"
-    rows = [json.loads(line) for line in (results / "flicker.jsonl").read_text().splitlines()]
-    label = "sundae, with a head in any case"
-    assert rows == [{"log": f"{name}-flicker", "config": f"{name}, {label}"} for name in ("a", "b")]
     # The one that was stopped had begun to write.
     assert (results / "prune.csv").read_text().split() == ["a-prune", "a-prune", "b-prune"]
 
 
 def test_a_failure_leaves_the_others(options: RecordOptions, capsys: pytest.CaptureFixture[str]) -> None:
-    programs = Programs(SundaeError("python failed with 1; its log is x, which ends with:\nno GPU"), at="a-flicker")
+    programs = Programs(SundaeError("python failed with 1; its log is x, which ends with:\nno GPU"), at="a-prune")
     assert record(options, programs) == 1
     assert programs.ran[-1] == "plot.py"
-    assert "a-flicker failed: no GPU" in capsys.readouterr().out
+    assert "a-prune failed: no GPU" in capsys.readouterr().out
     results = options.folder.parent / "results"
-    assert (results / "films.jsonl").is_file()
-    assert not (results / "flicker.jsonl").exists()  # a part of a table is none
+    assert (results / "formats.csv").is_file()
+    assert not (results / "prune.csv").exists()  # a part of a table is none
     again = Programs()
     assert record(options, again) == 0
-    assert again.ran[0] == "a-flicker"
-    assert len((results / "flicker.jsonl").read_text().splitlines()) == 2
+    assert again.ran[0] == "a-prune"
+    assert (results / "prune.csv").read_text().split() == ["a-prune", "b-prune", "a-prune"]
 
 
 def test_the_list_says_what_is_done(options: RecordOptions) -> None:
@@ -101,7 +93,7 @@ def test_the_list_says_what_is_done(options: RecordOptions) -> None:
     assert record(listed, Programs(), console) == 0
     lines = console.export_text().splitlines()
     assert [line.startswith("done") for line in lines].count(False) == 1
-    assert all("benchmarks" in line or "harness.films" in line or " pack " in line for line in lines)
+    assert all("benchmarks" in line for line in lines)
 
 
 def test_a_folder_without_captures_is_an_error(tmp_path: Path) -> None:

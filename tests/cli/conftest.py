@@ -24,8 +24,8 @@ def commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Commands:
     for index in range(PHOTOS):
         photo(Path("photos", f"{index}.JPG"))
     made = Commands()
-    monkeypatch.setattr("sundae_ns.cli.run.run_in_group", made)
-    monkeypatch.setattr("sundae_ns.cli.run.measured_step", made.measured)
+    for module in ("run", "train"):
+        monkeypatch.setattr(f"sundae_ns.cli.{module}.run_command", made)
     monkeypatch.setattr("sundae_ns.cli.run.has_gpu", lambda: made.gpu)
     monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
     return made

@@ -1,27 +1,28 @@
-"""The doctor's findings and advice on simulated machines."""
+"""What the doctor finds on simulated machines, and what it advises."""
 
 from __future__ import annotations
 
 import ctypes.util
-import shutil
 import sys
-from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
+from command_line import run
 
-from sundae_ns import evaluation
-from sundae_ns.cli import doctor, main
+from sundae_ns.cli import doctor
 from sundae_ns.errors import BackendError
 
 
-def finding(name: str, compile_kernels: bool = False) -> doctor.Finding:
-    (found,) = [one for one in doctor.examine(compile_kernels) if one.name == name]
-    return found
+def check(name: str, compile_kernels: bool = False) -> tuple[bool, str, str]:
+    """Whether a part is there, what the doctor says of it, and its remedy."""
+    (part,) = [part for part in doctor.parts(compile_kernels) if part.name == name]
+    try:
+        return True, part.check(), part.remedy
+    except doctor.Missing as error:
+        return False, str(error), part.remedy
 
 
 @pytest.fixture
@@ -39,95 +40,69 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sundae_ns.gpu.loss.loss_kernels", lambda *_: None)
 
 
-def _kernels(monkeypatch: pytest.MonkeyPatch, problem: str | None) -> None:
-    def select(name: str, device: str) -> None:
+def select(problem: str | None = None) -> object:
+    def selected(name: str, device: str) -> None:
         assert (name, device) == ("gsplat", "cuda")
         if problem:
             raise BackendError(problem)
 
-    monkeypatch.setattr("sundae_ns.rasterization.select_backend", select)
+    return selected
 
 
-def test_without_cuda_auto_selects_the_compiled_loops(no_cuda: None) -> None:
-    found = finding("CUDA")
-    assert not found.ok
-    assert not found.needed
-    assert found.fix
-    assert "auto selects cpu" in finding("rasteriser").detail
-    assert not finding("gsplat kernels", compile_kernels=True).ok
+def test_without_cuda_auto_selects_the_compiled_loops(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not check("CUDA")[0]
+    assert "auto selects cpu" in check("rasteriser")[1]
+    for name in ("gsplat kernels", "our kernels"):
+        assert check(name, True)[:2] == (False, check(name)[1])
+    monkeypatch.setattr("sundae_ns.rasterization.numba_problem", lambda: "numba does not import (x; y)")
+    found, said, remedy = check("rasteriser")
+    assert not found
+    assert "auto selects reference" in said
+    assert "numba does not import (x; y)" in said
+    assert remedy == "pip install numba"
 
 
-def test_without_numba_auto_selects_the_reference(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = "numba does not import (x; y); pip install numba"
-    monkeypatch.setattr("sundae_ns.rasterization.numba_problem", lambda: problem)
-    found = finding("rasteriser")
-    assert not found.ok
-    assert not found.needed
-    assert "auto selects reference" in found.detail
-    assert "numba does not import (x; y)" in found.detail
-    assert found.fix == "pip install numba"
-
-
-def test_with_working_kernels_auto_selects_gsplat(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    _kernels(monkeypatch, None)
-    assert "Imaginary 9000" in finding("CUDA").detail
-    assert finding("gsplat kernels", compile_kernels=True).ok
-    assert finding("rasteriser", compile_kernels=True).detail == "auto selects gsplat"
-
-
-def test_missing_kernels_are_built_only_on_request(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_of_gsplat(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "Imaginary 9000" in check("CUDA")[1]
     monkeypatch.setattr(doctor, "kernels_built", lambda: False)
-    _kernels(monkeypatch, "must not be tried")
-    found = finding("gsplat kernels")
-    assert found.detail == "not built yet"
-    assert found.fix.startswith("sundae doctor --compile")
-    assert "auto selects gsplat, after its kernels are built" in finding("rasteriser").detail
+    monkeypatch.setattr("sundae_ns.rasterization.select_backend", select("its kernels do not run (no nvcc)"))
+    found, said, remedy = check("gsplat kernels")
+    assert (found, said.partition(";")[0]) == (False, "not built yet"), "they are built only on request"
+    assert remedy.startswith("sundae doctor --compile")
+    assert check("gsplat kernels", True)[:2] == (False, "its kernels do not run (no nvcc)")
+    monkeypatch.setattr("sundae_ns.rasterization.select_backend", select())
+    assert check("gsplat kernels", True)[0]
+    assert "auto selects gsplat" in check("rasteriser")[1]
 
 
-def test_kernels_that_do_not_run(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    _kernels(monkeypatch, "its kernels do not run (no nvcc)")
-    found = finding("gsplat kernels", compile_kernels=True)
-    assert not found.ok
-    assert "no nvcc" in found.detail
-    assert "auto selects reference" in finding("rasteriser", compile_kernels=True).detail
-
-
-def test_own_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert finding("our kernels").ok
+@pytest.mark.parametrize(
+    "kernel", ["graphs.neighbors.Kernel", "compensation.fused.head_kernels", "gpu.loss.loss_kernels"]
+)
+def test_our_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch, kernel: str) -> None:
+    assert check("our kernels")[:2] == (True, "working")
 
     def refuse(*_: object) -> None:
         raise BackendError("a CUDA kernel does not run (too old): update the driver")
 
-    places = (
-        "sundae_ns.graphs.neighbors.Kernel",
-        "sundae_ns.compensation.fused.head_kernels",
-        "sundae_ns.gpu.loss.loss_kernels",
-    )
-    for place in places:
-        with monkeypatch.context() as patch:
-            patch.setattr(place, refuse)
-            found = finding("our kernels")
-        assert not found.ok
-        assert not found.needed
-        assert "layer by layer" in found.detail
-        assert found.fix == "update the driver"
+    monkeypatch.setattr(f"sundae_ns.{kernel}", refuse)
+    found, said, remedy = check("our kernels")
+    assert not found
+    assert "too old" in said
+    assert "update the driver" in remedy
 
 
 def test_built_kernels_are_found_in_torchs_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = tmp_path / "gsplat" / "__init__.py"
     package.parent.mkdir()
     package.touch()
-    spec: Any = type("Spec", (), {"origin": str(package)})
-    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda _: spec)
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda _: SimpleNamespace(origin=str(package)))
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path / "cache"))
     assert not doctor.kernels_built()
-    built = tmp_path / "cache" / "py311_cu128" / "gsplat_cuda" / "gsplat_cuda.so"
-    built.parent.mkdir(parents=True)
-    built.touch()
-    assert doctor.kernels_built()
-    built.unlink()
-    (package.parent / "csrc.so").touch()
-    assert doctor.kernels_built()
+    for built in (tmp_path / "cache" / "py311_cu128" / "gsplat_cuda" / "gsplat_cuda.so", package.parent / "csrc.so"):
+        built.parent.mkdir(parents=True, exist_ok=True)
+        built.touch()
+        assert doctor.kernels_built()
+        built.unlink()
 
 
 def compiler(folder: Path, output: str) -> Path:
@@ -151,30 +126,23 @@ def no_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("release", ["13.0", "13.1"])
-def test_nvcc_of_the_same_major_version_suffices(no_compiler: Path, release: str) -> None:
-    nvcc = compiler(no_compiler, f"Cuda compilation tools, release {release}, V{release}.88")
-    assert finding("nvcc") == doctor.Finding("nvcc", True, f"{nvcc} {release}, for gsplat's kernels")
-
-
-@pytest.mark.parametrize("output", ["Cuda compilation tools, release 12.0, V12.0.140", "release 3.0", "hello"])
-def test_nvcc_of_another_version_is_refused_by_torch(no_compiler: Path, output: str) -> None:
+@pytest.mark.parametrize(
+    ("output", "suffices"),
+    [
+        ("Cuda compilation tools, release 13.0, V13.0.88", True),
+        ("Cuda compilation tools, release 13.1, V13.1.88", True),
+        ("Cuda compilation tools, release 12.0, V12.0.140", False),
+        ("release 3.0", False),
+        ("hello", False),
+    ],
+)
+def test_nvcc_of_the_same_major_version_suffices(no_compiler: Path, output: str, suffices: bool) -> None:
     compiler(no_compiler, output)
-    found = finding("nvcc")
-    assert not found.ok
-    assert not found.needed
-    assert "this torch is built for 13.0" in found.detail
-    assert found.fix.startswith("apt-get install cuda-toolkit-13-0 ")
-    assert "export CUDA_HOME=/usr/local/cuda-13.0" in found.fix
-
-
-def test_torch_without_cuda_has_no_version_to_compare(no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.version, "cuda", None)
-    monkeypatch.setenv("CUDA_HOME", str(no_compiler / "nowhere"))
-    assert "CUDA toolkit of torch's version" in finding("nvcc").fix
-    monkeypatch.setenv("CUDA_HOME", str(no_compiler.parent))
-    compiler(no_compiler, "release 12.0")
-    assert finding("nvcc").ok
+    found, said, remedy = check("nvcc")
+    assert found == suffices
+    assert ("this torch 13.0" in said) != suffices
+    assert remedy.startswith("apt-get install cuda-toolkit-13-0 ")
+    assert "export CUDA_HOME=/usr/local/cuda-13.0" in remedy
 
 
 def test_nvcc_is_searched_like_torch_and_gsplat_do(no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,116 +150,64 @@ def test_nvcc_is_searched_like_torch_and_gsplat_do(no_compiler: Path, monkeypatc
     home = no_compiler.parent / "cuda"
     monkeypatch.setenv("CUDA_HOME", str(home))
     compiler(no_compiler, "release 12.0")
-    assert f"not found in {home / 'bin'}" in finding("nvcc").detail
+    assert f"not found in {home / 'bin'}" in check("nvcc")[1]
     nvcc = compiler(home / "bin", "release 13.0")
-    assert finding("nvcc").detail.startswith(f"{nvcc} 13.0")
+    assert check("nvcc")[1].startswith(f"{nvcc} 13.0")
     (no_compiler / "nvcc").unlink()
-    assert finding("nvcc").fix == f"export PATH={home / 'bin'}:$PATH"
+    assert check("nvcc")[1].startswith("not found in PATH")
+    compiler(no_compiler, "release 12.0")
+    monkeypatch.setattr(torch.version, "cuda", None)
+    assert check("nvcc")[0], "there is no version to compare"
 
 
 def test_the_oldest_driver_is_named(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
-    assert "built for CUDA 13.0, which needs 580 or newer; with an older driver, pip install -c" in finding("CUDA").fix
-    monkeypatch.setattr(torch.version, "cuda", "12.8")
-    assert finding("CUDA").fix.endswith("needs 525 or newer")
-    monkeypatch.setattr(torch.version, "cuda", "99.0")
-    assert "needs" not in finding("CUDA").fix
+    for version, words in (("13.0", "driver 580 or newer"), ("12.8", "driver 525 or newer"), ("99.0", "of its CUDA")):
+        monkeypatch.setattr(torch.version, "cuda", version)
+        assert words in check("CUDA")[2]
+    monkeypatch.setattr(torch.version, "cuda", None)
+    assert check("CUDA") == (False, "this torch is built without CUDA", "pip install torch==2.11.0")
 
 
-def test_programs_of_nerfstudios_commands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_programs_and_packages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert finding("ffmpeg").fix == "apt-get install ffmpeg"
+    assert check("ffmpeg") == (False, "not found, for ns-render", "apt-get install ffmpeg")
     (tmp_path / "ffmpeg").touch(mode=0o755)
-    assert finding("ffmpeg").detail == f"{tmp_path / 'ffmpeg'}, for ns-render"
-
-
-@pytest.mark.parametrize(("name", "module"), [("pycolmap", "pycolmap"), ("pillow-heif", "pillow_heif")])
-def test_packages_for_photos(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, module: str) -> None:
-    monkeypatch.setitem(sys.modules, module, SimpleNamespace(__version__="4.2.1"))  # type: ignore[arg-type]
-    assert finding(name).detail.startswith("4.2.1, for ")
-    monkeypatch.setitem(sys.modules, module, None)
-    found = finding(name)
-    assert (found.ok, found.needed) == (False, False)
-    assert found.detail.startswith("not installed, for ")
-    assert found.fix == 'pip install "sundae_ns[photos]"'
-    (tmp_path / f"{module}.py").write_text("raise ImportError('libgomp.so.1: cannot open shared object file')")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, module)
-    assert "cannot be loaded (libgomp.so.1: cannot open" in finding(name).detail
-
-
-@pytest.mark.parametrize("on_disk", [True, False])
-def test_lpips_weights(monkeypatch: pytest.MonkeyPatch, on_disk: bool) -> None:
-    monkeypatch.setattr(evaluation, "lpips_weights_available", lambda: on_disk)
-    found = finding("LPIPS weights")
-    assert found.ok == on_disk
-    if not on_disk:
-        assert not found.needed
-        # The command puts the file at the expected path.
-        *_, path, url = found.fix.split()
-        assert Path(path) == evaluation.lpips_weights_path()
-        assert url == evaluation.lpips_weights_url()
-
-
-def test_libraries_of_the_exporter(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert check("ffmpeg")[:2] == (True, f"{tmp_path / 'ffmpeg'}, for ns-render")
     monkeypatch.setattr(ctypes.util, "find_library", lambda _: None)
-    assert finding("libusb-1.0").fix == "apt-get install libusb-1.0-0"
-    assert finding("libGL").fix == "apt-get install libgl1"
-    monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")
-    assert finding("libGL").ok
+    assert not check("libGL")[0]
+    monkeypatch.setitem(sys.modules, "pycolmap", SimpleNamespace(__version__="4.2.1"))  # type: ignore[arg-type]
+    assert check("pycolmap")[1].startswith("4.2.1, for ")
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    found, said, remedy = check("pycolmap")
+    assert (found, said.partition(",")[0], remedy) == (False, "not installed", 'pip install "sundae_ns[photos]"')
+    (tmp_path / "pycolmap.py").write_text("raise ImportError('libgomp.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pycolmap")
+    assert "cannot be loaded (libgomp.so.1: cannot open" in check("pycolmap")[1]
 
 
-def test_versions_of_packages() -> None:
-    found = {one.name: one.detail for one in doctor.versions()}
-    assert found["torch"] == metadata.version("torch")
-    assert found["gsplat"] == metadata.version("gsplat")
-    assert {"python", "nerfstudio", "numpy"} <= set(found)
+def test_the_weights_of_lpips(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "weights.pth"
+    monkeypatch.setattr(doctor, "lpips_weights", lambda: ("https://a", path))
+    assert not check("LPIPS weights")[0]
+    assert check("LPIPS weights")[2] == f"curl --location --create-dirs --output {path} https://a"
+    path.touch()
+    assert check("LPIPS weights")[0]
 
 
-@pytest.fixture
-def report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
-    """Runs the doctor on a wide terminal: exit code and text."""
-    monkeypatch.setenv("COLUMNS", "200")
-    return lambda **options: (doctor.run_doctor(**options), capsys.readouterr().out)
-
-
-def test_a_machine_without_a_gpu_passes(no_cuda: None, report: Callable[..., tuple[int, str]]) -> None:
-    code, text = report()
-    assert code == 0
-    assert "auto selects cpu" in text
-    for one in doctor.examine():
-        assert one.name in text
-        assert one.ok or f"{one.name}: {one.fix}" in text
-
-
-def test_a_missing_package_fails(
-    no_cuda: None, monkeypatch: pytest.MonkeyPatch, report: Callable[..., tuple[int, str]]
+def test_the_report_lists_every_part_and_each_remedy(
+    no_cuda: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
+    assert run("doctor") == 0
+    text = capsys.readouterr().out
+    assert metadata.version("gsplat") in text
+    for part in doctor.parts():
+        assert part.name in text
+        assert check(part.name)[0] != (f"{part.name}: {part.remedy}" in text)
     monkeypatch.setattr(doctor, "PACKAGES", ("torch", "no-such-package"))
-    code, text = report()
-    assert code == 1
-    assert "no-such-package: pip install no-such-package" in text
-
-
-def test_everything_on_disk_needs_no_advice(
-    cuda: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, report: Callable[..., tuple[int, str]]
-) -> None:
-    _kernels(monkeypatch, None)
-    monkeypatch.setattr(evaluation, "lpips_weights_available", lambda: True)
-    monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")
-    monkeypatch.setattr(shutil, "which", lambda name: str(tmp_path / name))
-    for module in ("pycolmap", "pillow_heif"):
-        monkeypatch.setitem(sys.modules, module, SimpleNamespace(__version__="9.9"))  # type: ignore[arg-type]
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setenv("CUDA_HOME", str(tmp_path))
-    compiler(tmp_path / "bin", "release 13.0")
-    code, text = report(compile_kernels=True)
-    assert code == 0
-    assert "To fix" not in text
-
-
-def test_command(no_cuda: None, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["doctor"])
-    assert caught.value.code == 0
-    assert "rasteriser" in capsys.readouterr().out
+    assert run("doctor") == 1, "training lacks something"
+    assert "no-such-package: pip install no-such-package" in capsys.readouterr().out
+    monkeypatch.setattr(doctor, "parts", lambda _: [doctor.Part("python", lambda: "3.11")])
+    assert run("doctor") == 0
+    assert "To fix" not in capsys.readouterr().out

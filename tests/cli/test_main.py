@@ -34,10 +34,10 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str],
 
 
 def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(**_: object) -> int:
+    def broken(*_: object) -> int:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("sundae_ns.cli.doctor.run_doctor", broken)
+    monkeypatch.setattr("sundae_ns.cli.doctor.parts", broken)
     with pytest.raises(ZeroDivisionError):
         main(["doctor"])
 

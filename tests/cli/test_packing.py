@@ -2,35 +2,10 @@
 
 from __future__ import annotations
 
-import inspect
-import re
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 from command_line import run
-
-from sundae_ns.cli.packing import Precision, pack
-from sundae_ns.storage.pack import FINETUNED, PackConfig
-
-
-def test_options_are_those_of_the_configuration() -> None:
-    """They are repeated in the command, so that ``sundae --help`` does not import torch."""
-    defaults = {field.name: field.default for field in fields(PackConfig)}
-    assert inspect.signature(pack).parameters["block"].default == defaults.pop("block")
-    assert {field.name for field in fields(Precision)} == set(FINETUNED) == set(defaults)
-    source = inspect.getsource(Precision)
-    for name, default in defaults.items():
-        (line,) = re.findall(rf'^    {name}: .*\n    """(.*)"""$', source, re.MULTILINE)
-        assert line.endswith(f"; by default {default}, {FINETUNED[name]} with a fine-tune.")
-        assert getattr(Precision(), name) is None
-
-
-def test_the_options_of_precision_have_no_prefix(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("pack", "--help") == 0
-    shown = capsys.readouterr().out
-    assert "--position-bits" in shown
-    assert "--precision" not in shown
 
 
 @pytest.mark.parametrize(

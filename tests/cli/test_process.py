@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from sundae_ns.cli.process import quoted, run_in_group, word
-from sundae_ns.errors import StorageError
-from sundae_ns.storage.run_folder import reserve
+from sundae_ns.cli.process import quoted, run_command, run_logged, word
+from sundae_ns.errors import SundaeError
 
 CHILD = """
 import pathlib, signal, subprocess, sys
@@ -36,11 +35,11 @@ signal.pause()
 
 @pytest.mark.parametrize(("code", "expected"), [("pass", 0), ("raise SystemExit(7)", 7)])
 def test_the_exit_code_is_the_command_s(code: str, expected: int) -> None:
-    assert run_in_group([sys.executable, "-c", code]) == expected
+    assert run_command([sys.executable, "-c", code]) == expected
 
 
 def test_a_command_that_a_signal_ended() -> None:
-    assert run_in_group([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]) == 137
+    assert run_command([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]) == 137
 
 
 @pytest.mark.parametrize(
@@ -57,38 +56,11 @@ def test_a_signal_reaches_the_whole_group_once(tmp_path: Path, sent: signal.Sign
     thread = threading.Thread(target=interrupt)
     thread.start()
     # The command ends with 0, and yet what follows it must not start.
-    assert run_in_group([sys.executable, "-c", CHILD, str(tmp_path)]) == 128 + passed_on
+    assert run_command([sys.executable, "-c", CHILD, str(tmp_path)]) == 128 + passed_on
     thread.join()
     assert (tmp_path / "signals").read_text().split() == [str(int(passed_on))]
     assert signal.getsignal(sent) is before
     assert _ends(int((tmp_path / "grandchild").read_text()))
-
-
-TREE = """
-import pathlib, subprocess, sys, time
-subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
-pathlib.Path(sys.argv[1], "ready").touch()
-time.sleep(600)
-"""
-INTERRUPTED = """
-import sys
-from sundae_ns.cli.process import run_in_group
-sys.exit(run_in_group([sys.executable, "-c", sys.argv[1], sys.argv[2]], saves=sys.argv[3] == "saves"))
-"""
-
-
-@pytest.mark.parametrize(("saves", "lines"), [("saves", True), ("ends", False)])
-def test_an_interrupt_prints_nothing_where_nothing_is_saved(tmp_path: Path, saves: str, lines: bool) -> None:
-    words = [sys.executable, "-c", INTERRUPTED, TREE, str(tmp_path), saves]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
-        while not (tmp_path / "ready").exists():
-            time.sleep(0.01)
-        time.sleep(0.3)  # the grandchild starts
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert ("Traceback" in said) == lines
-    assert bool(said) == lines
 
 
 def _ends(pid: int) -> bool:
@@ -104,63 +76,29 @@ def _ends(pid: int) -> bool:
 
 
 def test_the_command_gets_no_input() -> None:
-    assert run_in_group([sys.executable, "-c", "import sys; raise SystemExit(sys.stdin.read() != '')"]) == 0
+    assert run_command([sys.executable, "-c", "import sys; raise SystemExit(sys.stdin.read() != '')"]) == 0
 
 
 PARENT = """
 import sys
 from pathlib import Path
-from sundae_ns.cli.process import run_in_group, run_logged
-from sundae_ns.storage.run_folder import reserve
+from sundae_ns.cli.process import run_command, run_logged
 words, here = [sys.executable, "-c", sys.argv[1], sys.argv[2]], Path(sys.argv[2])
-if sys.argv[3] == "in a group":
-    run_in_group(words, locks=[reserve(here)])
-else:
-    run_logged(words, here / "log")
-"""
-STUBBORN = """
-import pathlib, signal, subprocess, sys, time
-here = pathlib.Path(sys.argv[1])
-code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
-grandchild = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-grandchild.stdout.readline()
-(here / "grandchild").write_text(str(grandchild.pid))
-
-def save(number, frame):
-    (here / "saving").touch()
-    while not (here / "saved").exists():
-        time.sleep(0.01)
-    sys.exit(0)
-
-signal.signal(signal.SIGTERM, save)
-(here / "ready").touch()
-while True:
-    time.sleep(600)
+run_command(words) if sys.argv[3] == "shown" else run_logged(words, here / "log")
 """
 
 
-@pytest.mark.parametrize("way", ["in a group", "logged"])
-def test_a_killed_process_leaves_no_command_behind(tmp_path: Path, way: str) -> None:
-    parent = subprocess.Popen([sys.executable, "-c", PARENT, STUBBORN, tmp_path, way])
-    _wait_for(tmp_path / "ready")
+@pytest.mark.parametrize("way", ["shown", "logged"])
+def test_a_command_ends_with_a_killed_process(tmp_path: Path, way: str) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, CHILD, tmp_path, way], stdout=subprocess.DEVNULL)
+    wait_for(tmp_path / "ready")
     parent.kill()
     parent.wait()
-    _wait_for(tmp_path / "saving")  # the command may end by itself
-    if way == "in a group":
-        with pytest.raises(StorageError, match=f"process {parent.pid} on .* trains in"):
-            reserve(tmp_path)
-    (tmp_path / "saved").touch()
-    assert _ends(int((tmp_path / "grandchild").read_text()))
-    for _ in range(1000):  # the guard ends with the grandchild, a moment before or after it
-        try:
-            reserve(tmp_path)
-            break
-        except StorageError:
-            time.sleep(0.01)
-    reserve(tmp_path)
+    wait_for(tmp_path / "signals")
+    assert (tmp_path / "signals").read_text().split() == [str(int(signal.SIGTERM))], "a training saves itself"
 
 
-def _wait_for(path: Path) -> None:
+def wait_for(path: Path) -> None:
     for _ in range(3000):
         if path.exists():
             return
@@ -168,9 +106,31 @@ def _wait_for(path: Path) -> None:
     pytest.fail(f"there is no {path.name}")
 
 
-def test_a_command_that_is_not_installed(capfd: pytest.CaptureFixture[str]) -> None:
-    assert run_in_group(["no-such-command-of-sundae"]) == 127
-    assert capfd.readouterr().err == "sundae: no-such-command-of-sundae cannot be started (No such file or directory)\n"
+def test_a_command_that_is_not_installed() -> None:
+    with pytest.raises(SundaeError, match="^no-such-command cannot be started \\(No such file or directory\\); "):
+        run_command(["no-such-command"])
+
+
+def test_a_failing_command_shows_its_last_lines_and_keeps_its_log(tmp_path: Path) -> None:
+    log, lines = tmp_path / "train.log", list[str]()
+    script = "import sys; print('first', flush=True); print('the cause', file=sys.stderr); sys.exit(3)"
+    with pytest.raises(SundaeError, match="failed with 3.*ends with:\nfirst\nthe cause$"):
+        run_logged([sys.executable, "-c", script], log, lines.append)
+    assert log.read_text() == "".join(lines) == "first\nthe cause\n"
+
+
+def test_an_interrupt_leaves_no_logged_command_behind(tmp_path: Path) -> None:
+    pids = []
+
+    def interrupt(line: str) -> None:
+        pids.append(int(line))
+        raise KeyboardInterrupt
+
+    code = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
+    with pytest.raises(KeyboardInterrupt):
+        run_logged([sys.executable, "-c", code], tmp_path / "log.txt", interrupt)
+    with pytest.raises(ProcessLookupError):
+        os.kill(pids[0], 0)
 
 
 def test_a_path_is_no_option() -> None:

@@ -14,7 +14,6 @@ from PIL import Image
 from run_commands import PHOTOS, STEPS, Commands, refusal, run, write_video
 
 from sundae_ns import method_configs
-from sundae_ns.cli.forecast import Forecast, trained_size
 
 
 def test_photos_become_a_scene_and_a_report(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
@@ -27,7 +26,7 @@ def test_photos_become_a_scene_and_a_report(commands: Commands, capsys: pytest.C
     assert commands.ran[0] == ["sundae", "poses", "photos", "-o", "out/capture"]
     assert commands.option("--pipeline.model.pruning.keep-ratio", 1) == "0.2"
     assert commands.option("--max-num-iterations", 1) == "100"
-    for place in (1, 2, 3, 4):
+    for place in (1, 2, 3):
         assert commands.option("--data", place) == "out/capture"
 
 
@@ -47,7 +46,6 @@ def test_a_video_is_taken(commands: Commands, tmp_path: Path) -> None:
     assert run("my walk.mp4", "-o", "out") == 0
     assert commands.ran[0] == ["sundae", "poses", "my walk.mp4", "-o", "out/capture"]
     assert commands.option("--experiment-name", 1) == "my walk"
-    assert commands.asked[0][1:] == (64, 48), "the forecast knows the size of its frames"
 
 
 def test_a_capture_needs_no_poses(commands: Commands) -> None:
@@ -92,7 +90,6 @@ def test_a_capture_of_blender_needs_no_poses(commands: Commands, capsys: pytest.
     assert commands.names == STEPS[1:]
     assert capsys.readouterr().out.startswith("# capture in Blender layout: 8 training images, over white\n")
     assert commands.ran[0][-1] == "blender-data"
-    assert commands.asked[0][1:] == (16, 12), "the forecast knows the size of its images"
 
 
 def test_a_size_and_a_quality(commands: Commands) -> None:
@@ -103,21 +100,21 @@ def test_a_size_and_a_quality(commands: Commands) -> None:
     assert config.pipeline.model.pruning.max_bytes == 2_000_000
     assert config.pipeline.model.pruning.max_drop == 0.03
     config.pipeline.model.pruning.validate()
-    assert commands.option("--target-bytes", 3) == "2000000"
+    assert commands.option("--target-bytes", 2) == "2000000"
     commands.ran.clear()
     assert run("photos", "-o", "draft", "--quality", "draft") == 0
     assert commands.option("--max-num-iterations", 1) == "3000"
-    assert "--target-bytes" not in commands.ran[3]
+    assert "--target-bytes" not in commands.ran[2]
 
 
 def test_a_gpu_packs_with_a_fine_tune(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
     commands.gpu = True
     assert run("photos", "-o", "out", "--max-mb", "2") == 0
-    assert commands.option("--finetune", 3) == commands.option("--finetune-steps", 1) == "1500"
-    assert commands.option("--target-bytes", 3) == "2000000"
+    assert commands.option("--finetune", 2) == commands.option("--finetune-steps", 1) == "1500"
+    assert commands.option("--target-bytes", 2) == "2000000"
     # Trials count the bytes of a pack without one.
     assert commands.option("--pipeline.model.pruning.max-bytes", 1) == "3333333"
-    assert shlex.join(commands.ran[3]) in capsys.readouterr().out
+    assert shlex.join(commands.ran[2]) in capsys.readouterr().out
     commands.ran.clear()
     assert run("photos", "-o", "draft", "--quality", "draft") == 0
     commands.gpu = False
@@ -129,9 +126,10 @@ def test_a_fine_tune_that_fails_is_left_out(commands: Commands, capsys: pytest.C
     """For example because the GPU's memory is full; a scene that is larger is better than none."""
     commands.gpu = commands.out_of_memory = True
     assert run("photos", "-o", "out") == 0
-    assert commands.names == [*STEPS[:4], *STEPS[3:]]
-    assert commands.ran[4] == commands.ran[3][:-2]
-    assert f"after the fine-tune ended with 2:\n{shlex.join(commands.ran[4])}\n" in capsys.readouterr().out
+    assert commands.names == [*STEPS[:3], *STEPS[2:]]
+    assert commands.ran[3] == commands.ran[2][:-2]
+    said = f"# the fine-tune ended with 2; packing without it:\n{shlex.join(commands.ran[3])}\n"
+    assert said in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("code", [3, 130])
@@ -139,36 +137,4 @@ def test_a_pack_that_fails_or_stops_with_a_fine_tune_ends(commands: Commands, co
     commands.gpu = True
     commands.codes["sundae pack"] = code
     assert run("photos", "-o", "out") == code
-    assert commands.names[3:] == ["sundae pack"] * (1 if code == 130 else 2)
-
-
-def test_a_training_of_hours_on_a_cpu_is_foretold_before_it_starts(
-    commands: Commands, capsys: pytest.CaptureFixture[str]
-) -> None:
-    commands.forecast = Forecast(2.0, 30000, "cpu")
-    commands.codes["ns-train"] = 130
-    assert run("photos", "-o", "out") == 130
-    said, rest = capsys.readouterr().out.split("\n", 1)
-    assert said.startswith(
-        "# warning: 30,000 training steps take at least 16 h 40 min on this CPU, 2000 ms each at 16 x 12"
-    )
-    assert "--quality draft (1 h 40 min), --method sundae-tiny" in said
-    assert "# step 1 of 6" in rest
-    assert run("photos", "-o", "out") == 130
-    assert len(commands.asked) == 1, "a resumed training has a forecast of its own"
-    commands.forecast = Forecast(0.004, 30000, "cuda")
-    commands.codes.clear()
-    assert run("photos", "-o", "other") == 0
-    assert "# forecast: 30,000 training steps take about 2 min 0 s on this GPU" in capsys.readouterr().out
-
-
-def test_the_size_of_training_images(tmp_path: Path) -> None:
-    assert trained_size(tmp_path) is None
-    for index in range(3):
-        Image.new("RGB", (4000, 30), "grey").save(tmp_path / f"{index}.png")
-    assert trained_size(tmp_path) == (1000, 7)
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{"file_path": "1.png"}]}))
-    assert trained_size(tmp_path) == (1000, 7)
-    (tmp_path / "transforms.json").unlink()
-    write_model(tmp_path / "sparse" / "0", ["0.png"], (4000, 30))
-    assert trained_size(tmp_path) == (4000, 30), "there are no smaller images"
+    assert commands.names[2:] == ["sundae pack"] * (1 if code == 130 else 2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -32,7 +31,7 @@ def test_too_few_placed_photos(
 
 def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
     commands.silent = True
-    assert "sundae ended without its result" in refusal(capsys, "photos", "-o", "out")
+    assert "camera poses ended without its result" in refusal(capsys, "photos", "-o", "out")
 
 
 @pytest.mark.parametrize(
@@ -91,19 +90,6 @@ def test_other_settings_are_refused(
 ) -> None:
     assert run("photos", "-o", "out") == 0
     assert cause in refusal(capsys, "photos", "-o", "out", *more)
-
-
-def test_a_folder_of_an_earlier_version_has_the_normal_quality(
-    commands: Commands, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("photos", "-o", "out") == 0
-    settings = json.loads(Path("out/run.json").read_text())
-    for name in ("quality", "max_mb", "frames"):
-        del settings[name]
-    settings["matching"] = "exhaustive"
-    Path("out/run.json").write_text(json.dumps(settings))
-    assert run("photos", "-o", "out") == 0
-    assert "quality normal, not draft" in refusal(capsys, "photos", "-o", "out", "--quality", "draft")
 
 
 def test_damaged_settings(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,13 +29,13 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: False)
     found: list[list[str]] = []
 
-    def replace(words: list[str], *, saves: bool = True) -> int:
-        assert saves, "an interrupt lets it save itself"
+    def replace(words: list[str]) -> int:
+        print(shlex.join(words))
         assert words[0] == "ns-train"
         found.append(words)
         raise Replaced
 
-    monkeypatch.setattr("sundae_ns.cli.train.run_in_group", replace)
+    monkeypatch.setattr("sundae_ns.cli.train.run_command", replace)
     return found
 
 
@@ -196,19 +196,20 @@ class Trained:
     """Stands for the commands of ``sundae train``: a training leaves its run; each ends with the code it is told."""
 
     def __init__(self) -> None:
-        self.ran: list[tuple[list[str], bool]] = []
+        self.ran: list[list[str]] = []
         self.codes: dict[str, int] = {}
         self.elsewhere = False
 
-    def __call__(self, words: list[str], *, saves: bool = True) -> int:
-        self.ran.append((words, saves))
+    def __call__(self, words: list[str]) -> int:
+        print(shlex.join(words))
+        self.ran.append(words)
         if words[0] == "ns-train" and not self.elsewhere:
             run_of(self.run, Path(words[3]), 29999)
         return self.codes.get("--finetune" if "--finetune" in words else words[0], 0)
 
     @property
     def run(self) -> Path:
-        words = self.ran[0][0]
+        words = self.ran[0]
         return Path(words[5]) / "scene" / words[1] / words[words.index("--timestamp") + 1]
 
 
@@ -217,7 +218,7 @@ def trained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Trained:
     made = Trained()
     (tmp_path / "scene").mkdir()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sundae_ns.cli.train.run_in_group", made)
+    monkeypatch.setattr("sundae_ns.cli.train.run_command", made)
     monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: False)
     return made
 
@@ -230,8 +231,7 @@ def exit_code(*words: str) -> int:
 
 def test_a_finished_training_is_packed(trained: Trained, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code() == 0
-    (_, saves), (pack, packing_saves) = trained.ran
-    assert (saves, packing_saves) == (True, False), "an interrupt lets the training save itself"
+    _, pack = trained.ran
     assert pack == ["sundae", "pack", str(trained.run), "-o", str(trained.run / "scene.sundae")]
     assert capsys.readouterr().out.splitlines()[-1] == shlex.join(pack), "the command is printed"
 
@@ -242,8 +242,8 @@ def test_a_run_of_the_user_s_own_name_is_packed(trained: Trained, given: list[st
     trained.elsewhere = True
     run_of(Path("outputs/scene/sundae/mine"), Path("scene"), 29999)
     assert exit_code("--", *given) == 0
-    assert [words[2] for words, _ in trained.ran[1:]] == ["outputs/scene/sundae/mine"]
-    assert sum("--timestamp" in word for word in trained.ran[0][0]) == 1
+    assert [words[2] for words in trained.ran[1:]] == ["outputs/scene/sundae/mine"]
+    assert sum("--timestamp" in word for word in trained.ran[0]) == 1
 
 
 @pytest.mark.parametrize(("failed", "last"), [(False, "--finetune"), (True, "scene.sundae")])
@@ -253,9 +253,8 @@ def test_a_gpu_fine_tunes_the_pack_or_leaves_it(
     monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: True)
     trained.codes = {"--finetune": int(failed)}
     assert exit_code() == 0
-    (training, _), *packing = trained.ran
+    training, *packs = trained.ran
     assert option_of(training, "--finetune-steps") == "1500", "in place of the last steps"
-    packs = [words for words, _ in packing]
     assert packs[0][-2:] == ["--finetune", "1500"]
     assert len(packs) == 1 + failed
     assert any(last in word for word in packs[-1][-2:])
@@ -269,7 +268,7 @@ def option_of(words: list[str], name: str) -> str:
 def test_a_length_of_ns_train_is_the_user_s(trained: Trained, monkeypatch: pytest.MonkeyPatch, length: str) -> None:
     monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: True)
     assert exit_code("--", length, "40000") == 0
-    assert sum(word.startswith("--finetune-steps") for word in trained.ran[0][0]) == (length == "--finetune-steps")
+    assert sum(word.startswith("--finetune-steps") for word in trained.ran[0]) == (length == "--finetune-steps")
 
 
 def test_a_run_that_its_fine_tune_has_finished_is_no_interrupted_one(
@@ -279,11 +278,11 @@ def test_a_run_that_its_fine_tune_has_finished_is_no_interrupted_one(
     (run / "scene.sundae").touch()
     assert exit_code() == 0
     assert "# " not in capsys.readouterr().out
-    assert "--overwrite" not in trained.ran[-1][0]
+    assert "--overwrite" not in trained.ran[-1]
     trained.ran.clear()
     trained.elsewhere = True
     assert exit_code("--resume") == 0
-    (resumed, _), (pack, _) = trained.ran
+    resumed, pack = trained.ran
     assert option_of(resumed, "--load-dir") == str(run / "nerfstudio_models")
     assert (pack[2], pack[-1]) == (str(run), "--overwrite"), "the new steps take the place of their pack"
 

@@ -10,6 +10,7 @@ from io import StringIO
 import pytest
 
 from sundae_ns.evaluation import COLUMNS, Configuration, Measured, ViewQuality, csv_text
+from sundae_ns.evaluation.measured import markdown, number
 
 
 def row_of(run: Measured) -> dict[str, str]:
@@ -59,3 +60,21 @@ def test_json_has_no_nan(measured: Callable[..., Measured]) -> None:
     read = json.loads(json.dumps(run.as_json(), allow_nan=False))
     assert read["configurations"][0]["views"][0]["ssim"] is None
     assert read["bytes_total"] == 1_000_000
+
+
+def test_each_configuration_has_a_row_of_the_table(measured: Callable[..., Measured]) -> None:
+    run = measured("theirs", head=False)
+    views = tuple(replace(view, lpips=0.25) for view in run.full.views)
+    run = replace(run, lpips_net="vgg", configurations=(replace(run.full, views=views),))
+    text = markdown({"bicycle": [measured("ours"), run]}, ["this and that"])
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    assert rows[0][-1] == "LPIPS (vgg)"
+    assert rows[2:] == [
+        ["ours", "head on", "4,000", "3.00", "3.50", "25.50", "0.8500", "-", "0.2000", "-"],
+        ["ours", "head off", "4,000", "1.00", "2.00", "25.00", "0.8000", "-", "0.2000", "-"],
+        ["theirs", "no head", "4,000", "1.00", "2.00", "25.00", "0.8000", "-", "0.2000", "0.2500"],
+    ]
+    assert text.startswith("# bicycle\n")
+    assert text.endswith("- Left out: this and that\n")
+    assert number(None, 2) == number(float("nan"), 2) == "-"
+    assert number(1234.567, 1) == "1,234.6"

@@ -1,11 +1,13 @@
 import math
+import urllib.error
+import urllib.request
 
 import pytest
 import torch
 from scipy.ndimage import correlate1d
 
 from sundae_ns.errors import DataError
-from sundae_ns.evaluation import fitted_psnr, psnr, ssim
+from sundae_ns.evaluation import Lpips, fitted_psnr, flip, lpips_weights, psnr, quality_of, ssim
 from sundae_ns.evaluation.metrics import MOST_PSNR
 
 
@@ -79,10 +81,92 @@ def test_gradient_and_dtype(metric):
     assert metric(better, target) > value
 
 
-@pytest.mark.parametrize("metric", [psnr, ssim])
+@pytest.mark.parametrize("metric", [psnr, ssim, flip])
 @pytest.mark.parametrize("shape", [(4, 5), (3, 4, 5), (1, 4, 5, 3)])
 def test_wrong_shapes(metric, shape):
     with pytest.raises(DataError, match="shapes"):
         metric(torch.zeros(shape), torch.zeros(shape))
     with pytest.raises(DataError, match="shapes"):
         metric(torch.zeros(20, 20, 3), torch.zeros(20, 21, 3))
+
+
+def test_flip_is_the_authors_metric():
+    evaluate = pytest.importorskip("flip_evaluator").evaluate
+    truth, image = torch.rand(20, 30, 3), torch.rand(20, 30, 3)
+    expected = evaluate(truth.numpy(), image.numpy(), "LDR", applyMagma=False)[0].mean()
+    assert float(flip(image, truth)) == pytest.approx(float(expected), rel=1e-4)
+    assert flip(truth, truth) == 0
+    # Values are clamped to [0, 1] first.
+    assert float(flip(image + 2, truth)) == pytest.approx(float(flip(torch.ones_like(truth), truth)), abs=1e-6)
+
+
+def test_without_its_package_there_is_no_flip(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert flip(torch.zeros(4, 4, 3), torch.zeros(4, 4, 3)) is None
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """An empty torch.hub folder, and the time limits of requests, none of which is answered."""
+    limits = []
+
+    def refuse(*_, timeout):
+        limits.append(timeout)
+        raise urllib.error.URLError("no network")
+
+    monkeypatch.setattr(urllib.request, "urlopen", refuse)
+    monkeypatch.setattr(torch.hub, "_hub_dir", str(tmp_path))
+    return limits
+
+
+def test_without_weights_there_is_one_warning_and_no_error(hub, caplog):
+    metric, image = Lpips(), torch.rand(40, 40, 3)
+    assert [metric(image, image) for _ in range(3)] == [None] * 3
+    assert len(hub) == 1
+    assert 0 < hub[0] <= 10
+    (message,) = caplog.messages
+    url, path = lpips_weights()
+    for words in ("no network", url, str(path.parent)):
+        assert words in message
+    assert "\n" not in message
+
+
+def test_damaged_weights_are_one_warning(hub, caplog):
+    _, path = lpips_weights()
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"not a checkpoint")
+    assert Lpips()(torch.rand(40, 40, 3), torch.rand(40, 40, 3)) is None
+    assert len(caplog.records) == 1
+    assert hub == []
+
+
+def test_small_images_have_no_lpips_and_need_no_weights(hub, caplog):
+    assert Lpips()(torch.rand(31, 60, 3), torch.rand(31, 60, 3)) is None
+    assert hub == []
+    assert caplog.records == []
+
+
+def test_weights_on_disk_are_used_without_the_network(hub):
+    from torchvision.models import alexnet
+
+    torch.manual_seed(0)
+    _, path = lpips_weights()
+    path.parent.mkdir(parents=True)
+    # The file's name carries a hash, but torch.hub checks it only while downloading.
+    torch.save(alexnet(weights=None).state_dict(), path)
+    metric, target = Lpips(), torch.rand(32, 48, 3)
+    same, near, far = (metric(target + noise * torch.randn(32, 48, 3), target) for noise in (0, 0.05, 0.5))
+    assert hub == []
+    assert same == 0
+    assert 0 < near < far
+    assert not far.requires_grad
+    assert metric(target, target) == 0  # earlier calls leave no state
+
+
+def test_quality_has_what_can_be_measured():
+    image, truth = _pair()
+    found = quality_of(image.float(), truth.float(), lambda *_: None, visible=False)
+    assert (found.flip, found.lpips) == (None, None)
+    assert found.psnr == pytest.approx(float(psnr(image, truth)), abs=1e-4)
+    assert found.psnr_fitted >= found.psnr
+    assert quality_of(image, truth, lambda *_: torch.tensor(0.5)).lpips == 0.5

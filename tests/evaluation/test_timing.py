@@ -1,10 +1,13 @@
+import os
 import time
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.evaluation import median_ms
+from sundae_ns.evaluation import median_ms, peak_memory
 from sundae_ns.evaluation import timing as timing_module
 
 
@@ -36,3 +39,13 @@ def test_waits_for_the_device_on_both_sides(monkeypatch):
 def test_impossible_options(wrong):
     with pytest.raises(ConfigError):
         median_ms(lambda: None, device="cpu", **wrong)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="compares with Linux's own number")
+def test_the_peak_is_in_bytes_and_at_least_the_current_memory():
+    held = np.ones(64 << 20, np.uint8)
+    now = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    peak = peak_memory(torch.device("cpu"))
+    assert held.nbytes <= now <= peak * 1.01
+    del held
+    assert peak_memory(torch.device("cpu")) >= peak

@@ -36,9 +36,6 @@ WORDS: dict[str, list[str]] = {
     "view": ["RUN", "--no-open-browser"],
     "render": ["RUN", "-o", "out.png"],
     "report": ["RUN", "-o", "report"],
-    "curve": ["RUN", "-o", "out.png"],
-    "eval": ["RUN", "-o", "out.json"],
-    "bench": ["frame", "RUN"],
     "demo": ["DEMO", "--overwrite"],
     "doctor": [],
 }
@@ -51,7 +48,6 @@ SCRIPTS: dict[str, list[str] | str] = {
     "benchmarks/bench_pack.py": ["--run", "RUN", "--repeats", "1"],
     "benchmarks/bench_page.py": ["RUN"],
     "benchmarks/bench_viewers.py": ["RUN"],
-    "benchmarks/flicker.py": ["--load-config", "RUN"],
     "examples/plot_curve.py": "opens a run as render_packed.py does",
     "examples/render_packed.py": ["RUN", "out.png"],
     "examples/prune_ply.py": "opens a run as render_packed.py does",
@@ -126,11 +122,10 @@ def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> No
     def stop(server: ThreadingHTTPServer) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sundae_ns.cli.run.run_in_group", start)
-    monkeypatch.setattr("sundae_ns.cli.run.measured_step", lambda *_: None)
+    monkeypatch.setattr("sundae_ns.cli.run.run_command", start)
     monkeypatch.setattr("sundae_ns.cli.demo.run_logged", start)
     monkeypatch.setattr("sundae_ns.scenes.distill.CAMERAS", 8)
-    monkeypatch.setattr("sundae_ns.cli.train.run_in_group", start)
+    monkeypatch.setattr("sundae_ns.cli.train.run_command", start)
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", stop)
     with pytest.raises(SystemExit):
         main([command, *WORDS[command]])

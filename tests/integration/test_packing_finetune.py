@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sundae_ns.api.packing import contents_of
 from sundae_ns.cli import main
-from sundae_ns.cli.packing import pack
+from sundae_ns.cli.pack import pack
 from sundae_ns.errors import CheckpointError, ConfigError, MemoryExhaustedError
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes import finetune as packing_finetune

@@ -95,7 +95,7 @@ def test_nothing_is_left_out_without_need() -> None:
 
 def test_the_readme_has_commands_to_run() -> None:
     found = {words[1] for words in commands_of(PAGES[0])}
-    assert {"doctor", "pack", "export", "prune", "report", "bench"} <= found
+    assert {"doctor", "pack", "export", "prune", "report"} <= found
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from fake_colmap import FakeColmap
 from PIL import Image
 
 from sundae_ns.cli import main
-from sundae_ns.cli.process import run_in_group
+from sundae_ns.cli.process import run_command
 from sundae_ns.errors import StorageError
 from sundae_ns.storage.formats import kind_of
 from sundae_ns.storage.run_folder import reserve
@@ -34,10 +34,9 @@ def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Run ``sundae run`` with its commands in this process, which has imported nerfstudio; poses are the scene's."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny.scene / "images", "photos")
-    monkeypatch.setattr("sundae_ns.cli.run.measured_step", lambda *_: None)
     monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
 
-    def here(words: Sequence[str], *, locks: Sequence[int] = (), saves: bool = True) -> int:
+    def here(words: Sequence[str]) -> int:
         if words[:2] == ["sundae", "poses"]:
             shutil.copytree(tiny.scene, words[words.index("-o") + 1])
             return 0
@@ -52,7 +51,8 @@ def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
                 return int(end.code or 0)
         return 0
 
-    monkeypatch.setattr("sundae_ns.cli.run.run_in_group", here)
+    for module in ("run", "train"):
+        monkeypatch.setattr(f"sundae_ns.cli.{module}.run_command", here)
 
     def sundae_run(*words: str) -> int:
         with pytest.raises(SystemExit) as caught:
@@ -80,7 +80,7 @@ def test_photos_to_a_report_with_an_interruption(
         assert run(*words) == 130
     assert "the same command continues here" in capfd.readouterr().err
     assert [path.name for path in folder.glob("*/*.ckpt")] == [f"step-{STOP_AT:09d}.ckpt"]
-    assert not Path("out/eval.json").exists()
+    assert not Path("out/scene.sundae").exists()
 
     assert run(*words) == 0
     said = capfd.readouterr().out
@@ -88,15 +88,13 @@ def test_photos_to_a_report_with_an_interruption(
     assert [path.name for path in folder.glob("*/*.ckpt")] == [f"step-{STEPS - 1:09d}.ckpt"]
     (prune,) = json.loads((folder / "prune.json").read_text())
     assert prune["after"] == round(prune["before"] / 2)
-    assert json.loads(Path("out/eval.json").read_text())["results"]["gaussian_count"] == prune["after"]
+    assert {row["primitives"] for row in json.loads(Path("out/report/report.json").read_text())} == {prune["after"]}
     assert kind_of(Path("out/scene.sundae")) == "packed"
-    page = Path("out/report/report.md").read_text()
-    assert "Training curves" in page
-    assert "scene.sundae" in page
+    assert "scene.sundae" in Path("out/report/report.html").read_text(encoding="utf-8")
     assert "<canvas" in Path("out/scene.html").read_text(encoding="utf-8")
 
     assert run(*words) == 0
-    assert capfd.readouterr().out.count(": done\n") == 6
+    assert capfd.readouterr().out.count(": done\n") == 5
 
 
 COLMAP = """
@@ -130,12 +128,11 @@ def poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
     asked: list[list[str]] = []
 
-    def only_poses(words: list[str], **options: Any) -> int:
+    def only_poses(words: list[str]) -> int:
         asked.append(words)
-        return run_in_group(words, **options) if words[:2] == ["sundae", "poses"] else 3
+        return run_command(words) if words[:2] == ["sundae", "poses"] else 3
 
-    monkeypatch.setattr("sundae_ns.cli.run.run_in_group", only_poses)
-    monkeypatch.setattr("sundae_ns.cli.run.measured_step", lambda *_: None)
+    monkeypatch.setattr("sundae_ns.cli.run.run_command", only_poses)
     return asked
 
 

@@ -26,8 +26,7 @@ def test_metrics_with_and_without_the_head(
     build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = perturb(build()).eval()
-    monkeypatch.setattr(model.lpips, "download", False)
-    monkeypatch.setattr("sundae_ns.evaluation.lpips.lpips_weights_available", lambda _: False)
+    monkeypatch.setattr(model.lpips, "_failed", True)
     with torch.no_grad():
         outputs = model.get_outputs_for_camera(camera())
     metrics, images = model.get_image_metrics_and_images(outputs, batch())

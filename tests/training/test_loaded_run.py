@@ -27,7 +27,7 @@ def test_a_training_writes_where_it_is_told(tmp_path: Path) -> None:
     path = tmp_path / "config.yml"
     path.touch()
     assert loaded_run(["ns-train", "sundae", "--load-config", str(path)]) is None
-    assert loaded_run(["sundae", "eval", str(path)]) is None
+    assert loaded_run(["sundae", "report", str(path)]) is None
     assert loaded_run(["ns-eval", "--load-config"]) is None
     assert loaded_run(["ns-eval", "--output-path", str(path)]) is None
     assert loaded_run([]) is None

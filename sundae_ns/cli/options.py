@@ -1,4 +1,4 @@
-"""The one place that decides whether a command may write its output."""
+"""Options that commands share, and the one place that decides whether a command may write its output."""
 
 from __future__ import annotations
 
@@ -8,10 +8,16 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.errors import StorageError
+from sundae_ns.errors import ConfigError, StorageError
 
-Overwrite = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-"""The option ``--overwrite`` of every command that writes."""
+Source = Annotated[Path, tyro.conf.Positional]
+"""The file or the folder that a command reads."""
+Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+"""The option ``--out`` or ``-o``: what a command writes."""
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+"""An option without a ``--no-`` form, such as ``--overwrite``."""
+Direction = tuple[float, float, float]
+"""The option ``--up``."""
 
 
 def check_file(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> None:
@@ -64,3 +70,25 @@ def check_folder(out: Path, *, reads: Iterable[Path | None], overwrite: bool) ->
 def _contains(outer: Path, inner: Path) -> bool:
     """Whether a path is another one, or lies in that folder; links count as what they point to."""
     return inner.resolve().is_relative_to(outer.resolve())
+
+
+def check_suffix(out: Path, suffixes: Iterable[str]) -> str:
+    """The suffix of an output in lower case; ``ConfigError`` for another one."""
+    suffix = out.suffix.lower()
+    if suffix not in suffixes:
+        raise ConfigError(f"{out} has no supported suffix; name it {', '.join(suffixes)}")
+    return suffix
+
+
+def check_least(**values: tuple[float | None, float]) -> None:
+    """Raise ``ConfigError`` for the first option that is given and below its limit: ``steps=(steps, 1)``."""
+    for name, (value, least) in values.items():
+        if value is not None and not value >= least:
+            raise ConfigError(f"{name.replace('_', '-')} is {value}; give at least {least}")
+
+
+def check_exclusive(**values: object) -> None:
+    """Raise ``ConfigError`` if more than one of the options is given."""
+    given = [f"--{name.replace('_', '-')}" for name, value in values.items() if value is not None]
+    if len(given) > 1:
+        raise ConfigError(f"{given[0]} and {given[1]} exclude each other; give one")

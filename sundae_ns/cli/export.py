@@ -1,0 +1,96 @@
+"""``sundae export``: a scene as a web page, or as a file for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from sundae_ns.api.cleaning import within
+from sundae_ns.api.files import load, load_with_mask, save_for_viewers
+from sundae_ns.api.packing import packed_bytes, stated_start
+from sundae_ns.api.page import write_page
+from sundae_ns.api.views import with_start
+from sundae_ns.cli.inputs import Cleaning, copies_rows, open_packed
+from sundae_ns.cli.options import Direction, Flag, Out, Source, check_file, check_folder
+from sundae_ns.errors import ConfigError
+from sundae_ns.storage.formats import check_format
+from sundae_ns.storage.pack import container
+from sundae_ns.storage.ply import keep_vertices
+from sundae_ns.storage.run_folder import files_of
+
+
+def export(
+    scene: Source,
+    out: Out,
+    upright: bool = False,
+    start_view: str | None = None,
+    up: Direction | None = None,
+    data: Path | None = None,
+    overwrite: Flag = False,
+    cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
+) -> int:
+    """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz, .sog or .glb.
+
+    The page needs no network and no server. The other formats hold no features and no head; antialiased scenes are
+    marked as such.
+
+    Args:
+        scene: a run (its folder or config.yml), a packed scene, or a .ply, .spz, .sog, .glb, .splat, .ksplat or
+            gsplat's .pt.
+        out: file to write; its suffix selects the format: .html, .ply or .glb (exact), .spz or .sog (quantised,
+            much smaller). A name without a suffix is a folder of page and scene, for a web server.
+        upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
+            Do not use the rotated file for a warm start.
+        start_view: what a page opens with: index of a stored camera, or a camera file as sundae render reads it; by
+            default that of a packed scene, else the first camera.
+        up: direction about which a page turns, for example 0 0 1; by default that of the scene, else of its cameras.
+        data: folder of the capture, if it moved; for a page of a run.
+        overwrite: replace an existing file, once the new one is complete.
+    """
+    page = out.suffix.lower() in (".html", "")
+    if not page:
+        check_format(out)
+    check = check_file if out.suffix else check_folder
+    check(out, reads=[*files_of(scene), data], overwrite=overwrite)
+    started = start_view is not None or up is not None
+    if page:
+        if upright:
+            raise ConfigError("a page turns the scene upright by itself; leave out --upright")
+        opened, packed = open_packed(scene, data)
+        if cleaning.chosen:
+            opened = cleaning.cleaned(opened)
+            packed = packed_bytes(opened)
+        if started:
+            opened = with_start(opened, start_view, up)
+            packed = container.restated(packed, stated_start(opened))
+        size = write_page(out, opened, packed, title=out.resolve().stem)
+        print(f"{out}: {size:,} bytes; {'open it in a browser' if out.suffix else 'serve it'}")
+        return 0
+    copies = copies_rows(scene, out)
+    if copies and (upright or not cleaning.chosen):
+        raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
+    if started:
+        raise ConfigError(f"{out.suffix} files hold neither a start view nor an up axis; leave them out")
+    if copies:
+        found, usable = load_with_mask(scene)
+        rows = within(usable, cleaning.mask(found, ()))
+        keep_vertices(scene, out, rows)
+        print(f"{out}: {int(rows.sum()):,} of {len(rows):,} primitives")
+        return 0
+    # A run's cameras, which tell floaters, are in its capture.
+    found = open_packed(scene, data)[0] if cleaning.remove_floaters else load(scene)
+    found = cleaning.cleaned(found)
+    if upright and not found.in_model_frame:
+        raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
+    with Console(stderr=True).status(f"Writing {found.num_primitives:,} primitives"):  # minutes for a .sog of a million
+        written = save_for_viewers(found, out, upright=upright)
+    mode = ", antialiased" if found.antialiased else ""
+    print(f"{out}: {written.primitives:,} primitives, degree {written.degree}{mode}, {written.bytes:,} bytes")
+    if written.clamped:
+        print(f"clamped scales or colours of {written.clamped:,} primitives to the range of a .spz; a .sog has none")
+    if written.cut:
+        print(f"left out harmonics above SH degree {written.degree}, which {out.suffix} cannot store; .ply can")
+    return 0

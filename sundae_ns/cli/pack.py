@@ -1,0 +1,194 @@
+"""``sundae pack``: convert a scene into one small file."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from dataclasses import asdict, replace
+from functools import cache
+from io import StringIO
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+
+from sundae_ns.api.files import load
+from sundae_ns.api.packing import contents_of
+from sundae_ns.api.views import with_start
+from sundae_ns.cli.inputs import Cleaning
+from sundae_ns.cli.options import Direction, Flag, Out, check_exclusive, check_file, check_least
+from sundae_ns.cli.train import has_gpu
+from sundae_ns.errors import ConfigError, SundaeError
+from sundae_ns.storage.config_file import check_run
+from sundae_ns.storage.formats import PRIMITIVES, kind_of_primitives
+from sundae_ns.storage.pack import (
+    FINETUNE_STEPS,
+    FINETUNED,
+    Codecs,
+    PackConfig,
+    PackedScene,
+    fit_scene,
+    pack_bytes,
+    write_fitted,
+)
+from sundae_ns.storage.run_folder import files_of
+
+if TYPE_CHECKING:
+    from sundae_ns.scenes.targets import Judge
+
+
+def pack(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: Out,
+    target_bytes: int | None = None,
+    target_drop: float | None = None,
+    finetune: int = 0,
+    max_cameras: int = 100,
+    start_view: str | None = None,
+    up: Direction | None = None,
+    data: Path | None = None,
+    json: bool = False,
+    overwrite: Flag = False,
+    precision: Annotated[PackConfig, tyro.conf.arg(name="")] = PackConfig(),  # noqa: B008
+    cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
+) -> int:
+    """Pack a scene into one file that can be rendered; print the size of each part, and the quality before and after.
+
+    Args:
+        run: a run of sundae or splatfacto (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat,
+            .ksplat or gsplat's .pt.
+        out: file to write, for example scene.sundae.
+        target_bytes: find the finest steps whose file has at most this many bytes.
+        target_drop: find the coarsest steps that lose at most this PSNR on some test views, dB.
+        finetune: training steps with quantisation in the loop before packing, for example 1000; the run is not changed.
+            Bits and steps at their defaults are then coarser, for a smaller file.
+        max_cameras: maximum number of training cameras to store for viewers; with 0, the capture is not needed.
+        start_view: what a page of the scene opens with: index of a stored camera, or a camera file as sundae render
+            reads it; by default the first camera.
+        up: direction that is upwards, for example 0 0 1; by default that of a run's capture.
+        data: folder of the capture, if it moved.
+        json: print one JSON object in place of the table.
+        overwrite: replace an existing file, once the new one is complete.
+    """
+    check_exclusive(target_bytes=target_bytes, target_drop=target_drop)
+    check_least(max_cameras=(max_cameras, 0), finetune=(finetune, 0), target_bytes=(target_bytes, 1))
+    if target_drop is not None and not 0 < target_drop < 100:
+        raise ConfigError(f"target-drop is {target_drop}; give a positive number of dB")
+    if cleaning.chosen and (finetune or target_drop is not None):
+        raise ConfigError(
+            f"--finetune and --target-drop look at photos of the whole scene; leave out {cleaning.chosen[0]}, or cut "
+            "the scene by `sundae export` or `sundae prune` afterwards"
+        )
+    usual = asdict(PackConfig())
+    given = {name: value for name, value in asdict(precision).items() if value != usual[name]}
+    config = replace(precision, **{**FINETUNED, **given}) if finetune else precision
+    config.validate()
+    check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
+    kind = kind_of_primitives(run)
+    for name, value in (("--finetune", finetune), ("--target-drop", target_drop), ("--data", data)):
+        if kind is not None and value:
+            raise ConfigError(f"{run} is a {PRIMITIVES[kind]} without photos; leave out {name}, or give a run")
+    if kind is None:
+        check_run(run)
+    judge, notes, tuned = _judge_of(run, data), list[str](), finetune > 0
+    packs: list[tuple[PackedScene, Codecs]] = []
+    # The bar writes to the real stdout while nerfstudio's messages are suppressed.
+    with (
+        Progress(console=Console(file=sys.stdout), transient=True, disable=json) as progress,
+        redirect_stdout(StringIO()),
+    ):
+        task = progress.add_task("Reading the run", total=3 + finetune)
+        if kind is None:
+            from sundae_ns.scenes.models import load_run  # takes seconds
+
+            scene = load_run(run, max_cameras=max_cameras, data=data)
+        else:
+            scene = load(run)
+        source = contents_of(with_start(cleaning.cleaned(scene, progress=False), start_view, up))
+        progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
+        if finetune:
+            from sundae_ns.scenes.finetune import finetune as tune
+
+            packs.append(tune(run, source, config, finetune, data=data, progress=lambda _: progress.advance(task)))
+        progress.update(task, description="Packing")
+        if target_bytes is not None or target_drop is not None:
+            from sundae_ns.scenes.targets import Search, fewest_bytes, least_drop
+
+            # Not what is fitted already without a fine-tune: its positions are rounded.
+            searches = [Search(source, precision, judge), *(Search(*each, judge) for each in packs)]
+            if target_bytes is not None:
+                found = least_drop(searches, target_bytes)
+            else:
+                found = fewest_bytes(searches[::-1], target_drop or 0.0)
+            if packs and found.scene is not packs[0][0]:
+                notes.append("the fine-tune loses too much for the target; packed without it, try more steps")
+                finetune = 0
+            packs = [(found.scene, found.codecs)]  # both are compared already
+        else:
+            packs.append(fit_scene(source, precision))
+        report = write_fitted(out, *packs[0])
+        progress.update(task, advance=1, description="Measuring")
+        quality, figures = "", dict[str, Any]()
+        if kind is None and cleaning.crop is None:  # photos show what a box leaves out
+            quality, figures = _measured(judge, packs, finetune, notes)
+    for note in notes:
+        print(note, file=sys.stderr)
+    if json:
+        print(dumps({"file": str(out), **report.summary(), **figures}))
+        return 0
+    print(f"{out}: {report.primitives:,} primitives in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
+    print(f"{'':14}{'bytes':>12}{'bits per primitive':>20}")
+    for name, bits in report.bits.items():
+        print(f"{name:14}{round(bits * report.primitives / 8):12,}{bits:20.2f}")
+    print(f"{'all':14}{report.bytes:12,}{8 * report.bytes / report.primitives:20.2f}")
+    if quality:
+        print(quality)
+    if quality and not tuned and not cleaning.chosen and has_gpu():
+        print(f"--finetune {FINETUNE_STEPS} makes it about 40% smaller")
+    return 0
+
+
+def _judge_of(run: Path, data: Path | None) -> Callable[[], Judge]:
+    """Opens the test views of a run, once."""
+
+    @cache
+    def judge() -> Judge:
+        from sundae_ns.scenes.targets import Judge
+
+        return Judge(run, data)
+
+    return judge
+
+
+def _measured(
+    judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Codecs]], finetune: int, notes: list[str]
+) -> tuple[str, dict[str, Any]]:
+    """A line and figures of the quality of a pack; a second pack is that without the fine-tune. Adds to the notes."""
+    from sundae_ns.scenes.targets import is_worth
+
+    try:
+        opened = judge()
+        before, after = opened.before, opened.quality(*packs[0])
+    except SundaeError as error:
+        notes.append(f"the quality is not measured: {error}")
+        return "", {}
+    figures: dict[str, Any] = {"psnr": [before.psnr, after.psnr], "views": opened.views}
+    line = f"PSNR {before.psnr:.2f} -> {after.psnr:.2f} dB"
+    if math.isfinite(before.ssim + after.ssim):  # not for images smaller than its window
+        figures["ssim"] = [before.ssim, after.ssim]
+        line += f", SSIM {before.ssim:.4f} -> {after.ssim:.4f}"
+    for plain in packs[1:]:
+        without = opened.quality(*plain).psnr
+        size, plain_size = (len(pack_bytes(*pack)[0]) for pack in (packs[0], plain))
+        if not is_worth(after.psnr, size, without, plain_size):
+            notes.append(
+                f"the fine-tune of {finetune:,} steps loses {before.psnr - after.psnr:.2f} dB; a pack without it has "
+                f"{plain_size:,} bytes and loses {before.psnr - without:.2f} dB, which is worth more: give more steps, "
+                "or leave out --finetune"
+            )
+    return f"{line}, before and after, on {opened.views} of {opened.all_views} test views", figures
