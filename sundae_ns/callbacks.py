@@ -84,7 +84,7 @@ class NerfstudioRun:
         return self._datamanager.train_indices
 
     def training_views(self) -> list[TrainingView]:
-        """The training views that are not held out for the whole training."""
+        """All training views."""
         return training_views(self.model, self._datamanager)
 
     def hold_out(self, indices: Iterable[int]) -> None:
@@ -97,7 +97,7 @@ class NerfstudioRun:
             yield self._photo(camera, batch)
 
     def photos(self) -> Iterator[Photo]:
-        """The training views that are not held out for the whole training; transparent pixels are masked."""
+        """All training views; transparent pixels are masked."""
         for camera, batch in self._datamanager.views(self.view_indices()):
             photo, image = self._photo(camera, batch), batch["image"]
             if image.shape[-1] == 4:
@@ -194,6 +194,6 @@ def _say(line: str) -> None:
 
 
 def training_views(model: Any, datamanager: SundaeDatamanager) -> list[TrainingView]:
-    """The training views of a datamanager that are not held out."""
+    """All training views of a datamanager."""
     with torch.no_grad():  # a camera optimizer moves them
         return [TrainingView(model.view_of(camera), mask) for camera, mask in datamanager.training_views()]

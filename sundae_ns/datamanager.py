@@ -25,7 +25,6 @@ from sundae_ns.data.layouts import larger_model, unused_masks
 from sundae_ns.data.photos import TURNED, exif_orientation, turn, wrong_size
 from sundae_ns.errors import ConfigError, DataError, SundaeError, one_line
 from sundae_ns.parsing import (
-    LightNerfstudioParser,
     check_cameras,
     check_capture,
     rebound,
@@ -35,8 +34,6 @@ from sundae_ns.parsing import (
     warn_of_cloud,
 )
 from sundae_ns.training.warning import warn
-
-__all__ = ["LightNerfstudioParser", "SundaeDatamanager", "SundaeDatamanagerConfig"]  # a config.yml may name these here
 
 DATASET_FRAME = "sundae_dataset_frame"
 """Metadata key of the training set: transform ``[3, 4]`` and scale from the capture's coordinates to the model's."""
@@ -50,19 +47,8 @@ def view_index(camera: Cameras) -> int | None:
 def _shows_something(batch: Mapping[str, Tensor]) -> bool:
     """Whether a pixel of an image is neither fully transparent nor masked."""
     image, mask = batch["image"], batch.get("mask")
-    shown = None if mask is None else mask > 0
-    if image.shape[-1] == 4:
-        opaque = image[..., 3:] > 0
-        shown = opaque if shown is None else opaque & shown.to(opaque.device)
-    return shown is None or bool(shown.any())
-
-
-def _fits(cameras: Cameras, device: torch.device) -> bool:
-    """Whether the images of these cameras, three bytes a pixel, leave half of a GPU's free memory for the training."""
-    if device.type != "cuda":
-        return True
-    size = 3 * int((cameras.width * cameras.height).sum())
-    return size <= torch.cuda.mem_get_info(device)[0] / 2
+    shown = image[..., 3:] > 0 if image.shape[-1] == 4 else torch.ones_like(image[..., :1], dtype=torch.bool)
+    return bool((shown if mask is None else shown & (mask > 0).to(shown.device)).any())
 
 
 class CheckedDataset(InputDataset):
@@ -78,15 +64,39 @@ class CheckedDataset(InputDataset):
         self.cameras.camera_type = torch.full_like(self.lenses, CameraType.PERSPECTIVE.value)
         self.turned: dict[int, int] = {}
         """EXIF orientations of images that their cameras see turned."""
+        self._checked = False
 
     @contextmanager
     def as_photographed(self) -> Iterator[None]:
         """Cameras with the types of their files, while nerfstudio loads and undistorts images."""
-        drawn, self.cameras.camera_type = self.cameras.camera_type, self.lenses
+        perspective, self.cameras.camera_type = self.cameras.camera_type, self.lenses
         try:
             yield
         finally:
-            self.cameras.camera_type = drawn
+            self.cameras.camera_type = perspective
+
+    def check_images(self) -> None:
+        """Check the files once: undistortion, which comes with loading, crops the cameras.
+
+        Raises:
+            DataError: an image or a mask cannot be read, or has another size.
+        """
+        if self._checked:
+            return
+        scale = self.scale_factor
+        masks: Sequence[Path | None] = self._dataparser_outputs.mask_filenames or [None] * len(self)
+        widths, heights = self.cameras.width.flatten().tolist(), self.cameras.height.flatten().tolist()
+        for index, (path, mask, *expected) in enumerate(zip(self.image_filenames, masks, widths, heights)):
+            full = check_image(path)
+            if [int(side * scale) for side in full] != expected:
+                orientation = exif_orientation(path)
+                full = full[::-1]
+                if orientation not in TURNED or [int(side * scale) for side in full] != expected:
+                    raise wrong_size(path, full[::-1], (expected[0], expected[1]), orientation)
+                self.turned[index] = orientation
+            if mask is not None and check_image(mask, mask=True) != full:
+                raise DataError(f"{mask} differs in size from its image {path.name}; make it {full[0]} x {full[1]} px")
+        self._checked = True
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Pixels ``[H, W, 3 or 4]``, turned as the camera sees them."""
@@ -110,8 +120,6 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
     """Full images, in an order that depends on the seed and the step alone."""
 
     _target: type = field(default_factory=lambda: SundaeDatamanager)
-    holdout_every: int = 0
-    """Hold out every n-th training view, for decisions that must not use test views. 0 holds out none."""
     robust_frame: bool = False
     """Centre and scale the scene by the cameras that stand near each other, and shift survey coordinates in float64.
     False takes all cameras, as nerfstudio does."""
@@ -147,17 +155,10 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
                 "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run would "
                 "differ; use random"
             )
-        if config.holdout_every < 0 or config.holdout_every == 1:
-            raise ConfigError(f"holdout-every is {config.holdout_every}; give 0 (none) or at least 2")
         set_parser(config.dataparser, config.robust_frame)
-        self._checked: list[CheckedDataset] = []
         data = config.capture
-        check_capture(
-            config.dataparser,
-            data,
-            ("train", "val" if test_mode == "val" else "test"),
-            images=test_mode != "inference",
-        )
+        splits = ("train", "val" if test_mode == "val" else "test")
+        check_capture(config.dataparser, data, splits, images=test_mode != "inference")
         try:
             super().__init__(config, device, test_mode, **kwargs)
         except SundaeError:
@@ -181,8 +182,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         if len(outputs.image_filenames) == 0:
             raise DataError(f"no training images in {self.config.dataparser.data}; check the path and the split")
         points = outputs.metadata.get("points3D_xyz")
-        warning = check_cameras(outputs.cameras, outputs.image_filenames, points)
-        if warning is not None:
+        if (warning := check_cameras(outputs.cameras, outputs.image_filenames, points)) is not None:
             warn(warning)
         if points is not None:
             warn_of_cloud(points, outputs.cameras)
@@ -220,12 +220,11 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     @property
     def train_indices(self) -> list[int]:
-        """Indices of the training views that are not held out for the whole training."""
-        every = self.config.holdout_every
-        return [i for i in range(len(self.train_dataset)) if not every or (i + 1) % every]
+        """Indices of all training views."""
+        return list(range(len(self.train_dataset)))
 
     def hold_back(self, indices: Iterable[int]) -> None:
-        """Hold out these of :attr:`train_indices` too, from the next step on, until the next call."""
+        """Hold these training views out, from the next step on, until the next call."""
         held_back = frozenset(indices)
         self._served = [index for index in self.train_indices if index not in held_back]
         self._order: tuple[int, list[int]] = (-1, [])  # pass over the views, and its order
@@ -240,7 +239,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         return self._order[1][position]
 
     def training_views(self) -> Iterator[tuple[Cameras, torch.Tensor | None]]:
-        """Training views that are not held out for the whole training: camera of shape ``(1,)`` on the CPU, and mask.
+        """All training views: camera of shape ``(1,)`` on the CPU, and mask.
 
         The mask is bool ``[H, W, 1]``, True for pixels to train on; None for all pixels.
         """
@@ -258,34 +257,34 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         return map(self._view, indices)
 
     def _view(self, index: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
-        batch = dict(self.cached_train[index])
+        batch = dict(self.cached_train[index])  # first: undistortion, which comes with it, changes the camera
         batch["image"] = batch["image"].to(self.device, non_blocking=True)  # pinned in host memory
-        return self._camera(index), batch
-
-    def _camera(self, index: int) -> Cameras:
-        """A training camera, cached because nerfstudio's slicing is slow; ask for it after its image was read."""
-        if index not in self._cameras:
+        if index not in self._cameras:  # nerfstudio's slicing is slow
             camera = self.train_dataset.cameras[index : index + 1]
             camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
             self._cameras[index] = camera
-        return self._cameras[index]
+        return self._cameras[index], batch
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         """Camera (on the CPU) and batch of ``step``."""
         return self._view(self.view_of_step(step + self.rank))
 
+    def _fill_the_gpu(self, cameras: Cameras) -> bool:
+        """Whether images, three bytes a pixel, leave less than half of a GPU's free memory for the training."""
+        device, size = torch.device(self.device), 3 * int((cameras.width * cameras.height).sum())
+        return device.type == "cuda" and size > torch.cuda.mem_get_info(device)[0] / 2
+
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> list[dict[str, torch.Tensor]]:
         dataset = self.train_dataset if split == "train" else self.eval_dataset
-        self._check_images(dataset)
+        dataset.check_images()
         if split == "train" and self.eval_dataset:
-            # Report a damaged test view now, not at the prune.
-            self._check_images(self.eval_dataset)
+            self.eval_dataset.check_images()  # report a damaged test view now, not at the prune
         if cache_images_device == "cpu" and not torch.cuda.is_available():
             # The stock "cpu" cache pins memory, which needs a driver; "gpu" means the model's device.
             cache_images_device = "gpu"
-        elif cache_images_device == "gpu" and not _fits(dataset.cameras, torch.device(self.device)):
+        elif cache_images_device == "gpu" and self._fill_the_gpu(dataset.cameras):
             CONSOLE.print(
                 f"the {split} images need more than half of the free GPU memory: they stay in main memory, and each "
                 "step copies one",
@@ -308,21 +307,3 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
                 soft_wrap=True,
             )
         return loaded
-
-    def _check_images(self, dataset: CheckedDataset) -> None:
-        """Check the files of a dataset once, because undistortion, which comes with loading, crops the cameras."""
-        if any(checked is dataset for checked in self._checked):
-            return
-        scale = dataset.scale_factor
-        masks: Sequence[Path | None] = dataset._dataparser_outputs.mask_filenames or [None] * len(dataset)
-        widths, heights = dataset.cameras.width.flatten().tolist(), dataset.cameras.height.flatten().tolist()
-        for index, (path, mask, *expected) in enumerate(zip(dataset.image_filenames, masks, widths, heights)):
-            full = check_image(path)
-            if [int(side * scale) for side in full] != expected:
-                orientation = exif_orientation(path)
-                if orientation not in TURNED or [int(side * scale) for side in full[::-1]] != expected:
-                    raise wrong_size(path, full, expected, orientation)
-                dataset.turned[index], full = orientation, full[::-1]
-            if mask is not None and check_image(mask, mask=True) != full:
-                raise DataError(f"{mask} differs in size from its image {path.name}; make it {full[0]} x {full[1]} px")
-        self._checked.append(dataset)

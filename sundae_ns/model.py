@@ -1,7 +1,6 @@
-"""The SUNDAE model: splatfacto's field with spectral pruning and neural compensation.
+"""The SUNDAE model for nerfstudio: it connects state, extensions and rendering to splatfacto's interface.
 
-It connects nerfstudio to state, source of primitives, extensions and rendering. Module path and class names are written
-into every run's ``config.yml``, so moving them breaks saved runs.
+Module path and class names are written into every run's ``config.yml``, so moving them breaks saved runs.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ from sundae_ns.viewer import ViewerControls, in_viewer
 
 @dataclass
 class SundaeModelConfig(SplatfactoModelConfig):
-    """Splatfacto, spectrally pruned and compensated. Options of splatfacto keep their meaning."""
+    """Splatfacto, pruned and compensated. Options of splatfacto keep their meaning."""
 
     _target: type = field(default_factory=lambda: SundaeModel)
     pruning: PruningConfig = field(default_factory=PruningConfig)
@@ -84,7 +83,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
 
 
 class SundaeModel(SplatfactoModel):
-    """Warms up a Gaussian field, prunes it spectrally, and compensates for the loss.
+    """Trains Gaussians, prunes them, and compensates for the loss.
 
     A subclass of ``SplatfactoModel``, because nerfstudio's exporter and viewer test for it. Everything that ties the
     original to CUDA or to downloads is replaced: initialisation, view matrix, outputs, LPIPS.
@@ -245,13 +244,12 @@ class SundaeModel(SplatfactoModel):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
 
     def _training_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
-        background, state = self._get_background_color(), self.state
-        view, window = self._training_view(camera)
+        background, (view, window) = self._get_background_color(), self._training_view(camera)
         settings, depth = self.render_settings(training=True), self.config.output_depth_during_training
         images, splatted = self.training_step.images(view, background, settings, depth=depth)
-        state.info = splatted.info
+        self.state.info = splatted.info
         for extension in self.extensions:
-            extension.before_backward(state)
+            extension.before_backward(self.state)
         del images["feature_image"]
         return {**images, "background": background, "window": window}
 
@@ -286,7 +284,7 @@ class SundaeModel(SplatfactoModel):
 
     @property
     def training_step(self) -> TrainingStep:
-        """The training step; nerfstudio's loop and recordings run the same one."""
+        """The training step, which nerfstudio's loop runs in two halves."""
         return TrainingStep(self.source, self.state, self.losses, self.state.field)
 
     def _training_view(self, camera: Cameras) -> tuple[View, Window | None]:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -35,11 +35,6 @@ from sundae_ns.rendering.render import LocalField
 from sundae_ns.training.field_state import FieldState
 
 RuleName = Literal["as configured", "band: high", "band: low", "band: both"]
-
-STEP = 0.01
-"""Step of the slider, and its lowest share."""
-STEPS_BETWEEN_SCORES = 100
-"""Training steps after which the scores of a moving field are computed again."""
 
 ContributionOf = Callable[[Any, int | None], Tensor]
 """Contribution of the primitives ``[N]``, given nerfstudio's datamanager and the number that a prune will keep."""
@@ -78,8 +73,7 @@ def previewed_rule(configured: PruneRule, name: RuleName) -> PruneRule:
     return band_rule(replace(configured, signal="positions"), bands[name]) if name in bands else configured
 
 
-@dataclass(frozen=True)
-class Visible:
+class Visible(NamedTuple):
     """What an image shows."""
 
     source: LocalField
@@ -90,13 +84,13 @@ class Visible:
 
 
 class _FieldVersion:
-    """Identifies a field without keeping it alive: exactly, or to within some steps while it is trained."""
+    """Identifies a field without keeping it alive: exactly, or to within a hundred steps while it is trained."""
 
     def __init__(self, state: FieldState, training: bool) -> None:
         values = list(state.field.values())
         self._parameters = [weakref.ref(value) for value in values]  # surgery makes new parameters
         # Each change in place raises a tensor's version, in training at every step; there, count steps instead.
-        steps = [state.step // STEPS_BETWEEN_SCORES] if training else [value._version for value in values]
+        steps = [state.step // 100] if training else [value._version for value in values]
         self._version = [state.field.num_primitives, *steps]
 
     def matches(self, other: _FieldVersion) -> bool:
@@ -127,22 +121,20 @@ class ViewerControls(torch.nn.Module):
         super().__init__()
         self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
         hint = "Show only what a prune to this share would keep; 1 shows everything"
-        self.keep_ratio = ViewerSlider("Keep ratio", 1.0, STEP, 1.0, STEP, cb_hook=self._show_expected, hint=hint)
+        self.keep_ratio = ViewerSlider("Keep ratio", 1.0, 0.01, 1.0, 0.01, cb_hook=self._show_expected, hint=hint)
         hint = "Number of primitives and, where trials have found it, what so few lose if they are trained on"
         self.expected = ViewerText("Expected", "", disabled=True, hint=hint)
-        rules = list(get_args(RuleName))
-        hint = "Rule of the previewed prune; the head is disabled in a preview"
+        rules, hint = list(get_args(RuleName)), "Rule of the previewed prune; the head is disabled in a preview"
         self.rule = ViewerDropdown("Rule", rules[0], rules, hint=hint)
-        self.control = ViewerControl()
-        """Gives access to the viewer, and so to the training views."""
+        self.control = ViewerControl()  # gives access to the viewer, and so to the training views
         self.training_field = False
         """Whether a trainer changes the field."""
         self._state, self._configured, self._contribute, self._curve = state, configured, contribute, curve
         self._lock = threading.Lock()
         self._seen: _FieldVersion | None = None
         self._graphs: dict[str, NeighborGraph] = {}
-        self._contribution: tuple[int | None, Tensor] | None = None
-        self._found: tuple[tuple[str, float], Pruned | None] | None = None
+        self._contributions: dict[int | None, Tensor] = {}
+        self._previews: dict[tuple[str, float], Pruned | None] = {}
 
     @property
     def field_key(self) -> FieldKey | None:
@@ -187,21 +179,20 @@ class ViewerControls(torch.nn.Module):
         name, share = self.rule.value, round(float(self.keep_ratio.value), 6)
         if share >= 1 or not in_viewer():
             return None
-        asked = (name, share)
         with self._lock:
-            now = _FieldVersion(self._state, self.training_field)
-            if self._seen is None or not self._seen.matches(now):
-                self._seen = now
-                self._graphs, self._contribution, self._found = {}, None, None
-            if self._found is None or self._found[0] != asked:
-                found: Pruned | None = None
+            version = _FieldVersion(self._state, self.training_field)
+            if self._seen is None or not self._seen.matches(version):
+                self._seen = version
+                self._graphs, self._contributions, self._previews = {}, {}, {}
+            if (name, share) not in self._previews:
+                pruned: Pruned | None = None
                 try:
-                    found = self._prune(previewed_rule(self._configured, name), share)
+                    pruned = self._prune(previewed_rule(self._configured, name), share)
                 except (SundaeError, torch.cuda.OutOfMemoryError) as error:
                     # An exception in the viewer's thread would end all rendering.
                     CONSOLE.log(f"[yellow]No preview of {name}: {one_line(error)}")
-                self._found = (asked, found)
-            return self._found[1]
+                self._previews = {(name, share): pruned}
+            return self._previews[name, share]
 
     @torch.no_grad()
     def _prune(self, rule: PruneRule, share: float) -> Pruned:
@@ -211,14 +202,15 @@ class ViewerControls(torch.nn.Module):
         count = kept_count(share, n)
         if rule.uses_graph and rule.edges not in self._graphs:
             self._graphs[rule.edges] = field_graph(usable, rule)
-        needed = rule.uses_contribution and count < n
-        weights = self._contribution_of(count if rule.uses_detail else None) if needed else None
+        weights = None
+        if rule.uses_contribution and count < n:
+            detail = count if rule.uses_detail else None
+            if detail not in self._contributions:
+                viewer: Any = getattr(self.control, "viewer", None)
+                if viewer is None:
+                    raise ConfigError(
+                        "there are no training views; open the run with ns-viewer, or choose another rule"
+                    )
+                self._contributions = {detail: self._contribute(viewer.pipeline.datamanager, detail)}
+            weights = self._contributions[detail]
         return prune_field(field, rule, count, weights, self._graphs.get(rule.edges))
-
-    def _contribution_of(self, count: int | None) -> Tensor:
-        if self._contribution is None or self._contribution[0] != count:
-            viewer: Any = getattr(self.control, "viewer", None)
-            if viewer is None:
-                raise ConfigError("there are no training views; open the run with ns-viewer, or choose another rule")
-            self._contribution = (count, self._contribute(viewer.pipeline.datamanager, count))
-        return self._contribution[1]

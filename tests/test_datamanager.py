@@ -80,40 +80,28 @@ def test_next_train_serves_the_view_of_the_step(capture: Path) -> None:
         assert (made.next_train(step)[0].metadata or {})["cam_idx"] == made.view_of_step(step + 1)
 
 
-def test_held_out_views_are_never_trained_on(capture: Path) -> None:
-    made = manager(capture, holdout_every=3)
-    assert made.holdout_indices == [2, 5]
-    assert made.train_indices == [0, 1, 3, 4, 6]
-    assert {made.view_of_step(step) for step in range(50)} == {0, 1, 3, 4, 6}
-    assert len(list(made.training_views())) == 5
-    held_back = list(made.views(made.holdout_indices))
-    assert [batch["image_idx"] for _, batch in held_back] == [2, 5]
-    camera, batch = held_back[0]
-    assert torch.equal(camera.camera_to_worlds[0], made.train_dataset.cameras.camera_to_worlds[2])
-    assert batch["image"].shape == (16, 20, 3)
-
-
-def test_a_held_back_view_goes_to_the_device_when_its_turn_comes(
+def test_held_back_views_are_not_trained_on_and_are_loaded_when_their_turn_comes(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = manager(capture, holdout_every=3)
+    made = manager(capture)
+    assert (made.holdout_indices, list(made.views([]))) == ([], [])
+    made.hold_back([2, 5])
+    assert made.holdout_indices == [2, 5]
+    assert {made.view_of_step(step) for step in range(50)} == {0, 1, 3, 4, 6}
+    cameras, masks = zip(*made.training_views(), strict=True)  # a prune looks at all of them
+    assert masks == (None,) * VIEWS
+    poses = torch.cat([camera.camera_to_worlds for camera in cameras])
+    assert torch.equal(poses, made.train_dataset.cameras.camera_to_worlds)
+    (camera, batch), _ = made.views(made.holdout_indices)
+    assert batch["image_idx"] == 2
+    assert torch.equal(camera.camera_to_worlds[0], made.train_dataset.cameras.camera_to_worlds[2])
+    assert batch["image"].shape == (16, 20, 3)
     moved: list[int] = []
     monkeypatch.setattr(made, "_view", moved.append)
     views = made.views(made.holdout_indices)
     assert moved == []
     next(views)
     assert moved == [2]
-
-
-def test_nothing_is_held_back_unless_asked_for(capture: Path) -> None:
-    made = manager(capture)
-    assert made.holdout_indices == []
-    assert list(made.views(made.holdout_indices)) == []
-    cameras, masks = zip(*made.training_views(), strict=True)
-    assert masks == (None,) * VIEWS
-    assert all(camera.shape == (1,) for camera in cameras)
-    poses = torch.cat([camera.camera_to_worlds for camera in cameras])
-    assert torch.equal(poses, made.train_dataset.cameras.camera_to_worlds)
 
 
 def test_masks_come_with_the_views_that_they_belong_to(own_copy: Path) -> None:
@@ -125,27 +113,18 @@ def test_masks_come_with_the_views_that_they_belong_to(own_copy: Path) -> None:
         (own_copy / "masks").mkdir(exist_ok=True)
         mask.save(own_copy / frame["mask_path"])
     edit(own_copy, frames=meta["frames"])
-    made = manager(own_copy, holdout_every=3)
+    made = manager(own_copy)
     widths = [int(made.cached_train[index]["mask"][0].sum()) for index in made.train_indices]
-    found = [(camera, mask) for camera, mask in made.training_views() if mask is not None]
-    assert [tuple(mask.shape) for _, mask in found] == [(16, 20, 1)] * 5
-    assert [int(mask[0].sum()) for _, mask in found] == widths
-    assert len(set(widths)) == 5
-    assert [float(c.camera_to_worlds.sum()) for c, _ in found] == [
-        float(made.train_dataset.cameras.camera_to_worlds[index].sum()) for index in made.train_indices
-    ]
-
-
-def test_masks_of_lenses_fit_the_cameras_that_nerfstudio_makes_of_them(own_copy: Path) -> None:
-    meta = json.loads((own_copy / "transforms.json").read_text())
-    mask = Image.new("L", (20, 16), 255)
-    mask.save(own_copy / "mask.png")
-    edit(own_copy, k1=0.3, k2=0.1, frames=[{**frame, "mask_path": "mask.png"} for frame in meta["frames"]])
-    # Before anything else has read the pictures.
-    for camera, mask_of in manager(own_copy).training_views():
-        assert mask_of is not None
-        assert mask_of.shape == (int(camera.height), int(camera.width), 1)
-        assert mask_of.shape != (16, 20, 1), "undistortion cuts nothing off"
+    masks = [mask for _, mask in made.training_views() if mask is not None]
+    assert [tuple(mask.shape) for mask in masks] == [(16, 20, 1)] * VIEWS
+    assert [int(mask[0].sum()) for mask in masks] == widths
+    assert len(set(widths)) == VIEWS
+    edit(own_copy, k1=0.3, k2=0.1)
+    # Before anything else has read the images, which undistortion crops.
+    for camera, cropped in manager(own_copy).training_views():
+        assert cropped is not None
+        assert cropped.shape == (int(camera.height), int(camera.width), 1)
+        assert cropped.shape != (16, 20, 1), "undistortion cuts nothing off"
 
 
 def test_a_round_lens_has_masks_of_its_own(own_copy: Path) -> None:
@@ -154,12 +133,6 @@ def test_a_round_lens_has_masks_of_its_own(own_copy: Path) -> None:
         assert mask is not None
         assert mask.shape == (int(camera.height), int(camera.width), 1)
         assert not mask.all()
-
-
-@pytest.mark.parametrize("every", [1, -2])
-def test_impossible_holdout(capture: Path, every: int) -> None:
-    with pytest.raises(ConfigError, match="holdout-every"):
-        manager(capture, holdout_every=every)
 
 
 def test_cpu_cache_without_cuda(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,33 +230,25 @@ def test_missing_point_cloud(own_copy: Path) -> None:
         manager(own_copy)
     edit(own_copy, ply_file_path=None)
     assert "points3D_xyz" not in manager(own_copy).train_dataparser_outputs.metadata
-
-
-def test_no_training_images(own_copy: Path) -> None:
     edit(own_copy, train_filenames=[])
     with pytest.raises(DataError, match="no training images"):
         manager(own_copy)
 
 
 @pytest.mark.parametrize(
-    ("file", "advice"),
+    ("file", "data", "advice"),
     [
-        ("a.jpg", "has no transforms.json; make a capture of images with `sundae poses "),
-        ("sparse/0/cameras.bin", "it is in COLMAP layout: add `colmap --colmap-path sparse/0` to ns-train"),
-        ("colmap/sparse/0/cameras.txt", "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
+        ("a.jpg", "", "has no transforms.json; make a capture of images with `sundae poses "),
+        ("sparse/0/cameras.bin", "", "it is in COLMAP layout: add `colmap --colmap-path sparse/0` to ns-train"),
+        ("colmap/sparse/0/cameras.txt", "", "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
+        ("walk.mp4", "walk.mp4", "is a file, not a capture; sundae poses"),
     ],
 )
-def test_a_folder_that_is_no_capture_says_how_to_make_one_of_it(tmp_path: Path, file: str, advice: str) -> None:
+def test_what_is_no_capture_says_how_to_make_one_of_it(tmp_path: Path, file: str, data: str, advice: str) -> None:
     (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / file).touch()
     with pytest.raises(DataError, match=advice):
-        manager(tmp_path)
-
-
-def test_a_file_that_is_no_capture(tmp_path: Path) -> None:
-    (tmp_path / "walk.mp4").touch()
-    with pytest.raises(DataError, match="is a file, not a capture; sundae poses"):
-        manager(tmp_path / "walk.mp4")
+        manager(tmp_path / data)
 
 
 def cameras(*, focal: float = 20.0, mirrored: bool = False, spread: float = 1.0, outlier: float = 0.0) -> Cameras:

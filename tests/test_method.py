@@ -9,9 +9,6 @@ from typing import Any
 
 import pytest
 
-from sundae_ns.training.trials import head as trials
-from sundae_ns.training.trials import stopping
-
 PAGE = Path(__file__).parents[1] / "docs" / "method.md"
 NAME = re.compile(r"`(sundae_ns(?:\.\w+)+)`")
 EQUATION = re.compile(r"```math\n(.*?)```\n", re.DOTALL)
@@ -50,35 +47,6 @@ def test_every_equation_has_its_function() -> None:
     text = PAGE.read_text(encoding="utf-8")
     assert len(EQUATION.findall(text)) > 15
     assert lonely(text) == []
-
-
-def test_the_pages_state_the_rule_of_the_trials() -> None:
-    rule = rf"\max({trials.LEAST_GAIN:g}, {trials.GAIN_PER_DOUBLING:g} \log_2"
-    assert rule in PAGE.read_text(encoding="utf-8")
-    words = f"gains {trials.LEAST_GAIN:g} dB, and {trials.GAIN_PER_DOUBLING:g} dB for each doubling of the bytes"
-    assert words in (PAGE.parent / "options.md").read_text(encoding="utf-8")
-
-
-def test_the_pages_state_when_training_stops() -> None:
-    words = f"fewer than {stopping.MANY_VIEWS} training views"
-    for page, growth in (
-        ("method.md", rf"\ge {1 + stopping.LEAST_LOSS:g}\, \ell_k"),
-        ("options.md", f"{stopping.LEAST_LOSS:.1%}"),
-    ):
-        text = (PAGE.parent / page).read_text(encoding="utf-8")
-        assert words in text
-        assert growth in text
-    assert stopping.WINDOW_SHARE == 1 / 50  # "fiftieth"
-
-
-def test_the_checks_can_fail() -> None:
-    with pytest.raises(AttributeError):
-        resolve("sundae_ns.filters.filters.no_such_filter")
-    with pytest.raises(AttributeError):
-        resolve("sundae_ns.no_such_room.at_all")
-    alone, named = "```math\na = b\n```\n\nNo function.\n", "```math\nc\n```\nBy `sundae_ns.x`.\n"
-    page = f"{alone}\n## Next\n\n`sundae_ns.filters.filters.high_pass`\n\n{named}"
-    assert lonely(page) == ["a = b"]
 
 
 def test_what_github_cannot_render_is_not_there() -> None:

@@ -227,47 +227,31 @@ def test_a_crop_box_cuts_the_preview_too() -> None:
 
 @torch.no_grad()
 @pytest.mark.parametrize("rule", RULES)
-def test_off_every_picture_is_as_before(rule: RuleName) -> None:
+def test_only_the_viewer_sees_the_preview_and_only_while_it_is_on(rule: RuleName) -> None:
+    """On, it shows base colours; it changes neither the model nor what training and evaluation see."""
     model, views = build()
-    before = picture(model)
-    model.viewer_controls.rule.value = rule
-    assert same(as_the_viewer(lambda: picture(model)), before)
-    assert views.asked == 0
-    # On, and off again.
-    model.viewer_controls.keep_ratio.value = 0.3
-    assert not same(as_the_viewer(lambda: picture(model)), before)
-    model.viewer_controls.keep_ratio.value = 1.0
-    assert same(as_the_viewer(lambda: picture(model)), before)
-
-
-@torch.no_grad()
-def test_on_it_shows_base_colours_and_touches_nothing() -> None:
-    model, _ = build()
-    before = {name: value.clone() for name, value in model.state_dict().items() if isinstance(value, Tensor)}
+    controls, before = model.viewer_controls, picture(model)
+    state = {name: value.clone() for name, value in model.state_dict().items() if isinstance(value, Tensor)}
     versions = [value._version for value in model.parameters()]
-    model.viewer_controls.keep_ratio.value = 0.3
-    found = as_the_viewer(lambda: picture(model))
-    assert torch.equal(found["rgb"], found["base_rgb"])
-    assert found["response"].max() > 0
-    after = model.state_dict()
-    assert all(torch.equal(after[name], value) for name, value in before.items())
-    assert [value._version for value in model.parameters()] == versions
-
-
-@torch.no_grad()
-def test_training_and_evaluation_do_not_see_it() -> None:
-    model, views = build()
-    model.train()
-    trained = picture(model)
-    model.eval()
-    evaluated = picture(model)
-    model.viewer_controls.keep_ratio.value = 0.1
-    assert same(picture(model), evaluated)
-    model.train()
-    assert same(
-        {k: v for k, v in picture(model).items() if v is not None}, {k: v for k, v in trained.items() if v is not None}
-    )
+    controls.rule.value = rule
+    assert same(as_the_viewer(lambda: picture(model)), before)
     assert views.asked == 0
+    controls.keep_ratio.value = 0.3
+    seen = as_the_viewer(lambda: picture(model))
+    assert torch.equal(seen["rgb"], seen["base_rgb"])
+    assert seen["response"].max() > 0
+    assert not same(seen, before)
+    assert same(picture(model), before)
+    trained = {}
+    for share in (0.3, 1.0):
+        controls.keep_ratio.value = share
+        trained[share] = {k: v for k, v in model.train().get_outputs_for_camera(camera()).items() if v is not None}
+        model.eval()
+    assert same(trained[0.3], trained[1.0])
+    assert same(as_the_viewer(lambda: picture(model)), before)
+    after = model.state_dict()
+    assert all(torch.equal(after[name], value) for name, value in state.items())
+    assert [value._version for value in model.parameters()] == versions
 
 
 @pytest.fixture

@@ -58,7 +58,7 @@ class TrainingRun(Protocol):
         """Number of held-out training views."""
 
     def training_views(self) -> list[TrainingView]:
-        """The training views that are not held out for the whole training."""
+        """All training views."""
 
     def view_indices(self) -> list[int]:
         """Indices of these views."""
@@ -70,7 +70,7 @@ class TrainingRun(Protocol):
         """The held-out training views, loaded one at a time."""
 
     def photos(self) -> Iterator[Photo]:
-        """The training views that are not held out for the whole training, in full size; transparent pixels masked."""
+        """All training views in full size; transparent pixels are masked."""
 
     def evaluate(self) -> dict[str, float]:
         """Mean ``psnr`` (dB) and ``ssim`` over all test views; empty without any."""

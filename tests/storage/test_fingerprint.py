@@ -121,7 +121,6 @@ def test_the_capture_changes_nothing() -> None:
         "--pipeline.model.base-loss-weight 0.3",
         "--pipeline.model.sh-degree 2",
         "--pipeline.model.warm-start field.ply",
-        "--pipeline.datamanager.holdout-every 8",
         "--pipeline.datamanager.camera-res-scale-factor 0.5",
         "--optimizers.means.optimizer.lr 1e-4",
         "--optimizers.compensation.scheduler.shape exponential",
