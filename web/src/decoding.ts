@@ -11,14 +11,13 @@ type Answer = { scene: Scene } | { error: string } | { share: number };
 /** What runs in the worker: answers one file with shares of the work, then with its scene or an error message. */
 export function answer(): void {
   self.onmessage = async ({ data }: MessageEvent<Uint8Array<ArrayBuffer>>) => {
-    let found: Answer;
     try {
-      found = { scene: await readScene(data, (share) => self.postMessage({ share })) };
+      self.postMessage({ scene: await readScene(data, (share) => self.postMessage({ share })) });
     } catch (error) {
-      const said = error instanceof PackError ? error.message : `The scene cannot be decoded (${error}).`;
-      found = { error: said };
+      self.postMessage({
+        error: error instanceof PackError ? error.message : `The scene cannot be decoded (${error}).`,
+      });
     }
-    self.postMessage(found);
   };
 }
 

@@ -27,7 +27,7 @@ export const showByPlayCanvas: Show = async (file, cameras, options) => {
   const asset = new Asset(file, isGltf ? "container" : "gsplat", { url: file });
   await new Promise<void>((done, fail) => {
     asset.on("load", () => done());
-    asset.on("error", (error) => fail(new Error(error)));
+    asset.on("error", (error: string) => fail(new Error(error)));
     app.assets.add(asset);
     app.assets.load(asset);
   });
@@ -48,7 +48,8 @@ export const showByPlayCanvas: Show = async (file, cameras, options) => {
     farClip: FAR,
     frustumCulling: false,
   });
-  camera.camera.calculateProjection = (matrix) => matrix.set(columns(projectionOf(place)));
+  camera.camera.calculateProjection = (matrix: { set(values: number[]): void }) =>
+    matrix.set(columns(projectionOf(place)));
   app.root.addChild(camera);
   const images: string[] = [];
   for (place of cameras) {

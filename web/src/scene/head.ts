@@ -8,9 +8,7 @@ const WIDTHS: Record<string, [number, number]> = {
   tiny: [8, 64],
   compact: [32, 64],
   wide: [64, 64],
-  small: [32, 256],
   regular: [64, 512],
-  large: [128, 1024],
 };
 const LEVELS = 4;
 

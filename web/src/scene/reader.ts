@@ -5,20 +5,16 @@ import { SECTIONS, type SectionFormat } from "./schema";
 
 export type Numbers =
   | Uint8Array<ArrayBuffer>
-  | Uint16Array<ArrayBuffer>
   | Uint32Array<ArrayBuffer>
   | Int8Array<ArrayBuffer>
-  | Int16Array<ArrayBuffer>
   | Float32Array<ArrayBuffer>
   | Float64Array<ArrayBuffer>;
 
 /** Arrays of the dtypes that a scene uses. */
 const ARRAYS: Record<string, new (bytes: ArrayBuffer) => Numbers> = {
   "|u1": Uint8Array,
-  "<u2": Uint16Array,
   "<u4": Uint32Array,
   "|i1": Int8Array,
-  "<i2": Int16Array,
   "<f4": Float32Array,
   "<f8": Float64Array,
 };

@@ -51,7 +51,6 @@ const BACKGROUNDS: Record<string, [number, number, number]> = {
   white: [1, 1, 1],
 };
 
-/** What is told of the share of a field that is decoded. */
 type OnProgress = (share: number) => void;
 
 /** Reads a packed scene, with memory bounded by its size; throws a PackError that says what is wrong. */
