@@ -15,7 +15,7 @@ from sundae_ns.gaussians.gaussians import SPLAT_NAMES, Field, Mended, mend, sh_d
 from sundae_ns.storage import checkpoint
 from sundae_ns.storage.coordinates import similarity
 from sundae_ns.storage.gltf import read_glb, write_glb
-from sundae_ns.storage.ply import MODEL_FRAME, is_nerfstudio_ply, ply_comments, read_ply, write_ply
+from sundae_ns.storage.ply import MODEL_FRAME, check_field, is_nerfstudio_ply, ply_comments, read_ply, write_ply
 from sundae_ns.storage.sog import read_sog, write_sog
 from sundae_ns.storage.splat import read_gsplat, read_ksplat, read_splat
 from sundae_ns.storage.spz import MAX_SH_DEGREE, clamped, read_spz, write_spz
@@ -31,8 +31,7 @@ PRIMITIVES: dict[Kind, str] = {
     "gsplat": "checkpoint of gsplat",
 }
 """Kinds of files that hold primitives alone, and their names."""
-FORMATS = (".ply", ".spz", ".sog", ".glb")
-"""Formats that :func:`write_for_viewers` writes."""
+FORMATS = (".ply", ".spz", ".sog", ".glb")  # that write_for_viewers writes
 ANTIALIASED = "SplatRenderMode: mip"
 """Header comment of a .ply whose scene was trained with antialiasing."""
 _FIRST_BYTES: dict[bytes, Kind] = {
@@ -267,6 +266,7 @@ def write_for_viewers(
         StorageError: the disk is full or not writable.
     """
     check_format(path)
+    check_field(params)
     mended = mend(params)
     field = {name: value.detach().cpu() for name, value in mended.field.as_harmonics().items()}
     kind = path.suffix.lower()

@@ -101,14 +101,6 @@ def test_a_valid_checkpoint_is_read(good: bytes, verdict: Any, tmp_path: Path) -
     assert verdict(lambda: start_warm(path), len(good)) is None
 
 
-@pytest.mark.parametrize("read", [resume, start_warm])
-@pytest.mark.seeds(30)
-def test_corrupted_file(good: bytes, corrupted: Any, verdict: Any, tmp_path: Path, seed: int, read: Any) -> None:
-    path = tmp_path / "a.ckpt"
-    path.write_bytes(corrupted(good, seed))
-    verdict(lambda: read(path), path.stat().st_size)
-
-
 @pytest.fixture
 def folder(good: bytes, tmp_path: Path) -> Iterator[Path]:
     """The trainer's folder with two checkpoints; the newer one is truncated."""
@@ -144,16 +136,6 @@ def rezipped(good: bytes, change: Callable[[str, bytes], bytes]) -> bytes:
         for entry in source.namelist():
             target.writestr(entry, change(entry, source.read(entry)))
     return out.getvalue()
-
-
-@pytest.mark.seeds(24)
-def test_corrupted_pickle_with_valid_checksums(
-    good: bytes, corrupted: Any, verdict: Any, tmp_path: Path, seed: int
-) -> None:
-    path = tmp_path / "a.ckpt"
-    path.write_bytes(rezipped(good, lambda name, data: corrupted(data, seed) if name.endswith("data.pkl") else data))
-    verdict(lambda: resume(path), path.stat().st_size)
-    verdict(lambda: start_warm(path), path.stat().st_size)
 
 
 def test_tensors_without_their_bytes(good: bytes, verdict: Any, tmp_path: Path) -> None:

@@ -159,25 +159,6 @@ def test_wrong_files(tmp_path, wrong):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "change", [{"opacities": torch.zeros(7)}, {"means": torch.zeros(7, 2)}, {"features_rest": torch.zeros(7, 4, 3)}]
-)
-def test_wrong_shapes_leave_the_old_file(tmp_path, change):
-    path = tmp_path / "a.ply"
-    path.write_text("old")
-    with pytest.raises(DataError, match=next(iter(change))):
-        write_ply(path, {**_field(), **change})
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_missing_parameter(tmp_path):
-    params = _field()
-    del params["quats"]
-    with pytest.raises(DataError, match="no quats"):
-        write_ply(tmp_path / "a.ply", params)
-
-
 def _lists(path, element):
     """A field whose vertices, or another element, have a list property."""
     rows = PlyData.read(str(path))["vertex"].data.copy()
