@@ -1,29 +1,23 @@
-"""The head without gradients, in a few kernels: for inference.
+"""The head in a few CUDA kernels, forward and backward.
 
 cuDNN convolves. Layer by layer, most of the head's time goes to reading and writing images: bias, activation, pooling,
 upsampling and concatenation are a pass each. A kernel of ``csrc/head.cu`` does everything between two convolutions in
-one pass, and writes its result where the next convolution reads it. The network is recorded as one CUDA graph per image
-size that repeats. :mod:`sundae_ns.compensation.fused_training` computes gradients.
+one pass, and writes its result where the next convolution reads it. Frames and training steps are recorded as a whole,
+with the head in them, because launching a hundred small kernels from Python takes longer than running them.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping
-from functools import partial
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from sundae_ns.compensation.unet import SLOPE, UNet
-from sundae_ns.errors import BackendError
-from sundae_ns.gpu.cuda_graphs import GraphCache, is_recording, record, warm_up
 from sundae_ns.gpu.kernels import Argument, Launch, load_kernels
-
-_log = logging.getLogger(__name__)
 
 PACK = 8
 """Channels that a thread moves at once, 16 bytes; images are padded to a multiple, which tensor cores need too."""
@@ -38,6 +32,71 @@ _TYPES = {torch.bfloat16: "-DBF16"}
 
 Launches = Mapping[str, Launch]
 """Launch functions by kernel name."""
+
+MOST_WORKERS = 2**17
+"""Threads that sum a gradient over the pixels; fewer leave the GPU idle, and more wait for each other to add."""
+
+
+def compensated(net: UNet, residual: bool, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
+    """The compensated image of a network without gradients; see :meth:`CompensationHead.forward`.
+
+    All images are float32 on CUDA. Pixels of ``splatted`` and ``alpha`` may have a stride, rows must be adjacent.
+
+    Args:
+        dtype: of the arithmetic, bfloat16.
+
+    Raises:
+        BackendError: the kernels cannot be compiled or loaded.
+    """
+    launches = head_kernels(base.device, dtype, head_options(net, residual))
+    height, width = base.shape[:2]
+    folded = folded_input(net, height, width, base, dtype)
+    fold_pixels(splatted, alpha, net.pixel_unshuffle, residual, folded, launches)
+    last = network(net, cast_weights(net, dtype), folded, launches).last
+    return unfold_pixels(net, last, base, alpha, launches)
+
+
+def correction(net: UNet, residual: bool, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
+    """One correction times accumulation, or one image if the network makes it by itself: ``[H, W, 3]`` float32.
+
+    It has gradients for splatted values, accumulation and the network's parameters. Arguments and errors are those of
+    :func:`compensated`.
+    """
+    layers = (*convolutions(net), net.out)
+    parameters = [value for layer in layers for value in (layer.weight, layer.bias)]
+    return cast("Tensor", _Correction.apply(splatted, alpha, net, residual, dtype, *parameters))
+
+
+class _Correction(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, splatted: Tensor, alpha: Tensor, net: UNet, residual: bool, dtype: torch.dtype, *_: Tensor
+    ) -> Tensor:
+        height, width, ctx.channels = splatted.shape
+        ctx.net, ctx.residual = net, residual
+        ctx.launches = head_kernels(splatted.device, dtype, head_options(net, residual))
+        ctx.weights = cast_weights(net, dtype)
+        folded = folded_input(net, height, width, splatted, dtype)
+        fold_pixels(splatted, alpha, net.pixel_unshuffle, residual, folded, ctx.launches)
+        ctx.tape = network(net, ctx.weights, folded, ctx.launches)
+        ctx.save_for_backward(alpha)
+        return unfold_pixels(net, ctx.tape.last, splatted.new_zeros(height, width, 3), alpha, ctx.launches)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        (alpha,) = ctx.saved_tensors
+        net, launches, tape = ctx.net, ctx.launches, ctx.tape
+        grad_raw, grad_alpha, *grad_last = unfold_backward(net, tape.last, gradient, alpha, launches)
+        grad_folded, grad_parameters = network_backward(net, ctx.weights, tape, grad_raw, launches)
+        # Channels that the network does not see have no gradient.
+        new = torch.empty if ctx.residual else torch.zeros
+        height, width = gradient.shape[:2]
+        grad_splatted = new(height, width, ctx.channels, dtype=torch.float32, device=gradient.device)
+        rows, columns = grad_folded.shape[-2:]
+        padded = grad_folded.shape[1] // net.pixel_unshuffle**2
+        sizes = [4 if ctx.residual else 0, ctx.channels - 3, padded, height, width, rows, columns]
+        launches["fold_backward"](rows * columns * padded, [grad_folded, *sizes, grad_splatted, grad_alpha])
+        return grad_splatted, grad_alpha, None, None, None, *grad_parameters, *grad_last
 
 
 def head_options(net: UNet, residual: bool) -> tuple[str, ...]:
@@ -62,26 +121,6 @@ def head_kernels(device: torch.device, dtype: torch.dtype, options: tuple[str, .
     return load_kernels("head.cu", KERNELS, (_TYPES[dtype], *options), device)
 
 
-class Weights:
-    """A network's convolution weights in the dtype of the arithmetic, channels last."""
-
-    def __init__(self, net: UNet, dtype: torch.dtype) -> None:
-        first, *others = (conv.weight.detach() for conv in convolutions(net))
-        channels = padded_channels(first.shape[1] // net.pixel_unshuffle**2, net.pixel_unshuffle)
-        shape = (len(first), channels * net.pixel_unshuffle**2, *first.shape[2:])
-        self._source = [first, *others]
-        # The number of channels of a folded image.
-        padded = first.new_zeros(shape, dtype=dtype).contiguous(memory_format=torch.channels_last)
-        self.cast = [padded, *(torch.empty_like(w, dtype=dtype, memory_format=torch.channels_last) for w in others)]
-        self.refresh()
-
-    def refresh(self) -> None:
-        """Copy the network's current weights."""
-        first, *others = self._source
-        self.cast[0][:, : first.shape[1]].copy_(first)
-        torch._foreach_copy_(self.cast[1:], others)
-
-
 class Tape(NamedTuple):
     """Values that the backward pass needs: inputs of the convolutions, and results before their bias and activation."""
 
@@ -93,6 +132,18 @@ class Tape(NamedTuple):
     """Input of the last kernel: the result of the last 3 x 3 convolution, without bias and activation.
 
     ``[1, width, h, w]`` channels last."""
+
+
+def cast_weights(net: UNet, dtype: torch.dtype) -> list[Tensor]:
+    """The weights of the 3 x 3 convolutions in the dtype of the arithmetic, channels last; half a million values."""
+    first, *others = (conv.weight.detach() for conv in convolutions(net))
+    channels = padded_channels(first.shape[1] // net.pixel_unshuffle**2, net.pixel_unshuffle) * net.pixel_unshuffle**2
+    shape = (len(first), channels, *first.shape[2:])  # as many as a folded image has
+    padded = first.new_zeros(shape, dtype=dtype).contiguous(memory_format=torch.channels_last)
+    padded[:, : first.shape[1]].copy_(first)
+    rest = [torch.empty_like(w, dtype=dtype, memory_format=torch.channels_last) for w in others]
+    torch._foreach_copy_(rest, others)
+    return [padded, *rest]
 
 
 def padded_channels(channels: int, fold: int) -> int:
@@ -115,11 +166,11 @@ def fold_pixels(splatted: Tensor, alpha: Tensor, size: int, residual: bool, fold
     launches["fold"](rows * columns * padded, [*images, *sizes, folded])
 
 
-def network(net: UNet, weights: Weights, folded: Tensor, launches: Launches) -> Tape:
+def network(net: UNet, weights: list[Tensor], folded: Tensor, launches: Launches) -> Tape:
     """Run the network from its folded input ``[1, C, h, w]``, channels last, to the input of the last kernel."""
     levels = len(net.encoder)
     inputs, coarse = [], []
-    convs = iter(zip(weights.cast, convolutions(net), strict=True))
+    convs = iter(zip(weights, convolutions(net), strict=True))
 
     def convolved(x: Tensor) -> tuple[Tensor, Tensor]:
         weight, conv = next(convs)
@@ -210,63 +261,91 @@ def pixel_stride(image: Tensor) -> int:
     return pixel
 
 
-class _Recording(NamedTuple):
-    graph: torch.cuda.CUDAGraph
-    folded: Tensor
-    """Input of the graph."""
-    raw: Tensor
-    """Output of the graph."""
+def network_backward(
+    net: UNet, weights: list[Tensor], tape: Tape, gradient: Tensor, launches: Launches
+) -> tuple[Tensor, list[Tensor]]:
+    """Gradients of :func:`network`, with the weights and the tape of the forward pass.
 
+    Args:
+        gradient: gradient of the last 3 x 3 convolution's result with its bias ``[1, width, h, w]``, channels last.
 
-class FusedInference:
-    """Compensated images of a network without gradients, with its current weights.
-
-    A plain object that refers to the network, so that graphs and weights stay out of checkpoints. The network's
-    parameters must stay the same tensors while on one device. A residual network corrects an image.
+    Returns:
+        The gradients of the folded input ``[1, C, h, w]``, channels last, and of weight and bias of each 3 x 3
+        convolution in turn, float32.
     """
+    levels = len(net.encoder)
+    widths = [conv.out_channels for conv in convolutions(net)]
+    grad_biases = torch.zeros(sum(widths), device=gradient.device).split(widths)
+    gradients: dict[int, tuple[Tensor, Tensor]] = {}
 
-    def __init__(self, net: UNet, residual: bool) -> None:
-        self.net = net
-        self.residual = residual
-        self._recorded: GraphCache[_Recording] = GraphCache()
-        self._can_record = True
+    def convolved(number: int, grad_raw: Tensor) -> Tensor:
+        x, weight = tape.inputs[number], weights[number]
+        pixels = grad_raw.shape[2] * grad_raw.shape[3]
+        workers = min(pixels * widths[number] // PACK, MOST_WORKERS)
+        launches["sum_pixels"](workers, [grad_raw, widths[number], pixels, workers, grad_biases[number]])
+        grad_x, grad_weight, _ = torch.ops.aten.convolution_backward(
+            grad_raw, x, weight, None, [1, 1], [1, 1], [1, 1], False, [0, 0], 1, [True, True, False]
+        )
+        channels = convolutions(net)[number].in_channels
+        # The memory format of the weights, so that autograd need not copy the gradient.
+        gradients[number] = (
+            grad_weight[:, :channels].float().contiguous(memory_format=torch.channels_last),
+            grad_biases[number],
+        )
+        return cast("Tensor", grad_x).contiguous(memory_format=torch.channels_last)
 
-    def __call__(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
-        """Compensate one image; see :meth:`sundae_ns.compensation.CompensationHead.forward`.
+    def double(block: int, grad_raw: Tensor) -> Tensor:
+        grad_middle = convolved(2 * block + 1, grad_raw)
+        _, channels, rows, columns = grad_middle.shape
+        middle = tape.inputs[2 * block + 1]
+        launches["activate_backward"](grad_middle.numel() // PACK, [grad_middle, middle, channels, rows * columns])
+        return convolved(2 * block, grad_middle)
 
-        All images are float32 on CUDA. Pixels of ``splatted`` and ``alpha`` may have a stride, rows must be adjacent.
-        ``dtype`` is that of the arithmetic, bfloat16.
+    grad_skips = []
+    for step in reversed(range(levels - 1)):
+        grad_skip = double(levels + step, gradient)
+        grad_skips.append(grad_skip)
+        coarse = tape.coarse[step]
+        _, channels, rows, columns = coarse.shape
+        # The second convolution of the coarser block precedes those of this block.
+        bias = bias_of(convolutions(net)[2 * (levels + step) - 1])
+        gradient = torch.empty_like(coarse)
+        launches["upsample_backward"](
+            coarse.numel() // PACK,
+            [grad_skip, grad_skip.shape[1], coarse, bias, channels, rows, columns, gradient],
+        )
+    gradient = double(levels - 1, gradient)
+    for level in reversed(range(levels - 1)):
+        grad_skip, skip = grad_skips[level], tape.inputs[2 * (2 * levels - 2 - level)]
+        rows, columns = skip.shape[-2:]
+        channels = gradient.shape[1]
+        grad_raw = image_like(gradient, channels, rows, columns)
+        launches["pool_backward"](
+            grad_raw.numel() // PACK, [grad_skip, skip, skip.shape[1], gradient, channels, rows, columns, grad_raw]
+        )
+        gradient = double(level, grad_raw)
+    return gradient, [tensor for number in range(len(gradients)) for tensor in gradients[number]]
 
-        Raises:
-            BackendError: the kernels cannot be compiled or loaded.
-        """
-        net = self.net
-        launches = head_kernels(base.device, dtype, head_options(net, self.residual))
-        height, width = base.shape[:2]
-        key = (height, width, dtype, net.out.weight.data_ptr())
-        new_input = partial(folded_input, net, height, width, base, dtype)
-        recorded = None
-        if self._can_record and not is_recording():
-            try:
-                recorded = self._recorded.get(key, lambda: self._record(new_input().zero_(), launches))
-            except BackendError as error:
-                _log.warning("the head is not recorded and runs kernel by kernel: %s", error)
-                self._can_record = False
-        folded = new_input() if recorded is None else recorded.folded
-        fold_pixels(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
-        if recorded is None:
-            raw = self._run(folded, launches)
-        else:
-            recorded.graph.replay()
-            raw = recorded.raw
-        return unfold_pixels(net, raw, base, alpha, launches)
 
-    def _run(self, folded: Tensor, launches: Launches) -> Tensor:
-        # Casting half a million weights costs nothing, and follows the network's training.
-        return network(self.net, Weights(self.net, folded.dtype), folded, launches).last
+def unfold_backward(
+    net: UNet, raw: Tensor, gradient: Tensor, alpha: Tensor, launches: Launches
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Gradients of :func:`unfold_pixels`, from that of the image ``[H, W, 3]``.
 
-    def _record(self, folded: Tensor, launches: Launches) -> _Recording:
-        with warm_up(folded.device):
-            self._run(folded, launches)
-        graph, raw = record(lambda: self._run(folded, launches), folded.device)
-        return _Recording(graph, folded, raw)
+    Returns:
+        The gradients of ``raw``, of accumulation ``[H, W, 1]``, and of weight and bias of the 1 x 1 convolution; the
+        last three are float32.
+    """
+    height, width = gradient.shape[:2]
+    rows, columns = raw.shape[-2:]
+    outputs = len(net.out.weight)
+    gradient, grad_raw = gradient.contiguous(), torch.empty_like(raw)
+    values, grad_values = raw.new_empty(rows, columns, raw.shape[1]), raw.new_empty(rows, columns, outputs)
+    grad_alpha = torch.zeros_like(alpha, memory_format=torch.contiguous_format)
+    layers: list[Argument] = [raw, *last_layers(net), rows, columns]
+    images: list[Argument] = [gradient, alpha, pixel_stride(alpha), height, width]
+    launches["unfold_backward"](rows * columns, [*layers, *images, grad_raw, values, grad_values, grad_alpha])
+    # Sum row by row: as one product it would be a single sum over all pixels, which a GPU cannot parallelise.
+    grad_weight = torch.bmm(grad_values.transpose(1, 2), values).sum(dim=0, dtype=torch.float32)
+    grad_bias = grad_values.sum(dim=(0, 1), dtype=torch.float32)
+    return grad_raw, grad_alpha, grad_weight.reshape(net.out.weight.shape), grad_bias

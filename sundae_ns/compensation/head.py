@@ -16,8 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from sundae_ns.compensation.fused import FusedInference
-from sundae_ns.compensation.fused_training import FusedTraining
+from sundae_ns.compensation import fused
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError, ConfigError
 
@@ -135,11 +134,6 @@ class CompensationHead(nn.Module):
             zero_init=config.mode == "residual",
         )
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._accelerate()
-
-    def _accelerate(self) -> None:
-        residual = self.config.mode == "residual"
-        self._inference, self._training = FusedInference(self.net, residual), FusedTraining(self.net, residual)
         self._can_fuse = True
         # Listed once, because every frame asks for the addresses and a walk over all layers takes 0.1 ms.
         self._weights = tuple(self.net.parameters())
@@ -166,7 +160,7 @@ class CompensationHead(nn.Module):
             own.data, own.grad = getattr(module, name).data.to(own), None
             setattr(module, name, own)
         self.net.train(self.training)
-        self._accelerate()
+        self._weights = tuple(self.net.parameters())
 
     def forward(self, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
         """Compensate one image.
@@ -185,8 +179,8 @@ class CompensationHead(nn.Module):
         if self._can_fuse and dtype != torch.float32:
             try:
                 if not torch.is_grad_enabled():
-                    return self._inference(base, splatted, alpha, dtype)
-                out = self._training(splatted, alpha, dtype)
+                    return fused.compensated(self.net, residual, base, splatted, alpha, dtype)
+                out = fused.correction(self.net, residual, splatted, alpha, dtype)
                 return base + out if residual else out
             except BackendError as error:
                 _log.warning("the head runs layer by layer, not with the kernels for %s: %s", base.device, error)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
 from sundae_ns.errors import BackendError, ConfigError, DataError
@@ -78,14 +78,16 @@ def knn(points: Tensor, k: int) -> Neighbors:
     kernel = _kernel(points.device, dtype, k) if points.is_cuda else None
     if kernel is None:
         coordinates = np.ascontiguousarray(points.detach().to(device="cpu", dtype=torch.float64).numpy())
-        found = _search_host(coordinates, k)
+        found = _search_host(coordinates, k, str(dtype).removeprefix("torch."))
         indices, distances = (torch.from_numpy(values).to(points.device) for values in found)
     else:
         indices, distances = search_tree(build_tree(points.detach().to(dtype)), k, kernel)
     return Neighbors(indices, distances.to(points.dtype))
 
 
-def _search_host(coordinates: NDArray[np.float64], k: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _search_host(
+    coordinates: NDArray[np.float64], k: int, dtype: DTypeLike
+) -> tuple[NDArray[np.int64], NDArray[np.floating]]:
     """Indices and ascending distances ``[N, k]`` of the neighbours of points ``[N, 3]``.
 
     A k-d tree cannot separate points at one position: among a million clones each search would visit all of them. So
@@ -100,7 +102,7 @@ def _search_host(coordinates: NDArray[np.float64], k: int) -> tuple[NDArray[np.i
     counts = np.diff(np.append(starts, n))
     # Fitting boxes to their points takes a quarter of the time to build, and saves nothing in a balanced tree.
     tree = cKDTree(coordinates[order[starts]], compact_nodes=False)
-    indices, distances = np.empty((n, k), np.int64), np.empty((n, k))
+    indices, distances = np.empty((n, k), np.int64), np.empty((n, k), dtype)
     slots, nearest = np.arange(k + 1), np.arange(1, min(k + 1, len(starts)) + 1)
     for rows in np.array_split(order, -(-n // CHUNK)):
         lengths, positions = (found.ravel() for found in tree.query(coordinates[rows], k=nearest, workers=-1))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from typing import cast
 
 import pytest
 import torch
@@ -12,10 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from sundae_ns.compensation import CompensationHead, HeadConfig, fused, fused_training
-from sundae_ns.compensation.fused_training import FusedTraining, _Graphs, _Pass, network_backward
-from sundae_ns.errors import BackendError, SundaeError
-from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, RECORD_AT
+from sundae_ns.compensation import CompensationHead, HeadConfig, fused
+from sundae_ns.errors import BackendError
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -56,12 +53,7 @@ def splatted(height: int, width: int, num_features: int, *, seed: int = 0) -> tu
 
 @torch.no_grad()
 def by_kernels(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    base, seen, alpha = images
-    launches = compiled(head)
-    folded = fused.folded_input(head.net, *base.shape[:2], base, torch.float32).fill_(torch.nan)
-    fused.fold_pixels(seen, alpha, head.config.pixel_unshuffle, head.config.mode == "residual", folded, launches)
-    last = fused.network(head.net, fused.Weights(head.net, torch.float32), folded, launches).last
-    return fused.unfold_pixels(head.net, last, base, alpha, launches)
+    return fused.compensated(head.net, head.config.mode == "residual", *images, torch.float32)
 
 
 @pytest.mark.parametrize("mode", ["residual", "features"])
@@ -112,14 +104,13 @@ def layer_gradients(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor
     return [out.detach(), *grads, *(p.grad.clone() for p in head.parameters() if p.grad is not None)]
 
 
-def kernel_gradients(
-    head: CompensationHead, images: tuple[Tensor, Tensor, Tensor], grad_out: Tensor, training: FusedTraining
-) -> Gradients:
+def kernel_gradients(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor], grad_out: Tensor) -> Gradients:
     """The image and gradients by the fused."""
     base, *leaves = images[0], *(image.clone().requires_grad_() for image in images[1:])
     head.zero_grad()
-    out = training(*leaves, torch.float32)
-    out = base + out if head.config.mode == "residual" else out
+    residual = head.config.mode == "residual"
+    out = fused.correction(head.net, residual, *leaves, torch.float32)
+    out = base + out if residual else out
     (out * grad_out).sum().backward()
     return [out.detach(), *(leaf.grad for leaf in leaves), *(p.grad.clone() for p in head.parameters())]
 
@@ -134,135 +125,32 @@ def assert_same(found: Gradients, expected: Gradients) -> None:
 @pytest.mark.parametrize("pixel_unshuffle", [1, 2, 4])
 def test_same_gradients(mode: str, pixel_unshuffle: int) -> None:
     head = make(mode=mode, pixel_unshuffle=pixel_unshuffle)
-    training = FusedTraining(head.net, mode == "residual")
     for size in ((37, 50), (16, 16)):
         images, grad_out = splatted(*size, 5), torch.randn(*size, 3)
         assert_same(
-            kernel_gradients(head, images, grad_out, training),
+            kernel_gradients(head, images, grad_out),
             layer_gradients(head, images, grad_out),
         )
 
 
 def test_sums_over_pixels_by_few_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fused_training, "MOST_WORKERS", 37)
+    monkeypatch.setattr(fused, "MOST_WORKERS", 37)
     head, images, grad_out = make(), splatted(37, 50, 5), torch.randn(37, 50, 3)
-    training = FusedTraining(head.net, True)
-    assert_same(kernel_gradients(head, images, grad_out, training), layer_gradients(head, images, grad_out))
+    assert_same(kernel_gradients(head, images, grad_out), layer_gradients(head, images, grad_out))
 
 
 @given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
 def test_same_gradients_at_any_size(height: int, width: int, num_features: int, seed: int) -> None:
     head = make(num_features=num_features)
     images, grad_out = splatted(height, width, num_features, seed=seed), torch.randn(height, width, 3)
-    training = FusedTraining(head.net, True)
     both = zip(
-        kernel_gradients(head, images, grad_out, training),
+        kernel_gradients(head, images, grad_out),
         layer_gradients(head, images, grad_out),
         strict=True,
     )
     for found, expected in both:
         # Compare norms: some image has an activation so near zero that rounding decides its slope.
         assert float((found - expected).norm()) <= 2e-3 * max(float(expected.norm()), 1e-3)
-
-
-class FakeGraph:
-    """Stands for a CUDA graph."""
-
-    def __init__(self, replay: Callable[[], None]) -> None:
-        self.replay = replay
-
-
-def as_recorded(head: CompensationHead, height: int, width: int) -> _Pass:
-    """A pass whose results lie in the same buffers each time, as those of a recording do."""
-    net, launches = head.net, compiled(head)
-    weights = fused.Weights(net, torch.float32)
-    folded = fused.folded_input(net, height, width, torch.empty(0), torch.float32).zero_()
-    tape = fused.network(net, weights, folded, launches)
-    grad_raw = torch.zeros_like(tape.last)
-    grad_folded, grad_parameters = network_backward(net, weights, tape, grad_raw, launches)
-
-    def forward() -> None:
-        for gradient in grad_parameters:
-            gradient.fill_(torch.nan)  # the two graphs share their memory
-        weights.refresh()
-        again = fused.network(net, weights, folded, launches)
-        for old, new in zip([*tape.inputs, *tape.coarse, tape.last], [*again.inputs, *again.coarse, again.last]):
-            if old is not folded:
-                old.copy_(new)
-
-    def backward() -> None:
-        found, gradients = network_backward(net, weights, tape, grad_raw, launches)
-        grad_folded.copy_(found)
-        for old, new in zip(grad_parameters, gradients, strict=True):
-            old.copy_(new)
-
-    graphs = [cast("torch.cuda.CUDAGraph", FakeGraph(run)) for run in (forward, backward)]
-    return _Pass(launches, weights, tape, grad_raw, _Graphs(*graphs, grad_folded, grad_parameters))
-
-
-def test_gradients_of_replayed_passes_are_not_copied_and_add_up() -> None:
-    head = make()
-    training = FusedTraining(head.net, True)
-    made = as_recorded(head, 37, 50)
-    training._recorded[37, 50, torch.float32, head.net.out.weight.data_ptr()] = made
-    images, grad_out = [splatted(37, 50, 5, seed=seed) for seed in range(3)], torch.randn(37, 50, 3)
-    expected = [layer_gradients(head, seen, grad_out)[3:] for seen in images]
-    head.zero_grad()
-    for seen in images[:2]:
-        (training(seen[1].clone().requires_grad_(), seen[2], torch.float32) * grad_out).sum().backward()
-    assert_same([p.grad for p in head.parameters() if p.grad is not None], [a + b for a, b in zip(*expected[:2])])
-    assert_same(kernel_gradients(head, images[2], grad_out, training)[3:], expected[2])
-    head.zero_grad()
-    out = training(images[0][1].clone().requires_grad_(), images[0][2], torch.float32)
-    other = torch.randn(37, 50, 3)
-    (out * grad_out).sum().backward(retain_graph=True)
-    (out * other).sum().backward()
-    twice = [p.grad.clone() for p in head.parameters() if p.grad is not None]
-    assert_same(twice, layer_gradients(head, images[0], grad_out + other)[3:])
-    assert_same(kernel_gradients(head, images[2], grad_out, training)[3:], expected[2])
-    assert made.graphs is not None
-    for parameter, gradient in zip(training._parameters, made.graphs.grad_parameters):
-        assert parameter.grad is not None
-        assert parameter.grad.data_ptr() == gradient.data_ptr()
-
-
-def test_gradients_of_an_earlier_image_are_refused() -> None:
-    head = make()
-    training = FusedTraining(head.net, True)
-    images = [splatted(16, 16, 5, seed=seed) for seed in range(2)]
-    outs = [training(p[1].clone().requires_grad_(), p[2], torch.float32) for p in images]
-    with pytest.raises(SundaeError, match=r"before the next forward pass$"):
-        outs[0].sum().backward()
-    outs[1].sum().backward()
-
-
-@torch.no_grad()
-def test_a_head_that_cannot_be_recorded_runs_kernel_by_kernel(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def refuse(*_: object) -> None:
-        raise BackendError("no recordings today")
-
-    head = make()
-    images = splatted(16, 16, 5)
-    expected = head(*images)
-    monkeypatch.setattr(head._inference, "_record", refuse)
-    for _ in range(RECORD_AT + 2):
-        torch.testing.assert_close(head._inference(*images, torch.float32), expected, rtol=1e-4, atol=1e-5)
-    assert caplog.text.count("kernel by kernel: no recordings today") == 1
-
-
-def test_late_gradients_of_replayed_passes_are_refused() -> None:
-    """Two images of one size share their buffers."""
-    head = make()
-    training = FusedTraining(head.net, True)
-    recorded = as_recorded(head, 16, 16)
-    training._recorded[16, 16, torch.float32, head.net.out.weight.data_ptr()] = recorded
-    images = [splatted(16, 16, 5, seed=seed) for seed in range(2)]
-    outs = [training(seen[1].clone().requires_grad_(), seen[2], torch.float32) for seen in images]
-    with pytest.raises(SundaeError, match=r"before the next forward pass$"):
-        outs[0].sum().backward()
-    outs[1].sum().backward()
 
 
 def test_kernels_compile_for_gpus_that_have_the_types(compile_for_gpu: Callable[..., bytes]) -> None:
@@ -279,7 +167,6 @@ def test_on_a_gpu_at_any_size_with_changing_weights(mode: str) -> None:
     exact = make(mode=mode, size="compact", num_features=13, precision="fp32").cuda().eval()
     quick = make(mode=mode, size="compact", num_features=13).cuda().eval()
     sizes = [(33, 40)] * 5 + [(48, 64)] * 4 + [(33, 40), (16, 16)] + [(31, 30)] * 3 + [(20, 30)] * 3 + [(8, 8)] * 3
-    kept = []
     for seed, (height, width) in enumerate([*sizes, *sizes]):
         for parameter in exact.parameters():
             parameter += 0.01 * torch.randn_like(parameter)
@@ -288,22 +175,7 @@ def test_on_a_gpu_at_any_size_with_changing_weights(mode: str) -> None:
         found, expected = quick(*images), exact(*images)
         scale = float((expected - images[0]).abs().max())
         assert float((found - expected).abs().max()) < 0.02 * scale
-        kept.append((found, found.clone()))
     assert quick._can_fuse
-    assert len(quick._inference._recorded) == MAX_GRAPHS
-    for found, copy in kept:  # no image was overwritten by a later one
-        assert torch.equal(found, copy)
-
-
-@pytest.mark.gpu
-@torch.no_grad()
-def test_recorded_and_unrecorded_images_are_equal() -> None:
-    head = make(size="compact", num_features=13).cuda().eval()
-    images = tuple(image.cuda() for image in splatted(64, 80, 13))
-    shown = [head(*images) for _ in range(5)]
-    assert len(head._inference._recorded) == 1
-    for image in shown[1:]:
-        assert torch.equal(image, shown[0])
 
 
 @pytest.mark.gpu
@@ -351,7 +223,6 @@ def test_training_on_a_gpu_matches_the_layers(mode: str) -> None:
     for table, slack in [*((each, 0.1) for each in norms), (together, 0.01)]:
         error, allowed, whole = table.unbind(1)
         assert (error <= 4 * allowed + slack * whole).all(), (error, allowed, whole)
-    assert len(quick._training._recorded) == MAX_GRAPHS
 
 
 @pytest.mark.gpu
@@ -362,7 +233,6 @@ def test_gradients_of_several_images_add_up_on_a_gpu() -> None:
     shown = [tuple(image.cuda() for image in splatted(*size, 13, seed=n)) for n, size in enumerate(sizes)]
     for images in shown:
         parts.append(layer_gradients(head, images, torch.ones(3, device="cuda"))[3:])
-    assert len(head._training._recorded) == 2
     head.zero_grad()
     for base, *leaves in shown:
         head(base, *(leaf.clone().requires_grad_() for leaf in leaves)).sum().backward()

@@ -29,7 +29,7 @@ N = 60
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: Any, mode: str) -> None:
-    model = build(pruning={"score": "contribution"}, rasterize_mode=mode)
+    model = build(rasterize_mode=mode)
     # Thinner than a pixel, where the two modes differ by far.
     model.gauss_params["scales"].data[:30] = -6.0
     model.gauss_params["means"].data[4] = torch.tensor([0.0, 0.0, 50.0])
@@ -44,12 +44,13 @@ def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: A
     assert float(total.sum()) == pytest.approx(float(torch.stack(alphas).sum()), rel=1e-4)
 
 
-@pytest.mark.parametrize("score", ["contribution", "detail-contribution"])
-def test_what_masks_leave_out_of_training_asks_for_no_primitives(build: Build, datamanager: Any, score: str) -> None:
+@pytest.mark.parametrize("count", [None, N // 2])
+def test_what_masks_leave_out_of_training_asks_for_no_primitives(
+    build: Build, datamanager: Any, count: int | None
+) -> None:
     """The two halves of an image add up to the whole; many primitives contribute to one half only."""
-    model = build(pruning={"score": score})
+    model = build()
     model.gauss_params["scales"].data[:] = -4.0
-    count = N // 2 if score == "detail-contribution" else None
     whole = model.contribution(datamanager, count)
     left = torch.zeros(32, 40, 1, dtype=torch.bool)
     left[:, :20] = True

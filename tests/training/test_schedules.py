@@ -348,7 +348,6 @@ def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> No
         ({"mode": "continuous", "max_drop": 0.1}, "max_drop is set, and trials do not decide"),
         ({"mode": "continuous", "keep_ratio": None}, "keep_ratio is None and mode is continuous"),
         ({"mode": "off", "max_primitives": 4}, "mode is off, which prunes nothing"),
-        ({"mode": "auto"}, "mode auto has gone: one-shot without keep_ratio lets trials decide"),
         ({"mode": "continuous", "max_primitives": 4, "target_primitives": 5}, "is more than max_primitives"),
     ],
 )
