@@ -34,7 +34,7 @@ from sundae_ns.evaluation import median_ms
 from sundae_ns.gpu.cuda_graphs import record, warm_up
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.rasterization import BackendName, rasterize, select_backend
-from sundae_ns.training import losses
+from sundae_ns.training import step
 
 SIZES = ((533, 800), (824, 1240), (1893, 1061))
 """Height and width of the images of the loss and of the heads, pixels."""
@@ -97,7 +97,7 @@ def loss(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     def convolved(dtype: torch.dtype) -> Callable[[Tensor, Tensor], Tensor]:
         ssim = SSIM(data_range=1.0, channel=3)
         ssim.win = ssim.win.to(options.device, dtype)  # no buffer: moving the module would leave it
-        return lambda image, target: losses.convolved_loss(image, target, ssim, SSIM_WEIGHT)
+        return lambda image, target: step.convolved_loss(image, target, ssim, SSIM_WEIGHT)
 
     def graded(way: Callable[[Tensor, Tensor], Tensor], image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         leaf = image.detach().requires_grad_()
@@ -106,7 +106,7 @@ def loss(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
     ways = {"convolutions": convolved(torch.float32)}
     if options.device == "cuda":
-        ways["fused"] = lambda image, target: losses.fused_loss(image, target, SSIM_WEIGHT)[0]
+        ways["fused"] = lambda image, target: step.fused_loss(image, target, SSIM_WEIGHT)[0]
     for height, width in SIZES:
         torch.manual_seed(0)
         target = torch.rand(height, width, 3, device=options.device)

@@ -108,7 +108,7 @@ def outcome(folder: Path, steps: int) -> dict[str, Any]:
     return {
         "tensors": {name: value for name, value in state["pipeline"].items() if isinstance(value, torch.Tensor)},
         "prunes": [{key: prune[key] for key in ("step", "before", "after", "warm_up", "pruned")} for prune in prunes],
-        "trials": {path.name: json.loads(path.read_text()) for path in folder.glob("[st]*.json")},
+        "trials": {path.name: json.loads(path.read_text()) for path in folder.glob("trials.json")},
         "files": sorted(path.name for path in models.iterdir()),
     }
 
@@ -201,7 +201,7 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
         else:
             resumed_psnr.append(quality(folder))
             same = resumed_psnr[-1] > min(undisturbed) - SPREAD
-        decisions[found["trials"].get("trials.json", {}).get("decision", "")] += 1
+        decisions[found["trials"].get("trials.json", {}).get("head", {}).get("decision", "")] += 1
         for name, held in (("one prune", one_prune), ("the same result", same), ("nothing left lying", clean)):
             tally[name] += held
         lost += not (killed and one_prune and same and clean)
@@ -212,7 +212,7 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
         "steps": what.steps,
         "save_every": what.save_every,
         "primitives": [reference["prunes"][0]["before"], reference["prunes"][0]["after"]],
-        **({"decision": reference["trials"]["trials.json"]["decision"]} if kind == "trials" else {}),
+        **({"decision": reference["trials"]["trials.json"]["head"]["decision"]} if kind == "trials" else {}),
         **({"decisions after kills": decisions} if kind == "trials" and not exact else {}),
         "same seed, same result": repeatable if exact else None,
         **({} if exact else {"psnr, undisturbed": undisturbed, "psnr, resumed": resumed_psnr}),

@@ -62,8 +62,8 @@ class Room(NamedTuple):
 ROOMS = {
     "pruning": Room(("pruning/[!_]*.py",), ("pruning/test_*.py", "training/test_schedules.py")),
     "schedules": Room(
-        ("training/schedules.py", "training/trials/curve.py"),
-        ("training/test_schedules.py", "training/trials/test_curve.py"),
+        ("training/pruning.py", "training/choice.py"),
+        ("training/test_schedules.py", "training/test_choice.py", "training/test_golden_trials.py"),
     ),
     "surgery": Room(("gaussians/surgery.py", "gaussians/merging.py"), ("gaussians/test_*.py",)),
     "packing": Room(("storage/pack/[!_]*.py",), ("storage/pack/test_*.py", "fuzz/test_readers.py")),

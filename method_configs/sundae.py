@@ -15,10 +15,8 @@ from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.trainer import SundaeTrainerConfig
-from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
-from sundae_ns.training.progress import ProgressWriter
-from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.schedulers import PruneAwareDecayConfig
+from sundae_ns.training import nerfstudio_configs as configs
+from sundae_ns.training.pruning import PruningConfig
 
 
 def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
@@ -33,16 +31,17 @@ def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
     rates = {"means": 1.6e-4, "features_dc": 0.0025, "features_rest": 0.0025 / 20, "opacities": 0.05, "scales": 0.005}
     rates |= {"quats": 0.001, "features": 0.0025, "camera_opt": 1e-4}
     groups: dict[str, Any] = {
-        name: {"optimizer": FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None} for name, rate in rates.items()
+        name: {"optimizer": configs.FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None}
+        for name, rate in rates.items()
     }
     restart = None if plain else rates["means"]
-    groups["means"]["scheduler"] = PruneAwareDecayConfig(lr_final=1.6e-6, max_steps=steps, lr_restart=restart)
-    groups["camera_opt"]["scheduler"] = PruneAwareDecayConfig(lr_final=5e-7, max_steps=steps)
+    groups["means"]["scheduler"] = configs.PruneAwareDecayConfig(lr_final=1.6e-6, max_steps=steps, lr_restart=restart)
+    groups["camera_opt"]["scheduler"] = configs.PruneAwareDecayConfig(lr_final=5e-7, max_steps=steps)
     rise = min(500, steps // 12)
     groups["compensation"] = {
         # The usual eps: with the tiny one of 3DGS, weights with almost no gradient would take full steps.
-        "optimizer": NetworkAdamConfig(lr=1e-3, eps=1e-8, weight_decay=0.0 if plain else 0.15),
-        "scheduler": PruneAwareDecayConfig(
+        "optimizer": configs.NetworkAdamConfig(lr=1e-3, eps=1e-8, weight_decay=0.0 if plain else 0.15),
+        "scheduler": configs.PruneAwareDecayConfig(
             lr_final=1e-5, max_steps=steps, lr_restart=1e-3, hold_until_prune=True, warmup_steps=rise, shape="cosine"
         ),
     }
@@ -87,7 +86,7 @@ def method(
         ),
         logging=LoggingConfig(
             steps_per_log=100 if cuda else 10,  # TensorBoard waits for the GPU to read the figures of a step
-            local_writer=LocalWriterConfig(_target=ProgressWriter, enable=True),
+            local_writer=LocalWriterConfig(_target=configs.ProgressWriter, enable=True),
         ),
         optimizers=optimizers(steps, plain=plain_optimizers),
         # A training ends by itself, so that the next command runs; ns-viewer shows the run afterwards.

@@ -20,12 +20,11 @@ from sundae_ns.rendering import LocalField, RenderSettings, TrainingView
 from sundae_ns.storage.accounting import BYTES_PER_FLOAT, bytes_of_module, megabytes
 from sundae_ns.storage.config_file import find_config
 from sundae_ns.storage.run_folder import take_records
-from sundae_ns.training.extension import Extension, Photo
-from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.state import Extension, FieldState, Photo
 
 
 class NerfstudioRun:
-    """A training by nerfstudio's trainer; see :class:`sundae_ns.training.extension.TrainingRun` for the members.
+    """A training by nerfstudio's trainer; see :class:`sundae_ns.training.state.TrainingRun` for the members.
 
     Args:
         model: a ``SundaeModel``, which imports this module.

@@ -33,7 +33,7 @@ from sundae_ns.parsing import (
     undistorting,
     warn_of_cloud,
 )
-from sundae_ns.training.warning import warn
+from sundae_ns.training.progress import warn
 
 DATASET_FRAME = "sundae_dataset_frame"
 """Metadata key of the training set: transform ``[3, 4]`` and scale from the capture's coordinates to the model's."""

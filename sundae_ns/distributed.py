@@ -44,9 +44,8 @@ from sundae_ns.rasterization.reference import BLUR, FOV_MARGIN, camera_center
 from sundae_ns.rendering.render import NEAR_PLANE, ColorSettings, LocalField, colors_from
 from sundae_ns.rendering.views import View
 from sundae_ns.training.densification import COUNTED, start_counting
-from sundae_ns.training.extension import Extension
-from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.photo_gains import PhotoGains
+from sundae_ns.training.exposure import PhotoGains
+from sundae_ns.training.state import Extension, FieldState
 
 HEAD = "compensation"
 """Name of the head's optimizer: every rank holds a copy of the head."""

@@ -33,14 +33,12 @@ from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, LocalField, RenderSett
 from sundae_ns.rendering.views import View, crop_image, view_of
 from sundae_ns.storage import checkpoint
 from sundae_ns.training.build import build
-from sundae_ns.training.extension import Extension
-from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.initial_field import Start
-from sundae_ns.training.losses import StepLosses
-from sundae_ns.training.photo_gains import PhotoGains
-from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.step import StepInputs, TrainingStep, training_part
-from sundae_ns.training.trials.count import CountTrials
+from sundae_ns.training.exposure import PhotoGains
+from sundae_ns.training.initialize import Start
+from sundae_ns.training.pruning import PruningConfig
+from sundae_ns.training.state import Extension, FieldState
+from sundae_ns.training.step import StepInputs, StepLosses, TrainingStep, training_part
+from sundae_ns.training.trials import Trials
 from sundae_ns.viewer import ViewerControls, in_viewer
 
 
@@ -278,7 +276,7 @@ class SundaeModel(SplatfactoModel):
 
     def count_curve(self) -> list[CurvePoint]:
         """The curve by which trials have chosen the number of primitives; empty without them."""
-        return [point for one in self.extensions if isinstance(one, CountTrials) for point in one.progress.curve()]
+        return [point for one in self.extensions if isinstance(one, Trials) for point in one.progress.curve()]
 
     # ----------------------------------------------------------------------------------------------------- training
 

@@ -33,13 +33,10 @@ from sundae_ns.storage import checkpoint, run_folder
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.checkpoint import random_state, set_random_state
 from sundae_ns.storage.config_file import find_capture
-from sundae_ns.training.interruption import Interruption, resume_command
-from sundae_ns.training.loaded_run import loaded_run
-from sundae_ns.training.optimizers import FusedAdamConfig
-from sundae_ns.training.progress import long_on_cpu
-from sundae_ns.training.recorded import RecordedStep
-from sundae_ns.training.run_length import schedule_table, set_schedule
-from sundae_ns.training.warning import warn
+from sundae_ns.training.capture import RecordedStep
+from sundae_ns.training.nerfstudio_configs import FusedAdamConfig
+from sundae_ns.training.progress import Interruption, loaded_run, long_on_cpu, resume_command, warn
+from sundae_ns.training.schedules import schedule_table, set_schedule
 from sundae_ns.viewer import stop_rendering
 
 
@@ -67,7 +64,9 @@ class SundaeTrainerConfig(TrainerConfig):
         datamanager = self.pipeline.datamanager
         if isinstance(datamanager, SundaeDatamanagerConfig):
             datamanager.check()
-        set_schedule(self, sys.argv[1:])
+        from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
+
+        set_schedule(self, all_methods.get(str(self.method_name)), sys.argv[1:])
         scaled = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
         title = f"{self.max_num_iterations:,}{scaled} steps"
         table = Table("part of training", "steps", title=title, title_justify="left")

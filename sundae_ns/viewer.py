@@ -32,7 +32,7 @@ from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import Pruned, PruneRule, band_rule, field_graph, kept_count, prune_field
 from sundae_ns.rendering.frames import FieldKey
 from sundae_ns.rendering.render import LocalField
-from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.state import FieldState
 
 RuleName = Literal["as configured", "band: high", "band: low", "band: both"]
 

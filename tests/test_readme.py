@@ -13,7 +13,7 @@ import pytest
 from sundae_ns.cli import main
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.method_configs.sundae import sundae
-from sundae_ns.training.pruning_config import PruningConfig
+from sundae_ns.training.pruning import PruningConfig
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 import tyro
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
@@ -32,8 +32,8 @@ from sundae_ns.storage import checkpoint
 from sundae_ns.storage.checkpoint import random_state, set_random_state
 from sundae_ns.storage.config_file import load_config
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
-from sundae_ns.training.interruption import Interruption
-from sundae_ns.training.run_length import set_schedule
+from sundae_ns.training.progress import Interruption
+from sundae_ns.training.schedules import set_schedule
 
 
 def state(step: int, n: int = 50) -> dict[str, Any]:
@@ -300,7 +300,7 @@ def configured(tmp_path: Path, *words: str) -> Any:
     arguments = ["sundae", "--output-dir", str(tmp_path), "--experiment-name", "e", *words]
     config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)  # type: ignore[call-overload]
     config.timestamp = "t"
-    set_schedule(config, arguments)
+    set_schedule(config, all_methods.get(str(config.method_name)), arguments)
     return config
 
 

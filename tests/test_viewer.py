@@ -27,9 +27,8 @@ from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.pruning import PruneRule, response
 from sundae_ns.pruning.decision import FieldPruner
 from sundae_ns.rendering import LocalField, render_view
-from sundae_ns.training.optimizers import FusedAdamConfig
-from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.schedules import PruningSchedule
+from sundae_ns.training.nerfstudio_configs import FusedAdamConfig
+from sundae_ns.training.pruning import PruningConfig, PruningSchedule
 from sundae_ns.viewer import RuleName, ViewerControls, previewed_rule
 
 N = 90

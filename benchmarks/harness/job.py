@@ -20,7 +20,7 @@ from typing import Annotated, Any, NoReturn
 
 import torch
 import tyro
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler, writer
@@ -48,7 +48,7 @@ from sundae_ns.storage.pack import (
     write_fitted,
 )
 from sundae_ns.trainer import SundaeTrainerConfig
-from sundae_ns.training.run_length import set_schedule
+from sundae_ns.training.schedules import set_schedule
 
 NEVER = 10**9
 """A step that no training reaches."""
@@ -248,7 +248,7 @@ def _parsed(arguments: Words) -> TrainerConfig:
     assert isinstance(config, TrainerConfig)
     config.pipeline.datamanager.data = config.data
     if isinstance(config, SundaeTrainerConfig):
-        set_schedule(config, arguments)
+        set_schedule(config, all_methods.get(str(config.method_name)), arguments)
     return config
 
 

@@ -12,8 +12,8 @@ from typing import Any
 import sundae_ns.pruning.decision
 import sundae_ns.storage.atomic
 import sundae_ns.storage.checkpoint
-import sundae_ns.training.report
-from sundae_ns.training.trials import engine
+import sundae_ns.training.pruning
+from sundae_ns.training import trials
 
 Place = Callable[[int], None]
 """Prepares this process to die the n-th time that it comes there."""
@@ -84,13 +84,13 @@ TRAINING: dict[str, Place] = {
     **SAVES,
     "prune: deciding": lambda n: after(1, sundae_ns.pruning.decision, "decide", at_once),
     "prune: sliced": lambda n: after(1, sundae_ns.pruning.decision, "keep", when_done),
-    "prune: half recorded": lambda n: after(1, sundae_ns.training.report, "write_text", half_recorded),
+    "prune: half recorded": lambda n: after(1, sundae_ns.training.pruning, "write_text", half_recorded),
 }
 TRIALS: dict[str, Place] = {
-    "trial: started": lambda n: after(n, engine.TrialEngine, "start", when_done),
-    "trial: measuring": lambda n: after(n, engine, "measure_heldout", at_once),
-    "trial: back to the field before it": lambda n: after(1, engine.TrialEngine, "go_back", when_done),
-    "trials: ended": lambda n: after(1, engine.TrialEngine, "end", when_done),
+    "trial: started": lambda n: after(n, trials.TrialEngine, "start", when_done),
+    "trial: measuring": lambda n: after(n, trials, "measure_heldout", at_once),
+    "trial: back to the field before it": lambda n: after(1, trials.TrialEngine, "go_back", when_done),
+    "trials: ended": lambda n: after(1, trials.TrialEngine, "end", when_done),
     **SAVES,
 }
 COMMANDS: dict[str, Place] = {

@@ -51,7 +51,7 @@ def distill(
     check_file(out, reads=[source, cameras], overwrite=overwrite)
     scene = load(source).to(fastest_device())
     from sundae_ns.scenes.distill import Distillation
-    from sundae_ns.training.interruption import Interruption
+    from sundae_ns.training.progress import Interruption
 
     partial = out.with_name(f"{out.name}.partial")
     console = Console(stderr=True)

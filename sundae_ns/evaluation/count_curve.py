@@ -1,4 +1,4 @@
-"""The curve of expected quality over the number of primitives, as a run records it in ``curve.json``."""
+"""The curve of expected quality over the number of primitives, as a run records it in ``trials.json``."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ import numpy as np
 from sundae_ns.errors import CheckpointError
 from sundae_ns.evaluation.measured import MEGABYTE, table
 
-CURVE = "curve.json"
-"""Name of the record in the folder of a run."""
+RECORD = "trials.json"  # in the folder of a run
 
 
 @dataclass(frozen=True)
@@ -30,9 +29,8 @@ class CurvePoint:
     ssim: float
     """Expected SSIM."""
     psnr_loss: float
-    """PSNR that is lost against the best count, dB."""
+    """PSNR (dB) that is lost against the best count for it; so for SSIM."""
     ssim_loss: float
-    """SSIM that is lost against the best count for SSIM."""
     psnr_error: float
     """Standard error of the loss over the views, dB."""
     ssim_error: float
@@ -62,14 +60,16 @@ def read_count_curve(folder: Path) -> CountCurve | None:
     Raises:
         CheckpointError: the record is damaged.
     """
-    path, names = folder / CURVE, {field.name for field in fields(CurvePoint)}
+    path, names = folder / RECORD, {field.name for field in fields(CurvePoint)}
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8")).get("count")
+        if found is None:
+            return None
         points = [CurvePoint(**{name: _number(point[name]) for name in names}) for point in found["curve"]]  # type: ignore[arg-type]
         return CountCurve(int(found["chosen"]), int(found["full"]), str(found["reason"]), tuple(points))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path} cannot be read ({error}); remove it, or train the run again") from error
 
 

@@ -13,7 +13,7 @@ from sundae_ns.api.files import FRAME_FILE
 from sundae_ns.data.capture import read_json
 from sundae_ns.errors import DataError
 from sundae_ns.parsing.placing import STRAY, TYPES, stray_cameras
-from sundae_ns.training.warning import warn
+from sundae_ns.training.progress import warn
 
 
 def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None = None) -> str | None:

@@ -27,7 +27,7 @@ from sundae_ns.data.lenses import DISTORTION, INTRINSICS, PERSPECTIVE, Lens, len
 from sundae_ns.errors import DataError
 from sundae_ns.parsing.placing import COARSE_STEP, Array, Placing, float32_step, rebound, replaced
 from sundae_ns.storage.ply import read_point_cloud
-from sundae_ns.training.warning import warn
+from sundae_ns.training.progress import warn
 
 
 def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, images: bool = True) -> None:

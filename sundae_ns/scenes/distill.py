@@ -31,13 +31,11 @@ from sundae_ns.rendering import LocalField, View
 from sundae_ns.storage.accounting import stored_bytes
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, weights_of
-from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.losses import StepLosses
-from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
-from sundae_ns.training.recorded import RecordedStep
-from sundae_ns.training.schedulers import sparse_factor
-from sundae_ns.training.step import StepInputs, TrainingStep
-from sundae_ns.training.trials.head import least_gain
+from sundae_ns.training.capture import RecordedStep
+from sundae_ns.training.choice import least_gain
+from sundae_ns.training.schedules import NETWORK_BETAS, fused_adam, network_groups, sparse_factor
+from sundae_ns.training.state import FieldState
+from sundae_ns.training.step import StepInputs, StepLosses, TrainingStep
 
 _log = logging.getLogger(__name__)
 
@@ -140,11 +138,11 @@ class Distillation:
                 networks["head"] = CompensationHead(self._head_config).to(params["means"].device)
         trained = {name: Parameter(value) for name, value in params.items()}
         optimizers: dict[str, torch.optim.Optimizer] = {
-            name: FusedAdamConfig(lr=RATES[name], eps=1e-15).setup([value]) for name, value in trained.items()
+            name: fused_adam([{"params": [value], "lr": RATES[name]}], eps=1e-15) for name, value in trained.items()
         }
         if self._head_config is not None:
-            adam = NetworkAdamConfig(lr=1e-3, eps=1e-8, weight_decay=0.15)
-            optimizers["compensation"] = adam.setup(networks["head"].parameters())
+            groups = network_groups(networks["head"].parameters(), 1e-3, weight_decay=0.15)
+            optimizers["compensation"] = fused_adam(groups, eps=1e-8, betas=NETWORK_BETAS, decoupled_weight_decay=True)
         state = FieldState(Field(trained, field.encoding), networks, optimizers, pruning={"num_prunes": 1})
         focals = [view.focal for view in self.cameras]
         state.trained_focal = (min(focals), max(focals))

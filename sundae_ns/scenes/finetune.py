@@ -26,8 +26,8 @@ from sundae_ns.rendering.render import RenderSettings
 from sundae_ns.scenes.models import load_model, place
 from sundae_ns.storage.pack import Codecs, PackConfig, PackedScene, fit_scene
 from sundae_ns.storage.pack.codecs import estimated_bits
-from sundae_ns.training.optimizers import NetworkAdamConfig
-from sundae_ns.training.recordings import StepRecordings
+from sundae_ns.training.capture import StepRecordings
+from sundae_ns.training.schedules import NETWORK_BETAS
 from sundae_ns.training.step import StepInputs, StepResult
 
 _log = logging.getLogger(__name__)
@@ -128,9 +128,7 @@ def _optimizer(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Optim
         {"params": [value], "lr": RATES[name], "eps": 1e-15} for name, value in field.items()
     ]
     if head:
-        groups.append(
-            {"params": list(head.values()), "lr": RATES["head"], "eps": 1e-8, "betas": NetworkAdamConfig.betas}
-        )
+        groups.append({"params": list(head.values()), "lr": RATES["head"], "eps": 1e-8, "betas": NETWORK_BETAS})
     on_cuda = next(iter(field.values())).is_cuda
     if on_cuda:
         for group in groups:

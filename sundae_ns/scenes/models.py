@@ -44,7 +44,7 @@ from sundae_ns.storage.config_file import check_run, config_of, load_config
 from sundae_ns.storage.fingerprint import fingerprint
 from sundae_ns.storage.formats import kind_of, refuse, unread
 from sundae_ns.storage.run_folder import prunes_of
-from sundae_ns.training.pruning_config import PruningConfig
+from sundae_ns.training.pruning import PruningConfig
 
 _PARSERS: dict[str, type[DataParserConfig]] = {
     "blender-data": BlenderDataParserConfig,

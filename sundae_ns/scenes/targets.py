@@ -19,7 +19,7 @@ from sundae_ns.errors import PackError, SundaeError
 from sundae_ns.scenes.models import load_model, place
 from sundae_ns.storage.pack import Codecs, PackConfig, PackedScene, fit_scene, pack_bytes
 from sundae_ns.storage.pack.config import STEPS
-from sundae_ns.training.trials.head import GAIN_PER_DOUBLING
+from sundae_ns.training.choice import GAIN_PER_DOUBLING
 
 FINEST, COARSEST = -3.0, 4.0
 """Ends of the search: powers of two of the factor."""

@@ -3,7 +3,7 @@
 config.yml           options, as nerfstudio saves them (:mod:`sundae_ns.storage.config_file`)
 nerfstudio_models/   checkpoints (:mod:`sundae_ns.storage.checkpoint`)
 prune.json           a list with an object for each prune
-trials.json, stopping.json   what the trials decided
+trials.json                  what the trials decided
 training.lock        names the process that trains here, which holds its lock
 """
 
@@ -23,8 +23,8 @@ from sundae_ns.storage.checkpoint import newest_step
 from sundae_ns.storage.config_file import capture_and_source, config_of, schedule_length
 
 LOCK = "training.lock"
-PRUNES, TRIALS, STOPPING = "prune.json", "trials.json", "stopping.json"
-"""Records of what a resumed run does not repeat; the watch of the last one follows the decision of the trials."""
+PRUNES = "prune.json"
+"""Record of the prunes, which a resumed run does not repeat."""
 _held: dict[Path, TextIO] = {}
 
 
@@ -127,11 +127,6 @@ def take_records(source: Path, run: Path, step: int) -> None:
     before = [record for record in prunes if isinstance(record.get("step"), int) and record["step"] <= step]
     if before and not (run / PRUNES).exists():
         write_text(run / PRUNES, json.dumps(before, indent=2))
-    with suppress(OSError, ValueError, AttributeError, TypeError):
-        decided = json.loads(regular(source / TRIALS).read_text(encoding="utf-8")).get("step", step) <= step
-        for name in (TRIALS, STOPPING) if decided else ():
-            if (source / name).is_file() and not (run / name).exists():
-                write_text(run / name, (source / name).read_text(encoding="utf-8"))
 
 
 # ----------------------------------------------------------------------------------------------------- unfinished runs

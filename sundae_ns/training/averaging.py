@@ -5,16 +5,17 @@ A step sees one image, so the weights wander around what suits all of them; thei
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sundae_ns.training.extension import Extension, TrainingRun
-from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.state import Extension, FieldState, TrainingRun
+
+log = logging.getLogger(__name__)
 
 AVERAGED_EVERY = 10
 """Steps between two weights that count: neighbours differ by little."""
@@ -144,7 +145,7 @@ class Averaging(Extension):
         if state.step % AVERAGED_EVERY == 0:
             self._mean.count_in(weights)
         if state.step == last and self._mean.fits(weights):
-            CONSOLE.log(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
+            log.info(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
             replaced = self._mean.replace(weights)
             self._replaced = replaced if self._alone else {}
             if last == end:  # after a part, the mean goes on with the rest of the run

@@ -10,23 +10,15 @@ from sundae_ns.compensation import CompensationHead
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.training.averaging import Averaging
-from sundae_ns.training.dense_start import DenseStart
 from sundae_ns.training.densification import Densification, make_strategy
-from sundae_ns.training.extension import Extension
-from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.floaters import FloaterRemoval
-from sundae_ns.training.initial_field import Frame, Points, Start, initial_field
-from sundae_ns.training.options import ModelOptions
-from sundae_ns.training.photo_gains import PhotoGains
-from sundae_ns.training.pruning import ScheduledPruning
-from sundae_ns.training.schedules import PruningSchedule
-from sundae_ns.training.trials.count import CountTrials
-from sundae_ns.training.trials.engine import TrialEngine
-from sundae_ns.training.trials.head import HeadTrials
-from sundae_ns.training.trials.stopping import EarlyStopping
+from sundae_ns.training.exposure import PhotoGains
+from sundae_ns.training.initialize import DenseStart, Frame, Points, Start, initial_field
+from sundae_ns.training.pruning import FloaterRemoval, PruningSchedule, ScheduledPruning
+from sundae_ns.training.state import Extension, FieldState
+from sundae_ns.training.trials import AfterPrune, Trials
 
 
-def check(options: ModelOptions) -> None:
+def check(options: Any) -> None:
     """Check options that cannot work, alone or together.
 
     Raises:
@@ -51,20 +43,20 @@ def check(options: ModelOptions) -> None:
 
 
 def build(
-    options: ModelOptions, num_images: int, points: Points | None, frame: Frame | None
+    options: Any, num_images: int, points: Points | None, frame: Frame | None
 ) -> tuple[FieldState, list[Extension], Start]:
     """Build the parts on the CPU.
 
     Args:
-        options: of the model.
+        options: ``SundaeModelConfig``.
         num_images: number of training images.
         points: sparse points of the capture, if it has any.
         frame: transform from the capture's coordinates to the model's, if known.
 
     Returns:
-        State of field and head; extensions in their order (dense start, densification, removal of floaters, trials of
-        counts, scheduled pruning, trials of the head and stopping, gains of the photos, averaging; trials and
-        averaging optional); what to announce when training starts.
+        State of field and head; extensions in their order (dense start, densification, removal of floaters, trials,
+        scheduled pruning, trials after the prune, gains of the photos, averaging; trials and averaging optional);
+        what to announce when training starts.
 
     Raises:
         ConfigError: an option cannot work.
@@ -87,16 +79,22 @@ def build(
     densification.initialize(state)
     state.pruning = schedule.initialize_state()
     begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
-    engine = TrialEngine(begins_at)
     removal = FloaterRemoval(None if points is None else points[0])
     dense = DenseStart(options, points, num_images, num_features=num_features, cap=strategy.cap)
     extensions: list[Extension] = [dense, densification, removal]
-    counts = CountTrials(pruning, densification, engine, alone=options.head.mode != "auto") if pruning.decides else None
-    extensions += [] if counts is None else [counts]
-    extensions.append(ScheduledPruning(schedule, evaluate=options.evaluate_prune))
-    if options.head.mode == "auto":
-        decision = HeadTrials(begins_at, state, engine, None if counts is None else counts.head_pays)
-        extensions += [decision, EarlyStopping(decision, options.ssim_lambda, engine)]
+    scheduled, decides_head = ScheduledPruning(schedule, evaluate=options.evaluate_prune), options.head.mode == "auto"
+    if pruning.decides or decides_head:
+        trials = Trials(
+            pruning,
+            state,
+            densification,
+            begins_at=begins_at,
+            decides_head=decides_head,
+            ssim_weight=options.ssim_lambda,
+        )
+        extensions += [trials, scheduled, AfterPrune(trials)]
+    else:
+        extensions.append(scheduled)
     extensions.append(PhotoGains(num_images, options.photo_gains))
     if options.average_share > 0:
         extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))

@@ -13,9 +13,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from torch import Tensor
 
-from sundae_ns.training.extension import Extension, TrainingRun
-from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.options import ModelOptions
+from sundae_ns.training.state import Extension, FieldState, TrainingRun
 
 STATISTICS = ("grad2d", "count", "radii")
 """Tensors ``[N]`` in the running state of gsplat's strategy."""
@@ -154,7 +152,7 @@ class Densification(Extension):
             self.strategy.step_post_backward(params, state.optimizers, running, state.schedule_step, state.info)
 
 
-def make_strategy(options: ModelOptions, num_images: int) -> CappedStrategy:
+def make_strategy(options: Any, num_images: int) -> CappedStrategy:
     """Strategy of the warm-up. It ends before the prune that would undo it.
 
     Args:

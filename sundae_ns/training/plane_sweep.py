@@ -18,7 +18,7 @@ from torch.nn.functional import grid_sample, interpolate, normalize, pad
 from sundae_ns.gpu.kernels import Launch, kernels_where_possible
 from sundae_ns.gpu.sweep import WINDOW, FusedCorrelations, Patches, sweep_kernels
 from sundae_ns.rendering.views import View
-from sundae_ns.training.extension import Photo
+from sundae_ns.training.state import Photo
 
 CONTRAST = 0.02
 """Least standard deviation of the grey values of a patch: a flat one fits anywhere."""

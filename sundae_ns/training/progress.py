@@ -1,19 +1,60 @@
-"""Progress of a training in the terminal: share and time left, PSNR and number of primitives."""
+"""What a training and the terminal tell each other: messages, time left, and signals that stop a run."""
 
 from __future__ import annotations
 
+import logging
 import math
+import os
+import shlex
+import signal
+import threading
 import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
 from typing import Any
 
-from nerfstudio.utils.writer import EVENT_STORAGE, GLOBAL_BUFFER, EventName, LocalWriter
 
-from sundae_ns.training.duration import LONG, duration
+class ConsoleHandler(logging.Handler):
+    """Prints messages with their time, and warnings in yellow; no markup, because names of files may hold brackets."""
 
-METRICS_EVENT = "Train Metrics Dict"
-"""Event of nerfstudio's trainer with the metrics of a training image."""
-LINE_EVERY = 10.0
-"""Seconds between two lines."""
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a message."""
+        from rich.console import Console
+
+        console, text = Console(width=120), self.format(record)
+        if record.levelno >= logging.WARNING:
+            console.print(f"Warning: {text}", style="yellow", markup=False, soft_wrap=True)
+        else:
+            console.print(f"[{time.strftime('%H:%M:%S')}] {text}", markup=False)
+
+
+def show_log() -> None:
+    """Show the log of the package on the console. The shell of a command asks for it, a library does not."""
+    log = logging.getLogger("sundae_ns")
+    if not any(isinstance(handler, ConsoleHandler) for handler in log.handlers):
+        log.addHandler(ConsoleHandler())
+        log.setLevel(logging.INFO)
+        log.propagate = False
+
+
+def warn(text: str) -> None:
+    """Show a warning of the shell."""
+    show_log()
+    logging.getLogger("sundae_ns").warning(text)
+
+
+LONG = 1800.0
+"""Seconds of a training on a CPU that are worth a warning."""
+
+
+def duration(seconds: float) -> str:
+    """A duration in two units at most: ``1 h 5 min``, ``2 min``, ``40 s``."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 class TimeLeft:
@@ -48,41 +89,6 @@ class TimeLeft:
         return None if self.step_s is None else (total - done) * self.step_s
 
 
-class ProgressWriter(LocalWriter):
-    """Prints a line every ten seconds. nerfstudio's table moves the cursor, even in a log file, and has no PSNR."""
-
-    def __init__(self, config: Any, banner_messages: list[str] | None = None) -> None:
-        super().__init__(config, banner_messages)
-        for line in banner_messages or []:
-            print(line, flush=True)
-        self._printed_at = -LINE_EVERY
-        self._metrics: Any = None
-        self._time_left = TimeLeft()
-
-    def write_stats_log(self, step: int) -> None:
-        """Print a line if it is due.
-
-        Args:
-            step: ignored; it belongs to nerfstudio's first event, which is the configuration after a start.
-        """
-        events = {event["name"]: event for event in EVENT_STORAGE}
-        # nerfstudio measures every few steps only, and ten steps after a prune may take a minute on a CPU.
-        if METRICS_EVENT in events:
-            self._metrics = events[METRICS_EVENT]["event"]
-        trained = events.get(EventName.ITER_TRAIN_TIME.value)
-        if trained is not None and self._metrics is not None and time.monotonic() - self._printed_at >= LINE_EVERY:
-            self._printed_at = time.monotonic()
-            done, total = trained["step"] + 1, GLOBAL_BUFFER["max_iter"]
-            left = self._time_left.update(done, total, self._printed_at)
-            speed = 1000 * (self._time_left.step_s or 0.0)
-            pace = "" if left is None else f"{duration(left)} left at {speed:.0f} ms a step  "
-            print(
-                f"{done} ({100 * done / max(total, 1):.2f}%)  {pace}PSNR {float(self._metrics['psnr']):.2f} dB  "
-                f"{self._metrics['gaussian_count']:,} primitives",
-                flush=True,
-            )
-
-
 def long_on_cpu(seconds: float, left: int) -> str | None:
     """A warning if a training on a CPU takes more than half an hour; None otherwise.
 
@@ -97,3 +103,95 @@ def long_on_cpu(seconds: float, left: int) -> str | None:
         "step). sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and smaller images "
         "are faster: end the command with nerfstudio-data --downscale-factor 4"
     )
+
+
+COMMANDS = ("ns-eval", "ns-render", "ns-export", "ns-viewer")
+"""Commands that open a finished run; ns-train also has --load-config, and writes to the folder that it names."""
+_OPTION = "--load-config"
+
+
+def loaded_run(program: Sequence[str]) -> Path | None:
+    """Folder of the run that a command opens by its ``config.yml``; None for other commands.
+
+    Args:
+        program: the command and its arguments, as in ``sys.argv``.
+    """
+    if not program or Path(program[0]).stem not in COMMANDS:
+        return None
+    values = [""]
+    for word, following in zip(program, [*program[1:], ""], strict=True):
+        name, equals, value = word.partition("=")
+        if name.replace("_", "-") == _OPTION:
+            values.append(value if equals else following)
+    config = Path(values[-1])
+    return config.absolute().parent if values[-1] and config.is_file() else None
+
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_REPLACED = ("load_dir", "load_step", "load_checkpoint", "max_num_iterations", "schedule_length")
+
+
+class Interruption:
+    """While it is entered, the first signal is noted, and a second SIGINT leaves at once. Other threads are left alone.
+
+    Args:
+        ask: called at the first signal, in the signal handler.
+        quiet: whether another process says what happens.
+    """
+
+    def __init__(self, ask: Callable[[], None], *, quiet: bool = False) -> None:
+        self.number = 0
+        """The first signal; 0 for none."""
+        self._ask, self._quiet = ask, quiet
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Interruption:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._handle) for number in STOP_SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.restore()
+
+    def restore(self) -> None:
+        """Give the signals back to whoever had them before."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.number == 0:
+            self.number = number
+            self._say("\nStopping after this step, to save a checkpoint; Ctrl-C again leaves at once.\n")
+            self._ask()
+        elif number == signal.SIGINT:
+            self._say("\nLeft without saving; older checkpoints are whole.\n")
+            os._exit(128 + number)
+
+    def _say(self, text: str) -> None:
+        if not self._quiet:
+            os.write(2, text.encode())  # a handler may interrupt a print
+
+
+def resume_command(program: Sequence[str], folder: Path, method: str, data: object) -> str:
+    """The command that trains the remaining steps of a run.
+
+    Args:
+        program: the command line that started the run; if it is not ``ns-train``'s, one is made from the others.
+        folder: the run's checkpoints.
+        method: its method.
+        data: the capture.
+    """
+    if Path(program[0]).name != "ns-train" or len(program) < 2:
+        return shlex.join(["ns-train", method, "--data", str(data), "--load-dir", str(folder)])
+    words, skip = [], False
+    for word in program[2:]:
+        option = word[2:].partition("=")[0].replace("-", "_") if word.startswith("--") else None
+        if option in _REPLACED:
+            skip = "=" not in word
+        elif skip:
+            skip = False
+        else:
+            words.append(word)
+    # Before the rest, which may end in a subcommand of the data parser.
+    return shlex.join(["ns-train", program[1], "--load-dir", str(folder), *words])

@@ -27,9 +27,8 @@ from sundae_ns.gaussians.surgery import keep
 from sundae_ns.rasterization import rasterize, select_backend
 from sundae_ns.rasterization.reference import project
 from sundae_ns.rendering import ColorSettings, LocalField, View
-from sundae_ns.training.extension import Extension
-from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.optimizers import FusedAdamConfig
+from sundae_ns.training.nerfstudio_configs import FusedAdamConfig
+from sundae_ns.training.state import Extension, FieldState
 
 REFERENCE = select_backend("reference", "cpu")
 COLORS = ColorSettings(REFERENCE)

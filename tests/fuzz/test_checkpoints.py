@@ -23,7 +23,7 @@ from sundae_ns.distributed import Ranks
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.storage.formats import read_field
 from sundae_ns.trainer import SundaeTrainer
-from sundae_ns.training.optimizers import FusedAdamConfig
+from sundae_ns.training.nerfstudio_configs import FusedAdamConfig
 
 
 def small_model() -> SundaeModel:

@@ -19,8 +19,8 @@ from sundae_ns.gpu.kernels import Launch, kernels_where_possible
 from sundae_ns.gpu.loss import fused_loss
 from sundae_ns.rendering.views import View
 from sundae_ns.training import plane_sweep
-from sundae_ns.training.extension import Photo
-from sundae_ns.training.losses import image_losses
+from sundae_ns.training.state import Photo
+from sundae_ns.training.step import image_losses
 
 
 @pytest.fixture(autouse=True)

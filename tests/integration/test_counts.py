@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,19 +10,18 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer
-from trial_runs import PRUNE_AT, STEPS, same, tidy, tiny_run, tiny_scene
+from trial_runs import PRUNE_AT, STEPS, tidy, tiny_run, tiny_scene
 
 from sundae_ns.evaluation.count_curve import read_count_curve
 from sundae_ns.pruning import kept_count
-from sundae_ns.training.heldout import HeldOutQuality
-from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.trials import count as count_trials
-from sundae_ns.training.trials import engine
+from sundae_ns.training import trials
+from sundae_ns.training.choice import HeldOutQuality
+from sundae_ns.training.pruning import PruningConfig
 
 VIEWS = 40
 TRIAL, HEAD_TRIAL = 2, 5
 """Steps of a trial of a count and of the head: a fiftieth and a twentieth of so short a run."""
-DECIDED = PRUNE_AT + len(count_trials.SHARES) * TRIAL
+DECIDED = PRUNE_AT + len(trials.SHARES) * TRIAL
 """Step of the decision if all counts are tried."""
 Make = Callable[..., Trainer]
 
@@ -56,45 +54,51 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     proportion, and what a head gains at a tenth."""
 
     def fix(losses: dict[float, float], head: float = 0.0) -> None:
-        real = engine.measure_heldout
+        real = trials.measure_heldout
 
         def measured(run: Any, **options: Any) -> list[HeldOutQuality]:
-            (trials,) = (one for one in extensions_of(run) if one.name == "count")
-            if trials.progress.phase != "trials":
+            progress = trials_of(run.model).progress
+            if progress.stage not in ("count", "tenth"):
                 return real(run, **options)
-            share = count_trials.SHARES[len(trials.progress.counts) - 1]
-            found, similar = 30 - losses[share], 0.9 - 0.03 * losses[share]
-            if trials.progress.tries_head:
-                assert run.state.head_enabled == (len(trials.progress.head) == 1)
-                assert run.source.total == kept_count(0.1, trials.progress.full)
-                found, similar = 30 + head * len(trials.progress.head), 0.9
+            tenth = progress.of("tenth")
+            if progress.stage == "tenth":
+                assert run.state.head_enabled == (len(tenth) == 1)
+                assert run.source.total == kept_count(0.1, progress.full)
+                found, similar = 30 + head * len(tenth), 0.9
+            else:
+                loss = losses[trials.SHARES[len(progress.of("count"))]]
+                found, similar = 30 - loss, 0.9 - 0.03 * loss
             return [HeldOutQuality(100, found, similar, found) for _ in run.heldout_views()]
 
-        monkeypatch.setattr(engine, "measure_heldout", measured)
+        monkeypatch.setattr(trials, "measure_heldout", measured)
 
     return fix
 
 
-def extensions_of(run: Any) -> list[Any]:
-    return list(run.model.extensions)
+def trials_of(model: Any) -> Any:
+    return next(extension for extension in model.extensions if extension.name == "trials")
+
+
+def records_of(trainer: Trainer) -> Any:
+    path = trainer.base_dir / "trials.json"
+    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def record_of(trainer: Trainer) -> dict[str, Any]:
-    return dict(json.loads((trainer.base_dir / "curve.json").read_text()))
+    return dict(records_of(trainer)["count"])
 
 
 def head_steps(model: Any) -> float:
     """Steps in which the head was trained, without those that were taken back."""
-    (engine,) = (saved["engine"] for one in model.extensions if "engine" in (saved := one.state_dict()))
-    return float(model.state.schedule_step - model.state.head_starts_at - engine["taken_back"])
+    return float(model.state.schedule_step - model.state.head_starts_at - trials_of(model).engine.taken_back)
 
 
 def watch(trainer: Trainer) -> tuple[list[int], dict[str, torch.Tensor]]:
     """Collects the views that are served by step, and the field before the trials and before the prune."""
     manager, served, fields = trainer.pipeline.datamanager, [], {}
     model: Any = trainer.pipeline.model
-    trials, pruning = ({one.name: one for one in model.extensions}[name] for name in ("count", "pruning"))
-    serve, begin, prune = manager.view_of_step, trials._begin, pruning.after_step
+    deciding, pruning = ({one.name: one for one in model.extensions}[name] for name in ("trials", "pruning"))
+    serve, begin, prune = manager.view_of_step, deciding._begin_counts, pruning.after_step
 
     def view_of_step(step: int) -> int:
         served.append(serve(step))
@@ -105,11 +109,11 @@ def watch(trainer: Trainer) -> tuple[list[int], dict[str, torch.Tensor]]:
         begin(run)
 
     def pruned(run: Any) -> None:
-        if run.state.schedule_step >= PRUNE_AT and trials.progress.phase == "done" and "after" not in fields:
+        if run.state.schedule_step >= PRUNE_AT and "count" in deciding.progress.chosen and "after" not in fields:
             fields["after"] = model.gauss_params["means"].detach().clone()
         prune(run)
 
-    manager.view_of_step, trials._begin, pruning.after_step = view_of_step, began, pruned
+    manager.view_of_step, deciding._begin_counts, pruning.after_step = view_of_step, began, pruned
     return served, fields
 
 
@@ -150,16 +154,16 @@ def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make: Make, judge: Any, 
     trainer = make(head="auto")
     model: Any = trainer.pipeline.model
     fresh = {name: value.clone() for name, value in model.state.head.state_dict().items()}
-    (trials,) = (one for one in model.extensions if one.name == "trials")
-    settle, found = trials._settle, {}
+    deciding = trials_of(model)
+    settle, found = deciding._finish_with, {}
 
     def settled(*words: Any) -> None:
         found.update({name: value.clone() for name, value in model.state.head.state_dict().items()})
         settle(*words)
 
-    trials._settle = settled
+    deciding._finish_with = settled
     trainer.train()
-    record, verdict = record_of(trainer), json.loads((trainer.base_dir / "trials.json").read_text())
+    record, verdict = record_of(trainer), records_of(trainer)["head"]
     assert (record["head"]["pays"], verdict["decision"]) == (decision == "head", decision)
     assert record["head"]["head"]["psnr"] - record["head"]["plain"]["psnr"] == pytest.approx(gain)
     assert verdict["step"] == record["step"]
@@ -173,42 +177,14 @@ def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make: Make, judge: Any, 
 
 
 def test_where_a_tenth_is_kept_the_head_has_its_usual_trials(make: Make, judge: Any) -> None:
-    judge(dict.fromkeys(count_trials.SHARES, 0.0), 0.2)
+    judge(dict.fromkeys(trials.SHARES, 0.0), 0.2)
     trainer = make(head="auto")
     trainer.train()
-    record, verdict = record_of(trainer), json.loads((trainer.base_dir / "trials.json").read_text())
+    record, verdict = record_of(trainer), records_of(trainer)["head"]
     assert record["chosen"] <= record["full"] / 10
     assert "head" not in record
     assert verdict["step"] > record["step"]
     assert not set(record["held_out_views"]) & set(verdict["held_out_views"])
-
-
-@pytest.mark.parametrize(
-    ("head", "stops"),
-    [("residual", (10, 45, DECIDED + 3)), ("auto", (45, DECIDED + 3, DECIDED + HEAD_TRIAL + 3))],
-)
-def test_a_resumed_run_takes_the_same_decision_bit_for_bit(
-    make: Make, judge: Any, head: str, stops: tuple[int, ...]
-) -> None:
-    """Before and in the trials of counts, in those of the head, and after the decision."""
-    # All counts are tried, and more than a tenth is chosen, so that the head has its trials.
-    judge({1.0: 0.0, 0.4: 0.0, 0.2: 0.05, 0.1: 0.45, 0.05: 0.65, 0.025: 0.8}, 0.2)
-    whole = make(head=head, name="whole", save_every=math.gcd(*stops))
-    whole.train()
-    for stop in stops:
-        more = STEPS - stop - 1
-        name = f"from {stop}"
-        resumed = make(head=head, name=name, load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=more)
-        resumed.train()
-        last = f"step-{STEPS - 1:09d}.ckpt"
-        folders = (whole.checkpoint_dir, resumed.checkpoint_dir)
-        a, b = (torch.load(folder / last, map_location="cpu", weights_only=True) for folder in folders)
-        for part in ("pipeline", "optimizers", "schedulers"):
-            same(a[part], b[part])
-        if stop < record_of(whole)["step"]:
-            assert record_of(whole) == record_of(resumed)
-    if head == "auto":
-        assert record_of(whole)["step"] == DECIDED + 2 * HEAD_TRIAL
 
 
 def test_a_head_in_any_case_rests_during_the_trials_and_counts_its_own_steps(make: Make, judge: Any) -> None:
@@ -259,11 +235,11 @@ def test_where_trials_cannot_decide_a_tenth_stays_and_one_line_says_so(
     assert trainer.pipeline.model.num_points == 20  # type: ignore[union-attr]
     said = " ".join(capsys.readouterr().out.split())
     assert said.count(f"pruning keeps 10% of the primitives: {reason}") == 1
-    assert not (trainer.base_dir / "curve.json").exists()
+    assert "count" not in records_of(trainer)
 
 
 def test_a_number_that_the_user_gives_is_kept_exactly(make: Make) -> None:
     trainer = make(pruning={"target_primitives": 33})
     trainer.train()
     assert trainer.pipeline.model.num_points == 33  # type: ignore[union-attr]
-    assert not (trainer.base_dir / "curve.json").exists()
+    assert "count" not in records_of(trainer)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
-from sundae_ns.training import dense_start
+from sundae_ns.training import initialize
 
 
 def test_a_whole_run_and_its_resume(
@@ -18,8 +18,8 @@ def test_a_whole_run_and_its_resume(
     monkeypatch: pytest.MonkeyPatch,
     tiny: Any,
 ) -> None:
-    monkeypatch.setitem(dense_start.SIDES, "cpu", 48)
-    monkeypatch.setitem(dense_start.FILLED, "cpu", 800)
+    monkeypatch.setitem(initialize.SIDES, "cpu", 48)
+    monkeypatch.setitem(initialize.FILLED, "cpu", 800)
 
     def change(config: Any) -> None:
         config.pipeline.model.dense_start_views = 12
@@ -39,7 +39,7 @@ def test_a_whole_run_and_its_resume(
             4,
         )
 
-    monkeypatch.setattr(dense_start, "Sweep", None)
+    monkeypatch.setattr(initialize, "Sweep", None)
     resumed: Any = trainer_of(resume)
     resumed.train()
     for name, value in whole.model.gauss_params.items():

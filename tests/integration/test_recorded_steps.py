@@ -12,7 +12,7 @@ from nerfstudio.utils import writer
 
 from sundae_ns.errors import BackendError
 from sundae_ns.storage import checkpoint
-from sundae_ns.training.recorded import RecordedStep
+from sundae_ns.training.capture import RecordedStep
 from sundae_ns.training.step import StepResult
 
 MakeTrainer = Callable[[Callable[[TrainerConfig], Any]], Trainer]

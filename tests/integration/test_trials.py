@@ -14,16 +14,14 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.eval_utils import eval_setup
-from trial_runs import LENGTH, PRUNE_AT, STEPS, same, tidy, tiny_run, tiny_scene
+from trial_runs import LENGTH, PRUNE_AT, STEPS, tidy, tiny_run, tiny_scene
 
 from sundae_ns.api.packing import contents_of
 from sundae_ns.callbacks import NerfstudioRun
-from sundae_ns.errors import CheckpointError
 from sundae_ns.scenes.measure import sizes
 from sundae_ns.scenes.models import load_run
-from sundae_ns.training.heldout import HeldOutQuality
-from sundae_ns.training.trials import engine
-from sundae_ns.training.trials import head as head_trials
+from sundae_ns.training import choice, trials
+from sundae_ns.training.choice import HeldOutQuality
 
 DECIDED = PRUNE_AT + 3 * LENGTH
 """Step of the decision if all candidates are tried."""
@@ -46,12 +44,12 @@ def make(scenes: Callable[[int], Path], tmp_path: Path) -> Iterator[Make]:
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Fixes what the candidates gain on every held-out view: PSNR in dB, SSIM. Bytes of a tiny field do not count."""
-    monkeypatch.setattr(head_trials, "GAIN_PER_DOUBLING", 0.0)
-    monkeypatch.setattr(engine, "AVERAGED_EVERY", 1)  # means, in trials of five steps
-    monkeypatch.setattr(head_trials, "MEAN_SHARE", 0.6)
+    monkeypatch.setattr(choice, "GAIN_PER_DOUBLING", 0.0)
+    monkeypatch.setattr(trials, "AVERAGED_EVERY", 1)  # means, in trials of five steps
+    monkeypatch.setattr(trials, "MEAN_SHARE", 0.6)
 
     def fix(head: tuple[float, float] = NONE, features: tuple[float, float] = NONE) -> None:
-        real = engine.measure_heldout
+        real = trials.measure_heldout
 
         def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
             state, width = run.state, run.state.field["features"].shape[1]
@@ -64,24 +62,23 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
                 HeldOutQuality(view.pixels, 20 + decibels + 1e-4 * view.psnr, 0.5 + similarity) for view in real(run)
             ]
 
-        monkeypatch.setattr(engine, "measure_heldout", measured)
+        monkeypatch.setattr(trials, "measure_heldout", measured)
 
     return fix
 
 
 def _record(trainer: Trainer) -> dict[str, Any]:
-    return dict(json.loads((trainer.base_dir / "trials.json").read_text()))
+    return dict(json.loads((trainer.base_dir / "trials.json").read_text())["head"])
 
 
 def _trials(model: Any) -> Any:
     """The extension that decides about the head."""
-    (trials,) = (extension for extension in model.extensions if extension.name == "trials")
-    return trials
+    return next(extension for extension in model.extensions if extension.name == "trials")
 
 
 def _taken_back(model: Any) -> int:
     """Steps of trials whose field was dropped."""
-    return int(_trials(model).state_dict()["engine"]["taken_back"])
+    return int(_trials(model).engine.taken_back)
 
 
 def _served(trainer: Trainer) -> list[int]:
@@ -155,7 +152,7 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     trial = _trials(model)
     seen: dict[int, tuple[torch.Tensor, float]] = {}
     head_rates: dict[int, list[float]] = {}
-    real = trial.after_step
+    real = trial.after_prune
 
     def after_step(run: Any) -> None:
         real(run)
@@ -163,7 +160,7 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
         rate = run.state.schedulers["means"].lr_lambdas[0](run.state.step)
         seen[run.state.step] = (model.gauss_params["means"].detach().clone(), rate)
 
-    trial.after_step = after_step
+    trial.after_prune = after_step
     trainer.train()
     starts = [PRUNE_AT + i * LENGTH for i in range(tried)]
     # All trials start from the field and the rate right after the prune.
@@ -173,8 +170,8 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     # Each head's rate rises from the first step of its trial on, and is as high as it may be well before the end.
     for step in starts[1:]:
         for lowest, highest in zip(head_rates[step], head_rates[step + LENGTH // 2], strict=True):
-            assert lowest == pytest.approx(highest * 2 / (round(head_trials.RISE_SHARE * LENGTH) + 1), rel=0.05)
-    decided, place = PRUNE_AT + tried * LENGTH, head_trials.CANDIDATES.index(chosen) + 1
+            assert lowest == pytest.approx(highest * 2 / (round(trials.RISE_SHARE * LENGTH) + 1), rel=0.05)
+    decided, place = PRUNE_AT + tried * LENGTH, choice.HEADS.index(chosen) + 1
     end = seen[PRUNE_AT + place * LENGTH - 1][0]
     assert not torch.equal(end, seen[PRUNE_AT][0])
     # The field at the end of the chosen trial is one step away from the last that was seen of it.
@@ -195,71 +192,6 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     assert contents_of(load_run(trainer.base_dir)).field.get("features", torch.zeros(1, 0)).shape[1] == width
 
 
-def test_the_verdict_is_on_the_mean_of_the_weights(make: Make, judge: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    judge(head=(0.5, 0.01))
-    trainer = make()
-    model: Any = trainer.pipeline.model
-    trial = _trials(model)
-    own: dict[int, torch.Tensor] = {}
-    after: dict[int, torch.Tensor] = {}
-    judged: dict[int, torch.Tensor] = {}
-    act, measure = trial.after_step, engine.measure_heldout
-
-    def means() -> torch.Tensor:
-        return model.gauss_params["means"].detach().clone()
-
-    def after_step(run: Any) -> None:
-        own[run.state.step] = means()
-        act(run)
-        after[run.state.step] = means()
-
-    def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
-        if run.state.step <= DECIDED:  # later ones are of the watch
-            judged[run.state.step] = means()
-        return measure(run)
-
-    trial.after_step = after_step
-    monkeypatch.setattr(engine, "measure_heldout", measured)
-    trainer.train()
-    assert list(judged) == [PRUNE_AT + i * LENGTH for i in (1, 2, 3)]
-    for step, found in judged.items():
-        torch.testing.assert_close(found, torch.stack([own[step - i] for i in range(3)]).mean(dim=0))
-        assert not torch.equal(found, own[step])
-    # Training goes on from the weights themselves: those that the chosen trial ended with.
-    assert torch.equal(after[DECIDED], own[PRUNE_AT + 2 * LENGTH])
-
-
-@pytest.mark.parametrize(
-    ("gains", "stops"),
-    [
-        ((0.5, 1.0), (PRUNE_AT - 4, PRUNE_AT + 2, PRUNE_AT + 2 * LENGTH + 4, DECIDED + 5)),
-        ((0.5, 0.5), (DECIDED + 5,)),
-        ((-0.5, 0.0), (PRUNE_AT + LENGTH + 3, PRUNE_AT + 2 * LENGTH + 4)),
-    ],
-)
-def test_a_resumed_run_takes_the_same_decision_bit_for_bit(
-    make: Make, judge: Any, gains: tuple[float, float], stops: tuple[int, ...]
-) -> None:
-    """Before the prune, in each trial, and after the decision."""
-    judge(head=(gains[0], gains[0] / 10), features=(gains[1], gains[1] / 10))
-    whole = make(name="whole", save_every=math.gcd(*stops))
-    whole.train()
-    for stop in stops:
-        more = STEPS - stop - 1
-        resumed = make(name=f"from {stop}", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=more)
-        resumed.train()
-        last = f"step-{STEPS - 1:09d}.ckpt"
-        folders = (whole.checkpoint_dir, resumed.checkpoint_dir)
-        a, b = (torch.load(folder / last, map_location="cpu", weights_only=True) for folder in folders)
-        same(a["pipeline"], b["pipeline"])
-        same(a["optimizers"], b["optimizers"])
-        same(a["schedulers"], b["schedulers"])
-        models: list[Any] = [one.pipeline.model for one in (whole, resumed)]
-        assert _taken_back(models[0]) == _taken_back(models[1]) > 0
-        if stop < _record(whole)["step"]:  # before the decision
-            assert _record(whole) == _record(resumed)
-
-
 def test_with_few_views_two_are_held_out_in_turn(make: Make, judge: Any) -> None:
     judge(head=(0.5, 0.01))
     trainer = make(8)
@@ -267,11 +199,11 @@ def test_with_few_views_two_are_held_out_in_turn(make: Make, judge: Any) -> None
     trainer.train()
     first, second = _record(trainer)["held_out_views"]
     length = LENGTH // 2
-    trials_of = [served[PRUNE_AT + 1 + i * length : PRUNE_AT + 1 + (i + 1) * length] for i in range(6)]
+    served_by_trial = [served[PRUNE_AT + 1 + i * length : PRUNE_AT + 1 + (i + 1) * length] for i in range(6)]
     assert _record(trainer)["decision"] == "head"
     assert _record(trainer)["steps_per_trial"] == length
-    assert not any(first in trial for trial in trials_of[::2])
-    assert not any(second in trial for trial in trials_of[1::2])
+    assert not any(first in trial for trial in served_by_trial[::2])
+    assert not any(second in trial for trial in served_by_trial[1::2])
     assert trainer.pipeline.model.head.config.num_features == 5
 
 
@@ -297,7 +229,7 @@ def test_a_run_that_is_too_short_for_trials_says_so(make: Make, capsys: pytest.C
 
 def test_masks_that_leave_no_pixel_leave_no_head(make: Make, judge: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     judge(head=(0.5, 0.01))
-    monkeypatch.setattr(engine, "measure_heldout", lambda run, **_: [])
+    monkeypatch.setattr(trials, "measure_heldout", lambda run, **_: [])
     trainer = make()
     trainer.train()
     assert _record(trainer)["decision"] == "plain"
@@ -315,20 +247,6 @@ def test_a_late_head_has_its_trials_late(make: Make, judge: Any) -> None:
     assert trainer.pipeline.model.state.head_enabled
 
 
-def test_a_checkpoint_that_lacks_the_field_to_return_to_is_refused(make: Make, judge: Any) -> None:
-    judge(head=(0.5, 0.01))
-    stop = PRUNE_AT + LENGTH + 2
-    whole = make(name="whole", save_every=stop)
-    whole.train()
-    path = whole.checkpoint_dir / f"step-{stop:09d}.ckpt"
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    state["pipeline"]["_model._extra_state"]["extensions"]["trials"]["engine"]["kept"]["plain"] = None
-    model: Any = make(name="other").pipeline.model
-    inner = {name.removeprefix("_model."): value for name, value in state["pipeline"].items() if "_model." in name}
-    with pytest.raises(CheckpointError, match="lacks a field"):
-        model.load_state_dict(inner)
-
-
 @pytest.mark.parametrize(("trial", "width"), [(1, 5), (2, 29)])
 def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, trial: int, width: int) -> None:
     """The head of the trial that one GPU was in."""
@@ -339,7 +257,7 @@ def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, tria
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=3)
     model: Any = resumed.pipeline.model
     trials_of_run = _trials(model)
-    assert "start" in trials_of_run.state_dict()["engine"]["kept"]
+    assert "start" in trials_of_run.engine.kept
     resumed.ranks.count = 2
     attributes = TrainingCallbackAttributes(resumed.optimizers, resumed.grad_scaler, resumed.pipeline, resumed)
     trials_of_run.before_training(NerfstudioRun(model, attributes))
@@ -349,4 +267,4 @@ def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, tria
     assert model.state.head_enabled
     assert model.gauss_params["features"].shape[1] == width
     assert resumed.pipeline.datamanager.holdout_indices == []
-    assert trials_of_run.state_dict()["engine"]["kept"] == {}
+    assert trials_of_run.engine.kept == {}

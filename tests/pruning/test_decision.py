@@ -32,7 +32,7 @@ from sundae_ns.pruning import (
     response,
 )
 from sundae_ns.pruning.merge import voronoi_labels
-from sundae_ns.training.pruning_config import PruningConfig
+from sundae_ns.training.pruning import PruningConfig
 
 SHARE = 0.2
 DEFAULT = PruneRule()

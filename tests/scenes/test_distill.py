@@ -56,14 +56,14 @@ def test_it_is_the_same_for_a_seed(ball: sn.Scene, views: list[sn.View]) -> None
 def test_a_head_is_kept_only_where_it_pays(
     ball: sn.Scene, views: list[sn.View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sundae_ns.training.trials.head.LEAST_GAIN", 1000.0)
+    monkeypatch.setattr("sundae_ns.training.choice.LEAST_GAIN", 1000.0)
     made = Distillation(ball, keep=0.1, views=views, steps=20)
     assert made.train(lambda *_: True)
     assert made.gain is not None
     assert made.result().head is None
     assert "features" not in made.result().field
     for name in ("LEAST_GAIN", "GAIN_PER_DOUBLING"):
-        monkeypatch.setattr(f"sundae_ns.training.trials.head.{name}", -1000.0)
+        monkeypatch.setattr(f"sundae_ns.training.choice.{name}", -1000.0)
     made = Distillation(ball, keep=0.1, views=views, steps=20)
     assert made.train(lambda *_: True)
     result = made.result()
@@ -78,7 +78,7 @@ def test_a_resumed_training_ends_as_an_uninterrupted_one(
     head: bool, ball: sn.Scene, views: list[sn.View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("LEAST_GAIN", "GAIN_PER_DOUBLING"):
-        monkeypatch.setattr(f"sundae_ns.training.trials.head.{name}", -1000.0)
+        monkeypatch.setattr(f"sundae_ns.training.choice.{name}", -1000.0)
 
     def begun() -> Distillation:
         return Distillation(ball, keep=0.1, views=views, steps=20, head=head)

@@ -95,19 +95,15 @@ def test_records_follow_a_resumed_run(tmp_path: Path) -> None:
     old.mkdir()
     take_records(old, tmp_path / "none", 9)  # there are none
     (old / "prune.json").write_text('[{"step": 3, "after": 9}, {"step": 5, "after": 4}, {"step": 8, "after": 2}]')
-    (old / "trials.json").write_text('{"step": 6, "decision": "head"}')
-    (old / "stopping.json").write_text('{"steps_on_all_views": 7}')
-    for step, prunes, decided in ((2, [], False), (5, [3, 5], False), (6, [3, 5], True), (8, [3, 5, 8], True)):
+    for step, prunes in ((2, []), (5, [3, 5]), (8, [3, 5, 8])):
         new = tmp_path / f"resumed-after-{step}"
         new.mkdir()
         take_records(old, new, step)
         assert [record["step"] for record in prunes_of(new)] == prunes
-        assert [(new / name).exists() for name in ("trials.json", "stopping.json")] == [decided, decided]
     (new / "prune.json").write_text("[]")
     take_records(old, new, 8)
     assert prunes_of(new) == []  # its own record
     for text in ("[", "[1]", "1", '{"step": "a"}', '[{"step": "a"}]', "[{}]"):
-        for name in ("prune.json", "trials.json"):
-            (old / name).write_text(text)
+        (old / "prune.json").write_text(text)
         take_records(old, tmp_path / "none", 9)
     assert not (tmp_path / "none").exists()

@@ -19,8 +19,8 @@ from torch import Tensor
 from sundae_ns.callbacks import NerfstudioRun
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.model import SundaeModel, SundaeModelConfig
-from sundae_ns.training.optimizers import FusedAdamConfig
-from sundae_ns.training.pruning_config import PruningConfig
+from sundae_ns.training.nerfstudio_configs import FusedAdamConfig
+from sundae_ns.training.pruning import PruningConfig
 
 
 def _points(n: int = 60) -> tuple[Tensor, Tensor]:

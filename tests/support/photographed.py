@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from sundae_ns.rendering.views import View
-from sundae_ns.training.extension import TrainingRun
-from sundae_ns.training.photo_gains import FIRST_STEPS, REFRESHED_EVERY, PhotoGains
+from sundae_ns.training.exposure import FIRST_STEPS, REFRESHED_EVERY, PhotoGains
+from sundae_ns.training.state import TrainingRun
 
 COUNT = 48
 ANGLES = torch.arange(COUNT) * 2 * math.pi / COUNT

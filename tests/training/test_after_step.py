@@ -12,8 +12,8 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from sundae_ns.model import SundaeModel
-from sundae_ns.training.initial_field import Start
-from sundae_ns.training.schedulers import Decay
+from sundae_ns.training.initialize import Start
+from sundae_ns.training.schedules import Decay
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[..., Any]

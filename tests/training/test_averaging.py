@@ -13,7 +13,7 @@ from sundae_ns.errors import ConfigError
 from sundae_ns.training import averaging
 from sundae_ns.training.averaging import Averaging
 from sundae_ns.training.build import check
-from sundae_ns.training.extension import TrainingRun
+from sundae_ns.training.state import TrainingRun
 
 LAST = 99
 

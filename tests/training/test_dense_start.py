@@ -13,7 +13,7 @@ from torch import Tensor
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.gaussians import sh_to_rgb
 from sundae_ns.model import SundaeModel
-from sundae_ns.training import dense_start
+from sundae_ns.training import initialize
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[..., Any]
@@ -44,7 +44,7 @@ class FakeSweep:
 
 @pytest.fixture(autouse=True)
 def fake(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dense_start, "Sweep", FakeSweep)
+    monkeypatch.setattr(initialize, "Sweep", FakeSweep)
     monkeypatch.setattr(FakeSweep, "most", FOUND)
 
 
@@ -61,7 +61,7 @@ def test_the_field_starts_from_both_clouds(
     assert model.num_points == 60 + FOUND
     assert torch.equal(model.means[:60].detach(), points()[0])
     assert torch.equal(FakeSweep.seen, points()[0])
-    assert (FakeSweep.longest, FakeSweep.wanted) == (dense_start.SIDES["cpu"], dense_start.FILLED["cpu"] - 60)
+    assert (FakeSweep.longest, FakeSweep.wanted) == (initialize.SIDES["cpu"], initialize.FILLED["cpu"] - 60)
     assert float((model.means[60:].detach() - 5).min()) >= 0
     colours = sh_to_rgb(model.gauss_params["features_dc"][60:].detach())
     assert torch.allclose(colours, torch.tensor([0.2, 0.4, 0.6]).expand(FOUND, 3), atol=1e-5)
@@ -113,7 +113,7 @@ def test_more_points_than_wanted_are_thinned_evenly(
     build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(FakeSweep, "most", 900)
-    monkeypatch.setitem(dense_start.FILLED, "cpu", 60 + 90)
+    monkeypatch.setitem(initialize.FILLED, "cpu", 60 + 90)
     model = few(build)
     training_of(model)
     added = model.means[60:, 0].detach()
@@ -125,8 +125,8 @@ def test_more_points_than_wanted_are_thinned_evenly(
 def test_a_cloud_that_is_not_sparse_stays_as_it_is(
     build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(dense_start.FILLED, "cpu", 60)
-    monkeypatch.setattr(dense_start, "Sweep", None)
+    monkeypatch.setitem(initialize.FILLED, "cpu", 60)
+    monkeypatch.setattr(initialize, "Sweep", None)
     model = few(build)
     training_of(model)
     assert model.num_points == 60
@@ -136,7 +136,7 @@ def test_a_cloud_that_is_not_sparse_stays_as_it_is(
 def test_a_cpu_sweeps_few_views(
     build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch, most: int, swept: bool
 ) -> None:
-    monkeypatch.setattr(dense_start, "MOST_ON_CPU", most)
+    monkeypatch.setattr(initialize, "MOST_ON_CPU", most)
     model = few(build)
     training_of(model)
     assert model.num_points == 60 + swept * FOUND

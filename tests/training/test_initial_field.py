@@ -17,7 +17,7 @@ from sundae_ns.errors import CheckpointError
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage.coordinates import similarity
 from sundae_ns.storage.ply import write_ply
-from sundae_ns.training.initial_field import FEWEST_POINTS
+from sundae_ns.training.initialize import FEWEST_POINTS
 
 Build = Callable[..., SundaeModel]
 Points = Callable[[], tuple[Tensor, Tensor]]

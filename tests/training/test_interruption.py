@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sundae_ns.training.interruption import Interruption, resume_command
+from sundae_ns.training.progress import Interruption, resume_command
 
 
 def test_the_first_signal_is_noted_and_the_handlers_come_back() -> None:
@@ -24,7 +24,7 @@ def test_the_first_signal_is_noted_and_the_handlers_come_back() -> None:
 
 TWICE = """
 import signal
-from sundae_ns.training.interruption import Interruption
+from sundae_ns.training.progress import Interruption
 with Interruption(lambda: None):
     signal.raise_signal(signal.SIGINT)
     print("saving", flush=True)

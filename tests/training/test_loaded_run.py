@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sundae_ns.training.loaded_run import loaded_run
+from sundae_ns.training.progress import loaded_run
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.model import SundaeModel
-from sundae_ns.training.losses import StepLosses, image_losses
+from sundae_ns.training.step import StepLosses, image_losses
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]

@@ -10,8 +10,8 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.method_configs import sundae
-from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
-from sundae_ns.training.schedulers import PruneAwareDecayConfig, notify_pruned
+from sundae_ns.training.nerfstudio_configs import FusedAdamConfig, NetworkAdamConfig, PruneAwareDecayConfig
+from sundae_ns.training.schedules import notify_pruned
 
 
 def trained(config: AdamOptimizerConfig, device: str = "cpu") -> torch.Tensor:

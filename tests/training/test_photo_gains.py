@@ -15,10 +15,9 @@ from torch import Tensor
 
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering.views import View
-from sundae_ns.training import photo_gains
-from sundae_ns.training.extension import TrainingRun
-from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.photo_gains import LEAST_PHOTOS, PhotoGains, places
+from sundae_ns.training import exposure
+from sundae_ns.training.exposure import LEAST_PHOTOS, PhotoGains, places
+from sundae_ns.training.state import FieldState, TrainingRun
 
 Build = Callable[..., SundaeModel]
 ON_CPU = cast(FieldState, SimpleNamespace(device=torch.device("cpu")))
@@ -48,7 +47,7 @@ def test_light_that_changes_with_the_place_stays_in_the_photos() -> None:
 
 def test_differences_no_larger_than_a_fields_own_errors_stay_in_the_photos() -> None:
     """So a capture whose light does not change is trained as without gains, to the bit."""
-    true = torch.exp(0.8 * photo_gains.NOISE * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0)))
+    true = torch.exp(0.8 * exposure.NOISE * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0)))
     gains, run = begin()
     measure(gains, run, lambda index: image_of(index) * true[index])
     assert torch.equal(found(gains), torch.ones(COUNT, 3))
@@ -94,7 +93,7 @@ def test_a_photo_that_says_nothing_has_no_gain(spoilt: Tensor) -> None:
 def test_gains_are_bounded() -> None:
     gains, run = begin()
     measure(gains, run, lambda index: image_of(index) * (1e-5 if index == 7 else 1.0), rounds=1)
-    assert gains.state_dict()["measured"][7].tolist() == pytest.approx([-math.log(photo_gains.MOST)] * 3)
+    assert gains.state_dict()["measured"][7].tolist() == pytest.approx([-math.log(exposure.MOST)] * 3)
 
 
 def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alone(
@@ -204,7 +203,7 @@ def test_auto_divides_photos_of_changing_light_from_the_decision_on() -> None:
 @pytest.mark.parametrize("differences", ["even light", "three photos", "the place"])
 def test_auto_leaves_a_capture_of_even_light_alone_and_measures_no_more(differences: str) -> None:
     """So it is trained as without gains, to the bit. A few photos in other light are no change of exposure."""
-    noise = 0.8 * photo_gains.NOISE * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0))
+    noise = 0.8 * exposure.NOISE * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0))
     true = {
         "even light": torch.exp(noise),
         "three photos": torch.where(torch.arange(COUNT) < 3, 2.5, 1.0)[:, None].expand(-1, 3),

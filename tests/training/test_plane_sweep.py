@@ -15,8 +15,8 @@ from torch import Tensor
 
 from sundae_ns.rendering.views import View
 from sundae_ns.training import plane_sweep
-from sundae_ns.training.extension import Photo
 from sundae_ns.training.plane_sweep import Sweep
+from sundae_ns.training.state import Photo
 
 SIDE, VIEWS = 72, 24
 """Neighbouring cameras differ by about 15 degrees around the scene, and by up to 36 in height."""

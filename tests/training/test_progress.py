@@ -9,24 +9,24 @@ import pytest
 from nerfstudio.utils import writer
 
 from sundae_ns.cli.process import percent_of
-from sundae_ns.training import progress
-from sundae_ns.training.duration import duration
-from sundae_ns.training.progress import METRICS_EVENT, ProgressWriter, TimeLeft, long_on_cpu
+from sundae_ns.training import nerfstudio_configs
+from sundae_ns.training.nerfstudio_configs import METRICS_EVENT, ProgressWriter
+from sundae_ns.training.progress import TimeLeft, duration, long_on_cpu
 
 
 def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.setattr(writer, "GLOBAL_BUFFER", {})
-    monkeypatch.setattr(progress, "GLOBAL_BUFFER", {"max_iter": 400})
+    monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": 400})
     events: list[dict[str, Any]] = [
         # A resumed run writes its configuration first.
         {"name": "config", "event": {}, "step": 0},
         {"name": "Train Iter (time)", "event": 0.25, "step": 159},
         {"name": METRICS_EVENT, "event": {"psnr": 21.456, "gaussian_count": 12345}},
     ]
-    monkeypatch.setattr(progress, "EVENT_STORAGE", events)
+    monkeypatch.setattr(nerfstudio_configs, "EVENT_STORAGE", events)
     made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10), ["Viewer at: somewhere"])
     clock = [100.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(nerfstudio_configs.time, "monotonic", lambda: clock[0])
     made.write_stats_log(0)
     made.write_stats_log(0)
     clock[0] += 10
@@ -76,10 +76,10 @@ def test_a_lasting_change_is_followed() -> None:
 
 
 def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    monkeypatch.setattr(progress, "LINE_EVERY", 0.0)
-    monkeypatch.setattr(progress, "GLOBAL_BUFFER", {"max_iter": 4})
+    monkeypatch.setattr(nerfstudio_configs, "LINE_EVERY", 0.0)
+    monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": 4})
     events: list[dict[str, Any]] = [{"name": "Train Iter (time)", "event": 2.0, "step": 0}]
-    monkeypatch.setattr(progress, "EVENT_STORAGE", events)
+    monkeypatch.setattr(nerfstudio_configs, "EVENT_STORAGE", events)
     made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10))
     made.write_stats_log(0)
     assert capsys.readouterr().out == "", "nothing is measured yet"

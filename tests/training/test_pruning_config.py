@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from sundae_ns.training.pruning_config import PruningConfig
+from sundae_ns.training.pruning import PruningConfig
 
 
 @pytest.mark.parametrize(

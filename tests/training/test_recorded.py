@@ -13,11 +13,8 @@ from torch import Tensor
 
 from sundae_ns.gaussians.surgery import narrow
 from sundae_ns.model import SundaeModel
-from sundae_ns.training import buffers as buffers_module
-from sundae_ns.training import recordings as recordings_module
-from sundae_ns.training.buffers import Buffers, start_moments, trained_parameters
-from sundae_ns.training.recorded import RecordedStep
-from sundae_ns.training.recordings import StepRecordings
+from sundae_ns.training import capture
+from sundae_ns.training.capture import Buffers, RecordedStep, StepRecordings, start_moments, trained_parameters
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[..., Any]
@@ -146,7 +143,7 @@ def test_replayed_steps_train_the_same_field(
 def test_a_step_without_room_for_its_pairs_changes_nothing(
     both: Callable[..., tuple[Any, Recorded]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recordings_module, "SPARE_PAIRS", 0.5)
+    monkeypatch.setattr(capture, "SPARE_PAIRS", 0.5)
     _, recorded = both("cuda", pruning={"mode": "off"})
     recorded.step(0)
     recorded.step(1)  # another SH degree, kernel by kernel again
@@ -160,7 +157,7 @@ def test_a_step_without_room_for_its_pairs_changes_nothing(
     assert all(torch.equal(recorded.model.gauss_params[name], value) for name, value in before.items())
     held = recorded.training.optimizers.optimizers["means"].state[recorded.model.gauss_params["means"]]
     assert [float(held["step"])] == steps
-    monkeypatch.setattr(recordings_module, "SPARE_PAIRS", 2.0)
+    monkeypatch.setattr(capture, "SPARE_PAIRS", 2.0)
     recorded.step(3)
     torch.cuda.synchronize()
     assert not torch.equal(recorded.model.gauss_params["means"], before["means"])
@@ -181,14 +178,14 @@ def test_more_image_sizes_than_recordings(monkeypatch: pytest.MonkeyPatch) -> No
         recordings._steps += 1
         return recordings._recording(None, None, None, kind, None)  # type: ignore[arg-type]
 
-    sizes = recordings_module.MAX_RECORDINGS
+    sizes = capture.MAX_RECORDINGS
     for _ in range(3):
         assert all(ask(kind) is not None for kind in range(sizes))
         assert ask(sizes) is None
     assert made == [11] * sizes
     recordings._most_on_host.fill_(12)  # a view needed more pairs than fit
     assert ask(0).pairs == 25
-    recordings._steps += recordings_module.UNUSED
+    recordings._steps += capture.UNUSED
     assert ask(sizes) is not None
     assert len(recordings._recordings) == sizes
 
@@ -222,7 +219,7 @@ def test_buffers_are_new_only_when_the_field_does_not_fit(
     build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     training = training_of(build(n=60))
-    monkeypatch.setattr(buffers_module, "SPARE", 1.25)
+    monkeypatch.setattr(capture, "SPARE", 1.25)
     state = training.model.state
     trained = trained_parameters(state)
     start_moments(state, trained)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sundae_ns.training.report import PruneReport
+from sundae_ns.training.pruning import PruneReport
 
 PLAIN = PruneReport(
     step=15000,

@@ -9,7 +9,8 @@ import pytest
 from nerfstudio.configs.method_configs import all_methods
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.training.run_length import (
+from sundae_ns.training.pruning import PruningSchedule
+from sundae_ns.training.schedules import (
     LEAST_IMAGES,
     LEAST_RECOVERY,
     fit_to_length,
@@ -18,7 +19,6 @@ from sundae_ns.training.run_length import (
     step_options,
     take_options,
 )
-from sundae_ns.training.schedules import PruningSchedule
 
 OURS = sorted(name for name in all_methods if name.startswith("sundae"))
 

@@ -10,17 +10,8 @@ import torch
 from torch.optim import Adam
 from torch.optim.lr_scheduler import ExponentialLR, LambdaLR
 
-from sundae_ns.training.optimizers import NetworkAdamConfig
-from sundae_ns.training.schedulers import (
-    MOST_FACTOR,
-    SPARSE,
-    Decay,
-    PruneAwareDecayConfig,
-    limit_rise,
-    notify_pruned,
-    put_restarts,
-    restarts,
-)
+from sundae_ns.training.nerfstudio_configs import NetworkAdamConfig, PruneAwareDecayConfig
+from sundae_ns.training.schedules import MOST_FACTOR, SPARSE, Decay, limit_rise, notify_pruned, put_restarts, restarts
 
 
 def scheduler(**options: object) -> LambdaLR:

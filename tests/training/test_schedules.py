@@ -14,9 +14,7 @@ from torch.optim import Adam, Optimizer
 
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.pruning.decision import FieldPruner
-from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.report import PruneReport
-from sundae_ns.training.schedules import COUNT, PruningSchedule
+from sundae_ns.training.pruning import COUNT, PruneReport, PruningConfig, PruningSchedule
 
 Field = tuple[dict[str, Parameter], dict[str, Optimizer]]
 

@@ -10,21 +10,22 @@ remove it from every other view. So a gain is a high-pass response on the graph 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.filters import Smoother
 from sundae_ns.graphs import build_graph
 from sundae_ns.rendering.views import View
-from sundae_ns.training.extension import Extension, TrainingRun
-from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.warning import warn
+from sundae_ns.training.state import Extension, FieldState, TrainingRun
+
+log = logging.getLogger(__name__)
+
 
 NEIGHBORS = 8
 """Neighbours of a camera in the graph."""
@@ -106,7 +107,7 @@ class PhotoGains(Extension):
             self._divides = False
             if self._mode == "on":
                 few = f"{len(indices)} training photos are too few to be compared with those beside them"
-                warn(f"photo-gains is off: {few}")
+                log.warning(f"photo-gains is off: {few}")
             return
         self._state, self._rows = run.state, np.asarray(indices)
         positions = places([own.view for own in run.training_views()]).cpu()
@@ -156,7 +157,7 @@ class PhotoGains(Extension):
             return
         exposure = self._gains.double().cpu().log().mean(dim=1)
         most = float(exposure.abs().max().exp()) - 1
-        CONSOLE.log(
+        log.info(
             f"photos are up to {most:.0%} brighter or darker than those beside them; training has taken that out"
             if most > 0
             else "photos are as bright as those beside them; none was changed"

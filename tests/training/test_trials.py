@@ -1,24 +1,31 @@
-"""The engine of trials by itself: several lengths, several fields to go back to, and a state that is resumed."""
+"""Trials without a trainer: the engine, states of checkpoints, and estimated sizes."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from models import Training
 from torch.optim import SGD, Adam
 from torch.optim.lr_scheduler import LambdaLR
 
+from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import CheckpointError
-from sundae_ns.training.heldout import HeldOutQuality
-from sundae_ns.training.schedulers import Decay
-from sundae_ns.training.trials import engine
-from sundae_ns.training.trials.engine import Trial, TrialEngine
+from sundae_ns.gaussians import FEATURES
+from sundae_ns.model import SundaeModel
+from sundae_ns.storage.pack.scene import PackedScene, fit_scene, pack_bytes
+from sundae_ns.training import trials as trials_module
+from sundae_ns.training.choice import HeldOutQuality, Tried
+from sundae_ns.training.schedules import Decay
+from sundae_ns.training.trials import Progress, Trial, TrialEngine, Trials, packed_size
 
+Build = Callable[..., SundaeModel]
 VIEW = HeldOutQuality(10, 20.0, 0.5)
 
 
@@ -45,7 +52,7 @@ class FakeRun:
 
 @pytest.fixture
 def run(build: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> FakeRun:
-    monkeypatch.setattr(engine, "AVERAGED_EVERY", 1)
+    monkeypatch.setattr(trials_module, "AVERAGED_EVERY", 1)
     state = build(n=20).state
     state.head_starts_at = math.inf
     state.field["means"].data.zero_()
@@ -97,7 +104,7 @@ def test_the_mean_of_the_last_weights_is_measured(
         seen.append(height(run))
         return [VIEW]
 
-    monkeypatch.setattr(engine, "measure_heldout", measured)
+    monkeypatch.setattr(trials_module, "measure_heldout", measured)
     trials = TrialEngine()
     trials.start(run, Trial(5, averaged=averaged))  # type: ignore[arg-type]
     run.train(trials)
@@ -137,10 +144,9 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun) -> None:
     saved = copy.deepcopy(trials.state_dict())
     state.provisional = False
     other.load_state_dict(state, saved)
-    other.require("first")
     assert state.provisional
     run.held_out = []
-    other.resume(run)  # type: ignore[arg-type]
+    other.hold_out(run)  # type: ignore[arg-type]
     assert run.held_out == [1, 3]
     assert run.train(other) == 2
     other.take_mean(state)
@@ -149,10 +155,102 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun) -> None:
     assert (height(run), other.taken_back) == (0.0, 6)
 
 
-@pytest.mark.parametrize("saved", [{}, {"kept": {"first": {}}}, {"trial": {"length": 3}}])
-def test_a_state_without_a_field_to_go_back_to_is_refused(run: FakeRun, saved: dict[str, Any]) -> None:
-    trials = TrialEngine()
-    trials.load_state_dict(run.state, saved)
+def test_the_mode_auto_adds_a_trial_and_the_others_do_not(build: Build) -> None:
+    assert "trials" in {extension.name for extension in build(head={"mode": "auto"}).extensions}
+    for mode in ("residual", "features", "off"):
+        assert "trials" not in {extension.name for extension in build(head={"mode": mode}).extensions}
+    names = [extension.name for extension in build(head={"mode": "off"}, pruning={"keep_ratio": None}).extensions]
+    assert names.index("trials") < names.index("pruning") < names.index("after-prune")
+
+
+def test_an_undecided_head_is_residual_and_disabled(build: Build) -> None:
+    model = build(head={"mode": "auto"})
+    model.step = 10**6
+    assert model.head is not None
+    assert model.head.config.mode == "residual"
+    assert not model.state.head_enabled
+
+
+def test_a_head_is_undecided_by_default_and_then_residual() -> None:
+    assert HeadConfig().mode == "auto"
+    assert CompensationHead(HeadConfig()).config.mode == "residual"
+
+
+def test_a_removed_head_leaves_no_values_and_no_moments(build: Build) -> None:
+    model = build(head={"mode": "residual"})
+    training = Training(model)
+    for step in range(3, 6):
+        training.step(step)
+    training.step(6)
+    assert model.state.head_enabled
+    assert training.optimizers.optimizers["compensation"].state
+    features = model.gauss_params["features"]
+    model.state.remove_head()
+    assert model.head is None
+    assert model.gauss_params["features"] is features
+    assert features.numel() == 0
+    assert not training.optimizers.optimizers["compensation"].state
+    assert not training.optimizers.optimizers["features"].state
+    before = model.gauss_params["means"].detach().clone()
+    training.step(7)
+    assert not model.gauss_params["means"].detach().equal(before)
+
+
+@pytest.fixture
+def undecided(build: Build) -> tuple[SundaeModel, Trials]:
+    """A model whose head is to be decided about, and its trials."""
+    model = build(head={"mode": "auto"})
+    return model, next(one for one in model.extensions if isinstance(one, Trials))
+
+
+def saved(stage: str = "", kept: tuple[str, ...] = (), **progress: Any) -> dict[str, Any]:
+    """A state of trials."""
+    engine = TrialEngine()
+    engine.kept = {name: {} for name in kept}
+    engine.trial = Trial(10, num_features=5, counts=False) if stage else None
+    return {"progress": asdict(Progress(stage, **progress)), "engine": engine.state_dict(), "head": True}
+
+
+def test_a_checkpoint_without_a_decision_names_the_option(undecided: tuple[SundaeModel, Trials]) -> None:
+    model, trials = undecided
+    with pytest.raises(CheckpointError, match=r"--pipeline.model.head.mode"):
+        trials.prepare_loading(model.state, {})
+
+
+@pytest.mark.parametrize(("stage", "kept"), [("head", ("start",)), ("count", ()), ("length", ("plain",))])
+def test_a_state_without_a_field_to_go_back_to_is_refused(
+    undecided: tuple[SundaeModel, Trials], stage: str, kept: tuple[str, ...]
+) -> None:
+    model, trials = undecided
+    tried = [Tried("head", 9, "plain", 9)]
     with pytest.raises(CheckpointError, match="lacks a field") as raised:
-        trials.require("first")
+        trials.load_state_dict(model.state, saved(stage, kept, tried=tried))
     assert "\n" not in str(raised.value)
+
+
+def test_only_trials_do_without_mirrored_images(undecided: tuple[SundaeModel, Trials]) -> None:
+    """They are too short to see what these bring; a run that resumes in a trial goes on with it."""
+    model, trials = undecided
+    for state, mirrored in ((saved("head", ("start",)), False), (saved(chosen={"head": "head"}), True)):
+        trials.load_state_dict(model.state, state)
+        model.step = 10**6
+        assert model.state.head_enabled
+        assert model.resolution(model.step).mirror == mirrored
+
+
+@pytest.mark.parametrize("with_head", [False, True])
+def test_a_part_of_a_field_tells_the_size_of_all_of_it(with_head: bool) -> None:
+    n, generator = 20_000, torch.Generator().manual_seed(0)
+    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}
+    shapes |= {"features_rest": (3, 3), FEATURES: (5,)}
+    field = {name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()}
+    head = CompensationHead(HeadConfig(mode="residual", size="tiny", num_features=5)) if with_head else None
+    found = packed_size(field, head)
+    assert found is not None
+    packed = {name: value for name, value in field.items() if with_head or name != FEATURES}
+    data, sections = pack_bytes(*fit_scene(PackedScene(packed, {} if head is None else dict(head.state_dict()))))
+    of_head = sum(size for name, size in sections.items() if name.startswith("head/"))
+    assert found[1] == pytest.approx(of_head, rel=0.01)
+    assert (found[1] > 0) == with_head
+    assert found[0] == pytest.approx(len(data) - of_head, rel=0.1)
+    assert packed_size({**field, "means": torch.full((n, 3), torch.nan)}) is None

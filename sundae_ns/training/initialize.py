@@ -1,21 +1,35 @@
-"""The field that a model starts from: sparse points of the capture, random points, or a finished field."""
+"""The field that a training starts from: sparse points of the capture, random points, or a finished field.
+
+Structure from motion finds points where it can tell one from another: a few hundred in a dozen photos, few on lawns and
+walls. There, :class:`DenseStart` adds points by a plane sweep through the images. Where a field begins without any, it
+explains each image by primitives near its camera, and other views do not agree.
+"""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import track
 from torch import Tensor
 
+from sundae_ns.api.virtual import by_device
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.gaussians.gaussians import rgb_to_logit, sh_to_rgb
+from sundae_ns.gaussians.surgery import replace_parameter
+from sundae_ns.pruning.selection import neighbor_order, select_systematic
 from sundae_ns.storage.coordinates import similarity
 from sundae_ns.storage.formats import kind_of, read_field
-from sundae_ns.training.options import ModelOptions
-from sundae_ns.training.warning import warn
+from sundae_ns.training.plane_sweep import Sweep
+from sundae_ns.training.state import Extension, FieldState, TrainingRun
+
+log = logging.getLogger(__name__)
+
 
 FEWEST_POINTS = 50
 """With fewer sparse points a user hears that photos overlap too little."""
@@ -44,11 +58,11 @@ class Start:
         if self.failure is not None:
             raise self.failure
         for warning in self.warnings:
-            warn(warning)
+            log.warning(warning)
 
 
 def initial_field(
-    options: ModelOptions, points: Points | None, frame: Frame | None, *, num_features: int, cap: int | None
+    options: Any, points: Points | None, frame: Frame | None, *, num_features: int, cap: int | None
 ) -> tuple[dict[str, Tensor], Start]:
     """Parameters of a new model, float32 on the CPU, and what to report if it is trained.
 
@@ -56,7 +70,7 @@ def initial_field(
     error is reported only when training starts.
 
     Args:
-        options: of the model.
+        options: ``SundaeModelConfig``.
         points: sparse points of the capture, if it has any.
         frame: of the capture, if known.
         num_features: length of the feature vectors; 0 for none.
@@ -77,7 +91,7 @@ def initial_field(
 
 
 def _sparse_field(
-    options: ModelOptions, points: Points | None, num_features: int, cap: int | None
+    options: Any, points: Points | None, num_features: int, cap: int | None
 ) -> tuple[dict[str, Tensor], Start]:
     warnings: list[str] = []
     if points is not None and len(points[0]) > 0 and not options.random_init:
@@ -102,7 +116,7 @@ def _sparse_field(
     return params, Start(tuple(warnings))
 
 
-def _warm_field(options: ModelOptions, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
+def _warm_field(options: Any, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
     params, in_model_frame, _ = read_field(source)
     if options.warm_start_frame != "auto":
         in_model_frame = options.warm_start_frame == "model"
@@ -124,5 +138,77 @@ def _warm_field(options: ModelOptions, source: Path, frame: Frame | None, num_fe
     params["features_rest"] = rest
     if num_features:
         params[FEATURES] = initial_features(params["features_dc"], num_features)
-    CONSOLE.log(f"warm start: {len(params['means'])} primitives from {source}")
+    log.info(f"warm start: {len(params['means'])} primitives from {source}")
     return params
+
+
+SIDES = {"cuda": 640, "cpu": 160}
+"""Longest side of the swept images, pixels, by device: a CPU takes a second a view, a GPU a fraction."""
+MOST_ON_CPU = 24
+"""Most views that a CPU sweeps."""
+FILLED = {"cuda": 100_000, "cpu": 20_000}
+"""Number of points up to which a sparse cloud is filled; a larger one stays as it is."""
+
+
+class DenseStart(Extension):
+    """Begins the training anew from sparse and dense points, before the first step.
+
+    Args:
+        options: ``SundaeModelConfig``.
+        points: sparse points of the capture; None or none at all leave the field as it is.
+        num_images: number of training images.
+        num_features: length of the feature vectors; 0 for none.
+        cap: highest number of primitives to start with; None for no cap.
+    """
+
+    name = "dense-start"
+
+    def __init__(
+        self, options: Any, points: Points | None, num_images: int, *, num_features: int, cap: int | None
+    ) -> None:
+        self._options, self._points, self._num_features, self._cap = options, points, num_features, cap
+        wanted = 2 <= num_images <= options.dense_start_views and options.warm_start is None and not options.random_init
+        self._done = not wanted or points is None or len(points[0]) == 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: a checkpoint holds the field that has begun."""
+        return {}
+
+    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """A field of a checkpoint is in training."""
+        self._done = True
+
+    def before_training(self, run: TrainingRun) -> None:
+        """Sweep, and put the larger field in the place of the one from sparse points."""
+        if self._done:
+            return
+        self._done = True
+        assert self._points is not None
+        state, (sparse, colours) = run.state, self._points
+        too_many = state.device.type == "cpu" and len(run.view_indices()) > MOST_ON_CPU
+        if too_many or len(sparse) >= by_device(FILLED, state.device):
+            return
+        xyz, rgb = self._swept(run, sparse.to(state.device))
+        colours = colours.float()
+        colours = colours if len(colours) else torch.full_like(sparse, 127.5)
+        points = torch.cat([sparse, xyz.to(sparse)]), torch.cat([colours, 255 * rgb.to(colours)])
+        params, _ = initial_field(self._options, points, None, num_features=self._num_features, cap=self._cap)
+        for name, value in params.items():  # without moments
+            replace_parameter(state.field.data, state.optimizers, name, value.to(state.device), {})
+        log.info(
+            f"{len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones "
+            "(--pipeline.model.dense-start-views 0 leaves them out)"
+        )
+
+    @torch.no_grad()
+    def _swept(self, run: TrainingRun, sparse: Tensor) -> Points:
+        """Positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``; evenly spread ones if too many are found."""
+        most = by_device(FILLED, run.state.device) - len(sparse)
+        sweep = Sweep(run.photos(), sparse[sparse.isfinite().all(dim=1)], by_device(SIDES, run.state.device))
+        for i in track(range(len(sweep.photos)), "Plane sweep", transient=True):
+            sweep.add(i)
+        xyz, rgb = sweep.points(most)
+        if len(xyz) > most:
+            even = select_systematic(torch.ones(len(xyz)), most, neighbor_order(xyz), self._options.pruning.seed)
+            xyz, rgb = xyz[even.to(xyz.device)], rgb[even.to(rgb.device)]
+        return xyz.cpu(), rgb.cpu()

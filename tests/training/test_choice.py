@@ -1,4 +1,4 @@
-"""The curve of quality over the number of primitives, and what is chosen by it."""
+"""What is chosen by measurements of held-out views: the number of Gaussians, the head, and the length."""
 
 from __future__ import annotations
 
@@ -7,21 +7,33 @@ import math
 from collections.abc import Sequence
 
 import pytest
+import torch
+from torch import Tensor
 
+from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.evaluation.count_curve import CurvePoint
-from sundae_ns.training.trials.curve import (
+from sundae_ns.evaluation.metrics import MOST_PSNR
+from sundae_ns.training.choice import (
+    HEADS,
+    MOST_HELD_OUT,
     PSNR_WEIGHTS,
     SSIM_WEIGHTS,
     HeadGain,
+    HeldOutQuality,
     Tolerance,
+    Tried,
     affordable,
+    best_head,
     choose,
     curve_of,
     head_pays,
     is_lost,
+    mean_quality,
+    plan_heads,
     still_climbs,
     with_head,
 )
+from sundae_ns.training.trials import view_quality
 
 COUNTS = (1000, 400, 200, 100)
 Views = list[list[float]]
@@ -36,8 +48,15 @@ def trials(psnr: Sequence[float], ssim: Sequence[float], *, spread: Sequence[flo
     return [[[100.0, 0.0, s, p + offset] for offset in spread] for p, s in zip(psnr, ssim, strict=True)]
 
 
+def curve(counts: Sequence[int], measured: Sequence[Views], sizes: Sequence[int | None]) -> list[CurvePoint]:
+    rows = zip(counts, measured, sizes, strict=True)
+    return curve_of(
+        [Tried("count", n, "plain", 9, views, None if size is None else [size, 0]) for n, views, size in rows]
+    )
+
+
 def test_losses_are_those_against_the_best_of_each_figure() -> None:
-    found = curve_of([100] * 4, trials([30, 31, 30.5, 29], [0.9, 0.89, 0.88, 0.87]), [4, 3, 2, None])
+    found = curve([100] * 4, trials([30, 31, 30.5, 29], [0.9, 0.89, 0.88, 0.87]), [4, 3, 2, None])
     assert [one.bytes for one in found] == [4, 3, 2, None]
     assert [one.psnr_loss for one in found] == pytest.approx([PSNR_WEIGHTS[0] * loss for loss in (1, 0, 0.5, 2)])
     assert [one.ssim_loss for one in found] == pytest.approx([SSIM_WEIGHTS[0] * loss for loss in (0, 0.01, 0.02, 0.03)])
@@ -46,7 +65,7 @@ def test_losses_are_those_against_the_best_of_each_figure() -> None:
 
 
 def test_each_halving_gains_more_after_the_trial() -> None:
-    found = curve_of((400, 100), trials([30, 30], [0.9, 0.9]), [None, None])
+    found = curve((400, 100), trials([30, 30], [0.9, 0.9]), [None, None])
     assert [one.count for one in found] == [400, 100]
     assert [one.psnr_loss for one in found] == pytest.approx([2 * PSNR_WEIGHTS[1], 0])
     assert [one.ssim_loss for one in found] == pytest.approx([2 * SSIM_WEIGHTS[1], 0])
@@ -54,12 +73,12 @@ def test_each_halving_gains_more_after_the_trial() -> None:
 
 def test_the_error_is_of_the_differences_between_counts_on_the_same_view() -> None:
     """Views differ by decibels from each other, but all counts alike."""
-    alike = curve_of(COUNTS[:2], trials([30, 29], [0.9, 0.9], spread=(-5, 0, 5)), [None, None])
+    alike = curve(COUNTS[:2], trials([30, 29], [0.9, 0.9], spread=(-5, 0, 5)), [None, None])
     assert alike[1].psnr_error == pytest.approx(0, abs=1e-9)
     unlike = trials([30, 29], [0.9, 0.9])
     for offset, view in zip((-0.3, 0, 0.3), unlike[1], strict=True):
         view[3] += offset
-    found = curve_of(COUNTS[:2], unlike, [None, None])
+    found = curve(COUNTS[:2], unlike, [None, None])
     assert found[1].psnr_error == pytest.approx(PSNR_WEIGHTS[0] * 0.3 / math.sqrt(3))
 
 
@@ -68,13 +87,13 @@ def test_views_count_by_their_pixels() -> None:
     measured[1][0][3] = 20.0
     for trial in measured:
         trial[0][0] = 1e-9
-    assert curve_of([100, 100], measured, [None, None])[1].psnr_loss == pytest.approx(0, abs=1e-6)
+    assert curve([100, 100], measured, [None, None])[1].psnr_loss == pytest.approx(0, abs=1e-6)
 
 
 def test_images_that_are_not_finite_lose_everything() -> None:
     measured = trials([30, 29], [0.9, 0.9])
     measured[0][0][3] = math.nan
-    found = curve_of(COUNTS[:2], measured, [None, None])
+    found = curve(COUNTS[:2], measured, [None, None])
     assert found[0].psnr_loss == math.inf
     assert found[1].psnr_loss == 0
     assert choose(found, Tolerance()) == COUNTS[1]
@@ -163,9 +182,12 @@ def test_a_head_that_lets_the_scene_shrink_needs_to_gain_little() -> None:
 
 
 def test_the_gain_of_a_head_in_ssim_is_in_decibels_of_its_distance_from_one() -> None:
-    gain = HeadGain.of(10, (30.0, 0.9), (30.5, 0.95))
+    def trial(decibels: float, similarity: float) -> Tried:
+        return Tried("tenth", 10, "plain", 9, [[100.0, decibels, similarity]])
+
+    gain = HeadGain.of(trial(30.0, 0.9), trial(30.5, 0.95))
     assert (gain.psnr, gain.ssim, gain.ssim_db) == pytest.approx((0.5, 0.05, 10 * math.log10(2)))
-    assert HeadGain.of(10, (30.0, 0.0), (30.5, 0.0)).ssim_db is None
+    assert HeadGain.of(trial(30.0, 0.0), trial(30.5, 0.0)).ssim_db is None
 
 
 def test_a_budget_in_bytes_is_a_count_between_the_tried_ones() -> None:
@@ -179,3 +201,134 @@ def test_a_curve_that_still_climbs_asks_for_more_primitives() -> None:
     assert still_climbs([point(1000), point(400, 0.5)], Tolerance())
     assert not still_climbs([point(1000), point(400, 0.05)], Tolerance())
     assert not still_climbs([point(1000, 0.3), point(400, 0.5), point(200)], Tolerance())
+
+
+@pytest.mark.parametrize(("views", "held_out"), [(12, 2), (16, 2), (43, 5), (73, 9), (105, 13), (255, 16), (2000, 16)])
+def test_an_eighth_of_the_views_is_held_out_within_limits(views: int, held_out: int) -> None:
+    (fold,), length = plan_heads(range(views), 30000)
+    assert length == 1200
+    assert len(set(fold)) == held_out <= MOST_HELD_OUT
+    # Even gaps: no stretch of the capture goes unjudged.
+    gaps = [b - a for a, b in zip(fold, fold[1:])]
+    assert max(gaps) - min(gaps) <= 1
+    assert fold[0] >= 1
+    assert fold[-1] < views - 1
+
+
+@pytest.mark.parametrize("views", [6, 9, 11])
+def test_with_few_views_two_are_held_out_in_turn(views: int) -> None:
+    ((first,), (second,)), length = plan_heads([10 * i for i in range(views)], 30000)
+    assert length == 600
+    assert first != second
+    assert first % 10 == second % 10 == 0
+
+
+@pytest.mark.parametrize("views", [6, 12, 255])
+@pytest.mark.parametrize("steps", [1000, 7000, 18000, 30000, 60000])
+def test_deciding_costs_at_most_a_tenth_of_the_steps(views: int, steps: int) -> None:
+    folds, length = plan_heads(range(views), steps)
+    # The trial of one candidate continues.
+    assert (len(HEADS) * len(folds) - 1) * length <= 0.1 * steps
+
+
+@pytest.mark.parametrize(("steps", "length"), [(7000, 350), (18000, 900), (30000, 1200), (60000, 2400)])
+def test_short_runs_have_longer_trials_for_their_length(steps: int, length: int) -> None:
+    """In a trial of 720 steps, 500 of them a rise, a head on bonsai showed 0.08 of the 1.8 dB that it gains."""
+    assert plan_heads(range(255), steps)[1] == length
+
+
+def best_of(measured: Sequence[Views], *, folds: int = 1, sizes: Sequence[int] = (100, 110, 120)) -> str:
+    """The best head of trials; bytes of the candidates count little."""
+    rows = [Tried("head", 9, HEADS[i // folds], 9, views, [sizes[i // folds], 0]) for i, views in enumerate(measured)]
+    return best_head(rows, folds)
+
+
+@pytest.mark.parametrize(
+    ("head", "features", "best"),
+    [
+        ((0.09, 0.01), None, "plain"),
+        ((0.2, 0.01), (0.29, 0.02), "head"),
+        ((0.2, 0.01), (0.31, 0.01), "features"),
+        ((0.2, 0.01), (0.9, 0.009), "head"),
+        ((0.5, -0.001), None, "plain"),
+        ((0.5, 0.0), (0.9, 0.0), "features"),
+        ((float("nan"), 0.01), None, "plain"),
+        ((float("inf"), 0.01), None, "plain"),
+        ((0.5, 0.01), (0.9, float("nan")), "head"),
+    ],
+)
+def test_a_candidate_must_gain_over_the_cheaper_ones_and_must_not_lose_ssim(
+    head: tuple[float, float], features: tuple[float, float] | None, best: str
+) -> None:
+    # Two folds; the second view has more pixels and is harder.
+    measured = [
+        [[float(pixels), decibels + gain[0], 0.7 + gain[1]]]
+        for gain in ((0.0, 0.0), head, *([] if features is None else [features]))
+        for pixels, decibels in ((100, 25.0), (300, 20.0))
+    ]
+    assert best_of(measured, folds=2) == best
+
+
+def test_a_candidate_counts_when_all_its_folds_have_ended() -> None:
+    plain, head = [[10.0, 20.0, 0.5]], [[10.0, 30.0, 0.9]]
+    assert best_of([plain, plain, head], folds=2) == "plain"
+    assert best_of([plain, plain, head, head], folds=2) == "head"
+
+
+@pytest.mark.parametrize(("gain", "size", "best"), [(0.41, 200, "head"), (0.39, 200, "plain"), (0.39, 190, "head")])
+def test_a_candidate_that_takes_more_bytes_must_gain_more(gain: float, size: int, best: str) -> None:
+    measured = [[[10.0, 20.0, 0.5]], [[10.0, 20.0 + gain, 0.5]]]
+    assert best_of(measured, sizes=(100, size, 400)) == best
+
+
+def test_views_of_heads_count_by_their_pixels() -> None:
+    # A gain of 1 dB on few pixels does not outweigh a loss on many.
+    plain, head = [[10.0, 20.0, 0.5], [990.0, 20.0, 0.5]], [[10.0, 21.0, 0.6], [990.0, 19.99, 0.6]]
+    assert best_of([plain, head]) == "plain"
+
+
+@pytest.fixture
+def pair() -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    target = torch.rand(24, 32, 3, generator=generator)
+    return (target + 0.1 * torch.rand(24, 32, 3, generator=generator)).clamp(0, 1), target
+
+
+def test_without_a_mask_it_is_that_of_the_whole_image(pair: tuple[Tensor, Tensor]) -> None:
+    found = view_quality(*pair, None)
+    assert found.pixels == 24 * 32
+    assert found.psnr == pytest.approx(float(psnr(*pair)))
+    assert found.ssim == pytest.approx(float(ssim(*pair)))
+
+
+def test_only_pixels_under_the_mask_count(pair: tuple[Tensor, Tensor]) -> None:
+    image, target = pair
+    mask = torch.zeros(24, 32, dtype=torch.bool)
+    mask[:, :16] = True
+    spoilt = torch.where(mask[..., None], image, torch.full_like(image, math.nan))
+    found = view_quality(spoilt, target, mask)
+    error = (image - target)[:, :16].square().mean()
+    assert found.pixels == 24 * 16
+    assert found.psnr == pytest.approx(float(-10 * torch.log10(error)), abs=1e-4)
+    # Half of the image is exact, and must not hide the other half; windows across the border see both.
+    whole = float(ssim(torch.where(mask[..., None], image, target), target))
+    half = float(ssim(image[:, :16], target[:, :16]))
+    assert abs(found.ssim - half) < 0.3 * abs(whole - half)
+
+
+def test_views_count_by_their_pixels_and_a_masked_view_not_at_all(pair: tuple[Tensor, Tensor]) -> None:
+    assert view_quality(*pair, torch.zeros(24, 32, dtype=torch.bool)).pixels == 0
+    assert mean_quality([HeldOutQuality(300, 20.0, 0.5), HeldOutQuality(100, 40.0, 0.9)]) == (25.0, pytest.approx(0.6))
+
+
+def test_an_exact_image_is_finite_and_a_broken_one_is_not(pair: tuple[Tensor, Tensor]) -> None:
+    image, target = pair
+    assert view_quality(target, target, None).psnr == MOST_PSNR
+    assert not math.isfinite(view_quality(torch.full_like(image, math.nan), target, None).psnr)
+
+
+def test_an_image_smaller_than_the_window_of_ssim_has_a_psnr(pair: tuple[Tensor, Tensor]) -> None:
+    image, target = (one[:8] for one in pair)
+    found = view_quality(image, target, None)
+    assert found.ssim == 0
+    assert math.isfinite(found.psnr)
