@@ -15,11 +15,9 @@ from typing import Annotated, Literal, TypeVar
 import tyro
 
 from sundae_ns.cli.options import Out, Source, check_least
-from sundae_ns.cli.process import quoted
+from sundae_ns.cli.process import quoted, word
 from sundae_ns.errors import ConfigError, DataError, StorageError, SundaeError, one_line
 
-FRAMES = 150
-"""Default number of frames of a video."""
 T = TypeVar("T")
 
 
@@ -30,11 +28,17 @@ class PoseOptions:
     matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
     """photos that are compared: all pairs, neighbours in time and similar ones (for a video), or similar ones; by
     default what suits their number."""
-    frames: int = FRAMES
+    frames: int = 150
     """number of frames of a video; the sharpest of each stretch."""
     masks: Path | None = None
     """folder with a mask for each photo, under its name; training leaves out what is black. By default one named masks
     beside the photos."""
+
+    def words(self) -> list[str]:
+        """Words of the command for what is not the default."""
+        usual = PoseOptions()
+        given = {name: value for name, value in vars(self).items() if value != getattr(usual, name)}
+        return [text for name, value in given.items() for text in (f"--{name}", word(Path(str(value))))]
 
 
 def poses(

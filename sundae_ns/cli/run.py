@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -15,11 +15,16 @@ from typing import Annotated, Literal, NamedTuple
 import tyro
 
 from sundae_ns.cli.options import Out, Source, check_folder
-from sundae_ns.cli.poses import FRAMES, PoseOptions, check_poses
+from sundae_ns.cli.poses import PoseOptions, check_poses
 from sundae_ns.cli.process import quoted, run_command, word
 from sundae_ns.cli.train import TrainOptions, finetune_words, has_gpu, pack_run
 from sundae_ns.data.layouts import is_model, is_posed, no_transforms, posed_layout
 from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
+from sundae_ns.poses import placed_in
+from sundae_ns.storage.atomic import put_aside, write_text
+from sundae_ns.storage.config_file import schedule_length
+from sundae_ns.storage.pack import FINETUNED_SIZE, container, tuned_steps
+from sundae_ns.storage.run_folder import LOCK, reserve, steps_left
 
 SETTINGS = "run.json"
 """File with the settings of the first command; a repeated one must share them."""
@@ -78,121 +83,87 @@ class Project:
     def check(self) -> None:
         """Raise ``ConfigError`` for options that contradict each other."""
         self.train.check(self.photos)
-        if self.max_mb is not None and not 0.01 <= self.max_mb <= 1e6:
-            raise ConfigError(f"max-mb is {self.max_mb:g}; give at least 0.01")
-        if self.poses.masks is not None and self.posed:
-            raise ConfigError(
-                f"{self.photos} has poses already; give each frame of transforms.json its mask_path, or a COLMAP model "
-                "its masks with `sundae train CAPTURE -- colmap --masks-path`"
-            )
-        if self.quality == "draft" and self.train.steps is not None:
-            raise ConfigError(f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality")
-        if self.quality == "draft" and self.train.method == "sundae-tiny":
-            raise ConfigError("sundae-tiny is shorter than a draft; leave out --quality")
-        decides = self.train.keep is None and self.train.method == "sundae"
-        for name, given in (("--max-mb", self.max_mb is not None), ("--quality best", self.quality == "best")):
-            if given and not decides:
-                raise ConfigError(
-                    f"{name} needs a method that decides the number of primitives; leave out --keep and --method"
-                )
+        mb, draft, steps = self.max_mb, self.quality == "draft", self.train.steps
+        fixed = self.train.keep is not None or self.train.method != "sundae"
+        decides = "needs a method that decides the number of primitives; leave out --keep and --method"
+        for wrong, words in (
+            (mb is not None and not 0.01 <= mb <= 1e6, f"max-mb is {mb or 0:g}; give at least 0.01"),
+            (
+                self.poses.masks is not None and self.posed,
+                f"{self.photos} has poses already; give each frame of transforms.json its mask_path, or a COLMAP "
+                "model its masks with `sundae train CAPTURE -- colmap --masks-path`",
+            ),
+            (draft and steps is not None, f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality"),
+            (
+                draft and self.train.method == "sundae-tiny",
+                "sundae-tiny is shorter than a draft; leave out --quality",
+            ),
+            (fixed and mb is not None, f"--max-mb {decides}"),
+            (fixed and self.quality == "best", f"--quality best {decides}"),
+        ):
+            if wrong:
+                raise ConfigError(words)
 
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
         packed, report, page = (self.out / name for name in ("scene.sundae", "report/report.html", "scene.html"))
-
-        def step(name: str, result: Path, *words: str | Path) -> Step:
-            line = [word(part) if isinstance(part, Path) else part for part in words]
-            return Step(name, lambda: run_command(line), lambda: result.is_file() and _is_page(result), result)
-
+        measure = ["sundae", "report", word(self.run), word(packed), "--data", word(self.capture)]
+        measure += ["-o", word(report.parent), "--overwrite"]
+        export = ["sundae", "export", word(packed), "-o", word(page)]
         steps = [
             Step("train", self.run_training, self.trained),
             Step("pack", lambda: self.run_pack(packed), lambda: _is_packed(packed), packed),
-            step(
-                *("report", report, "sundae", "report", self.run, packed, "--data", self.capture),
-                *("-o", report.parent, "--overwrite"),
-            ),
-            step("web page", page, "sundae", "export", packed, "-o", page),
+            Step("report", lambda: run_command(measure), lambda: _is_page(report), report),
+            Step("web page", lambda: run_command(export), lambda: _is_page(page), page),
         ]
         return steps if self.posed else [Step("camera poses", self.find_poses, self.placed), *steps]
 
     def find_poses(self) -> int:
         """Make the capture."""
-        from sundae_ns.storage.atomic import put_aside
-
         with writing(f"cannot replace {self.capture}"):
             put_aside(self.capture)  # damaged
-        words = ["sundae", "poses", word(self.photos), "-o", word(self.capture)]
-        words += ["--matching", self.poses.matching] if self.poses.matching != "auto" else []
-        words += ["--frames", str(self.poses.frames)] if self.poses.frames != FRAMES else []
-        words += ["--masks", word(self.poses.masks)] if self.poses.masks is not None else []
-        return run_command(words)
+        return run_command(["sundae", "poses", word(self.photos), "-o", word(self.capture), *self.poses.words()])
 
     def placed(self) -> bool:
         """Whether the capture is whole."""
-        from sundae_ns.poses import placed_in
-
         try:
             placed_in(self.capture)
         except DataError:
             return False
         return True
 
-    def check_placed(self) -> None:
-        """Raise ``DataError`` if too few photos have a pose."""
-        from sundae_ns.poses import placed_in
-
-        placed = placed_in(self.capture)
-        if not placed.enough:
+    def run_training(self) -> int:
+        """Train, or resume a training; ``DataError`` if too few photos have a pose."""
+        if not self.posed and not (placed := placed_in(self.capture)).enough:
             raise DataError(
                 f"COLMAP placed {len(placed.placed)} of {placed.total} photos; {placed.again}, and start in another "
                 f"folder, or train on these with `sundae run {quoted(self.capture)} -o OTHER`"
             )
-
-    def run_training(self) -> int:
-        """Train, or resume a training."""
-        if not self.posed:
-            self.check_placed()
-        saved, resumes = self.run / "nerfstudio_models", self._steps_left() is not None
+        saved, resumes = self.run / "nerfstudio_models", steps_left(self.run) is not None
         if not resumes and any(saved.glob("*.ckpt")):
-            from sundae_ns.storage.atomic import put_aside
-
             with writing(f"cannot replace {self.run}"):
                 put_aside(self.run)
         # The name may begin with a dash.
         more = [f"--experiment-name={self.run.parent.parent.name}", "--timestamp", self.run.name]
-        more += ["--vis", "viewer+tensorboard"]
-        more += finetune_words() if self.tunes else []
+        more += ["--vis", "viewer+tensorboard", *(finetune_words() if self.tunes else [])]
         options = self.train
         if resumes:  # trains the steps that are left
+            options = replace(options, steps=None)
             more += ["--load-dir", word(saved)]
-            options = TrainOptions(options.method, options.keep)
         else:
-            if self.quality == "draft":
-                options = TrainOptions(options.method, options.keep, DRAFT_STEPS)
-            if self.quality == "best":
-                more += ["--pipeline.model.pruning.max-drop", "0.03"]
-            if self.max_bytes is not None:
-                from sundae_ns.storage.pack import FINETUNED_SIZE
-
-                # Trials count the bytes of packs without a fine-tune.
+            options = replace(options, steps=DRAFT_STEPS) if self.quality == "draft" else options
+            more += ["--pipeline.model.pruning.max-drop", "0.03"] if self.quality == "best" else []
+            if self.max_bytes is not None:  # trials count the bytes of packs without a fine-tune
                 most = round(self.max_bytes / FINETUNED_SIZE) if self.tunes else self.max_bytes
                 more += ["--pipeline.model.pruning.max-bytes", str(most)]
         return run_command(options.words(self.capture, self.out / "runs", more))
 
     def trained(self) -> bool:
         """Whether the last step is saved, of those before the pack's fine-tune."""
-        left = self._steps_left()
+        left = steps_left(self.run)
         if left is None or left <= 0:
             return left is not None
-        from sundae_ns.storage.config_file import schedule_length
-        from sundae_ns.storage.pack import tuned_steps
-
         return self.tunes and left <= tuned_steps(schedule_length(self.run / "config.yml"))
-
-    def _steps_left(self) -> int | None:
-        from sundae_ns.storage.run_folder import steps_left
-
-        return steps_left(self.run)
 
     def run_pack(self, packed: Path) -> int:
         """Pack the run."""
@@ -206,13 +177,13 @@ class Project:
             ConfigError: its settings were others.
             StorageError: another process works in the folder, it holds other files, or it cannot be written.
         """
-        from sundae_ns.storage.atomic import write_text
-        from sundae_ns.storage.run_folder import LOCK, reserve
-
-        masks = None if self.poses.masks is None else str(self.poses.masks.resolve())
-        settings = {"photos": str(self.photos.resolve()), **asdict(self.train), **asdict(self.poses), "masks": masks}
-        settings |= {"quality": self.quality, "max_mb": self.max_mb}
-        path = self.out / SETTINGS
+        path, masks = self.out / SETTINGS, self.poses.masks
+        settings: dict[str, object] = {
+            "photos": str(self.photos.resolve()),
+            "quality": self.quality,
+            "max_mb": self.max_mb,
+        }
+        settings |= {**asdict(self.train), **asdict(self.poses), "masks": str(masks.resolve()) if masks else None}
         if self.out.resolve().is_relative_to(self.photos.resolve()):
             raise StorageError(f"{self.out} lies in {self.photos}, which the command reads; choose another folder")
         # An earlier command may have been killed after it made the lock.
@@ -226,16 +197,15 @@ class Project:
             return
         try:
             before = json.loads(path.read_bytes())
-            pairs = [(name, before[name], value) for name, value in settings.items()]
+            changed = [(name, before[name], now) for name, now in settings.items() if before[name] != now]
         except (ValueError, TypeError, KeyError) as error:
             raise StorageError(f"{path} is damaged; choose another folder") from error
-        for name, *values in pairs:
-            if values[0] != values[1]:
-                first, now = ("left out" if value is None else value for value in values)
-                raise ConfigError(
-                    f"{self.out} was made with {name} {first}, not {now}; "
-                    "repeat the first command, or choose another folder"
-                )
+        for name, *values in changed:
+            first, now = ("left out" if value is None else value for value in values)
+            raise ConfigError(
+                f"{self.out} was made with {name} {first}, not {now}; "
+                "repeat the first command, or choose another folder"
+            )
 
 
 def run(
@@ -302,10 +272,8 @@ def _check_input(photos: Path) -> None:
 
 def _is_packed(path: Path) -> bool:
     """Whether a file is a packed scene whose checksums are right."""
-    from sundae_ns.storage.pack.container import read_header, read_sections
-
     try:
-        read_sections(path, read_header(path))
+        container.read_sections(path, container.read_header(path))
     except SundaeError:
         return False
     return True
@@ -313,4 +281,4 @@ def _is_packed(path: Path) -> bool:
 
 def _is_page(path: Path) -> bool:
     """Whether a web page has its end, which comes after the scene; a full disk or a copy may have left a part."""
-    return path.read_bytes()[-16:].rstrip().endswith((b"</html>", b"-->"))
+    return path.is_file() and path.read_bytes()[-16:].rstrip().endswith((b"</html>", b"-->"))

@@ -11,7 +11,6 @@ import pytest
 from command_line import run
 
 from sundae_ns.cli import main
-from sundae_ns.cli.main import COMMANDS
 
 
 @pytest.mark.parametrize("wrong", ["foreign folder", "file", "option"])
@@ -40,20 +39,6 @@ def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sundae_ns.cli.doctor.parts", broken)
     with pytest.raises(ZeroDivisionError):
         main(["doctor"])
-
-
-def test_the_list_of_commands_fits_one_screen(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("--help") == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) <= 24
-    assert max(map(len, lines)) <= 100
-    assert [line.split()[0] for line in lines if line.startswith("  ")] == list(COMMANDS)
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_shows_its_options(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(command, "--help") == 0
-    assert capsys.readouterr().out.startswith(f"usage: sundae {command}")
 
 
 @pytest.mark.parametrize(
@@ -85,17 +70,6 @@ def test_threads_of_torch_do_not_spin_unless_the_user_chose(
         monkeypatch.delenv("OMP_WAIT_POLICY")
     run("export", tmp_path / "missing", tmp_path / "out.ply")
     assert os.environ["OMP_WAIT_POLICY"] == (chosen or "PASSIVE")
-
-
-def test_commands_keep_the_memory_of_a_step_unless_the_user_chose(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "0")
-    monkeypatch.setenv("MALLOC_MMAP_THRESHOLD_", "0")
-    monkeypatch.delenv("MALLOC_MMAP_THRESHOLD_")
-    run("export", tmp_path / "missing", tmp_path / "out.ply")
-    assert os.environ["MALLOC_TRIM_THRESHOLD_"] == "0"
-    assert os.environ["MALLOC_MMAP_THRESHOLD_"] == str(32 * 1024**2)
 
 
 def test_torch_is_not_loaded_before_a_command_starts() -> None:

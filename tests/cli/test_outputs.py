@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from short_prunes import SHORT
 
 from sundae_ns.cli import main
 from sundae_ns.cli.options import check_file, check_folder
@@ -221,36 +219,3 @@ def test_a_reader_of_stdout_that_has_left_is_no_error(here: Path, unbuffered: st
         assert process.stderr.read() == b""
     assert process.returncode == 141
     assert (here / "left.ply").is_file()
-
-
-def test_commands_on_fields_import_no_nerfstudio(here: Path) -> None:
-    commands = [
-        ["export", "a.sundae", "-o", "a-again.ply"],
-        ["export", "a.ply", "-o", "x.spz"],
-        ["export", "run", "-o", "x.ply"],
-        ["prune", "a.ply", "-o", "pruned.ply", "--views", "2"],
-    ]
-    (here / "run" / "nerfstudio_models").mkdir(parents=True)
-    (here / "run" / "config.yml").write_text(
-        "!!python/object:nerfstudio.engine.trainer.TrainerConfig\n"
-        "data: !!python/object/apply:pathlib.PosixPath [scene]\n"
-        "pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig\n"
-        "  model: !!python/object:nerfstudio.models.splatfacto.SplatfactoModelConfig\n"
-        "    _target: !!python/name:nerfstudio.models.splatfacto.SplatfactoModel ''\n"
-        "    rasterize_mode: antialiased\n"
-    )
-    points = torch.rand(30, 3)
-    field = from_points(points, points, sh_degree=1, num_features=0)
-    state = {f"_model.gauss_params.{name}": value for name, value in field.items()}
-    torch.save({"step": 3, "pipeline": state}, here / "run" / "nerfstudio_models" / "step-000000003.ckpt")
-    code = (
-        f"import json, sys\nfrom sundae_ns.cli import main\n{SHORT}"
-        "for words in json.loads(sys.argv[1]):\n"
-        "    try:\n        main(words)\n    except SystemExit as end:\n        assert not end.code, words\n"
-        "    assert 'nerfstudio' not in sys.modules, words"
-    )
-    started = [sys.executable, "-c", code, json.dumps(commands)]
-    result = subprocess.run(started, capture_output=True, text=True, check=False, cwd=here)
-    assert result.returncode == 0, result.stderr
-    assert all((here / words[3]).is_file() for words in commands)
-    assert b"SplatRenderMode: mip" in (here / "x.ply").read_bytes()[:400]

@@ -16,7 +16,6 @@ from fake_colmap import FakeColmap
 from PIL import Image
 from run_commands import photo, write_video
 
-from sundae_ns.poses import reconstruct
 from sundae_ns.storage import run_folder
 
 PHOTOS = 6
@@ -53,12 +52,6 @@ def test_each_stage_and_the_result_are_one_line(colmap: FakeColmap, capsys: pyte
     again = "to add them, photograph the way from 3.JPG to 4.JPG again"
     assert lines[6].startswith(f"# without a pose: 4.JPG, 5.JPG; {again}")
     assert len(json.loads(Path("capture/transforms.json").read_text())["frames"]) == 4
-
-
-def test_models_that_do_not_join_are_named(colmap: FakeColmap, capsys: pytest.CaptureFixture[str]) -> None:
-    colmap.models = [4, 3]
-    assert poses("photos", "-o", "capture") == 0
-    assert "the largest of 2 models that do not join; others have 3 photos" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ["-a folder", "$(touch PWNED)", "a'b\"c", "ünï cöde 像"])
@@ -190,9 +183,3 @@ def test_an_interrupt_ends_at_once_and_the_same_command_continues(
     assert colmap.calls["features"] == [], "these were found before"
     assert colmap.calls["models"] == ["OPENCV"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "photos"]
-
-
-def test_the_log_of_colmap_is_silent(colmap: FakeColmap) -> None:
-    assert poses("photos", "-o", "capture") == 0
-    assert reconstruct.pycolmap() is colmap
-    assert colmap.logging.minloglevel == 3

@@ -42,7 +42,7 @@ def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.Captur
         (["video.mp4", "-o", "out"], "video.mp4 is not a video that OpenCV decodes"),
         (["photos/0.JPG", "-o", "out"], "photos/0.JPG is neither a folder of photos nor a video"),
         (["photos", "-o", "out", "--frames", "2"], "frames is 2; give at least 3"),
-        (["model", "-o", "out"], "model/sparse/0: cameras.bin ends early"),
+        (["model", "-o", "out"], "cameras.bin is not a complete cameras.bin of COLMAP"),
         (["model/sparse/0", "-o", "out"], "is a COLMAP model without its images"),
         (["undistorted", "-o", "out"], "undistorted has no image 0.png, which its model dense/sparse states"),
         (["blender", "-o", "out"], "blender/transforms_train.json is not JSON"),

@@ -215,13 +215,6 @@ def test_small_images_lose_nothing(measured: Callable[..., Measured], width: int
     assert np.array_equal(decoded(view.images["error map"]).convert("RGB"), errors)
 
 
-def test_larger_images_look_like_their_tensors(measured: Callable[..., Measured]) -> None:
-    flat = [torch.full((16, 800, 3), value) for value in (0.2, 0.5, 0.8)]
-    view = shown_view(0, "a", *flat, measured().full.views[0], measured().base.views[0])
-    for address, image in zip((view.photo, view.images["rendering"], view.images["head off"]), flat, strict=True):
-        assert np.abs(np.asarray(decoded(address)) / 255 - image.numpy()).max() < 0.01
-
-
 def test_a_rendering_that_is_not_finite_is_shown(measured: Callable[..., Measured]) -> None:
     broken = torch.full((16, 16, 3), math.nan)
     view = shown_view(0, "a", torch.ones(16, 16, 3), broken, broken, measured().full.views[0], None)
@@ -277,17 +270,6 @@ def test_its_figures_are_those_of_the_report(measured: Callable[..., Measured]) 
     assert [float(card["data-psnr"] or 0) for card in cards] == [view.psnr for view in run.full.views]
     assert "sundae report x" in page.words
     assert "All 3 test views" in page.words
-
-
-def test_it_says_how_many_views_it_shows(measured: Callable[..., Measured]) -> None:
-    run = shown(measured())
-    page = Page(page_of(replace(run, views=run.views[1:])))
-    assert "2 of 3 test views: the worst, the best" in page.words
-    assert "Images are compressed" not in page.words
-    large = replace(run.views[0], size=(2400, 1800), shown=(1200, 900))
-    page = Page(page_of(replace(run, views=[large])))
-    assert f"Images are compressed here, and reduced to {LONGEST_SIDE} pixels" in page.words
-    assert "2400 x 1800 px, shown at 50%" in page.words
 
 
 def test_hostile_names_stay_text(measured: Callable[..., Measured]) -> None:
