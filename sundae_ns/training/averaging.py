@@ -17,8 +17,7 @@ from sundae_ns.training.state import Extension, FieldState, TrainingRun
 
 log = logging.getLogger(__name__)
 
-AVERAGED_EVERY = 10
-"""Steps between two weights that count: neighbours differ by little."""
+AVERAGED_EVERY = 10  # Steps between two weights that count: neighbours differ by little
 
 NamedTensors = Mapping[str, Tensor]
 
@@ -105,8 +104,7 @@ class Averaging(Extension):
         self.share = share
         self.settled_at = settled_at
         self._mean = RunningMean()
-        self._restored = 0
-        """Returns to a snapshot that the field had made when the mean began."""
+        self._restored = 0  # Returns to a snapshot that the field had made when the mean began
         self._replaced: dict[str, Tensor] = {}
         """Weights of the last step, which the mean has replaced: a longer training goes on from them."""
         self._alone = True

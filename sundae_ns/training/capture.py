@@ -27,11 +27,9 @@ from sundae_ns.training.densification import COUNTED, STATISTICS, count_view, st
 from sundae_ns.training.state import FieldState
 from sundae_ns.training.step import StepInputs, StepLosses, StepResult, TrainingStep
 
-SPARE = 1.1
-"""Capacity for a field that grows, as a multiple of its number of primitives."""
+SPARE = 1.1  # Capacity for a field that grows, as a multiple of its number of primitives
 
-MOMENTS = ("exp_avg", "exp_avg_sq")
-"""Adam's moments in the state of its optimizer."""
+MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's moments in the state of its optimizer
 
 _UNSEEN = {"means": 1e15, "scales": -30.0, "opacities": -30.0}
 """Values of the rows beyond: behind the far plane, without width, transparent. Others are zero."""
@@ -42,8 +40,7 @@ class _Rows(NamedTuple):
 
     name: str
     value: Tensor
-    replace: Callable[[Tensor], object]
-    """Puts another tensor in its place."""
+    replace: Callable[[Tensor], object]  # Puts another tensor in its place
 
 
 class Buffers:
@@ -133,11 +130,9 @@ def _fill(held: Tensor, row: _Rows) -> None:
     held[n:].fill_(_UNSEEN.get(row.name, 0.0))
 
 
-SPARE_PAIRS = 2.0
-"""Capacity for tile/primitive pairs, as a multiple of the most that a view has needed."""
+SPARE_PAIRS = 2.0  # Capacity for tile/primitive pairs, as a multiple of the most that a view has needed
 
-MAX_RECORDINGS = 8
-"""Recordings kept at a time: one for each image size and SH degree in use."""
+MAX_RECORDINGS = 8  # Recordings kept at a time: one for each image size and SH degree in use
 
 UNUSED = 1000
 """Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by
@@ -150,12 +145,9 @@ StepWork = Callable[[StepInputs, RenderSettings, Capacity | None], StepResult]
 @dataclass(frozen=True)
 class _Recording:
     graph: torch.cuda.CUDAGraph
-    inputs: StepInputs
-    """The graph reads them here."""
-    result: StepResult
-    """The graph writes it here."""
-    pairs: int
-    """Tile/primitive pairs that fit."""
+    inputs: StepInputs  # The graph reads them here
+    result: StepResult  # The graph writes it here
+    pairs: int  # Tile/primitive pairs that fit
 
 
 class StepRecordings:
@@ -171,15 +163,11 @@ class StepRecordings:
     def __init__(self, *, record: bool = True) -> None:
         self._record = record
         self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()
-        self._used: dict[Hashable, int] = {}
-        """Step at which a recording was last replayed."""
+        self._used: dict[Hashable, int] = {}  # Step at which a recording was last replayed
         self._steps = 0
-        self._warm: set[Hashable] = set()
-        """Kinds of steps that have run kernel by kernel."""
-        self._most: Tensor | None = None
-        """Most tile/primitive pairs that a view has needed, on the device, int64 ``[]``."""
-        self._most_on_host: Tensor | None = None
-        """Its pinned copy, some steps late."""
+        self._warm: set[Hashable] = set()  # Kinds of steps that have run kernel by kernel
+        self._most: Tensor | None = None  # Most tile/primitive pairs that a view has needed, on the device, int64 []
+        self._most_on_host: Tensor | None = None  # Its pinned copy, some steps late
 
     def forget(self, *, pairs: bool = False) -> None:
         """Drop all recordings; with ``pairs`` also measure again how many pairs a view needs."""
@@ -283,24 +271,20 @@ class StepRecordings:
         return _Recording(graph, own, result, pairs)
 
 
-HEAD = "compensation"
-"""Name of the head's optimizer."""
+HEAD = "compensation"  # Name of the head's optimizer
 
 
 @dataclass(frozen=True)
 class _Held:
     """The tensors of a state whose field lies in the buffers, to notice cheaply when one is replaced."""
 
-    trained: tuple[str, ...]
-    """Names of the parameters of the field that are trained."""
-    growing: bool
-    """Whether the buffers have spare rows."""
+    trained: tuple[str, ...]  # Names of the parameters of the field that are trained
+    growing: bool  # Whether the buffers have spare rows
     groups: list[tuple[str, torch.optim.Optimizer, dict[str, Any]]]
     """Groups of parameters that a step trains: name of the optimizer, optimizer, group."""
     tensors: list[tuple[Mapping[Any, Any], Any, Any]]
     """Mapping, key and value of everything that surgery and restored snapshots replace."""
-    addresses: Hashable
-    """What a recording reads beside the buffers: the head's weights, and the counts of steps."""
+    addresses: Hashable  # What a recording reads beside the buffers: the head's weights, and the counts of steps
 
     @classmethod
     def of(cls, state: FieldState, trained: tuple[str, ...], head: CompensationHead | None) -> _Held:

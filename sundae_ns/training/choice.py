@@ -31,13 +31,10 @@ LEAST_GAIN = 0.1
 GAIN_PER_DOUBLING = 0.4
 """PSNR that a larger scene must gain for each doubling of the stored bytes, dB. Twice as many Gaussians gain about
 twice this at the end of a run, and a trial shows a part of a gain."""
-LEAST_LOSS = 0.005
-"""Growth of the loss over the best measurement, as a share, from which on more training harms."""
+LEAST_LOSS = 0.005  # Growth of the loss over the best measurement, as a share, from which on more training harms
 
-HELD_OUT_EVERY, MOST_HELD_OUT = 8, 16
-"""One of this many training views is held out, at most so many."""
-FEW_VIEWS = 12
-"""With fewer training views, two are held out in turn, for trials of half the length."""
+HELD_OUT_EVERY, MOST_HELD_OUT = 8, 16  # One of this many training views is held out, at most so many
+FEW_VIEWS = 12  # With fewer training views, two are held out in turn, for trials of half the length
 HEAD_STEPS = 1200
 """Length of a trial of a head, if it is between the shares below: shorter ones show too little of what it gains."""
 LEAST_TRIAL, MOST_TRIAL = 0.04, 0.05
@@ -50,12 +47,9 @@ LEAST_TRIAL, MOST_TRIAL = 0.04, 0.05
 class HeldOutQuality(NamedTuple):
     """Quality of the image of one held-out view. The figures are NaN or infinite if the image is not finite."""
 
-    pixels: int
-    """Number of pixels that count: those under the mask."""
-    psnr: float
-    """PSNR of these pixels, dB."""
-    ssim: float
-    """SSIM of these pixels; 0 for an image that is smaller than the window of SSIM."""
+    pixels: int  # Number of pixels that count: those under the mask
+    psnr: float  # PSNR of these pixels, dB
+    ssim: float  # SSIM of these pixels; 0 for an image that is smaller than the window of SSIM
     fitted: float = math.nan
     """PSNR after the affine map of colours that fits best, dB: without differences in light and exposure of the photo.
     NaN if it was not asked for."""
@@ -65,14 +59,10 @@ class HeldOutQuality(NamedTuple):
 class Tried:
     """A candidate after its trial; plain values, for checkpoints."""
 
-    stage: str
-    """What it was tried for: count, tenth (a head on a tenth of the Gaussians), head, or length."""
-    count: int
-    """Gaussians."""
-    head: str
-    """One of :data:`HEADS`."""
-    length: int
-    """Training steps of the trial."""
+    stage: str  # What it was tried for: count, tenth (a head on a tenth of the Gaussians), head, or length
+    count: int  # Gaussians
+    head: str  # One of HEADS
+    length: int  # Training steps of the trial
     views: list[list[float]] = field(default_factory=list)
     """For each held-out view the values of a :class:`HeldOutQuality`; empty if masks leave no pixel."""
     bytes: list[int] | None = None
@@ -158,15 +148,11 @@ class HeadGain(NamedTuple):
     """What a head has gained in trials with this number of Gaussians."""
 
     primitives: int
-    psnr: float
-    """dB."""
+    psnr: float  # dB
     ssim: float
-    ssim_db: float | None = None
-    """By how much 1 - SSIM has fallen, dB; None where images are too small for SSIM."""
-    features: int | None = None
-    """Estimated bytes of the features of these Gaussians in a packed scene; None if unknown."""
-    head: int = 0
-    """Bytes of the packed head."""
+    ssim_db: float | None = None  # By how much 1 - SSIM has fallen, dB; None where images are too small for SSIM
+    features: int | None = None  # Estimated bytes of the features of these Gaussians in a packed scene; None if unknown
+    head: int = 0  # Bytes of the packed head
 
     @classmethod
     def of(cls, plain: Tried, head: Tried) -> HeadGain:
@@ -222,8 +208,7 @@ def _bytes_at(curve: Sequence[CurvePoint], count: int) -> float | None:
 class Tolerance(NamedTuple):
     """What a smaller field may lose against the best one."""
 
-    psnr: float = 0.1
-    """dB."""
+    psnr: float = 0.1  # dB
     ssim: float = 0.003
 
     @classmethod

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from sundae_ns.training.state import Extension, FieldState, TrainingRun
 
-STATISTICS = ("grad2d", "count", "radii")
-"""Tensors ``[N]`` in the running state of gsplat's strategy."""
+STATISTICS = ("grad2d", "count", "radii")  # Tensors [N] in the running state of gsplat's strategy
 
 COUNTED = "counted"
 """Entry of ``info`` of a step that has added its statistics to the running state: recorded, or of several ranks."""
@@ -83,8 +82,7 @@ def count_view(state: Mapping[str, Any], grads: Tensor, radii: Tensor, width: in
 class CappedStrategy(DefaultStrategy):
     """gsplat's densification with an exact cap: under it, the primitives with the highest gradients grow first."""
 
-    cap: int | None = None
-    """Highest number of primitives; None for no cap."""
+    cap: int | None = None  # Highest number of primitives; None for no cap
 
     def see_each_image_after_resets(self, steps: int) -> None:
         """Let the field grow again only once opacities have recovered from a reset.

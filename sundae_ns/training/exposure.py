@@ -27,32 +27,21 @@ from sundae_ns.training.state import Extension, FieldState, TrainingRun
 log = logging.getLogger(__name__)
 
 
-NEIGHBORS = 8
-"""Neighbours of a camera in the graph."""
-SMOOTHING = 8.0
-"""Strength of the filter that computes the smooth part of the gains."""
+NEIGHBORS = 8  # Neighbours of a camera in the graph
+SMOOTHING = 8.0  # Strength of the filter that computes the smooth part of the gains
 NOISE = 0.03
 """Relative differences between neighbours by errors of the field. They are 1 to 3% where the light is constant."""
 NOTICED = 0.035
 """``auto`` divides photos if half of them differ by more from their neighbours (root mean square of the channels)."""
-FIRST_STEPS = 1500
-"""Steps before that decision. A younger field errs more than the photos differ."""
-FIRST_MEASUREMENTS = 2
-"""Measurements of a photo before that decision, in the mean."""
-LEAST_PHOTOS = 32
-"""Least number of photos. The neighbours of fewer photos are too far apart."""
-MEASURED_EVERY = 2
-"""Steps between two measurements. A measurement launches some ten small kernels."""
-REFRESHED_EVERY = 200
-"""Steps between two updates. An update waits for the GPU."""
-NEWEST_WEIGHT = 0.3
-"""Weight of a new measurement in the mean of a photo. Older ones are of an earlier field."""
-MOST = 4.0
-"""Largest measured factor between a photo and its image."""
-CLIPPED = 0.98
-"""Pixels of a photo from this value on may be clipped, and are not measured."""
-SAMPLE = 1 << 14
-"""Approximate number of measured pixels of an image."""
+FIRST_STEPS = 1500  # Steps before that decision. A younger field errs more than the photos differ.
+FIRST_MEASUREMENTS = 2  # Measurements of a photo before that decision, in the mean
+LEAST_PHOTOS = 32  # Least number of photos. The neighbours of fewer photos are too far apart.
+MEASURED_EVERY = 2  # Steps between two measurements. A measurement launches some ten small kernels.
+REFRESHED_EVERY = 200  # Steps between two updates. An update waits for the GPU.
+NEWEST_WEIGHT = 0.3  # Weight of a new measurement in the mean of a photo. Older ones are of an earlier field.
+MOST = 4.0  # Largest measured factor between a photo and its image
+CLIPPED = 0.98  # Pixels of a photo from this value on may be clipped, and are not measured
+SAMPLE = 1 << 14  # Approximate number of measured pixels of an image
 
 
 class PhotoGains(Extension):
@@ -72,16 +61,11 @@ class PhotoGains(Extension):
         self._gains = torch.ones(num_photos, 3)
         self._sums = torch.zeros(num_photos, 2, 3)
         """Sums since the last update: photo times image, and squares of the image, by channel."""
-        self._measured = np.zeros((num_photos, 3))
-        """Logarithms of the brightness of a photo over that of its image."""
-        self._counts = np.zeros(num_photos, np.int64)
-        """Updates of each photo."""
-        self._rows = np.zeros(0, np.int64)
-        """Indices of the training photos."""
-        self._smoother: Smoother | None = None
-        """Filter on the graph of their cameras; None if nothing is measured."""
-        self.total: Callable[[Tensor], Tensor] = lambda sums: sums
-        """Adds up the sums of several ranks."""
+        self._measured = np.zeros((num_photos, 3))  # Logarithms of the brightness of a photo over that of its image
+        self._counts = np.zeros(num_photos, np.int64)  # Updates of each photo
+        self._rows = np.zeros(0, np.int64)  # Indices of the training photos
+        self._smoother: Smoother | None = None  # Filter on the graph of their cameras; None if nothing is measured
+        self.total: Callable[[Tensor], Tensor] = lambda sums: sums  # Adds up the sums of several ranks
 
     def state_dict(self) -> dict[str, Any]:
         """Decision, gains and measurements."""

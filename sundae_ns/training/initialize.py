@@ -31,14 +31,11 @@ from sundae_ns.training.state import Extension, FieldState, TrainingRun
 log = logging.getLogger(__name__)
 
 
-FEWEST_POINTS = 50
-"""With fewer sparse points a user hears that photos overlap too little."""
+FEWEST_POINTS = 50  # With fewer sparse points a user hears that photos overlap too little
 
-Points = tuple[Tensor, Tensor]
-"""Positions ``[N, 3]`` and colours in 0 to 255 ``[N, 3]``."""
+Points = tuple[Tensor, Tensor]  # Positions [N, 3] and colours in 0 to 255 [N, 3]
 
-Frame = tuple[Tensor, float]
-"""Transform ``[3, 4]`` and scale from the capture's coordinates to those of the model."""
+Frame = tuple[Tensor, float]  # Transform [3, 4] and scale from the capture's coordinates to those of the model
 
 
 @dataclass(frozen=True)
@@ -46,8 +43,7 @@ class Start:
     """Warnings or an error to report when training starts. A checkpoint that is loaded first makes them irrelevant."""
 
     warnings: tuple[str, ...] = ()
-    failure: CheckpointError | None = None
-    """Why the model could not start from its warm start."""
+    failure: CheckpointError | None = None  # Why the model could not start from its warm start
 
     def announce(self) -> None:
         """Print the warnings.
@@ -144,8 +140,7 @@ def _warm_field(options: Any, source: Path, frame: Frame | None, num_features: i
 
 SIDES = {"cuda": 640, "cpu": 160}
 """Longest side of the swept images, pixels, by device: a CPU takes a second a view, a GPU a fraction."""
-MOST_ON_CPU = 24
-"""Most views that a CPU sweeps."""
+MOST_ON_CPU = 24  # Most views that a CPU sweeps
 FILLED = {"cuda": 100_000, "cpu": 20_000}
 """Number of points up to which a sparse cloud is filled; a larger one stays as it is."""
 

@@ -26,10 +26,8 @@ from sundae_ns.training.schedules import (
 
 show_log()  # all commands that train or open a run load these classes
 
-METRICS_EVENT = "Train Metrics Dict"
-"""Event of nerfstudio's trainer with the metrics of a training image."""
-LINE_EVERY = 10.0
-"""Seconds between two lines."""
+METRICS_EVENT = "Train Metrics Dict"  # Event of nerfstudio's trainer with the metrics of a training image
+LINE_EVERY = 10.0  # Seconds between two lines
 
 
 @dataclass

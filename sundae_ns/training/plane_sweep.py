@@ -20,32 +20,23 @@ from sundae_ns.gpu.sweep import WINDOW, FusedCorrelations, Patches, sweep_kernel
 from sundae_ns.rendering.views import View
 from sundae_ns.training.state import Photo
 
-CONTRAST = 0.02
-"""Least standard deviation of the grey values of a patch: a flat one fits anywhere."""
-LEAST_VARIANCE = 1e-5
-"""Lower limit for the variance of a patch of another view, so that a flat one does not correlate."""
-CORRELATION = 0.6
-"""Least correlation with one of the views."""
+CONTRAST = 0.02  # Least standard deviation of the grey values of a patch: a flat one fits anywhere
+LEAST_VARIANCE = 1e-5  # Lower limit for the variance of a patch of another view, so that a flat one does not correlate
+CORRELATION = 0.6  # Least correlation with one of the views
 NEIGHBORS = 3
 """Number of views that a view is compared with. The best one counts at a pixel, as often only one sees the place."""
-CONFIRMING = 24
-"""Number of best neighbours whose depths may confirm those of a view."""
-JUDGES = 5000
-"""Most sparse points, evenly drawn, that decide which views are neighbours."""
+CONFIRMING = 24  # Number of best neighbours whose depths may confirm those of a view
+JUDGES = 5000  # Most sparse points, evenly drawn, that decide which views are neighbours
 STEP, FEWEST, MOST = 1.5, 16, 256
 """Distance of two planes in another view, pixels of the reduced image, and the limits of the number of planes."""
 NEARER, FARTHER = 0.7, 4.0
 """Range of the depths, as shares of those of the nearest and farthest sparse points (without 2% on either side)."""
-SEEN = 8
-"""Fewest sparse points that state a range."""
+SEEN = 8  # Fewest sparse points that state a range
 LARGEST_ERROR, LARGEST_SHIFT = 0.1, 1.5
 """Largest relative difference of two depths that agree, and largest distance from the pixel that is come back to."""
-STEEPEST = 0.15
-"""Least cosine between the ray of a pixel and the normal of a plane."""
-_TILT = 0.766, 0.643
-"""Cosine and sine of 40 degrees, by which planes are turned."""
-_BATCH = 16
-"""Planes at a time."""
+STEEPEST = 0.15  # Least cosine between the ray of a pixel and the normal of a plane
+_TILT = 0.766, 0.643  # Cosine and sine of 40 degrees, by which planes are turned
+_BATCH = 16  # Planes at a time
 _LOOKED_AT = 16
 """Pixels examined for each wanted point: views do not agree on all of them, and even ones are chosen afterwards."""
 
@@ -55,17 +46,12 @@ class _Reduced:
     """A photo of reduced size, 12 bytes a pixel with its depth: captures have hundreds."""
 
     view: View
-    image: Tensor
-    """uint8 ``[H, W, 3]``."""
-    grey: Tensor
-    """``[1, 1, H, W]``."""
-    usable: Tensor
-    """Pixels that count and have contrast, bool ``[H, W]``."""
-    pose: Tensor
-    """Camera-to-world, OpenCV axes ``[4, 4]``."""
+    image: Tensor  # uint8 [H, W, 3]
+    grey: Tensor  # [1, 1, H, W]
+    usable: Tensor  # Pixels that count and have contrast, bool [H, W]
+    pose: Tensor  # Camera-to-world, OpenCV axes [4, 4]
 
-    unproject: Tensor
-    """Inverse intrinsics ``[3, 3]``."""
+    unproject: Tensor  # Inverse intrinsics [3, 3]
 
     def rays(self, row: Tensor, column: Tensor) -> Tensor:
         """Points at depth 1 behind pixel centres, camera coordinates ``[..., 3]``; rows and columns broadcast."""

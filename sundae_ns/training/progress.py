@@ -44,8 +44,7 @@ def warn(text: str) -> None:
     logging.getLogger("sundae_ns").warning(text)
 
 
-LONG = 1800.0
-"""Seconds of a training on a CPU that are worth a warning."""
+LONG = 1800.0  # Seconds of a training on a CPU that are worth a warning
 
 
 def duration(seconds: float) -> str:
@@ -140,8 +139,7 @@ class Interruption:
     """
 
     def __init__(self, ask: Callable[[], None], *, quiet: bool = False) -> None:
-        self.number = 0
-        """The first signal; 0 for none."""
+        self.number = 0  # The first signal; 0 for none
         self._ask, self._quiet = ask, quiet
         self._before: dict[int, Any] = {}
 

@@ -32,8 +32,7 @@ from sundae_ns.training.state import Extension, FieldState, TrainingRun
 log = logging.getLogger(__name__)
 
 
-USUAL_SHARE = 0.1
-"""Share that a prune keeps unless it is told otherwise; also where trials cannot decide."""
+USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise; also where trials cannot decide
 
 
 @dataclass
@@ -137,24 +136,15 @@ class PruningConfig(PruneRule):
 class PruneReport:
     """Numbers of one prune."""
 
-    step: int
-    """Training step after which it happened."""
-    before: int
-    """Number of primitives before it, including those that are not finite."""
-    after: int
-    """Number of primitives after it."""
-    dropped_nonfinite: int
-    """Primitives removed because a parameter was NaN or infinite."""
-    peak: int
-    """Highest number of primitives at any step so far."""
-    seconds: float
-    """Wall-clock time of decision and surgery, synchronised."""
-    tau: float | None = None
-    """Threshold of the graph on squared distances, squared scene units; None without a graph."""
-    sigma: float | None = None
-    """Width of the edge weights, scene units; None without a graph."""
-    isolated: int | None = None
-    """Primitives without a neighbour within the threshold; None without a graph."""
+    step: int  # Training step after which it happened
+    before: int  # Number of primitives before it, including those that are not finite
+    after: int  # Number of primitives after it
+    dropped_nonfinite: int  # Primitives removed because a parameter was NaN or infinite
+    peak: int  # Highest number of primitives at any step so far
+    seconds: float  # Wall-clock time of decision and surgery, synchronised
+    tau: float | None = None  # Threshold of the graph on squared distances, squared scene units; None without a graph
+    sigma: float | None = None  # Width of the edge weights, scene units; None without a graph
+    isolated: int | None = None  # Primitives without a neighbour within the threshold; None without a graph
 
     def summary(self) -> str:
         """One line for the log."""
@@ -198,10 +188,8 @@ def write_report(
         write_text(path, json.dumps(reports, indent=2))
 
 
-NEVER = -1
-"""Value of ``state["pruned_at"]`` before the first prune."""
-COUNT = "count"
-"""Key of the running state with the number that trials have chosen; 0 for the usual share."""
+NEVER = -1  # Value of state["pruned_at"] before the first prune
+COUNT = "count"  # Key of the running state with the number that trials have chosen; 0 for the usual share
 LEAST_OPACITY = 0.005
 """Lowest opacity of primitives that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
 
@@ -223,8 +211,7 @@ class PruningSchedule:
     records the peak.
     """
 
-    config: PruningConfig
-    """Valid options; not changed."""
+    config: PruningConfig  # Valid options; not changed
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
         """Whether a field of ``n`` primitives is to be pruned after this step.

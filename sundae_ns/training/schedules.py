@@ -33,8 +33,7 @@ DecayShape = Literal["exponential", "cosine"]
 SPARSE = 15_000
 """In a pruned field of fewer primitives centres move faster: on surfaces, they are the root of the quotient farther
 apart."""
-MOST_FACTOR = 5.0
-"""Largest factor on the rate of the centres, that of 600 primitives; nothing smaller was measured."""
+MOST_FACTOR = 5.0  # Largest factor on the rate of the centres, that of 600 primitives; nothing smaller was measured
 
 
 @dataclass
@@ -53,10 +52,8 @@ class Decay:
     warmup_steps: int
     shape: DecayShape = "exponential"
     pruned_at: int | None = None
-    after_prune: float = 1.0
-    """Factor on the rate after the prune."""
-    ends_at: int | None = None
-    """Step at which the decay after the prune ends, in place of ``max_steps``."""
+    after_prune: float = 1.0  # Factor on the rate after the prune
+    ends_at: int | None = None  # Step at which the decay after the prune ends, in place of max_steps
 
     def __call__(self, step: int) -> float:
         """The multiplier at ``step``."""
@@ -195,13 +192,11 @@ LEAST_IMAGES = 50
 """Images that densification sees between two rounds, at least: fewer say too little of a primitive's gradient."""
 LEAST_RECOVERY = 1000
 """Least steps between two resets of the opacities: shorter runs have no time to recover, and do without."""
-LONGEST_RISE = 12
-"""A learning rate rises over at most this fraction of the run."""
+LONGEST_RISE = 12  # A learning rate rises over at most this fraction of the run
 
 _SHAPES = ("sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle")
 """Options of the model that the shapes in a checkpoint depend on."""
-RESETS = "pipeline.model.reset_alpha_every"
-"""Counts rounds of densification, not steps."""
+RESETS = "pipeline.model.reset_alpha_every"  # Counts rounds of densification, not steps
 
 
 def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:

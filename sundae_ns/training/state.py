@@ -35,8 +35,7 @@ class FieldState:
     Surgery (densification, prunes) replaces parameters in ``field`` and ``optimizers``, and slices the running states.
     """
 
-    field: Field
-    """The primitives of this process."""
+    field: Field  # The primitives of this process
     networks: torch.nn.ModuleDict
     """Holds the head under ``head``. The model registers this module, so checkpoints lack a head that was removed."""
     optimizers: Mapping[str, Optimizer] = dataclasses.field(default_factory=dict)
@@ -45,25 +44,18 @@ class FieldState:
     """By the same names, where rates change."""
     densification: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Running state of densification; tensors ``[N, ...]`` and plain numbers."""
-    pruning: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Running state of pruning: plain integers."""
+    pruning: dict[str, Any] = dataclasses.field(default_factory=dict)  # Running state of pruning: plain integers
     info: dict[str, Any] = dataclasses.field(default_factory=dict)
     """What the rasteriser says of the last training image, with gradients after the backward pass."""
     trained_focal: tuple[float, float] | None = None
     """Shortest and longest focal length of the images that the head was trained on, pixels."""
 
-    step: int = 0
-    """Training step."""
-    offset: int = 0
-    """Steps of the schedule that a warm start skips."""
-    densify_until: int = 0
-    """Step of the schedule at which densification ends."""
-    head_starts_at: float = math.inf
-    """Step of the schedule after which the head is enabled."""
-    provisional: bool = False
-    """Whether a trial is trained whose field may be dropped."""
-    restored: int = 0
-    """Number of times in this process that other weights took the place of the trained ones."""
+    step: int = 0  # Training step
+    offset: int = 0  # Steps of the schedule that a warm start skips
+    densify_until: int = 0  # Step of the schedule at which densification ends
+    head_starts_at: float = math.inf  # Step of the schedule after which the head is enabled
+    provisional: bool = False  # Whether a trial is trained whose field may be dropped
+    restored: int = 0  # Number of times in this process that other weights took the place of the trained ones
     sh_degree_interval: int | None = None
     """Steps after which the next SH degree is enabled; None enables all at once, as after a warm start."""
 
@@ -176,21 +168,16 @@ class Photo(NamedTuple):
     """A training view with its image."""
 
     view: View
-    target: Tensor
-    """The image over the background of :attr:`TrainingRun.background`, in [0, 1] ``[H, W, 3]``."""
-    mask: Tensor | None
-    """Pixels that count, bool ``[H, W]``; None for all."""
+    target: Tensor  # The image over the background of TrainingRun.background, in [0, 1] [H, W, 3]
+    mask: Tensor | None  # Pixels that count, bool [H, W]; None for all
 
 
 class TrainingRun(Protocol):
     """What an extension may ask of the program that trains. nerfstudio's trainer stands behind it in ``ns-train``."""
 
-    state: FieldState
-    """The field in training."""
-    source: LocalField
-    """Where views get their primitives from."""
-    background: Tensor
-    """Background of images that are not trained on ``[3]``."""
+    state: FieldState  # The field in training
+    source: LocalField  # Where views get their primitives from
+    background: Tensor  # Background of images that are not trained on [3]
 
     @property
     def settings(self) -> RenderSettings:
@@ -244,8 +231,7 @@ class TrainingRun(Protocol):
 class Extension:
     """Base of the extensions: every verb does nothing. The model calls each verb on all extensions in their order."""
 
-    name: str
-    """Key of its state in checkpoints."""
+    name: str  # Key of its state in checkpoints
 
     def before_training(self, run: TrainingRun) -> None:
         """Check options and warn, before the first step and after a checkpoint has been loaded."""

@@ -9,35 +9,33 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
+import cv2
+import numpy as np
 import torch
 from pytorch_msssim import SSIM
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from sundae_ns.compensation import Window, training_window
 from sundae_ns.gpu.kernels import kernels_where_possible
-from sundae_ns.gpu.loss import SSIM_WINDOW, fused_loss, loss_kernels
+from sundae_ns.gpu.loss import SIGMA, SSIM_WINDOW, fused_loss, loss_kernels
 from sundae_ns.rasterization import Rasterization
 from sundae_ns.rendering.render import LocalField, RenderSettings, StepResolution, render_view
 from sundae_ns.rendering.views import View
-from sundae_ns.training.cpu_loss import ssim_loss
 from sundae_ns.training.state import FieldState
 
-LEAST_SQUARE = 1e-8
-"""Added to the mean square, so that its root has a gradient for equal images."""
+LEAST_SQUARE = 1e-8  # Added to the mean square, so that its root has a gradient for equal images
 
 
 @dataclass(frozen=True)
 class StepLosses:
     """Terms of the loss of a training step."""
 
-    options: Any
-    """``SundaeModelConfig``."""
-    ssim: SSIM
-    """SSIM of images ``[1, 3, H, W]``."""
-    num_images: int
-    """Number of training images; 0 if it is not known."""
+    options: Any  # SundaeModelConfig
+    ssim: SSIM  # SSIM of images [1, 3, H, W]
+    num_images: int  # Number of training images; 0 if it is not known
 
     def __call__(
         self,
@@ -90,7 +88,7 @@ def image_losses(
     """``lambda_1 L1 + lambda_2 (1 - SSIM)`` of the paper for an image, and the L1 loss of its base colours.
 
     In float32 one kernel computes both (:mod:`sundae_ns.gpu.loss`), and on a CPU SSIM is OpenCV's
-    (:mod:`sundae_ns.training.cpu_loss`). Images smaller than the window of SSIM are compared by L1 alone.
+    (:func:`ssim_loss`). Images smaller than the window of SSIM are compared by L1 alone.
 
     Args:
         image: rendered image ``[H, W, 3]``, differentiable.
@@ -129,6 +127,57 @@ def _losses(
     return convolved_loss(image, target, ssim, weight, l1_weight), of_base
 
 
+_GAUSSIAN = cv2.getGaussianKernel(SSIM_WINDOW, SIGMA, cv2.CV_32F)
+_C1, _C2 = 0.01**2, 0.03**2
+_HALF = SSIM_WINDOW // 2
+_WINDOWS = (slice(_HALF, -_HALF), slice(_HALF, -_HALF))  # centres of the windows that lie inside the image
+
+
+def ssim_loss(image: Tensor, target: Tensor) -> Tensor:
+    """Mean of 1 - SSIM over the windows inside the image (Wang et al. 2004), as pytorch_msssim; once differentiable.
+
+    ``image`` and ``target`` are float32 ``[H, W, 3]``, both sides at least the window; the target gets no gradient.
+    """
+    return cast("Tensor", _Dissimilarity.apply(image, target.detach()))
+
+
+def _filtered(values: Any) -> Any:
+    return cv2.sepFilter2D(values, -1, _GAUSSIAN, _GAUSSIAN, borderType=cv2.BORDER_CONSTANT)
+
+
+class _Dissimilarity(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
+        x, y = (np.ascontiguousarray(value.detach().numpy()) for value in (image, target))
+        mean_x, mean_y, squares, products = (_filtered(value)[_WINDOWS] for value in (x, y, x * x + y * y, x * y))
+        both, power = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+        luminance, luminance_max = 2 * both + _C1, power + _C1
+        structure, structure_max = 2 * (products - both) + _C2, squares - power + _C2
+        inverse = 1 / (luminance_max * structure_max)
+        value = luminance * structure * inverse
+        if ctx.needs_input_grad[0]:
+            # Derivatives by the means of x, x x and x y; covariances are means of products minus products of means.
+            by_mean = mean_y * (structure - luminance) * inverse
+            by_mean += mean_x * value * (1 / structure_max - 1 / luminance_max)
+            padded = np.zeros_like(x)
+
+            def spread(values: Any) -> Any:
+                padded[_WINDOWS] = values
+                return _filtered(padded)  # the window is symmetric
+
+            gradient = spread(by_mean)
+            gradient -= x * spread(value / structure_max)
+            gradient += y * spread(luminance * inverse)
+            gradient *= np.float32(-2 / value.size)
+            ctx.save_for_backward(torch.from_numpy(gradient))
+        return image.new_tensor(1 - value.mean(dtype=np.float64))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
+        return grad_loss * ctx.saved_tensors[0], None
+
+
 def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_weight: float | None = None) -> Tensor:
     """``l1_weight L1 + weight (1 - SSIM)`` by convolutions, on any device; ``l1_weight`` is ``1 - weight`` if None."""
     l1_weight = 1 - weight if l1_weight is None else l1_weight
@@ -144,16 +193,11 @@ class StepInputs:
     """What a step trains on."""
 
     view: View
-    target: Tensor
-    """The true image over the background ``[H, W, 3]``."""
-    mask: Tensor | None
-    """Pixels that count, float ``[H, W, 1]``; None for all."""
-    background: Tensor
-    """Colour ``[3]``."""
-    window: Window | None = None
-    """The part of the training image that is shown; None for the whole image."""
-    rates: Tensor | None = None
-    """Learning rates of the groups of parameters ``[G]``; None where the optimizer holds them."""
+    target: Tensor  # The true image over the background [H, W, 3]
+    mask: Tensor | None  # Pixels that count, float [H, W, 1]; None for all
+    background: Tensor  # Colour [3]
+    window: Window | None = None  # The part of the training image that is shown; None for the whole image
+    rates: Tensor | None = None  # Learning rates of the groups of parameters [G]; None where the optimizer holds them
     count: Tensor | None = None
     """Number of primitives ``[]``, where parameters have rows for more and a loss is a mean over them."""
 
@@ -179,12 +223,9 @@ class StepInputs:
 class StepResult:
     """Images and losses of a step; the next step overwrites them."""
 
-    images: dict[str, Tensor]
-    """``rgb``, ``base_rgb`` and ``accumulation``, each ``[H, W, C]``."""
-    losses: dict[str, Tensor]
-    """Terms of the loss ``[]``."""
-    loss: Tensor
-    """Their sum ``[]``."""
+    images: dict[str, Tensor]  # rgb, base_rgb and accumulation, each [H, W, C]
+    losses: dict[str, Tensor]  # Terms of the loss []
+    loss: Tensor  # Their sum []
 
 
 def training_part(state: FieldState, view: View, at: StepResolution) -> tuple[View, Window | None]:
@@ -205,14 +246,10 @@ def training_part(state: FieldState, view: View, at: StepResolution) -> tuple[Vi
 class TrainingStep(NamedTuple):
     """The step of a field, from a view to its loss."""
 
-    source: LocalField
-    """Where the view gets its primitives from."""
-    state: FieldState
-    """Says what is enabled at this step."""
-    losses: StepLosses
-    """Terms of the loss."""
-    params: Mapping[str, Tensor]
-    """Trained parameters, for the terms that see them."""
+    source: LocalField  # Where the view gets its primitives from
+    state: FieldState  # Says what is enabled at this step
+    losses: StepLosses  # Terms of the loss
+    params: Mapping[str, Tensor]  # Trained parameters, for the terms that see them
 
     def images(
         self,

@@ -143,18 +143,14 @@ def packed_size(field: Mapping[str, Tensor], head: torch.nn.Module | None = None
 class Trial:
     """Options of a trial; plain values, for checkpoints."""
 
-    length: int
-    """Training steps."""
-    held_out: list[int] = field(default_factory=list)
-    """Indices of the training views that are held out."""
+    length: int  # Training steps
+    held_out: list[int] = field(default_factory=list)  # Indices of the training views that are held out
     averaged: float = 0
     """Steps at its end over which weights are averaged; the mean is measured. 0 measures the last weights."""
     num_features: int | None = None
     """Width of the features: 0 disables the head, another width begins with a fresh one. None changes nothing."""
-    counts: bool = True
-    """Whether its field goes on in any case; that of others is :attr:`FieldState.provisional`."""
-    began: int = 0
-    """Step of the schedule at which it began; the engine sets it."""
+    counts: bool = True  # Whether its field goes on in any case; that of others is FieldState.provisional
+    began: int = 0  # Step of the schedule at which it began; the engine sets it
 
 
 class TrialEngine:
@@ -165,12 +161,10 @@ class TrialEngine:
     """
 
     def __init__(self, head_starts_at: float = -math.inf) -> None:
-        self.trial: Trial | None = None
-        """The current trial."""
+        self.trial: Trial | None = None  # The current trial
         self.kept: dict[str, dict[str, Any]] = {}
         """Copies of the field by name: a :meth:`FieldState.snapshot`, and the number of ``counted`` steps before it."""
-        self.taken_back = 0
-        """Steps after which the field went back to before them."""
+        self.taken_back = 0  # Steps after which the field went back to before them
         self.coming: dict[str, list[int]] = {}
         """Views that are held out for the trials to come of a stage. In a trial its own views are, and no others."""
         self._head_starts_at = head_starts_at
@@ -285,21 +279,16 @@ def _widen(state: FieldState, num_features: int) -> None:
 class Progress:
     """Where the trials of a run are; plain values, for checkpoints."""
 
-    stage: str = ""
-    """The stage whose candidates are tried; empty between stages, and ``paused`` at the end of the last."""
+    stage: str = ""  # The stage whose candidates are tried; empty between stages, and paused at the end of the last
     steps: int = 0
     """Length of the schedule when training started: a resumed run may be longer or shorter, its trials may not."""
-    full: int = 0
-    """Number of Gaussians before the prune."""
-    tried: list[Tried] = field(default_factory=list)
-    """All candidates after their trials."""
+    full: int = 0  # Number of Gaussians before the prune
+    tried: list[Tried] = field(default_factory=list)  # All candidates after their trials
     chosen: dict[str, Any] = field(default_factory=dict)
     """By decided stage: ``count`` (0 for the usual share), ``tenth`` (whether the head pays), ``head``, and ``length``
     (steps on all views; None for all that are left)."""
-    reason: str = ""
-    """Why the head was chosen without trials."""
-    watched_until: int = 0
-    """Step of the schedule at which the trial of the length ends at the latest."""
+    reason: str = ""  # Why the head was chosen without trials
+    watched_until: int = 0  # Step of the schedule at which the trial of the length ends at the latest
     records: dict[str, Any] = field(default_factory=dict)
     """What ``trials.json`` holds, by decided stage; a resumed run writes it again."""
 

@@ -7,8 +7,7 @@ import torch
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-from sundae_ns.training.cpu_loss import ssim_loss
-from sundae_ns.training.step import convolved_loss, image_losses
+from sundae_ns.training.step import convolved_loss, image_losses, ssim_loss
 
 SIZES = [(11, 11), (11, 40), (40, 12), (37, 53), (64, 96)]
 
