@@ -14,7 +14,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.eval_utils import eval_setup
-from trial_runs import LENGTH, PRUNE_AT, STEPS, tidy, tiny_run, tiny_scene
+from trial_runs import LENGTH, PRUNE_AT, tidy, tiny_run, tiny_scene
 
 from sundae_ns.api.packing import contents_of
 from sundae_ns.callbacks import NerfstudioRun
@@ -219,14 +219,6 @@ def test_with_too_few_views_the_head_stays_off(make: Make, capsys: pytest.Captur
     assert "the head is removed: 5 training views are too few" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_run_that_is_too_short_for_trials_says_so(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
-    trainer = make(max_num_iterations=PRUNE_AT + 5)
-    trainer.train()
-    assert not (trainer.base_dir / "trials.json").exists()
-    assert not trainer.pipeline.model.state.head_enabled
-    assert "before the head could be tried" in " ".join(capsys.readouterr().out.split())
-
-
 def test_masks_that_leave_no_pixel_leave_no_head(make: Make, judge: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     judge(head=(0.5, 0.01))
     monkeypatch.setattr(trials, "measure_heldout", lambda run, **_: [])
@@ -236,15 +228,6 @@ def test_masks_that_leave_no_pixel_leave_no_head(make: Make, judge: Any, monkeyp
     assert _record(trainer)["reason"] == "masks leave no pixel of the held-out training views"
     assert trainer.pipeline.model.head is None
     assert trainer.pipeline.datamanager.holdout_indices == []
-
-
-def test_a_late_head_has_its_trials_late(make: Make, judge: Any) -> None:
-    judge(head=(0.5, 0.01))
-    late = STEPS - 5 * LENGTH
-    trainer = make(start_at=late)
-    trainer.train()
-    assert _record(trainer)["step"] == late + 3 * LENGTH
-    assert trainer.pipeline.model.state.head_enabled
 
 
 @pytest.mark.parametrize(("trial", "width"), [(1, 5), (2, 29)])

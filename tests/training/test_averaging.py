@@ -88,23 +88,6 @@ def test_unfinished_schedules_and_growing_fields_keep_their_weights(state: Any) 
         assert torch.equal(state.field["means"], before)
 
 
-@pytest.mark.parametrize("planned", [False, True], ids=["interrupted", "a part"])
-def test_a_resumed_training_ends_with_the_same_mean(state: Any, planned: bool) -> None:
-    start = {name: value.detach().clone() for name, value in state.field.items()}
-    whole = Averaging(0.5, settled_at=0)
-    train(state, whole, range(LAST + 1))
-    expected = state.field["means"].detach().clone()
-    for name, value in state.field.items():
-        value.data.copy_(start[name])
-    first, second = Averaging(0.5, settled_at=0), Averaging(0.5, settled_at=0)
-    train(state, first, range(75), last=74 if planned else LAST)
-    second.load_state_dict(state, first.state_dict())
-    second.before_training(run_of(state))
-    train(state, second, range(75, LAST + 1))
-    assert torch.equal(state.field["means"], expected)
-    assert not second.state_dict()["mean"]  # the mean is in the field: a checkpoint needs it no more
-
-
 def test_a_longer_training_goes_on_from_the_last_weights(state: Any) -> None:
     """Not from their mean, which does not belong to the state of the optimizers."""
     mean, again = Averaging(0.5, settled_at=0), Averaging(0.5, settled_at=0)

@@ -269,12 +269,6 @@ def test_a_candidate_must_gain_over_the_cheaper_ones_and_must_not_lose_ssim(
     assert best_of(measured, folds=2) == best
 
 
-def test_a_candidate_counts_when_all_its_folds_have_ended() -> None:
-    plain, head = [[10.0, 20.0, 0.5]], [[10.0, 30.0, 0.9]]
-    assert best_of([plain, plain, head], folds=2) == "plain"
-    assert best_of([plain, plain, head, head], folds=2) == "head"
-
-
 @pytest.mark.parametrize(("gain", "size", "best"), [(0.41, 200, "head"), (0.39, 200, "plain"), (0.39, 190, "head")])
 def test_a_candidate_that_takes_more_bytes_must_gain_more(gain: float, size: int, best: str) -> None:
     measured = [[[10.0, 20.0, 0.5]], [[10.0, 20.0 + gain, 0.5]]]

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.gaussians import sh_to_rgb
 from sundae_ns.model import SundaeModel
 from sundae_ns.training import initialize
@@ -89,12 +88,6 @@ def test_other_fields_stay_as_they_are(build: Build, training_of: TrainingOf, op
     assert all(torch.equal(before[name], value) for name, value in model.gauss_params.items())
 
 
-def test_four_images_are_few_up_to_a_limit_of_four(build: Build, training_of: TrainingOf) -> None:
-    model = few(build, dense_start_views=4)
-    training_of(model)
-    assert model.num_points == 60 + FOUND
-
-
 def test_a_resumed_run_goes_on_with_its_own_field(build: Build, training_of: TrainingOf) -> None:
     training = training_of(few(build))
     training.step(0)
@@ -140,11 +133,6 @@ def test_a_cpu_sweeps_few_views(
     model = few(build)
     training_of(model)
     assert model.num_points == 60 + swept * FOUND
-
-
-def test_a_negative_number_of_views_is_an_error(build: Build) -> None:
-    with pytest.raises(ConfigError, match="dense-start-views is -1; give a number of images, 0 for no sweep"):
-        build(dense_start_views=-1)
 
 
 def test_photos_are_the_training_images_with_their_views(build: Build, training_of: TrainingOf) -> None:

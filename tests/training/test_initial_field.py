@@ -65,15 +65,6 @@ def test_a_finished_run_is_not_warned_of_what_it_did_not_start_from(
     assert "Warning" not in capsys.readouterr().out
 
 
-def test_random_points_on_request_need_no_warning(
-    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model = build(random_init=True, num_random=40)
-    assert model.num_points == 40
-    training_of(model)
-    assert "Warning" not in capsys.readouterr().out
-
-
 def test_a_cloud_above_the_cap_is_cut_before_the_first_step(
     build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -165,14 +156,6 @@ def test_colours_are_those_of_the_cloud_and_of_the_warm_start(
     for wanted in (0, 1):
         warm = build(sh_degree=wanted, warm_start=tmp_path / "step-000000001.ckpt")
         torch.testing.assert_close(colors_of(warm, camera()), shown, rtol=0, atol=2e-3)
-
-
-def test_a_warm_start_trains_at_full_resolution(build: Build, tmp_path: Path) -> None:
-    _ply(build, tmp_path / "a.ply")
-    options = {"num_downscales": 2, "resolution_schedule": 3000}
-    cold, warm = build(**options), build(warm_start=tmp_path / "a.ply", warm_start_frame="model", **options)
-    assert cold.train()._get_downscale_factor() == 4
-    assert warm.train()._get_downscale_factor() == 1
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])

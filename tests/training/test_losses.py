@@ -10,7 +10,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sundae_ns.errors import ConfigError
 from sundae_ns.model import SundaeModel
 from sundae_ns.training.step import StepLosses, image_losses
 
@@ -36,11 +35,6 @@ def test_head_and_field_learn_together(
         assert value.grad is not None, name
         assert torch.isfinite(value.grad).all(), name
         assert value.grad.any(), name
-
-
-def test_before_the_head_starts_there_is_one_loss(build: Build, training_of: TrainingOf) -> None:
-    assert set(training_of(build()).step(0)) == {"main_loss"}
-    assert set(training_of(build(base_loss_weight=0.0)).step(10)) == {"main_loss"}
 
 
 def test_masked_pixels_do_not_count(build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch) -> None:
@@ -95,11 +89,6 @@ def test_a_pruned_field_has_a_prior_that_counts_once(
         torch.testing.assert_close(found["scale_loss"], 0.6 / count * scales.mean())
     model.losses = StepLosses(build(prior_after_prune=0.0).config, model.ssim, 1)
     assert set(model.get_loss_dict(outputs, target)) == {"main_loss", "base_loss"}
-
-
-def test_a_negative_prior_is_refused(build: Build) -> None:
-    with pytest.raises(ConfigError, match="prior-after-prune is -0.1; give 0 or more"):
-        build(prior_after_prune=-0.1)
 
 
 def test_equal_images_have_a_gradient_of_zero(build: Build) -> None:

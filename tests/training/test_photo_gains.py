@@ -90,12 +90,6 @@ def test_a_photo_that_says_nothing_has_no_gain(spoilt: Tensor) -> None:
     torch.testing.assert_close(found(gains), torch.ones(COUNT, 3), rtol=1e-4, atol=1e-4)
 
 
-def test_gains_are_bounded() -> None:
-    gains, run = begin()
-    measure(gains, run, lambda index: image_of(index) * (1e-5 if index == 7 else 1.0), rounds=1)
-    assert gains.state_dict()["measured"][7].tolist() == pytest.approx([-math.log(exposure.MOST)] * 3)
-
-
 def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alone(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -237,12 +231,6 @@ def test_a_decision_is_resumed_and_an_option_replaces_it() -> None:
         assert other.state_dict()["divides"] is divides
         photo = image_of(1)
         assert (other.balanced(photo, batch_of(1)) is not photo) is divides
-
-
-def test_a_model_trains_with_the_mode_of_its_options(build: Build) -> None:
-    modes = {"auto": None, "on": True, "off": False}
-    assert {mode: build(photo_gains=mode).photo_gains.state_dict()["divides"] for mode in modes} == modes
-    assert build().photo_gains.state_dict()["divides"] is None
 
 
 def test_the_end_says_what_was_taken_out(capsys: pytest.CaptureFixture[str]) -> None:

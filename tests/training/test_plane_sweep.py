@@ -84,14 +84,6 @@ def test_colours_are_those_of_the_images(capture: tuple[list[Photo], Tensor], sw
     assert float(errors.median()) < 0.025
 
 
-def test_the_same_images_give_the_same_points(
-    capture: tuple[list[Photo], Tensor], swept: tuple[Tensor, Tensor]
-) -> None:
-    again = points_of(*capture)
-    assert torch.equal(again[0], swept[0])
-    assert torch.equal(again[1], swept[1])
-
-
 def test_of_more_points_than_wanted_an_even_part_is_found(
     capture: tuple[list[Photo], Tensor], swept: tuple[Tensor, Tensor]
 ) -> None:
@@ -102,15 +94,6 @@ def test_of_more_points_than_wanted_an_even_part_is_found(
         found, whole[torch.cdist(found, whole, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)], atol=1e-6
     )
     assert torch.allclose(points.mean(dim=0), swept[0].mean(dim=0), atol=0.05 * float(swept[0].std()))
-
-
-def test_larger_images_are_reduced(capture: tuple[list[Photo], Tensor]) -> None:
-    photos, sparse = capture
-    sweep = Sweep(photos, sparse, SIDE // 2)
-    assert sweep.add(0).shape == (SIDE // 2, SIDE // 2)
-    points, _ = points_of(photos, sparse, SIDE // 2)
-    assert len(points) > 300
-    assert float(gaps(photos, points).median()) < 0.04  # measured: 0.02
 
 
 def test_masked_pixels_give_no_points(capture: tuple[list[Photo], Tensor]) -> None:

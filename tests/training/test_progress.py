@@ -57,16 +57,6 @@ def test_the_time_left_does_not_jump() -> None:
     assert 0.6 < found[half][0] / (now - found[half][1]) < 1.5, "and it is right"
 
 
-def test_one_long_interval_does_not_change_the_time_left() -> None:
-    watch = TimeLeft()
-    for done in (0, 100, 200):
-        watch.update(done, 3000, done / 10)
-    usual = watch.update(300, 3000, 30.0)
-    assert usual == pytest.approx(270)
-    after = watch.update(310, 3000, 150.0)
-    assert after == pytest.approx(269, rel=0.2)
-
-
 def test_a_lasting_change_is_followed() -> None:
     watch, now = TimeLeft(), 0.0
     for done in range(0, 3001, 10):

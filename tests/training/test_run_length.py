@@ -117,17 +117,6 @@ def test_continuous_pruning_keeps_its_number_of_prunes(length: int) -> None:
     assert prunes(fitted("sundae-continuous", length)) == prunes(fitted("sundae-continuous", 30000)) == 7
 
 
-def test_the_fast_method_is_the_default_shortened_with_an_earlier_prune() -> None:
-    fast, short = all_methods["sundae-fast"], fitted("sundae", 18000)
-    own = {
-        *("pipeline.model.pruning.prune_at", "pipeline.model.stop_split_at", "pipeline.model.reset_alpha_every"),
-        # Of sundae-continuous alone.
-        *("pipeline.model.pruning.start", "pipeline.model.pruning.stop", "pipeline.model.pruning.every"),
-    }
-    assert {name for name in step_options(fast) if option(fast, name) != option(short, name)} <= own
-    assert fast.pipeline.model.pruning.prune_at == fast.pipeline.model.stop_split_at == 6000
-
-
 def test_a_resumed_run_keeps_its_schedule() -> None:
     run, usual = fitted("sundae", 6000), deepcopy(all_methods["sundae"])
     config = deepcopy(usual)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 
 import pytest
@@ -78,10 +77,6 @@ def test_centres_of_few_primitives_move_faster_after_the_prune(primitives: int, 
     assert head == usual
     never = rates(scheduler(), 130, prune_at=40, primitives=primitives)
     assert never == rates(scheduler(), 130)
-
-
-def test_without_restart_the_prune_changes_nothing() -> None:
-    assert rates(scheduler(), 80, prune_at=40) == pytest.approx(rates(scheduler(), 80))
 
 
 def test_held_until_the_prune_then_rising_and_falling() -> None:
@@ -160,22 +155,6 @@ def test_the_rise_of_a_rate_is_limited_before_it_begins() -> None:
     limit_rise({"compensation": made}, 1)
     assert made.optimizer.param_groups[0]["lr"] == pytest.approx(1 / 5 * 1e-2)
     assert {decay.warmup_steps for decay in made.lr_lambdas} == {4}
-
-
-@pytest.mark.parametrize("shape", ["exponential", "cosine"])
-@pytest.mark.parametrize("prune_at", [None, 30])
-def test_a_resumed_scheduler_goes_on_the_same(prune_at: int | None, shape: str) -> None:
-    options = {"lr_restart": 5e-3, "hold_until_prune": True, "warmup_steps": 20, "shape": shape}
-    whole, first, second = scheduler(**options), scheduler(**options), scheduler(**options)
-    expected = rates(whole, 90, prune_at, primitives=SPARSE // 4)
-    rates(first, 45, prune_at, primitives=SPARSE // 4)
-    buffer = io.BytesIO()
-    torch.save({"scheduler": first.state_dict(), "optimizer": first.optimizer.state_dict()}, buffer)
-    buffer.seek(0)
-    state = torch.load(buffer)
-    second.optimizer.load_state_dict(state["optimizer"])
-    second.load_state_dict(state["scheduler"])
-    assert rates(second, 45) == pytest.approx(expected[45:])
 
 
 def test_rates_are_python_floats() -> None:

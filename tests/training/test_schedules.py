@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import fields, replace
 from typing import Any
 
@@ -59,13 +58,6 @@ def run(
     return reports, state
 
 
-def saved_and_loaded(state: dict[str, Any]) -> dict[str, Any]:
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=True)
-
-
 def test_one_shot_prunes_once_and_training_goes_on() -> None:
     made = field()
     policy = PruningSchedule(PruningConfig(prune_at=3, keep_ratio=0.25))
@@ -82,31 +74,6 @@ def test_one_shot_prunes_once_and_training_goes_on() -> None:
     assert losses == sorted(losses, reverse=True)
     assert {len(value) for value in made[0].values()} == {25}
     assert made[1]["means"].state[made[0]["means"]]["exp_avg"].shape == (25, 3)
-
-
-def test_a_resumed_run_does_not_prune_twice() -> None:
-    policy = PruningSchedule(PruningConfig(prune_at=3, keep_ratio=0.5))
-    made = field()
-    _, state = run(policy, made, range(5))
-    reports, state = run(policy, made, range(2, 9), saved_and_loaded(state))
-    assert reports == []
-    assert state == {"pruned_at": 3, "num_prunes": 1, "peak": 100}
-    assert len(made[0]["means"]) == 50
-
-
-def test_a_warm_start_behind_the_step_prunes_at_once() -> None:
-    reports, _ = run(PruningSchedule(PruningConfig(prune_at=3)), field(), range(10, 14))
-    assert [report.step for report in reports] == [10]
-
-
-def test_the_same_seed_gives_the_same_field() -> None:
-    kept = []
-    for seed in (1, 1, 2):
-        made = field()
-        run(PruningSchedule(PruningConfig(prune_at=1, seed=seed)), made, range(3))
-        kept.append(made[0]["means"].detach())
-    assert torch.equal(kept[0], kept[1])
-    assert not torch.equal(kept[0], kept[2])
 
 
 def test_continuous_keeps_a_share_on_schedule() -> None:
@@ -161,15 +128,6 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
     assert state["peak"] == 100
 
 
-def test_a_resumed_continuous_run_goes_on_as_if_never_stopped() -> None:
-    config = PruningConfig(mode="continuous", start=1, every=2, stop=7, keep_ratio=0.8, num_neighbors=4)
-    whole, halves = field(), field()
-    run(PruningSchedule(config), whole, range(8))
-    _, state = run(PruningSchedule(config), halves, range(4))
-    run(PruningSchedule(config), halves, range(4, 8), saved_and_loaded(state))
-    assert torch.equal(whole[0]["means"], halves[0]["means"])
-
-
 def test_continuous_draws_anew_each_time() -> None:
     config = PruningConfig(mode="continuous", start=0, every=1, keep_ratio=0.5, redistribution="none")
     policy = PruningSchedule(config)
@@ -216,14 +174,6 @@ def test_the_state_of_densification_is_sliced_along() -> None:
     assert len(strategy_state["grad2d"]) == 10
     assert torch.equal(made[0]["means"], means[strategy_state["grad2d"]])
     assert strategy_state["scene_scale"] == 2.0
-
-
-def test_full_keep_ratio_keeps_all_and_asks_for_nothing() -> None:
-    made = field(10)
-    policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=1.0))
-    report = policy.after_step(FieldPruner(*made), policy.initialize_state(), 0)
-    assert report is not None
-    assert (report.before, report.after, report.sigma) == (10, 10, None)
 
 
 def test_off_never_prunes_but_counts() -> None:
@@ -277,17 +227,6 @@ def test_report_is_one_line_of_plain_numbers() -> None:
     assert "sigma" not in unscored.summary()
 
 
-def test_the_last_options_that_work() -> None:
-    edge = {"num_neighbors": 1, "every": 1, "start": 4, "stop": 4, "max_primitives": 1, "keep_ratio": 1.0, "gamma": 1.0}
-    PruningConfig(mode="continuous", **edge).validate()  # type: ignore[arg-type]
-
-
-def test_continuous_leaves_a_field_alone_that_holds_the_target() -> None:
-    policy = PruningSchedule(PruningConfig(mode="continuous", start=0, stop=10, every=1, target_primitives=100))
-    state = policy.initialize_state()
-    assert [policy.due(state, 0, n) for n in (99, 100, 101)] == [False, False, True]
-
-
 @pytest.mark.parametrize(("cap", "expected"), [(200, [70, 49, 34]), (70, [70, 49, 34]), (60, [60, 42, 29])])
 def test_continuous_under_a_cap_keeps_the_share_too(cap: int, expected: list[int]) -> None:
     config = PruningConfig(
@@ -312,34 +251,23 @@ def test_continuous_prunes_a_step_once() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("options", "words"),
     [
-        {"keep_ratio": 0.0},
-        {"keep_ratio": 1.01},
-        {"keep_ratio": float("nan")},
-        {"gamma": -0.1},
-        {"gamma": 1.1},
-        {"mode": "sometimes"},
-        {"selection": "best"},
-        {"score": "beauty"},
-        {"signal": "noise"},
-        {"num_neighbors": 0},
-        {"every": 0},
-        {"prune_at": -1},
-        {"start": 5, "stop": 4, "mode": "continuous"},
-        {"max_primitives": 0, "mode": "continuous"},
-        {"max_primitives": 0},
-    ],
-)
-def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match=next(iter(wrong))) as caught:
-        replace(PruningConfig(), **wrong).validate()
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+        ({"keep_ratio": 0.0}, "keep_ratio"),
+        ({"keep_ratio": 1.01}, "keep_ratio"),
+        ({"keep_ratio": float("nan")}, "keep_ratio"),
+        ({"gamma": -0.1}, "gamma"),
+        ({"gamma": 1.1}, "gamma"),
+        ({"mode": "sometimes"}, "mode"),
+        ({"selection": "best"}, "selection"),
+        ({"score": "beauty"}, "score"),
+        ({"signal": "noise"}, "signal"),
+        ({"num_neighbors": 0}, "num_neighbors"),
+        ({"every": 0}, "every"),
+        ({"prune_at": -1}, "prune_at"),
+        ({"start": 5, "stop": 4, "mode": "continuous"}, "start"),
+        ({"max_primitives": 0, "mode": "continuous"}, "max_primitives"),
+        ({"max_primitives": 0}, "max_primitives"),
         ({"keep_ratio": None, "max_drop": 0.0}, "max_drop is 0.0"),
         ({"max_bytes": 5}, "max_bytes is set, and trials do not decide .*: set keep_ratio to None"),
         ({"keep_ratio": None, "target_primitives": 5, "max_drop": 0.1}, "max_drop is set, and trials do not decide"),
@@ -349,14 +277,10 @@ def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> No
         ({"mode": "continuous", "max_primitives": 4, "target_primitives": 5}, "is more than max_primitives"),
     ],
 )
-def test_budgets_that_cannot_work_name_the_mend(options: dict[str, object], message: str) -> None:
-    with pytest.raises(ConfigError, match=message) as caught:
-        PruningConfig(**options).validate()  # type: ignore[arg-type]
+def test_impossible_options_are_refused_in_one_line(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        replace(PruningConfig(), **options).validate()
     assert "\n" not in str(caught.value)
-
-
-def test_a_target_may_be_the_cap() -> None:
-    PruningConfig(mode="continuous", max_primitives=5, target_primitives=5).validate()
 
 
 @pytest.mark.parametrize(
@@ -386,8 +310,3 @@ def test_trials_decide_how_many_stay_and_the_schedule_waits_for_them() -> None:
         assert schedule.due(decided, 3, 60)
         assert schedule.target(60, decided) == kept
     assert schedule.target(5, {**state, COUNT: 7}) == 5
-
-
-@pytest.mark.parametrize("mode", ["off", "one-shot"])
-def test_the_schedule_of_another_mode_is_not_looked_at(mode: Any) -> None:
-    PruningConfig(mode=mode, start=2000, stop=1000).validate()
