@@ -1,42 +1,58 @@
-"""Removal of primitives from a field during training: complete, and without effect on error."""
+"""Surgery on a field in training: removal, copies, snapshots; complete, and without effect on error."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor, nn
 from torch.nn import Parameter
+from torch.optim import Adam, Optimizer
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.surgery import check_wiring, keep
+from sundae_ns.gaussians.surgery import (
+    MAX_COPIES,
+    check_wiring,
+    draw_sources,
+    grow,
+    keep,
+    module_snapshot,
+    narrow,
+    restore,
+    restore_module,
+    snapshot,
+    split_evenly,
+)
 
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "features_rest": (8, 3), "opacities": (1,), "features": (13,)}
 
 
-def field(n: int = 20, seed: int = 0) -> tuple[dict[str, Parameter], dict[str, torch.optim.Optimizer]]:
+def field(n: int = 20, seed: int = 0) -> tuple[dict[str, Parameter], dict[str, Optimizer]]:
     generator = torch.Generator().manual_seed(seed)
     params = {name: Parameter(torch.randn(n, *shape, generator=generator)) for name, shape in SHAPES.items()}
     params["quats"].requires_grad_(False)
-    optimizers: dict[str, torch.optim.Optimizer] = {
-        name: torch.optim.Adam([{"params": value, "lr": 0.1}], eps=1e-15)
-        for name, value in params.items()
-        if name != "quats"
+    optimizers: dict[str, Optimizer] = {
+        name: Adam([{"params": value, "lr": 0.1}], eps=1e-15) for name, value in params.items() if name != "quats"
     }
     network = torch.nn.Linear(n, n)
-    optimizers["compensation"] = torch.optim.Adam(network.parameters())
+    optimizers["compensation"] = Adam(network.parameters())
     return params, optimizers
 
 
-def train(params: dict[str, Parameter], optimizers: dict[str, torch.optim.Optimizer]) -> float:
-    loss = sum(value.square().sum() for value in params.values() if value.requires_grad)
-    assert isinstance(loss, Tensor)
-    for optimizer in optimizers.values():
-        optimizer.zero_grad()
-    loss.backward()
-    for optimizer in optimizers.values():
-        optimizer.step()
+def train(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], steps: int = 1) -> float:
+    """Steps towards ones; the last loss."""
+    for _ in range(steps):
+        loss = torch.stack([(value - 1).square().sum() for value in params.values() if value.requires_grad]).sum()
+        for optimizer in optimizers.values():
+            optimizer.zero_grad()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
     return loss.item()
 
 
@@ -44,27 +60,33 @@ def some(n: int = 20) -> Tensor:
     return torch.arange(n) % 3 == 0
 
 
+def moments(optimizers: Mapping[str, Optimizer], params: Mapping[str, Tensor], name: str) -> Tensor:
+    return optimizers[name].state[params[name]]["exp_avg"]
+
+
+# -------------------------------------------------------------------------------------------------------------- removal
+
+
 def test_training_continues_as_if_only_the_kept_primitives_had_existed() -> None:
-    params, optimizers = field()
-    expected, expected_optimizers = field()
+    (params, optimizers), (expected, expected_optimizers) = field(), field()
+    still_alive = params["means"].exp().sum()
     keep(expected, expected_optimizers, [], some())
-    for _ in range(3):
-        train(params, optimizers)
-        train(expected, expected_optimizers)
+    for held, holders in ((params, optimizers), (expected, expected_optimizers)):
+        train(held, holders, 3)
     keep(params, optimizers, [], some())
-    for _ in range(3):
-        train(params, optimizers)
-        train(expected, expected_optimizers)
+    for held, holders in ((params, optimizers), (expected, expected_optimizers)):
+        train(held, holders, 3)
     for name, value in params.items():
         assert value.shape == (7, *SHAPES[name])
         torch.testing.assert_close(value, expected[name])
+    assert still_alive.grad_fn is not None  # a live graph of an earlier step does not break training
 
 
 def test_optimizers_hold_the_new_parameters_and_sliced_moments() -> None:
     params, optimizers = field()
     train(params, optimizers)
     old = dict(params)
-    moments = {name: optimizers[name].state[params[name]]["exp_avg"].clone() for name in SHAPES if name != "quats"}
+    before = {name: moments(optimizers, params, name).clone() for name in SHAPES if name != "quats"}
     keep(params, optimizers, [], some())
     for name, value in params.items():
         torch.testing.assert_close(value.data, old[name].data[some()])
@@ -77,18 +99,8 @@ def test_optimizers_hold_the_new_parameters_and_sliced_moments() -> None:
         assert optimizers[name].param_groups[0]["params"][0] is value
         assert optimizers[name].param_groups[0]["lr"] == 0.1
         assert int(state[value]["step"]) == 1
-        assert torch.equal(state[value]["exp_avg"], moments[name][some()])
+        assert torch.equal(state[value]["exp_avg"], before[name][some()])
         assert state[value]["exp_avg_sq"].shape == value.shape
-
-
-def test_a_live_graph_of_the_previous_step_does_not_break_training() -> None:
-    params, optimizers = field()
-    still_alive = params["means"].exp().sum()
-    train(params, optimizers)
-    keep(params, optimizers, [], some())
-    before = train(params, optimizers)
-    assert train(params, optimizers) < before
-    assert still_alive.grad_fn is not None
 
 
 def test_per_primitive_state_is_sliced_and_other_state_is_unchanged() -> None:
@@ -147,7 +159,7 @@ def test_nothing_changes_on_error(fault: str) -> None:
         params["features"] = Parameter(torch.zeros(19, 13))
         del optimizers["features"]
     elif fault == "stale":
-        optimizers["features"] = torch.optim.Adam([Parameter(torch.zeros(20, 13))])
+        optimizers["features"] = Adam([Parameter(torch.zeros(20, 13))])
     else:
         optimizers["features"].add_param_group({"params": [Parameter(torch.zeros(3))]})
     objects = dict(params)
@@ -173,9 +185,141 @@ def test_works_on_a_parameter_dict() -> None:
 @pytest.mark.gpu
 def test_a_mask_on_the_cpu_prunes_a_field_on_the_gpu() -> None:
     params = {name: Parameter(value.detach().cuda()) for name, value in field()[0].items()}
-    optimizers: dict[str, torch.optim.Optimizer] = {name: torch.optim.Adam([value]) for name, value in params.items()}
+    optimizers: dict[str, Optimizer] = {name: Adam([value]) for name, value in params.items()}
     train(params, optimizers)
     keep(params, optimizers, [], some())
     train(params, optimizers)
     assert params["means"].is_cuda
     assert len(params["means"]) == 7
+
+
+# ------------------------------------------------------------------------------------------------------------ snapshots
+
+
+def test_training_continues_from_a_snapshot_bit_for_bit() -> None:
+    params, optimizers = field()
+    train(params, optimizers, 3)
+    saved = snapshot(params, optimizers)
+    train(params, optimizers, 4)
+    expected = {name: value.detach().clone() for name, value in params.items()}
+    keep(params, optimizers, [], torch.arange(20) < 7)
+    narrow(params, optimizers, "features_rest", 3)
+    train(params, optimizers, 5)
+    for _ in range(2):  # a snapshot can be restored more than once
+        restore(params, optimizers, saved)
+        for name in SHAPES.keys() & optimizers.keys():
+            assert optimizers[name].param_groups[0]["params"] == [params[name]]
+            assert list(optimizers[name].state) == [params[name]]
+        train(params, optimizers, 4)
+        assert all(torch.equal(value, expected[name]) for name, value in params.items())
+
+
+def test_a_snapshot_before_the_first_step_has_no_moments() -> None:
+    params, optimizers = field()
+    saved = snapshot(params, optimizers)
+    train(params, optimizers)
+    del optimizers["means"]
+    restore(params, optimizers, saved)
+    assert not any(optimizers[name].state for name in SHAPES.keys() & optimizers.keys())
+    train(params, optimizers)
+
+
+def test_narrow_keeps_the_first_columns_and_their_moments() -> None:
+    params, optimizers = field()
+    train(params, optimizers, 2)
+    wide, before = params["features_rest"].detach().clone(), moments(optimizers, params, "features_rest")
+    for steps, width in ((2, 3), (3, 0)):
+        narrow(params, optimizers, "features_rest", width)
+        value = params["features_rest"]
+        assert torch.equal(value, wide[:, :width])
+        state = optimizers["features_rest"].state[value]
+        assert torch.equal(state["exp_avg"], before[:, :width])
+        assert state["step"] == steps
+        train(params, optimizers)
+        assert params["features_rest"].shape == (20, width, 3)
+        wide[:, :width] = params["features_rest"].detach()
+        before = moments(optimizers, params, "features_rest")
+
+
+def test_a_network_is_restored_in_place() -> None:
+    net = nn.Sequential(nn.Linear(3, 4), nn.Linear(4, 1))
+    optimizer = Adam(net.parameters())
+
+    def steps(count: int) -> None:
+        for _ in range(count):
+            optimizer.zero_grad()
+            net(torch.ones(2, 3)).square().sum().backward()
+            optimizer.step()
+
+    steps(3)
+    saved, objects = module_snapshot(net.parameters(), optimizer), list(net.parameters())
+    steps(4)
+    expected = [value.detach().clone() for value in net.parameters()]
+    steps(2)
+    restore_module(net.parameters(), optimizer, saved)
+    assert all(a is b for a, b in zip(objects, net.parameters()))
+    steps(4)
+    assert all(torch.equal(a, b) for a, b in zip(expected, net.parameters()))
+
+
+# --------------------------------------------------------------------------------------------------------------- copies
+
+
+def integral(opacity: float, scale: float, copies: int) -> float:
+    """Integral along a line of the opacity of ``copies`` primitives at one place, by the midpoint rule."""
+    x = (torch.arange(20_000, dtype=torch.float64) + 0.5) / 20_000 * 24 - 12
+    alpha = opacity * torch.exp(-0.5 * (x / scale) ** 2)
+    return float((1 - (1 - alpha) ** copies).sum() * 24 / 20_000)
+
+
+@given(st.floats(0.006, 0.995), st.integers(1, MAX_COPIES))
+def test_copies_are_as_opaque_as_the_original(opacity: float, copies: int) -> None:
+    new, scales = split_evenly(
+        torch.tensor([opacity], dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64), torch.tensor([copies])
+    )
+    assert 1 - (1 - float(new)) ** copies == pytest.approx(opacity, rel=1e-9)
+    assert integral(float(new), float(scales[0, 0]), copies) == pytest.approx(integral(opacity, 1.0, 1), rel=1e-6)
+
+
+def test_one_copy_is_the_original_and_float32_stays_finite() -> None:
+    opacities, scales = torch.rand(50).clamp(0.01, 0.99), torch.rand(50, 3) + 0.1
+    same, size = split_evenly(opacities, scales, torch.ones(50, dtype=torch.long))
+    torch.testing.assert_close(same, opacities)
+    torch.testing.assert_close(size, scales)
+    many = split_evenly(opacities, scales, torch.full((50,), 10**6))
+    assert many[0].dtype == many[1].dtype == torch.float32
+    assert all(torch.isfinite(value).all() and (value > 0).all() for value in many)
+
+
+@pytest.mark.gpu
+def test_split_evenly_agrees_with_gsplat() -> None:
+    from gsplat.relocation import compute_relocation
+
+    opacities, scales = torch.rand(500).clamp(0.01, 0.99).cuda(), torch.rand(500, 3).cuda() + 0.1
+    copies = torch.randint(1, 20, (500,)).cuda()
+    binoms = torch.tensor([[float(math.comb(n, k)) for k in range(51)] for n in range(51)]).cuda()
+    expected = compute_relocation(opacities, scales, copies.clone(), binoms)
+    for found, wanted in zip(split_evenly(opacities, scales, copies), expected):
+        torch.testing.assert_close(found, wanted, rtol=2e-3, atol=1e-5)
+
+
+def test_draws_follow_the_weights() -> None:
+    weights = torch.tensor([0.0, 1.0, 3.0, 0.0])
+    found = torch.bincount(draw_sources(weights, 40_000), minlength=4)
+    assert found[0] == found[3] == 0
+    assert 0.23 < found[1] / 40_000 < 0.27
+
+
+def test_growing_adds_the_exact_number() -> None:
+    params, optimizers = field(30)
+    train(params, optimizers)
+    old, before = params["means"].detach().clone(), moments(optimizers, params, "features").clone()
+    for count in (7, 0):
+        grow(params, optimizers, count, 0.005)
+        assert {len(value) for value in params.values()} == {37}
+    for name in SHAPES.keys() & optimizers.keys():
+        assert optimizers[name].param_groups[0]["params"] == [params[name]]
+        assert moments(optimizers, params, name).shape == params[name].shape
+    assert torch.equal(params["means"][:30], old)
+    assert torch.equal(moments(optimizers, params, "features")[:30], before)
+    assert not moments(optimizers, params, "features")[30:].any()
