@@ -15,8 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
-STOPPED = (130, 143)
-"""Exit codes of a training that SIGINT or SIGTERM stopped, and that has saved itself."""
+STOPPED = (130, 143)  # exit codes of a training that SIGINT or SIGTERM stopped, and that has saved itself
 NOTHING_SAVED = "Stopped before the first step: nothing to save."
 passed_on: list[int] = []
 """Signals that this process passed on to its ranks, in their order."""

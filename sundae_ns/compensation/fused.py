@@ -19,14 +19,10 @@ from torch import Tensor, nn
 from sundae_ns.compensation.unet import SLOPE, UNet
 from sundae_ns.gpu.kernels import Argument, Launch, load_kernels
 
-PACK = 8
-"""Channels that a thread moves at once, 16 bytes; images are padded to a multiple, which tensor cores need too."""
-
+PACK = 8  # channels that a thread moves at once, 16 bytes; images are padded to a multiple, which tensor cores need too
 _FORWARD = ("fold", "activate", "pool", "upsample", "unfold")
 
-KERNELS = (*_FORWARD, *(f"{name}_backward" for name in _FORWARD), "sum_pixels")
-"""Names of the kernels of ``head.cu``."""
-
+KERNELS = (*_FORWARD, *(f"{name}_backward" for name in _FORWARD), "sum_pixels")  # names of the kernels of head.cu
 _TYPES = {torch.bfloat16: "-DBF16"}
 """Compiler option for the dtype of images between the convolutions; tests add float32, on a CPU."""
 

@@ -37,8 +37,7 @@ MAX_PIXELS = 2**24
 """The head also fades out for images with more pixels than this at the trained scale, such as a wide view, unless they
 are rescaled by less than ``MARGIN``. It is off at twice as many: 33 million pixels take two gigabytes."""
 MARGIN = 1.25
-GRID = 16
-"""Sides of a training window are multiples of this many pixels, so that the U-Net needs no padding."""
+GRID = 16  # sides of a training window are multiples of this many pixels, so that the U-Net needs no padding
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
 _log = logging.getLogger(__name__)

@@ -10,12 +10,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-LEVELS = 4
-"""Number of resolutions of the network; the coarsest is 1 / 2 ** (LEVELS - 1) of its input."""
+LEVELS = 4  # number of resolutions of the network; the coarsest is 1 / 2 ** (LEVELS - 1) of its input
 
 
-SLOPE = 0.1
-"""Slope of the activation below zero. Without normalisation a plain ReLU can die, and whole levels with it."""
+SLOPE = 0.1  # slope of the activation below zero. Without normalisation a plain ReLU can die, and whole levels with it
 
 
 def _double_conv(c_in: int, c_out: int) -> nn.Sequential:

@@ -11,15 +11,9 @@ from torch.nn.functional import normalize
 SURFACE_EXPONENT = 1.6075
 """Exponent of Thomsen's formula for the surface area of an ellipsoid, which is exact to 1.1% for any axes."""
 
-PAIRS = 1 << 18
-"""Pairs of primitives whose overlap is computed at once; they take about 50 MiB."""
-
-ROWS = 1 << 16
-"""Primitives whose matrices are computed at once; the steps between take some 600 bytes a primitive."""
-
-_SWEEPS = 6
-"""Rotations of each pair of axes; the error squares with each sweep, and five reach the rounding of float64."""
-
+PAIRS = 1 << 18  # pairs of primitives whose overlap is computed at once; they take about 50 MiB
+ROWS = 1 << 16  # primitives whose matrices are computed at once; the steps between take some 600 bytes a primitive
+_SWEEPS = 6  # rotations of each pair of axes; the error squares with each sweep, and five reach the rounding of float64
 _LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])
 """Rows and columns of the six entries of a symmetric matrix, diagonal first."""
 

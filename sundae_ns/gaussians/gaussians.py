@@ -25,8 +25,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 
 Encoding = Literal["harmonics", "logits"]
 """How a field stores colours. ``harmonics``: ``features_dc`` and ``features_rest`` are coefficients of spherical
@@ -37,12 +36,8 @@ SPLAT_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opac
 
 _COLUMNS = {"means": 3, "scales": 3, "quats": 4, "features_dc": 3, "opacities": 1}
 
-MAX_SH_DEGREE = 4
-"""Highest SH degree of a field."""
-
-FEATURES = "features"
-"""Name of the parameter that SUNDAE adds to each primitive."""
-
+MAX_SH_DEGREE = 4  # highest SH degree of a field
+FEATURES = "features"  # name of the parameter that SUNDAE adds to each primitive
 LARGEST_LOGIT = 16.0
 """Logit for opacities of 0 and 1. Its float32 opacity is the last below 1, so that its logarithms stay finite."""
 
@@ -50,8 +45,7 @@ LEAST_SCALES = (-80.0, -43.0)
 """Range of the log-scale for widths of 0: as narrow as the narrowest of the field, and with a square that is a normal
 float32, unless a tiny scene needs less."""
 
-_QUATERNION_RANGE = 1e-6, 1e18
-"""Largest components of quaternions that can be normalised in float32."""
+_QUATERNION_RANGE = 1e-6, 1e18  # largest components of quaternions that can be normalised in float32
 
 
 def num_primitives(params: Mapping[str, Tensor]) -> int:

@@ -10,8 +10,7 @@ from torch.nn.functional import softplus
 
 from sundae_ns.gaussians.covariance import chunks, covariances, mean_projected_area, scales_and_quaternions
 
-MAX_OPACITY = 0.99
-"""Upper limit of merged opacities, at which the logit still has a gradient."""
+MAX_OPACITY = 0.99  # upper limit of merged opacities, at which the logit still has a gradient
 
 
 @torch.no_grad()

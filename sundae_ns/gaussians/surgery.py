@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from typing import Any
 
@@ -16,8 +15,6 @@ from sundae_ns.gaussians.gaussians import num_primitives
 
 Snapshot = dict[str, dict[str, Tensor]]
 """By parameter: its ``value`` and the tensors of its optimizer state, all on the CPU."""
-MAX_COPIES = 51
-"""Larger numbers of copies are clamped to this: the terms of the alternating sum grow with N."""
 
 
 def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> None:
@@ -222,76 +219,30 @@ def _state(entries: Mapping[str, Tensor], value: Tensor, optimizer: Optimizer) -
     }
 
 
-def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity and scale of each of ``copies`` primitives that together render like one.
-
-    Opacities ``o' = 1 - (1 - o)^(1/N)`` preserve the opacity at the centre. Equation 9 of "3D Gaussian Splatting as
-    Markov Chain Monte Carlo" (Kheradmand et al., 2024) gives the scale that preserves the integral along a ray, where
-    its double sum over binomials is a single one, because ``sum_{i=1..N} C(i-1, k) = C(N, k+1)``:
-
-        sigma' = sigma * o / sum_{j=1..N} C(N, j) (-1)^(j-1) o'^j / sqrt(j)
-
-    Args:
-        opacities: in (0, 1) ``[M]``.
-        scales: standard deviations, any unit ``[M, 3]``.
-        copies: number of copies including the original, at least 1 ``[M]``.
-
-    Returns:
-        Opacities ``[M]`` and scales ``[M, 3]``, with the dtype of the arguments.
-    """
-    n = copies.clamp(1, MAX_COPIES).to(torch.float64)
-    old = opacities.to(torch.float64)
-    new = 1 - (1 - old) ** (1 / n)
-    j = torch.arange(1, MAX_COPIES + 1, dtype=torch.float64, device=old.device)
-    table = torch.tensor(
-        [[math.comb(size, order) for order in range(1, MAX_COPIES + 1)] for size in range(MAX_COPIES + 1)],
-        dtype=torch.float64,
-        device=old.device,
-    )
-    signs = torch.where(j % 2 == 1, 1.0, -1.0)
-    total = (table[n.long()] * signs * new[:, None] ** j / j.sqrt()).sum(dim=1)
-    return new.to(opacities), scales * (old / total)[:, None].to(scales)
-
-
-def draw_sources(weights: Tensor, count: int) -> Tensor:
-    """Indices ``[count]`` drawn with replacement in proportion to ``weights`` ``[M]``, with torch's global generator.
-
-    By inversion in float64, because ``torch.multinomial`` takes at most 2^24 weights.
-    """
-    cumulative = weights.to(torch.float64).cumsum(dim=0)
-    uniform = torch.rand(count, dtype=torch.float64, device=weights.device) * cumulative[-1]
-    return torch.searchsorted(cumulative, uniform, right=True).clamp_max(len(weights) - 1)
-
-
 @torch.no_grad()
 def grow(
     params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], count: int, min_opacity: float
 ) -> None:
-    """Add ``count`` copies of primitives, drawn by opacity; the rendered image stays the same.
+    """Add ``count`` primitives: the most opaque ones become two at one place, which render alike.
 
-    Replaces the parameter objects, as :func:`keep` does.
+    Opacities ``o' = 1 - sqrt(1 - o)`` preserve the opacity at the centre, scales ``s' = s o / (2 o' - o'^2 / sqrt(2))``
+    the integral along a ray (3DGS-MCMC, Kheradmand et al., 2024, equation 9 for two copies). Replaces the parameter
+    objects, as :func:`keep` does.
 
     Args:
         optimizers: by parameter name; the moments of the copies are 0.
         min_opacity: lower limit of the new opacities.
     """
-    if count <= 0:
-        return
-    sources = draw_sources(params["opacities"].sigmoid().flatten(), count)
-    _split_sources(params, sources, min_opacity)
-    for name in list(params):
-        change_parameter(params, optimizers, name, lambda value: torch.cat([value, value[sources]]))
-        for moment in moments_of(optimizers, name, params[name]).values():
-            moment[-count:] = 0
-
-
-def _split_sources(params: Mapping[str, Tensor], sources: Tensor, min_opacity: float) -> None:
-    """Give each source that was drawn k times the opacity and scale of one of k + 1 copies."""
-    times = torch.bincount(sources, minlength=len(params["means"]))
-    chosen = times.nonzero().squeeze(1)
-    opacities, scales = split_evenly(
-        params["opacities"][chosen].sigmoid().flatten(), params["scales"][chosen].exp(), times[chosen] + 1
-    )
-    eps = torch.finfo(opacities.dtype).eps
-    params["opacities"].data[chosen] = torch.logit(opacities.clamp(min_opacity, 1 - eps))[:, None]
-    params["scales"].data[chosen] = scales.log()
+    while count > 0:
+        opacities = params["opacities"].detach().sigmoid().flatten()
+        rows = opacities.sort(descending=True, stable=True).indices[:count]
+        old = opacities[rows].double()
+        new = 1 - (1 - old).sqrt()
+        params["scales"].data[rows] += (old / (2 * new - new.square() / 2**0.5)).log().to(params["scales"])[:, None]
+        limited = new.to(opacities).clamp(min_opacity, 1 - torch.finfo(opacities.dtype).eps)
+        params["opacities"].data[rows] = torch.logit(limited)[:, None]
+        for name in list(params):
+            change_parameter(params, optimizers, name, lambda value, rows=rows: torch.cat([value, value[rows]]))  # type: ignore[misc]
+            for moment in moments_of(optimizers, name, params[name]).values():
+                moment[-len(rows) :] = 0
+        count -= len(rows)

@@ -8,11 +8,8 @@ from torch import Tensor
 
 from sundae_ns.graphs.neighbors import knn
 
-CUTOFF = 3.0
-"""Edges end at this many sigma, where the weight has fallen to exp(-4.5) = 0.011."""
-
-SAMPLED = 2**22
-"""Most distances of which the median is taken."""
+CUTOFF = 3.0  # edges end at this many sigma, where the weight has fallen to exp(-4.5) = 0.011
+SAMPLED = 2**22  # most distances of which the median is taken
 
 
 @dataclass(frozen=True, eq=False)

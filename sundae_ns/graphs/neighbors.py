@@ -23,16 +23,11 @@ from torch import Tensor
 from sundae_ns.errors import BackendError, ConfigError, DataError
 from sundae_ns.gpu.kernels import Kernel, Launch
 
-MOST_EXTENT = 1e150
-"""Largest coordinate whose squared distances float64 can hold."""
-MAX_NEIGHBORS = 128
-"""Most neighbours that the kernel supports; lists of up to about 32 stay in registers."""
-LEAF = 8
-"""Fewest points of a leaf if the tree has several; leaves hold fewer than twice as many."""
-FILE, KERNEL = "neighbors.cu", "nearest"
-"""Source file of the kernel, and its name."""
-CHUNK = 2**16
-"""Points searched at a time on the CPU; the arrays of each take about 50 MiB."""
+MOST_EXTENT = 1e150  # largest coordinate whose squared distances float64 can hold
+MAX_NEIGHBORS = 128  # most neighbours that the kernel supports; lists of up to about 32 stay in registers
+LEAF = 8  # fewest points of a leaf if the tree has several; leaves hold fewer than twice as many
+FILE, KERNEL = "neighbors.cu", "nearest"  # source file of the kernel, and its name
+CHUNK = 2**16  # points searched at a time on the CPU; the arrays of each take about 50 MiB
 
 _log = logging.getLogger(__name__)
 

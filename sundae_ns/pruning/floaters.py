@@ -12,8 +12,7 @@ from torch import Tensor
 
 NEAREST = 0.01
 """Share of the sparse points that may be nearer to a camera than the scene is taken to be: some of them are wrong."""
-FREE = 2 / 3
-"""Share of that distance which is taken to be empty."""
+FREE = 2 / 3  # share of that distance which is taken to be empty
 SUPPORT, REACH = 3, 0.5
 """A primitive is no floater if this many sparse points are within this share of the empty distance from it: a few
 photos may be of something near. Wrong points lie alone."""

@@ -24,21 +24,15 @@ LEAST_WIDTH = 0.25
 MOST_UNLIKE = 8.0
 """Largest difference of colours that counts, in typical differences. Weights fall to e^-32 and stay positive; otherwise
 a primitive of an extreme colour would have no neighbour and could not be merged."""
-UNSEEN = 0.001
-"""Share of all weight that is dropped, not merged: the lightest primitives."""
-FLOOR = 1e-4
-"""Least weight in a merge, as a share of the mean: primitives that nothing sees merge by their likeness."""
+UNSEEN = 0.001  # share of all weight that is dropped, not merged: the lightest primitives
+FLOOR = 1e-4  # least weight in a merge, as a share of the mean: primitives that nothing sees merge by their likeness
 WIDTH = 0.01
 """Variance added to each axis, as a share of the sum of all three: two parallel flat primitives are alike too."""
-PART = 0.5
-"""Share of the possible merges of a round that happen; the others wait for what the better ones leave."""
+PART = 0.5  # share of the possible merges of a round that happen; the others wait for what the better ones leave
 MOST_ROUNDS = 256
 """Most rounds; a field needs about 60. Thousands of clones that share their neighbours would need many more."""
-ROWS = 1 << 17
-"""Primitives whose edges are followed at once; they take about 100 MiB."""
-
-MOST_HOPS = 64
-"""Most edges between a dropped primitive and its kept one; keep ratios from 0.001 on need about a dozen."""
+ROWS = 1 << 17  # primitives whose edges are followed at once; they take about 100 MiB
+MOST_HOPS = 64  # most edges between a dropped primitive and its kept one; keep ratios from 0.001 on need about a dozen
 
 
 @torch.no_grad()

@@ -17,8 +17,7 @@ from torch import Tensor
 from sundae_ns.errors import DataError
 from sundae_ns.graphs.neighbors import build_tree
 
-LEAST_SHARE = 1e-200
-"""Least score of a systematic sample, as a share of the largest; lower scores are raised to it."""
+LEAST_SHARE = 1e-200  # least score of a systematic sample, as a share of the largest; lower scores are raised to it
 
 
 def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:

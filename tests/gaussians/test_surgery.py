@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,9 +15,7 @@ from torch.optim import Adam, Optimizer
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.surgery import (
-    MAX_COPIES,
     check_wiring,
-    draw_sources,
     grow,
     keep,
     module_snapshot,
@@ -26,7 +23,6 @@ from sundae_ns.gaussians.surgery import (
     restore,
     restore_module,
     snapshot,
-    split_evenly,
 )
 
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "features_rest": (8, 3), "opacities": (1,), "features": (13,)}
@@ -272,54 +268,34 @@ def integral(opacity: float, scale: float, copies: int) -> float:
     return float((1 - (1 - alpha) ** copies).sum() * 24 / 20_000)
 
 
-@given(st.floats(0.006, 0.995), st.integers(1, MAX_COPIES))
-def test_copies_are_as_opaque_as_the_original(opacity: float, copies: int) -> None:
-    new, scales = split_evenly(
-        torch.tensor([opacity], dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64), torch.tensor([copies])
-    )
-    assert 1 - (1 - float(new)) ** copies == pytest.approx(opacity, rel=1e-9)
-    assert integral(float(new), float(scales[0, 0]), copies) == pytest.approx(integral(opacity, 1.0, 1), rel=1e-6)
+@given(st.floats(0.02, 0.99))
+def test_copies_render_like_the_original(opacity: float) -> None:
+    params = {
+        "means": Parameter(torch.zeros(1, 3, dtype=torch.float64)),
+        "scales": Parameter(torch.zeros(1, 3, dtype=torch.float64)),
+        "opacities": Parameter(torch.logit(torch.tensor([[opacity]], dtype=torch.float64))),
+    }
+    grow(params, {}, 1, 0.005)
+    new, scale = params["opacities"].detach().sigmoid()[:, 0], params["scales"].detach().exp()
+    assert new[0] == new[1]
+    assert torch.equal(scale[0], scale[1])
+    assert 1 - (1 - float(new[0])) ** 2 == pytest.approx(opacity, rel=1e-9)
+    assert integral(float(new[0]), float(scale[0, 0]), 2) == pytest.approx(integral(opacity, 1.0, 1), rel=1e-6)
 
 
-def test_one_copy_is_the_original_and_float32_stays_finite() -> None:
-    opacities, scales = torch.rand(50).clamp(0.01, 0.99), torch.rand(50, 3) + 0.1
-    same, size = split_evenly(opacities, scales, torch.ones(50, dtype=torch.long))
-    torch.testing.assert_close(same, opacities)
-    torch.testing.assert_close(size, scales)
-    many = split_evenly(opacities, scales, torch.full((50,), 10**6))
-    assert many[0].dtype == many[1].dtype == torch.float32
-    assert all(torch.isfinite(value).all() and (value > 0).all() for value in many)
-
-
-@pytest.mark.gpu
-def test_split_evenly_agrees_with_gsplat() -> None:
-    from gsplat.relocation import compute_relocation
-
-    opacities, scales = torch.rand(500).clamp(0.01, 0.99).cuda(), torch.rand(500, 3).cuda() + 0.1
-    copies = torch.randint(1, 20, (500,)).cuda()
-    binoms = torch.tensor([[float(math.comb(n, k)) for k in range(51)] for n in range(51)]).cuda()
-    expected = compute_relocation(opacities, scales, copies.clone(), binoms)
-    for found, wanted in zip(split_evenly(opacities, scales, copies), expected):
-        torch.testing.assert_close(found, wanted, rtol=2e-3, atol=1e-5)
-
-
-def test_draws_follow_the_weights() -> None:
-    weights = torch.tensor([0.0, 1.0, 3.0, 0.0])
-    found = torch.bincount(draw_sources(weights, 40_000), minlength=4)
-    assert found[0] == found[3] == 0
-    assert 0.23 < found[1] / 40_000 < 0.27
-
-
-def test_growing_adds_the_exact_number() -> None:
+@pytest.mark.parametrize("count", [0, 7, 30, 95])
+def test_growing_adds_the_exact_number_upon_the_most_opaque(count: int) -> None:
     params, optimizers = field(30)
     train(params, optimizers)
     old, before = params["means"].detach().clone(), moments(optimizers, params, "features").clone()
-    for count in (7, 0):
-        grow(params, optimizers, count, 0.005)
-        assert {len(value) for value in params.values()} == {37}
+    opaque = params["opacities"].detach().flatten().argsort(descending=True)
+    grow(params, optimizers, count, 0.005)
+    assert {len(value) for value in params.values()} == {30 + count}
+    assert all(value.isfinite().all() for value in params.values())
     for name in SHAPES.keys() & optimizers.keys():
         assert optimizers[name].param_groups[0]["params"] == [params[name]]
         assert moments(optimizers, params, name).shape == params[name].shape
     assert torch.equal(params["means"][:30], old)
+    assert torch.equal(params["means"][30:60], old[opaque[: min(count, 30)]])
     assert torch.equal(moments(optimizers, params, "features")[:30], before)
     assert not moments(optimizers, params, "features")[30:].any()
