@@ -24,17 +24,12 @@ def bytes_of_module(module: nn.Module) -> int:
     return sum(tensor.numel() * tensor.element_size() for tensor in chain(module.parameters(), module.buffers()))
 
 
-def bytes_of_head(head: HeadConfig | None) -> int:
-    """Bytes of a head, computed without allocating its weights; 0 for none."""
-    if head is None or head.mode == "off":
-        return 0
-    with torch.device("meta"):
-        return bytes_of_module(CompensationHead(head))
-
-
 def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
-    """Bytes of a field and its head. The one place where a decision of training counts bytes."""
-    return bytes_of(params) + bytes_of_head(head)
+    """Bytes of a field and its head, whose weights are not allocated; the one count that decides in training."""
+    if head is None or head.mode == "off":
+        return bytes_of(params)
+    with torch.device("meta"):
+        return bytes_of(params) + bytes_of_module(CompensationHead(head))
 
 
 def megabytes(count: int) -> str:

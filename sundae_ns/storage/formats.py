@@ -15,10 +15,18 @@ from sundae_ns.gaussians.gaussians import SPLAT_NAMES, Field, Mended, mend, sh_d
 from sundae_ns.storage import checkpoint
 from sundae_ns.storage.coordinates import similarity
 from sundae_ns.storage.gltf import read_glb, write_glb
-from sundae_ns.storage.ply import MODEL_FRAME, check_field, is_nerfstudio_ply, ply_comments, read_ply, write_ply
+from sundae_ns.storage.ply import (
+    MAX_SH_DEGREE,
+    MODEL_FRAME,
+    check_field,
+    is_nerfstudio_ply,
+    ply_comments,
+    read_ply,
+    write_ply,
+)
 from sundae_ns.storage.sog import read_sog, write_sog
 from sundae_ns.storage.splat import read_gsplat, read_ksplat, read_splat
-from sundae_ns.storage.spz import MAX_SH_DEGREE, clamped, read_spz, write_spz
+from sundae_ns.storage.spz import clamped, read_spz, write_spz
 
 Kind = Literal["packed", "ply", "spz", "sog", "glb", "splat", "ksplat", "gsplat"]
 PRIMITIVES: dict[Kind, str] = {

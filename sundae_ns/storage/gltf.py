@@ -27,15 +27,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.errors import DataError, reading, regular
+from sundae_ns.errors import reading, regular
 from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.gaussians.gaussians import SH_C0, sh_degree
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.coordinates import similarity
-from sundae_ns.storage.ply import LEAST_OPACITY, check_field
+from sundae_ns.storage.ply import LEAST_OPACITY, MAX_SH_DEGREE, check_field, checked
 
 EXTENSION = "KHR_gaussian_splatting"
-MAX_SH_DEGREE = 3
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _MOST_JSON = 1 << 24
@@ -65,34 +64,21 @@ def semantics(degree: int) -> list[str]:
 def write_glb(
     path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False, in_model_frame: bool = False
 ) -> None:
-    """Write the base colours of a field as a .glb, atomically.
+    """Write the base colours of a finite field of SH degree at most 3 as a .glb, atomically.
 
-    Args:
-        path: the file; its folder must exist.
-        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.gaussians`. ``features`` are not
-            written.
-        antialiased: mark the scene as trained with antialiasing, for :func:`read_glb`.
-        in_model_frame: the field is in the coordinates of nerfstudio's model.
+    ``in_model_frame`` says that it is in the coordinates of nerfstudio's model.
 
     Raises:
         DataError: the field has no primitives, an SH degree above 3, or wrong shapes.
         StorageError: the disk is full or not writable.
     """
-    check_field(params)
-    if not len(params["means"]):
-        raise DataError(f"{path} would have no primitives; keep at least one")
-    if sh_degree(params["features_rest"]) > MAX_SH_DEGREE:
-        raise DataError(f"a .glb stores SH degrees up to {MAX_SH_DEGREE}; cut the coefficients, or write a .ply")
-    field = {name: value.detach().float().cpu() for name, value in params.items()}
-    field = similarity(field, _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0)
+    field = similarity(checked(path, params), _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0)
     opacities = field["opacities"].sigmoid()
-    quats = torch.nn.functional.normalize(field["quats"], dim=1)
-    quats[quats.norm(dim=1) < 0.5] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     colors = torch.cat([SH_C0 * field["features_dc"] + 0.5, opacities], dim=1).clamp(0, 1)
     attributes = {
         "POSITION": field["means"],
         "COLOR_0": (255 * colors).round().to(torch.uint8),
-        f"{EXTENSION}:ROTATION": quats.roll(-1, dims=1),
+        f"{EXTENSION}:ROTATION": field["quats"].roll(-1, dims=1),
         f"{EXTENSION}:SCALE": field["scales"].exp(),
         f"{EXTENSION}:OPACITY": opacities,
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": field["features_dc"],

@@ -39,6 +39,7 @@ MODEL_FRAME = "Coordinates: nerfstudio model"
 """Header comment of files in the coordinates of nerfstudio's model, not of the capture."""
 LEAST_OPACITY = 1e-6
 """Opacity of a byte of 0, and what one of 255 lacks to 1, in formats of bytes: their logits stay finite."""
+MAX_SH_DEGREE = 3  # of .spz, .sog and .glb
 _COLUMNS = {
     "means": ("x", "y", "z"),
     "features_dc": ("f_dc_0", "f_dc_1", "f_dc_2"),
@@ -69,6 +70,30 @@ def check_field(params: Mapping[str, Tensor], failure: type[SundaeError] = DataE
         raise failure(f"the field has no {', '.join(missing)}; it needs all of {', '.join(SPLAT_NAMES)}")
     for odd in odd_shapes(params):
         raise failure(odd)
+
+
+def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The parameters that .spz, .sog and .glb store, float32 on the CPU; quaternions become unit ones.
+
+    Raises:
+        DataError: the field has no primitives, values that are not finite, an SH degree above 3, or wrong shapes.
+    """
+    check_field(params)
+    field = {name: params[name].detach().to("cpu", torch.float32).contiguous() for name in SPLAT_NAMES}
+    if not len(field["means"]):
+        raise DataError(f"the field has no primitives, which a {path.suffix} cannot store; check the run")
+    if not all(bool(value.isfinite().all()) for value in field.values()):
+        raise DataError("some values are NaN or infinite; drop those primitives first (finite_mask)")
+    if field["features_rest"].shape[1] > (MAX_SH_DEGREE + 1) ** 2 - 1:
+        raise DataError(f"a {path.suffix} stores SH degrees up to {MAX_SH_DEGREE}; cut features_rest, or write a .ply")
+    # Opacities beyond these logits are 0 and 1 in every format, and would overflow before they are.
+    field["opacities"] = field["opacities"].clamp(-30.0, 30.0)
+    # Normalise in float64: the square of 1e-30 is 0 in float32.
+    quats = field["quats"].double()
+    norms = quats.norm(dim=1, keepdim=True)
+    identity = torch.tensor(np.eye(1, 4)[0])
+    field["quats"] = torch.where(norms > 0, quats / norms.clamp_min(torch.finfo(torch.float64).tiny), identity).float()
+    return field
 
 
 # ------------------------------------------------------------------------------------------------------------- writing

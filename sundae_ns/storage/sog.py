@@ -34,8 +34,7 @@ from torch import Tensor
 from sundae_ns.errors import DataError, reading, regular
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.coordinates import scene_order
-from sundae_ns.storage.ply import from_smallest_three
-from sundae_ns.storage.spz import MAX_SH_DEGREE, checked
+from sundae_ns.storage.ply import MAX_SH_DEGREE, checked, from_smallest_three
 
 META = "meta.json"
 MAX_PALETTE = 1 << 16  # palette rows that two bytes can index
@@ -52,13 +51,7 @@ _FIRST_MODE = 252  # alpha of a rotation without its first component; the next v
 
 
 def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
-    """Write the base colours of a field as a bundled .sog, atomically.
-
-    Args:
-        path: the file; its folder must exist.
-        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.gaussians`. ``features`` are not
-            written, and the order of primitives changes.
-        antialiased: mark the scene as trained with antialiasing.
+    """Write the base colours of a finite field of SH degree at most 3 as a bundled .sog, atomically, in another order.
 
     Raises:
         DataError: the field has no primitives, an SH degree above 3, or wrong shapes.
@@ -117,17 +110,13 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
 
 
 def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
-    """Read a .sog of version 2: bundled, or as a folder of images with a ``meta.json``.
-
-    Args:
-        path: the bundle, the folder, or its ``meta.json``.
+    """Read a bundled .sog, or a folder of images or the ``meta.json`` in it.
 
     Returns:
-        A field by the names of :data:`sundae_ns.gaussians.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
-        coordinates; and whether it is marked as trained with antialiasing.
+        A field as of ``ply.read_ply``, and whether it is marked as trained with antialiasing.
 
     Raises:
-        DataError: a file is missing, damaged, no .sog, or of another version.
+        DataError: a file is missing, damaged, no .sog, or of another version than 2.
     """
     with reading(path, "a complete .sog"), ExitStack() as stack:
         if path.is_dir() or path.name == META:

@@ -28,10 +28,8 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError, reading, regular
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.ply import check_field
+from sundae_ns.storage.ply import checked
 
-MAX_SH_DEGREE = 3
-"""Highest SH degree that .spz and .sog can store."""
 _HARMONICS_STEP = 1 / 64  # costs 0.03 dB; twice this step costs 0.12 dB (docs/formats.md)
 _VERSION = 3  # one gzip stream; more programs read it than version 4
 _HEADER_FLAGS = 14  # offset of the flags in the header
@@ -43,7 +41,6 @@ _LARGEST = (1 << 23) - 1  # largest coordinate in steps, 24 bits with a sign
 _MOST_BITS = 24  # fractional bits of a coordinate
 _FEWEST_BITS = 8
 _SCALES = (-10.0, 5.9375)  # log-scales that fit
-_MOST_LOGIT = 30.0
 _COLOR, _HARMONIC = 0.5 / 0.15, 1.0  # largest SH coefficients of degree 0, and of higher degrees
 
 
@@ -65,13 +62,7 @@ def fractional_bits(means: Tensor) -> int:
 
 
 def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
-    """Write the base colours of a field as a .spz, atomically.
-
-    Args:
-        path: the file; its folder must exist.
-        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.gaussians`. ``features`` are not
-            written.
-        antialiased: mark the scene as trained with antialiasing.
+    """Write the base colours of a finite field of SH degree at most 3 as a .spz, atomically.
 
     Raises:
         DataError: the field has no primitives, an SH degree above 3, a primitive too far away, or wrong shapes.
@@ -96,11 +87,7 @@ def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
 
 
 def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
-    """Read a .spz of version 1 to 4.
-
-    Returns:
-        A field by the names of :data:`sundae_ns.gaussians.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
-        coordinates; and whether it is marked as trained with antialiasing.
+    """Read a .spz of version 1 to 4: a field as of ``ply.read_ply``, and whether it is marked as antialiased.
 
     Raises:
         DataError: the file is missing, damaged, no .spz, or unpacks to far more than its size.
@@ -154,28 +141,3 @@ def clamped(field: Mapping[str, Tensor]) -> int:
     beyond |= (field["features_dc"].abs() > _COLOR).any(dim=1)
     beyond |= (field["features_rest"].flatten(1).abs() > _HARMONIC).any(dim=1)
     return int(beyond.sum())
-
-
-def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The parameters that .spz and .sog store, float32 on the CPU; quaternions are normalised, zero ones the identity.
-
-    Raises:
-        DataError: the field has no primitives, values that are not finite, an SH degree above 3, or wrong shapes.
-    """
-    check_field(params)
-    names = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-    field = {name: params[name].detach().to(device="cpu", dtype=torch.float32).contiguous() for name in names}
-    if not len(field["means"]):
-        raise DataError(f"the field has no primitives, which a {path.suffix} cannot store; check the run")
-    if not all(bool(value.isfinite().all()) for value in field.values()):
-        raise DataError("some values are NaN or infinite; drop those primitives first (finite_mask)")
-    if field["features_rest"].shape[1] > (MAX_SH_DEGREE + 1) ** 2 - 1:
-        raise DataError(f"a {path.suffix} stores SH degrees up to {MAX_SH_DEGREE}; cut features_rest, or write a .ply")
-    # Opacities beyond these logits are 0 and 1 in every format, and would overflow before they are.
-    field["opacities"] = field["opacities"].clamp(-_MOST_LOGIT, _MOST_LOGIT)
-    # Normalise in float64: the square of 1e-30 is 0 in float32.
-    quats = field["quats"].double()
-    norms = quats.norm(dim=1, keepdim=True)
-    identity = torch.tensor(np.eye(1, 4)[0])
-    field["quats"] = torch.where(norms > 0, quats / norms.clamp_min(torch.finfo(torch.float64).tiny), identity).float()
-    return field

@@ -1,13 +1,10 @@
-"""A stranger's run whose ``config.yml`` starts a program: no command of sundae, script or example starts it."""
+"""A stranger's run whose ``config.yml`` starts a program: no command of sundae starts it."""
 
 from __future__ import annotations
 
 import json
-import runpy
 import shutil
-import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -18,7 +15,6 @@ import yaml
 from sundae_ns.cli import main
 from sundae_ns.cli.main import COMMANDS
 
-ROOT = Path(__file__).parents[2]
 CONFIGS: dict[str, Callable[[str], str]] = {
     "nothing else": lambda text: "!!python/object/apply:os.system ['touch PWNED']\n",
     "among options": lambda text: text.replace(
@@ -40,36 +36,6 @@ WORDS: dict[str, list[str]] = {
     "doctor": [],
 }
 """Words of each command on a run, or on a folder with one."""
-SCRIPTS: dict[str, list[str] | str] = {
-    "benchmarks/bands.py": ["RUN", "-o", "bands", "--view", "0"],
-    "benchmarks/bench_export.py": ["--run", "RUN", "--splat-transform", "false"],
-    "benchmarks/bench_formats.py": ["RUN"],
-    "benchmarks/bench_graph.py": ["--field", "RUN", "--points", "200", "--repeats", "1", "--device", "cpu"],
-    "benchmarks/bench_pack.py": ["--run", "RUN", "--repeats", "1"],
-    "benchmarks/bench_page.py": ["RUN"],
-    "benchmarks/bench_viewers.py": ["RUN"],
-    "examples/plot_curve.py": "opens a run as render_packed.py does",
-    "examples/render_packed.py": ["RUN", "out.png"],
-    "examples/prune_ply.py": "opens a run as render_packed.py does",
-    "benchmarks/bench_step.py": "makes its field",
-    "benchmarks/bench_training.py": "trains its runs",
-    "benchmarks/browser.py": "trains its run",
-    "benchmarks/check_wheel.py": "trains its run",
-    "benchmarks/full_disk.py": "trains its run",
-    "benchmarks/fuzz_packs.py": "makes its packs",
-    "benchmarks/kill_and_resume.py": "trains its runs",
-    "benchmarks/memory_growth.py": "trains its run",
-    "benchmarks/multi_gpu.py": "takes a checkpoint without its config.yml",
-    "benchmarks/mutants.py": "takes the sources",
-    "benchmarks/paper.py": "trains its runs",
-    "benchmarks/plot.py": "takes tables",
-    "benchmarks/prune_without_photos.py": ["RUN", "-o", "prune.csv", "--shares", "0.5", "--steps", "2"],
-    "benchmarks/quality.py": "trains its runs",
-    "benchmarks/still_life.py": "makes a capture",
-    "benchmarks/suite.py": "trains its runs",
-    "benchmarks/tables.py": "takes tables",
-}
-"""Words of each script on a run, or why it takes none."""
 
 
 @pytest.fixture(params=CONFIGS)
@@ -97,12 +63,8 @@ def test_nerfstudio_would_run_it(kind: str, tmp_path: Path, monkeypatch: pytest.
     assert Path("PWNED").exists()
 
 
-def test_no_command_and_no_script_is_forgotten() -> None:
+def test_no_command_is_forgotten() -> None:
     assert WORDS.keys() == COMMANDS.keys()
-    found = {
-        path.relative_to(ROOT).as_posix() for name in ("benchmarks", "examples") for path in ROOT.glob(f"{name}/*.py")
-    }
-    assert SCRIPTS.keys() == found
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -131,14 +93,6 @@ def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> No
         main([command, *WORDS[command]])
     # Of nerfstudio's commands, ns-train reads a config.yml by our own reader; the test below starts it.
     assert set(asked) <= {"ns-train", "sundae"}
-
-
-@pytest.mark.parametrize("script", [name for name, words in SCRIPTS.items() if not isinstance(words, str)])
-@pytest.mark.usefixtures("hostile")
-def test_no_script_runs_it(script: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", [script, *SCRIPTS[script]])
-    with suppress(Exception, SystemExit):
-        runpy.run_path(str(ROOT / script), run_name="__main__")
 
 
 @pytest.mark.parametrize(

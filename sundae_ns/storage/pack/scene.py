@@ -10,13 +10,11 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from dataclasses import field as default
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.errors import PackError
@@ -211,25 +209,6 @@ class _Reader:
         return self.decoded(name, "levels", entropy.decode_levels, width, near), float(self.about(name)["step"])
 
 
-def _decode_means(reader: _Reader, n: int) -> tuple[Blocks, int, int]:
-    bits, size = (int(reader.about("means")[key]) for key in ("bits", "block"))
-    low, high = (reader.array("means", end, blocks=-(-n // size)) for end in ("low", "high"))
-    return Blocks(reader.decoded("means", "gaps", entropy.decode_gaps, n, size, bits), low, high), bits, size
-
-
-def _decode_quats(reader: _Reader, near: Near) -> NDArray[np.float32]:
-    levels, step = reader.levels("quats", near, 3)
-    found: NDArray[np.float32] = quantize.rotations_at(torch.from_numpy(levels), step).numpy()
-    return found
-
-
-def _decode_rows(reader: _Reader, name: str, near: Near, width: int) -> NDArray[np.float32]:
-    levels, step = reader.levels(name, near, width)
-    mean = reader.array(name, "mean", width=width)
-    basis = reader.array(name, "basis", square=width * width).reshape(width, width)
-    return quantize.rows_at(levels, mean, basis, step)
-
-
 def _decode_head(reader: _Reader) -> dict[str, Tensor]:
     if "head/levels" not in reader.arrays:
         return {}
@@ -285,27 +264,38 @@ def read_scene(path: Path) -> PackedScene:
 
 
 def _decoded(reader: _Reader, n: int, width: int, features: int) -> PackedScene:
-    blocks, bits, block = _decode_means(reader, n)
-    near = entropy.neighbours_of(blocks.cells, block)
-    # Start with the largest jobs, so that the threads end together.
-    wide = {name: channels for name, channels in (("features_rest", width), (FEATURES, features)) if channels}
-    narrow = {"scales": 3, "features_dc": 3, "opacities": 1}
-    rows = {name: partial(_decode_rows, reader, name, near, channels) for name, channels in (wide | narrow).items()}
-    jobs: dict[str, Callable[[], Any]] = {name: rows[name] for name in wide}
-    jobs["head"] = partial(_decode_head, reader)
-    jobs["quats"] = partial(_decode_quats, reader, near)
-    jobs |= {name: rows[name] for name in narrow}
-    jobs["means"] = partial(quantize.dequantize_positions, blocks, bits, block)
+    bits, size = (int(reader.about("means")[key]) for key in ("bits", "block"))
+    low, high = (reader.array("means", end, blocks=-(-n // size)) for end in ("low", "high"))
+    blocks = Blocks(reader.decoded("means", "gaps", entropy.decode_gaps, n, size, bits), low, high)
+    near = entropy.neighbours_of(blocks.cells, size)
+
+    def means() -> Array:
+        return quantize.dequantize_positions(blocks, bits, size)
+
+    def quats() -> Array:
+        levels, step = reader.levels("quats", near, 3)
+        return np.asarray(quantize.rotations_at(torch.from_numpy(levels), step).numpy())
+
+    def rows(name: str, channels: int) -> Array:
+        levels, step = reader.levels(name, near, channels)
+        mean = reader.array(name, "mean", width=channels)
+        basis = reader.array(name, "basis", square=channels**2).reshape(channels, channels)
+        return quantize.rows_at(levels, mean, basis, step)
+
     with ThreadPoolExecutor(2) as pool:
-        started = {name: pool.submit(job) for name, job in jobs.items()}
-        done = {name: future.result() for name, future in started.items()}
-    head = done.pop("head")
-    field = {name: torch.from_numpy(value) for name, value in done.items()}
+        # The largest jobs come first, so that the threads end together.
+        wide, narrow = {"features_rest": width, FEATURES: features}, {"scales": 3, "features_dc": 3, "opacities": 1}
+        jobs = {name: pool.submit(rows, name, channels) for name, channels in wide.items() if channels}
+        head = pool.submit(_decode_head, reader)
+        jobs["quats"] = pool.submit(quats)
+        jobs |= {name: pool.submit(rows, name, channels) for name, channels in narrow.items()}
+        jobs["means"] = pool.submit(means)
+        field = {name: torch.from_numpy(job.result()) for name, job in jobs.items()}
     rest = field.get("features_rest")
     field["features_rest"] = torch.zeros(n, 0, 3) if rest is None else rest.reshape(n, width // 3, 3)
     ordered = {name: field[name] for name in (*SPLAT_NAMES, FEATURES) if name in field}
     meta = {name: value for name, value in reader.meta.items() if name not in ("sections", "attributes", "primitives")}
-    return PackedScene(ordered, head, _decode_cameras(reader), meta)
+    return PackedScene(ordered, head.result(), _decode_cameras(reader), meta)
 
 
 def _shape(meta: Mapping[str, Any]) -> tuple[int, int, int]:
