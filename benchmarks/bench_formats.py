@@ -37,7 +37,7 @@ from sundae_ns.storage.atomic import replacing
 
 COLUMNS = (
     *("capture", "method", "format", "program", "bytes", "psnr", "ssim", "primitives"),
-    *("seed", "fingerprint", "command"),
+    *("seed", "command"),
 )
 PLACE = ("capture", "method", "format", "program", "seed")
 """Columns that name a row."""
@@ -96,7 +96,6 @@ def rows_of(opened: Opened, method: str, files: Iterator[Packed], scene: sn.Scen
             "ssim": round(quality.ssim, 4),
             "primitives": measured.num_primitives,
             "seed": "" if opened.seed is None else opened.seed,
-            "fingerprint": opened.fingerprint,
             "command": command,
         }
 

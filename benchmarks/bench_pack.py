@@ -164,7 +164,6 @@ def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
         "height": int(camera.height),
         "rasterizer": before.model.backend.name,
         "keep_ratio": None if before.kept is None else round(before.kept, 4),
-        "fingerprint": before.fingerprint,
         **{name: round(value, 4) for name, value in sums.items()},
     }
 

@@ -34,7 +34,6 @@ from nerfstudio.scripts.train import _set_random_seed
 from harness.job import configure, without_lpips
 from harness.plan import Job, parser_of
 from sundae_ns.evaluation import psnr, ssim
-from sundae_ns.storage.fingerprint import fingerprint
 
 ARMS: dict[str, list[str]] = {
     "splatfacto": ["splatfacto"],
@@ -125,7 +124,6 @@ def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
         "psnr": round(decibels, 3),
         "ssim": round(similarity, 4),
         "primitives": int(trainer.pipeline.model.num_points),
-        "fingerprint": fingerprint(trainer.config),
         "head": getattr(trainer.pipeline.model, "head", None) is not None,
         "peak_mib": round(peak),
         "curve": curve,

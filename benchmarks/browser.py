@@ -22,9 +22,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from ray_tracing import write_still_life
 
 from harness.chromium import find_chromium, wait_for
+from harness.still_life import write_still_life
 from harness.viewer_page import Server, ViewerPage
 
 PRUNE_AT = 300

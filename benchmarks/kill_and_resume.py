@@ -39,12 +39,12 @@ import torch
 import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.trainer import TrainerConfig
-from ray_tracing import write_still_life
 from rich.progress import track
 
 import sundae_ns as sn
 from harness import killing
 from harness.processes import Bench, command_here, train_here
+from harness.still_life import write_still_life
 from harness.watcher import Watcher, free_port
 from sundae_ns.errors import CheckpointError
 from sundae_ns.rendering.views import view_of

@@ -2,11 +2,9 @@
 
     python benchmarks/tables.py            # rewrite every table between its markers
     python benchmarks/tables.py quality    # print one table
-    python benchmarks/tables.py --suite DIR/results.jsonl    # first take over what suite.py has measured
 
 A page holds the markers ``<!-- table: NAME -->`` and ``<!-- end of table -->``; the lines between them are made here.
-``tests/benchmarks/test_scripts.py`` checks that every page is current. A row whose options are not those that its arm
-has today says "earlier default"; a suite takes the place of those that it measured again, with all their seeds.
+Rows of runs.csv are those of a suite's results.csv.
 """
 
 from __future__ import annotations
@@ -21,8 +19,6 @@ from typing import Any
 
 from harness.results import spread
 from harness.stored import MB, METHODS, lines_of
-from harness.take_over import take_over
-from harness.today import EARLIER, SHARE, is_of_today
 from sundae_ns.evaluation.measured import number, table
 
 ROOT = Path(__file__).parents[1]
@@ -30,8 +26,8 @@ PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 LEFT_OUT = ("splatfacto-7k", "sundae-warm-up", "sundae-with-head", "sundae-no-head-bytes", "band")
 """Methods of runs.csv that the table of quality leaves out; the text gives what they show."""
-TIMED = {"sundae": "sundae-auto"}
-"""Arms of runs.csv that bench_training.py calls by another name, the method's."""
+SHARE = 0.1
+"""Share that ``sundae`` keeps."""
 FORMATS = {".spz": ".spz", ".sog": ".sog", ".sog theirs": ".sog by splat-transform", ".sundae": ".sundae"}
 """Packed formats in the order of a table, by the heads that readers see."""
 
@@ -52,7 +48,7 @@ def runs() -> list[dict[str, Any]]:
 
 
 def _mean_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    words = ("scene", "method", "variant", "resolution", "gpu", "fingerprint", "command", "lpips_net")
+    words = ("scene", "method", "variant", "resolution", "gpu", "command", "lpips_net")
     mean: dict[str, Any] = {name: rows[0][name] for name in words}
     for name in rows[0].keys() - mean.keys():
         cells = [float(row[name]) if row[name] else None for row in rows]
@@ -62,7 +58,7 @@ def _mean_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
             mean[f"{name}_cell"] = spread(cells, 2 if name == "psnr" else 4)
     # A mean of equal shares need not be that share.
     share = None if mean["keep_ratio"] is None else round(mean["keep_ratio"], 4)
-    return {**mean, "keep_ratio": share, "of_today": all(map(is_of_today, rows))}
+    return {**mean, "keep_ratio": share}
 
 
 def default_runs() -> list[dict[str, Any]]:
@@ -70,11 +66,6 @@ def default_runs() -> list[dict[str, Any]]:
     rows = runs()
     usual = {(row["scene"], row["variant"]) for row in rows if row["keep_ratio"] == SHARE}
     return [row for row in rows if row["keep_ratio"] == SHARE or (row["scene"], row["variant"]) not in usual]
-
-
-def named(name: str, of_today: bool) -> str:
-    """A name of a method, marked if the row is not of today's default."""
-    return name if of_today else f"{name}, {EARLIER}"
 
 
 def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
@@ -107,7 +98,7 @@ def cells_of(row: dict[str, Any]) -> list[str]:
     """Capture, method, number of primitives, metrics and size of a row of runs.csv."""
     return [
         f"{row['scene']}, {row['resolution'].replace('x', ' x ')}",
-        named(METHODS[row["variant"]], row["of_today"]),
+        METHODS[row["variant"]],
         *(number(row["primitives"], 0), row["psnr_cell"], row["ssim_cell"]),
         number(row["psnr_base"], 2) if row["bytes_head"] else "",
         number(row["bytes_total"] / MB, 1),
@@ -119,7 +110,7 @@ def speed() -> list[str]:
     heads = ["field", "size", "head in", "primitives", "frame, ms", "splat, ms", "head, ms", "PSNR, dB", "SSIM", "GPU"]
     rows = [
         [
-            named(line["config"], is_of_today(line)),
+            line["config"],
             *(f"{line['width']} x {line['height']}", line["precision"] if line["ms_head"] else ""),
             *(number(line["primitives"], 0), number(line["ms_frame"], 2), number(line["ms_splat"], 2)),
             number(line["ms_head"], 2) if line["ms_head"] else "",
@@ -135,7 +126,7 @@ def training_time() -> list[str]:
     heads = ["capture", "method", "steps", "seconds", "ms a step", "primitives", "PSNR, dB", "SSIM", "GPU"]
     rows = [
         [
-            *(line["scene"], named(line["arm"], is_of_today({"variant": TIMED.get(line["arm"], line["arm"]), **line}))),
+            *(line["scene"], line["arm"]),
             *(number(line["steps"], 0), number(line["train_s"], 0)),
             number(1000 * line["train_s"] / line["steps"], 2),
             number(line["primitives"], 0),
@@ -153,9 +144,9 @@ def training_time() -> list[str]:
 def packing() -> list[str]:
     """What the default keeps of each capture, and its packs without and with a fine-tune, by means over seeds."""
     stock, made = {row["scene"]: row for row in runs() if row["variant"] == "splatfacto"}, []
-    for capture, (name, rows) in _defaults().items():
+    for capture, rows in _defaults().items():
         count, head = _mean(rows, "primitives"), "yes" if rows[0]["head"] == "yes" else ""
-        cells = [name, _quality([stock[capture]], ""), number(count, 0), head, _quality(rows, "")]
+        cells = [capture, _quality([stock[capture]], ""), number(count, 0), head, _quality(rows, "")]
         packed, tuned = (_mean(rows, f"{kind}_bytes") for kind in ("packed", "tuned"))
         cells += [number(packed / MB, 1), _quality(rows, "packed_")]
         cells += [number(tuned / MB, 2), number(8 * tuned / count, 0), _quality(rows, "tuned_")]
@@ -163,12 +154,12 @@ def packing() -> list[str]:
     return table("capture,stock,kept,head,sundae,MB,packed,MB,bits,fine-tuned".split(","), made)
 
 
-def _defaults() -> dict[str, tuple[str, list[dict[str, Any]]]]:
-    """Rows of curve.csv that the default has chosen, one for each seed, and their name in a table, by capture."""
+def _defaults() -> dict[str, list[dict[str, Any]]]:
+    """Rows of curve.csv that the default has chosen, one for each seed, by capture."""
     chosen: dict[str, list[dict[str, Any]]] = {}
     for row in (row for row in lines_of("curve.csv") if row["chosen"] == "yes"):
-        chosen.setdefault(row["capture"], []).append({"variant": "sundae-auto", **row})
-    return {capture: (named(capture, all(map(is_of_today, rows))), rows) for capture, rows in chosen.items()}
+        chosen.setdefault(row["capture"], []).append(row)
+    return chosen
 
 
 def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:
@@ -197,11 +188,11 @@ def packed_headline() -> list[str]:
     stock = _stock(lambda row: cell(row["bytes"], row["psnr"]))
     rows = [
         [
-            name,
+            capture,
             *(stock.get(capture, {}).get(kind, "") for kind in FORMATS),
             *(cell(_mean(found, f"{kind}_bytes"), _mean(found, f"{kind}_psnr")) for kind in ("packed", "tuned")),
         ]
-        for capture, (name, found) in _defaults().items()
+        for capture, found in _defaults().items()
     ]
     kinds = list(FORMATS.values())
     return table(["capture", f"splatfacto, {kinds[0]}", *kinds[1:], "sundae", "fine-tuned"], rows, words=1)
@@ -211,7 +202,7 @@ def _stock(cell: Callable[[dict[str, float]], Any]) -> dict[str, dict[str, Any]]
     """A cell of stock splatfacto for each format, by capture, from means over the seeds."""
     groups: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for line in sorted(lines_of("formats.csv"), key=lambda line: str(line["capture"])):
-        if line["method"] == "splatfacto" and is_of_today({"variant": "splatfacto", **line}):
+        if line["method"] == "splatfacto":
             theirs = " theirs" if line["program"].startswith("splat-transform") else ""
             groups.setdefault(line["capture"], {}).setdefault(line["format"] + theirs, []).append(line)
     return {
@@ -348,10 +339,7 @@ def with_tables(text: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", nargs="?", choices=TABLES, help="print this table, and rewrite nothing")
-    parser.add_argument("--suite", type=Path, metavar="RESULTS", help="results.jsonl of a suite to take over first")
     options = parser.parse_args()
-    if options.suite:
-        take_over(options.suite)
     if options.table:
         print("\n".join(TABLES[options.table]()))
         return

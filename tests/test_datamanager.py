@@ -15,8 +15,8 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from PIL import Image
-from ray_tracing import write_still_life
 
+from harness.still_life import write_still_life
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager, SundaeDatamanagerConfig, check_cameras
 from sundae_ns.errors import ConfigError, DataError
 

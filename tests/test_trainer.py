@@ -23,8 +23,8 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_meth
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
-from ray_tracing import write_still_life
 
+from harness.still_life import write_still_life
 from sundae_ns import method_configs
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, StorageError
 from sundae_ns.method_configs import sundae_tiny

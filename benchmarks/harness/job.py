@@ -37,7 +37,6 @@ from sundae_ns.scenes.finetune import finetune
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.models import Opened, load_model, load_run, model_of
 from sundae_ns.storage.atomic import write_text
-from sundae_ns.storage.fingerprint import fingerprint
 from sundae_ns.storage.pack import (
     FINETUNE_STEPS,
     FINETUNED,
@@ -224,12 +223,6 @@ def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
     config.steps_per_save = config.steps_per_eval_batch = NEVER
     config.steps_per_eval_image = config.steps_per_eval_all_images = NEVER
     return config, "ns-train " + " ".join(job.scene if word == job.data else word for word in arguments)
-
-
-def fingerprint_of(job: Job) -> str:
-    """Fingerprint of the run that the job makes with today's methods; its warm-up need not be done."""
-    # Neither capture nor seed counts.
-    return fingerprint(config_of(replace(job, data="capture", seed=0)))
 
 
 def config_of(job: Job) -> TrainerConfig:

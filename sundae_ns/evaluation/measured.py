@@ -34,11 +34,11 @@ COLUMNS = (
     *("scene", "method", "variant", "keep_ratio", "seed", "steps", "primitives"),
     *("psnr", "ssim", "psnr_base", "ssim_base", "psnr_fitted", "lpips", "lpips_net"),
     *("bytes_primitives", "bytes_head", "bytes_total", "ms_frame", "ms_splat", "ms_head"),
-    *("train_s", "prune_s", "peak_primitives", "peak_vram_mib", "gpu", "resolution", "fingerprint", "command"),
+    *("train_s", "prune_s", "peak_primitives", "peak_vram_mib", "gpu", "resolution", "command"),
 )
 """Columns of the CSV. Metrics are means over the test views, ``*_base`` without the head; ``bytes_*`` are bytes,
 ``ms_*`` milliseconds per frame, ``*_s`` seconds, and ``peak_vram_mib`` is the peak that torch allocated during
-training, MiB; ``fingerprint`` stands for the options of the run."""
+training, MiB."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,6 @@ class Measured:
     peak_vram_mib: float | None = None
     gpu: str = ""
     """Name of the GPU that rendered; empty for a CPU."""
-    fingerprint: str = ""
-    """Stands for the options of the run; empty if they are unknown."""
     command: str = ""
 
     @property

@@ -168,7 +168,6 @@ def measure_scene(
         prune_s=opened.prune_s,
         peak_primitives=model.state.pruning["peak"] or None,
         gpu=torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "",
-        fingerprint=opened.fingerprint,
         command=command,
     )
 

@@ -41,7 +41,6 @@ from sundae_ns.parsing import check_capture
 from sundae_ns.rendering.views import View
 from sundae_ns.storage import checkpoint
 from sundae_ns.storage.config_file import check_run, config_of, load_config
-from sundae_ns.storage.fingerprint import fingerprint
 from sundae_ns.storage.formats import kind_of, refuse, unread
 from sundae_ns.storage.run_folder import prunes_of
 from sundae_ns.training.pruning import PruningConfig
@@ -85,8 +84,6 @@ class Opened:
     """Seconds of its prunes."""
     packed_bytes: int | None = None
     """Size of the packed file; None for a run."""
-    fingerprint: str = ""
-    """Of the run's options; empty for a packed scene."""
     pipeline: Any = None
     """nerfstudio's pipeline of a run."""
 
@@ -160,7 +157,6 @@ def _open_packed(path: Path, data: Path | None) -> Opened:
 
 def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> Opened:
     config, stock = _config_of(path)
-    options = fingerprint(config)  # before a run of splatfacto becomes one of ours
     newest, loaded = checkpoint.read_newest(path.parent / config.relative_model_dir)
     manager = config.pipeline.datamanager = _datamanager_config(config.pipeline.datamanager)
     foreign = not isinstance(stock, SundaeModelConfig)
@@ -198,7 +194,6 @@ def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> O
         kept=1.0 if unpruned else _kept(prunes),
         seed=config.machine.seed,
         prune_s=0.0 if unpruned else _seconds(prunes),
-        fingerprint=options,
         pipeline=pipeline,
     )
 

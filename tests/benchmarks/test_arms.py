@@ -198,25 +198,3 @@ def test_arms_of_a_file_become_commands_of_ns_train(tmp_path: Path) -> None:
     pruning = steady.pipeline.model.pruning  # type: ignore[attr-defined]
     assert (steady.max_num_iterations, pruning.mode, pruning.keep_ratio) == (30_000, "continuous", 0.4)
     assert not steady.pipeline.model.evaluate_prune  # type: ignore[attr-defined]
-
-
-def test_options_of_an_arm_override_those_of_the_plan(tmp_path: Path) -> None:
-    text = "- {name: a, options: {pipeline.model.pruning.seed: 7, max-num-iterations: 100}}"
-    job = jobs_of(chosen(written(tmp_path, text)))["a"]
-    place = job.options.index("--pipeline.model.pruning.seed")
-    assert job.options[place + 1] == "7"
-    assert job.options.count("--pipeline.model.pruning.seed") == 1
-    # Rates decay over the arm's own length; its warm-up is that of all arms.
-    assert job.steps == 100
-    assert job.options[job.options.index("--optimizers.means.scheduler.max-steps") + 1] == "100"
-
-
-def test_each_method_has_a_warm_up_of_its_own(tmp_path: Path) -> None:
-    text = "- {name: a}\n- {name: b, options: {max-num-iterations: 9}}\n- {name: c, method: sundae-tiny}"
-    jobs = jobs_of(chosen(written(tmp_path, text)))
-    assert (jobs["a"].needs, jobs["b"].needs) == ("fox-sundae-warm-up-s42",) * 2
-    assert jobs["c"].needs == "fox-sundae-tiny-warm-up-s42"
-    warm_up = jobs["sundae-warm-up"]
-    assert (warm_up.method, warm_up.steps) == ("sundae", 12_000)
-    assert warm_up.options[-1] == "30000"
-    assert jobs["sundae-tiny-warm-up"].steps < 15_000

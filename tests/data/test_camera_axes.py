@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
-from ray_tracing.cameras import Camera, look_at, project
 from torch import Tensor
 
 from sundae_ns.data.camera_axes import world_to_camera, world_to_camera_floats
@@ -34,16 +32,6 @@ def test_a_point_in_front_and_below_has_positive_z_and_y() -> None:
     pose = torch.tensor([[1.0, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7]])
     point = torch.tensor([5.5, 5.0, 4.0, 1.0])  # half a unit to the right, one below, three in front of the camera
     assert (world_to_camera(pose) @ point).tolist() == [0.5, 1.0, 3.0, 1.0]
-
-
-def test_depth_agrees_with_the_projection_of_the_ray_tracer() -> None:
-    camera = Camera(look_at(np.array([3.0, 2.0, 1.0]), np.zeros(3)), focal=50.0, width=40, height=30)
-    points = np.random.default_rng(0).normal(size=(20, 3))
-    matrix = world_to_camera(torch.from_numpy(camera.camera_to_world[:3])).numpy()
-    local = points @ matrix[:3, :3].T + matrix[:3, 3]
-    image, depth = project(camera, points)
-    np.testing.assert_allclose(local[:, 2], depth)
-    np.testing.assert_allclose(50.0 * local[:, :2] / local[:, 2:] + [20, 15], image)
 
 
 def test_gradients_reach_the_pose() -> None:

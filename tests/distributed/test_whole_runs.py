@@ -199,7 +199,7 @@ if __name__ == "__main__":
 def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: Callable[[str, Path], None]) -> Path:
     """Runs of two ranks, trained once for all tests."""
     folder = tmp_path_factory.mktemp("ranks")
-    from ray_tracing import write_still_life  # not above: ranks import this file without pytest's paths
+    from harness.still_life import write_still_life  # not above: ranks import this file without pytest's paths
 
     write_still_life(folder / "scene", train_views=7, test_views=2, width=40, height=32, points=150)
     shutil.copytree(folder / "scene", folder / "masked")
@@ -395,7 +395,8 @@ raise ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -
 def test_ns_train_on_two_gpus(tmp_path: Path) -> None:
     """The command of users; the run opens on one GPU like any other."""
     from nerfstudio.utils.eval_utils import eval_setup
-    from ray_tracing import write_still_life
+
+    from harness.still_life import write_still_life
 
     write_still_life(tmp_path / "scene", train_views=12, test_views=3, width=64, height=48, points=300)
     options = {

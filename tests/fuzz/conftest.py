@@ -19,9 +19,9 @@ from typing import Any
 
 import pytest
 from colmap_models import write_model
-from ray_tracing import write_still_life
 from small_captures import HEIGHT, SIZE, VIEWS, WIDTH
 
+from harness.still_life import write_still_life
 from sundae_ns.errors import SundaeError
 
 FEW_SEEDS = 10

@@ -142,8 +142,8 @@ def test_members_of_an_exported_archive_are_plain_names(tmp_path: Path) -> None:
 
 def test_reading_a_capture_writes_nothing(tmp_path: Path, verdict: Any) -> None:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-    from ray_tracing import write_still_life
 
+    from harness.still_life import write_still_life
     from sundae_ns.parsing import LightNerfstudioParser, check_capture
 
     data = write_still_life(tmp_path / "scene", train_views=3, test_views=1, width=16, height=16, points=30, samples=1)

@@ -18,8 +18,9 @@ import pytest
 import yaml
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import profiler, writer
-from ray_tracing import write_still_life
 from short_prunes import short_prunes  # noqa: F401
+
+from harness.still_life import write_still_life
 
 Call = Callable[..., "subprocess.CompletedProcess[str]"]
 CallHere = Callable[..., str]

@@ -68,7 +68,7 @@ def test_each_format_has_a_row(tiny: Any, transform: Path, tmp_path: Path, monke
     assert psnr[".ply", "sundae_ns"] == pytest.approx(base, abs=1e-4)  # over the background of the run
     for row in rows.values():
         assert (row["capture"], row["primitives"]) == (opened.scene, str(scene.num_primitives))
-        assert (row["seed"], row["fingerprint"]) == (str(opened.seed), opened.fingerprint)
+        assert row["seed"] == str(opened.seed)
     sizes = {place: int(row["bytes"]) for place, row in rows.items()}
     assert sizes[".ply", "sundae_ns"] > sizes[".sog", "sundae_ns"] > 0
     assert sizes["fp32", ""] > sizes[".sundae", "sundae_ns"]

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from ray_tracing import write_still_life
 
+from harness.still_life import write_still_life
 from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 
 Load = Callable[..., SundaeDatamanager]

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from fake_colmap import FakeColmap
 from PIL import Image
-from ray_tracing import write_still_life
 from run_commands import write_video
 
+from harness.still_life import write_still_life
 from sundae_ns.data.capture import check_transforms
 from sundae_ns.errors import ConfigError, DataError, StorageError
 from sundae_ns.poses import Request, find_poses, reconstruct

@@ -11,9 +11,8 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.writer import EventName
 
-from harness.cameras import training_cameras
 from sundae_ns.api.packing import contents_of
-from sundae_ns.errors import CheckpointError, DataError
+from sundae_ns.errors import CheckpointError
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.scenes.models import load_model, load_run
 from sundae_ns.storage.config_file import load_config, schedule_length
@@ -91,7 +90,7 @@ HOSTILE = {
 def test_no_code_that_it_names_runs(tmp_path: Path, kind: str) -> None:
     mark, path = tmp_path / "ran", tmp_path / "config.yml"
     path.write_text(HOSTILE[kind].format(mark) if "{}" in HOSTILE[kind] else HOSTILE[kind])
-    for read in (load_config, load_run, load_model, training_cameras):
+    for read in (load_config, load_run, load_model):
         with pytest.raises(CheckpointError) as raised:
             read(path)
         assert "\n" not in str(raised.value)
@@ -113,8 +112,6 @@ def test_nerfstudios_own_reader_runs_it(tmp_path: Path) -> None:
 def test_a_file_that_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "config.yml"
     path.write_text(text)
-    with pytest.raises(DataError, match="another layout"):
-        training_cameras(path)
     with pytest.raises(CheckpointError):
         contents_of(load_run(path))
     with pytest.raises(CheckpointError):

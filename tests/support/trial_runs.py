@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import profiler, writer
-from ray_tracing import write_still_life
 from torch import Tensor
 
+from harness.still_life import write_still_life
 from sundae_ns.method_configs import sundae
 
 STEPS, PRUNE_AT = 100, 40

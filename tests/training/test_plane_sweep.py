@@ -1,16 +1,11 @@
-"""The plane sweep on ray-traced images, whose surfaces are known."""
+"""The plane sweep on images of a painted wall, the plane y = 0."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
-from ray_tracing.capture import still_life_views
-from ray_tracing.points import sparse_points
-from ray_tracing.still_life import still_life
-from ray_tracing.tracer import first_hits, render
 from torch import Tensor
 
 from sundae_ns.rendering.views import View
@@ -18,25 +13,34 @@ from sundae_ns.training import plane_sweep
 from sundae_ns.training.plane_sweep import Sweep
 from sundae_ns.training.state import Photo
 
-SIDE, VIEWS = 72, 24
-"""Neighbouring cameras differ by about 15 degrees around the scene, and by up to 36 in height."""
+SIDE, FOCAL = 72, 77.0
+
+
+def paint(points: Tensor) -> Tensor:
+    """Colours ``[N, 3]`` of points of the wall: sums of waves of many lengths."""
+    generator = torch.Generator().manual_seed(0)
+    waves = torch.randn(2, 40, generator=generator) * torch.logspace(0, 1, 40)
+    phases = 6.3 * torch.rand(40, 3, generator=generator)
+    values = torch.sin((points[:, [0, 2]].float() @ waves)[:, :, None] + phases).mean(dim=1)
+    return (0.5 + 1.6 * values).clamp(0, 1)
+
+
+def photo(eye: tuple[float, float, float]) -> Photo:
+    view = View.look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), width=SIDE, height=SIDE)
+    view = view._replace(K=torch.tensor([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1.0]]))
+    y, x = torch.meshgrid(torch.arange(SIDE) + 0.5, torch.arange(SIDE) + 0.5, indexing="ij")
+    rays = torch.stack([(x - SIDE / 2) / FOCAL, (y - SIDE / 2) / FOCAL, torch.ones_like(x)], dim=2).reshape(-1, 3)
+    rays = rays @ view.viewmat[:3, :3]
+    hits = view.center - rays * (view.center[1] / rays[:, 1])[:, None]
+    return Photo(view, paint(hits).reshape(SIDE, SIDE, 3), None)
 
 
 @pytest.fixture(scope="module")
 def capture() -> tuple[list[Photo], Tensor]:
-    """Three neighbouring photos of the still life, and sparse points."""
-    scene, cameras = still_life(), still_life_views(0, VIEWS, width=SIDE, height=SIDE)[:3]
-    images = [render(scene, camera) for camera in cameras]
-    xyz, _ = sparse_points(scene, cameras, images, 200, rng=np.random.default_rng(0))
-    photos = [
-        Photo(
-            View.from_pose(torch.from_numpy(camera.camera_to_world), (camera.focal,) * 2 + (SIDE / 2,) * 2, SIDE, SIDE),
-            torch.from_numpy(image),
-            None,
-        )
-        for camera, image in zip(cameras, images, strict=True)
-    ]
-    return photos, torch.from_numpy(xyz)
+    """Three neighbouring photos of the wall, from the side and from above, and sparse points."""
+    photos = [photo(eye) for eye in ((-1.2, -3.4, 0.8), (-0.3, -3.6, 1.3), (0.6, -3.3, 0.4))]
+    across = 2 * torch.rand(200, 2, generator=torch.Generator().manual_seed(1)) - 1
+    return photos, torch.stack([across[:, 0], torch.zeros(200), across[:, 1]], dim=1)
 
 
 def points_of(photos: list[Photo], sparse: Tensor, longest: int = SIDE, wanted: int = SIDE**2) -> tuple[Tensor, Tensor]:
@@ -47,15 +51,9 @@ def points_of(photos: list[Photo], sparse: Tensor, longest: int = SIDE, wanted: 
 
 
 def gaps(photos: list[Photo], points: Tensor) -> Tensor:
-    """Distance of points to the nearest surface along the rays from the three cameras, over their distance ``[N]``."""
-    found = []
-    for photo in photos:
-        eye = photo.view.center
-        rays = (points - eye).double()
-        length = rays.norm(dim=1)
-        hit, _ = first_hits(still_life(), eye.double().expand_as(rays).numpy(), (rays / length[:, None]).numpy())
-        found.append((torch.from_numpy(hit) - length).abs() / length)
-    return torch.stack(found).amin(dim=0)
+    """Distance of points to the wall along the rays from the three cameras, over their distance ``[N]``."""
+    eyes = torch.stack([photo.view.center for photo in photos])
+    return (points[:, 1] / (points[None, :, 1] - eyes[:, None, 1])).abs().amin(dim=0)
 
 
 @pytest.fixture(scope="module")
