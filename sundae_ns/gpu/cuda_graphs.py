@@ -21,9 +21,7 @@ RECORD_AT = 3
 
 _Result = TypeVar("_Result")
 
-_abandoned: list[torch.cuda.CUDAGraph] = []
-"""Unfinished graphs, kept alive because torch may still refer to them."""
-
+_abandoned: list[torch.cuda.CUDAGraph] = []  # unfinished graphs, kept alive because torch may still refer to them
 _thread = threading.local()
 _one_at_a_time = threading.Lock()
 

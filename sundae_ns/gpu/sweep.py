@@ -27,10 +27,8 @@ OPTIONS = (f"-DWINDOW={WINDOW}", f"-DTILE_WIDTH={_TILE_WIDTH}", f"-DTILE_HEIGHT=
 class Patches(NamedTuple):
     """The patches around the pixels of an image, float32 ``[H, W]`` each."""
 
-    grey: Tensor
-    """Grey value of the central pixel."""
-    size: Tensor
-    """Number of pixels inside the image."""
+    grey: Tensor  # of the central pixel
+    size: Tensor  # number of pixels inside the image
     mean: Tensor
     deviation: Tensor
 

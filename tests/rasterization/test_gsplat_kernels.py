@@ -1,4 +1,4 @@
-"""The tile lists given to gsplat: the CUDA source, compiled for the CPU."""
+"""Our kernels in gsplat's pipeline: the CUDA source, compiled for the CPU, against the reference in float64."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from sundae_ns.rasterization import (
     harmonic_colors,
     select_backend,
 )
-from sundae_ns.rasterization.gsplat_kernels import TILE, Capacity, Splats, tile_lists
+from sundae_ns.rasterization.gsplat_kernels import TILE, Capacity, GsplatLists, Splats, blend, tile_lists
+from sundae_ns.rasterization.reference import Projection, composite
 
 Field = dict[str, Tensor]
 
@@ -29,7 +30,31 @@ Field = dict[str, Tensor]
 @pytest.fixture(autouse=True)
 def on_cpu(load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gsplat_kernels, "load_kernels", load_on_cpu)
+    monkeypatch.setattr(gsplat_kernels, "LANES", 1)
     monkeypatch.setattr(gsplat_backend, "_check_kernels_take", lambda _: None)
+
+
+def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gsplat_kernels, "LANES", 32)
+    for dtype in (torch.int16, torch.int32):
+        compile_for_gpu("tiles.cu", "sm_75", gsplat_kernels.listing_options(dtype))
+    compile_for_gpu("colors.cu", "sm_90", gsplat_kernels.COLOR_OPTIONS)
+    for architecture, channels, absgrad in (("sm_75", 3, True), ("sm_90", 16, False), ("sm_90", 32, False)):
+        compile_for_gpu("blending.cu", architecture, gsplat_kernels.blending_options(channels, absgrad=absgrad))
+
+
+def test_second_derivatives_are_refused() -> None:
+    primitives = ellipses(5, 3, 20, 20)
+    leaves = leaves_of(primitives, torch.float32)
+    image, _ = blend(*leaves.values(), every_tile(primitives, 20, 20, spare=0), False)
+    means, center, dc, rest = colors_inputs()
+    colors = gsplat_kernels.harmonic_colors(1, means.requires_grad_(), center, dc, rest)
+    for value, leaf in ((image, leaves["means2d"]), (colors, means)):
+        with pytest.raises(SundaeError, match="second derivative"):
+            torch.autograd.grad(value.sum(), leaf, create_graph=True)
+
+
+# --------------------------------------------------------------------------------------------------------------- tiles
 
 
 def field(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Field:
@@ -182,6 +207,118 @@ def test_more_tiles_than_16_bits_count() -> None:
     assert {tile % 3300 // 100 for tile, list_ in enumerate(found) if len(list_)} == {32}
 
 
+# ------------------------------------------------------------------------------------------------------------ blending
+
+NAMES = ("means2d", "conics", "colors", "opacities")
+
+
+def ellipses(n: int, channels: int, width: int, height: int, *, opacity: float = 1.0) -> dict[str, Tensor]:
+    """Ellipses in and around an image, float64; some are opaque, and some are too faint to be blended."""
+    angle, sides = torch.rand(n) * 3.2, 10 ** (torch.rand(2, n) * 2.5 - 0.5)
+    c, s = angle.cos(), angle.sin()
+    xx, yy = sides[0] * c * c + sides[1] * s * s + 0.3, sides[0] * s * s + sides[1] * c * c + 0.3
+    xy = (sides[0] - sides[1]) * c * s
+    covariances = torch.stack([xx, xy, yy], dim=1).double()
+    det = covariances[:, 0] * covariances[:, 2] - covariances[:, 1] ** 2
+    opacities = (torch.rand(n).double() * 1.3).clamp(max=1) * opacity
+    opacities[::13] = 1e-3
+    return {
+        "covariances": covariances,
+        "depths": torch.rand(n).double() + 0.1,
+        "means2d": (torch.rand(1, n, 2).double() * 1.4 - 0.2) * torch.tensor([width, height]),
+        "conics": (covariances[:, [2, 1, 0]] * torch.tensor([1, -1, 1]) / det[:, None])[None],
+        "colors": torch.rand(1, n, channels).double(),
+        "opacities": opacities[None],
+    }
+
+
+def every_tile(primitives: dict[str, Tensor], width: int, height: int, spare: int) -> GsplatLists:
+    """Every primitive in every tile, by depth, and a tile below the image with ``spare`` pairs."""
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    order = primitives["depths"].argsort(stable=True).int()
+    starts = torch.arange(columns * (rows + (spare > 0)), dtype=torch.int32).clamp(max=columns * rows) * len(order)
+    pairs = torch.cat([order.repeat(columns * rows), torch.zeros(spare, dtype=torch.int32)])
+    return GsplatLists(width, height, starts.view(1, -1, columns), pairs)
+
+
+def expected(
+    primitives: dict[str, Tensor], leaves: dict[str, Tensor], width: int, height: int, absgrad: bool
+) -> tuple[Tensor, Tensor]:
+    radii = (3 * primitives["covariances"][:, [0, 2]].amax(1).sqrt()).ceil() + 1000  # no squares: every tile
+    projection = Projection(
+        means2d=primitives["means2d"][0],
+        covars2d=primitives["covariances"],
+        conics=leaves["conics"][0],
+        depths=primitives["depths"],
+        compensations=torch.ones_like(primitives["depths"]),
+        radii=radii.int(),
+    )
+    opacities = leaves["opacities"][0]
+    return composite(leaves["means2d"], projection, opacities, leaves["colors"][0], width, height, absgrad=absgrad)
+
+
+def leaves_of(primitives: dict[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
+    return {name: primitives[name].to(dtype, copy=True).requires_grad_() for name in NAMES}
+
+
+@pytest.mark.parametrize(
+    ("n", "channels", "width", "height", "absgrad"),
+    [
+        (60, 3, 40, 23, False),
+        (60, 3, 16, 16, True),
+        (400, 16, 33, 17, False),  # more than a batch, and pixels that are finished early
+        (20, 35, 20, 20, True),
+        (1, 1, 1, 1, False),
+    ],
+)
+@pytest.mark.parametrize("opacity", [0.3, 1.0], ids=["faint", "opaque"])
+def test_image_and_gradients_match_the_reference(
+    n: int, channels: int, width: int, height: int, absgrad: bool, opacity: float
+) -> None:
+    primitives = ellipses(n, channels, width, height, opacity=opacity)
+    ours, exact = leaves_of(primitives, torch.float32), leaves_of(primitives, torch.float64)
+    lists = every_tile(primitives, width, height, spare=7 if absgrad else 0)
+    image, alpha = blend(*ours.values(), lists, absgrad)
+    other_image, other_alpha = expected(primitives, exact, width, height, absgrad)
+    assert image.shape == (1, height, width, channels)
+    torch.testing.assert_close(image[0].double(), other_image, rtol=0, atol=2e-5)
+    torch.testing.assert_close(alpha[0].double(), other_alpha, rtol=0, atol=2e-5)
+    weights = torch.randn(height, width, channels + 1, dtype=torch.float64)
+    for images, alphas in ((image[0], alpha[0]), (other_image, other_alpha)):
+        (torch.cat([images, alphas], dim=-1) * weights).sum().backward()
+    pairs = [(ours[name].grad, exact[name].grad) for name in NAMES]
+    if absgrad:
+        pairs.append((ours["means2d"].absgrad, exact["means2d"].absgrad))  # type: ignore[attr-defined]
+    for found, truth in pairs:
+        assert found is not None
+        assert truth is not None
+        assert (found - truth).norm() <= 1e-4 * truth.norm() + 1e-6
+
+
+def test_gradients_flow_into_some_inputs_only() -> None:
+    primitives = ellipses(30, 3, 20, 20)
+    ours = {name: primitives[name].float() for name in NAMES}
+    ours["colors"].requires_grad_()
+    lists = every_tile(primitives, 20, 20, spare=0)
+    image, _ = blend(*ours.values(), lists, False)
+    (gradient,) = torch.autograd.grad(image.sum(), ours["colors"])
+    assert (gradient >= 0).all()
+    assert gradient.sum() > 0
+
+
+def test_an_empty_list_leaves_the_background() -> None:
+    ours = leaves_of(ellipses(5, 3, 20, 20), torch.float32)
+    lists = GsplatLists(20, 20, torch.zeros(1, 2, 2, dtype=torch.int32), torch.zeros(0, dtype=torch.int32))
+    image, alpha = blend(*ours.values(), lists, False)
+    assert not image.any()
+    assert not alpha.any()
+    (image.sum() + alpha.sum()).backward()
+    assert all(not leaf.grad.any() for leaf in ours.values() if leaf.grad is not None)
+
+
+# ------------------------------------------------------------------------------------------------------------- colours
+
+
 def colors_inputs() -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Centres, a camera's centre, and coefficients of degree 4.
 
@@ -214,19 +351,6 @@ def test_colors_and_gradients_match_the_reference(degree: int, each: bool) -> No
         # The constant harmonic does not depend on the place.
         gradient = torch.zeros_like(other) if other.grad is None else other.grad
         torch.testing.assert_close(one.grad.double(), gradient, rtol=1e-4, atol=5e-5)
-
-
-def test_second_derivatives_of_colors_are_refused() -> None:
-    means, center, dc, rest = colors_inputs()
-    found = gsplat_kernels.harmonic_colors(1, means.requires_grad_(), center, dc, rest)
-    with pytest.raises(SundaeError, match="second derivative"):
-        torch.autograd.grad(found.sum(), means, create_graph=True)
-
-
-def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes]) -> None:
-    for dtype in (torch.int16, torch.int32):
-        compile_for_gpu("tiles.cu", "sm_75", gsplat_kernels.listing_options(dtype))
-    compile_for_gpu("colors.cu", "sm_90", gsplat_kernels.COLOR_OPTIONS)
 
 
 def test_harmonics_that_are_not_recorded_are_gsplats(monkeypatch: pytest.MonkeyPatch) -> None:
