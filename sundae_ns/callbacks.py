@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.distributed import Ranks
-from sundae_ns.rendering import LocalField, RenderSettings, TrainingView
+from sundae_ns.rendering.render import LocalField, RenderSettings, TrainingView
 from sundae_ns.storage.accounting import BYTES_PER_FLOAT, bytes_of_module, megabytes
 from sundae_ns.storage.config_file import find_config
 from sundae_ns.storage.run_folder import take_records

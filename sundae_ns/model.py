@@ -270,7 +270,7 @@ class SundaeModel(SplatfactoModel):
         return late
 
     def contribution(self, datamanager: SundaeDatamanager, count: int | None = None) -> Tensor:
-        """Summed blending weight of each primitive ``[N]``; see :func:`sundae_ns.rendering.contribution`."""
+        """Summed blending weight of each primitive ``[N]``; see :func:`sundae_ns.rendering.render.contribution`."""
         views, settings = training_views(self, datamanager), self.render_settings(training=False)
         return contribution(self.source, views, self.background_color, settings, count, console=CONSOLE)
 

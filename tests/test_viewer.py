@@ -26,7 +26,7 @@ from sundae_ns.evaluation.count_curve import CurvePoint, expected_change
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.pruning import PruneRule, response
 from sundae_ns.pruning.decision import FieldPruner
-from sundae_ns.rendering import LocalField, render_view
+from sundae_ns.rendering.render import LocalField, render_view
 from sundae_ns.training.nerfstudio_configs import FusedAdamConfig
 from sundae_ns.training.pruning import PruningConfig, PruningSchedule
 from sundae_ns.viewer import RuleName, ViewerControls, previewed_rule

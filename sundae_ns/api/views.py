@@ -18,7 +18,7 @@ from sundae_ns.data.colmap import read_images
 from sundae_ns.data.lenses import kind_of_frame, with_focal_lengths
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.covariance import rotation_matrices
-from sundae_ns.rendering import View
+from sundae_ns.rendering.views import View
 
 Direction = tuple[float, float, float]
 

@@ -17,9 +17,8 @@ from sundae_ns.gaussians import mend
 from sundae_ns.gaussians.covariance import chunks
 from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.rasterization import rasterize_views
-from sundae_ns.rendering import View
 from sundae_ns.rendering.render import pass_options
-from sundae_ns.rendering.views import poses_looking_at
+from sundae_ns.rendering.views import View, poses_looking_at
 
 FOV = 40.0
 VIEWS = {"cpu": 128, "cuda": 256}

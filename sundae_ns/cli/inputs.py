@@ -20,7 +20,7 @@ from sundae_ns.api.views import views_of
 from sundae_ns.api.virtual import VIEWS
 from sundae_ns.cli.options import Flag
 from sundae_ns.errors import DataError
-from sundae_ns.rendering import View
+from sundae_ns.rendering.views import View
 from sundae_ns.storage.config_file import check_run, find_config
 from sundae_ns.storage.formats import kind_of, kind_of_primitives
 from sundae_ns.storage.ply import has_own_columns

@@ -17,7 +17,7 @@ from sundae_ns.cli.options import Direction, Flag, Out, Source, check_file
 from sundae_ns.errors import ConfigError
 from sundae_ns.evaluation.video import write_video
 from sundae_ns.rasterization import fastest_device
-from sundae_ns.rendering import View
+from sundae_ns.rendering.views import View
 from sundae_ns.storage.atomic import replacing, write_image
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")

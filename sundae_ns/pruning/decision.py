@@ -82,7 +82,7 @@ def decide(
         rule: how to score, select and merge.
         count: number of primitives to keep, at least 1; all finite primitives are kept if they are fewer.
         contribution: blending weights, summed over the training views, any device ``[N]``; see
-            :func:`sundae_ns.rendering.contribution`. Needed if ``rule.uses_contribution``.
+            :func:`sundae_ns.rendering.render.contribution`. Needed if ``rule.uses_contribution``.
         graph: :func:`field_graph` of the finite primitives by the same rule; built if not given and needed.
 
     Raises:

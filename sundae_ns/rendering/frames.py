@@ -189,7 +189,7 @@ class FrameReplay:
         self._lock = Lock()
 
     def render(self, source: LocalField, view: View, background: Tensor, settings: RenderSettings) -> dict[str, Any]:
-        """The images of a view, as :func:`sundae_ns.rendering.render_view` makes them.
+        """The images of a view, as :func:`sundae_ns.rendering.render.render_view` makes them.
 
         Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of a whole local field. Other
         frames, and the first of a size, are rendered kernel by kernel. Both agree up to the order in which kernels sum.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -100,7 +99,7 @@ class View(NamedTuple):
 
     def zoomed(self, factor: float) -> View:
         """The camera with the same field of view and sides ``factor`` times as long."""
-        width, height = _zoomed_size(self.width, self.height, factor)
+        width, height = (max(round(side * factor), 1) for side in (self.width, self.height))
         # Scale by the rounded sizes, so that the edges of both images agree. Row by row, because a tensor of numbers
         # would be copied to the device.
         K = torch.stack([self.K[0] * (width / self.width), self.K[1] * (height / self.height), self.K[2]])
@@ -135,26 +134,6 @@ def poses_looking_at(eyes: Tensor, targets: Tensor, up: Tensor) -> Tensor:
     right = torch.where(right.norm(dim=-1, keepdim=True) < 1e-6, other, right)
     right = torch.nn.functional.normalize(right, dim=-1)
     return torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)
-
-
-def zoomed(camera: Cameras, factor: float) -> Cameras:
-    """nerfstudio's camera of shape ``(1,)`` with the same field of view and sides ``factor`` times as long.
-
-    Size and intrinsics are those of :meth:`View.zoomed`. nerfstudio's own method rounds the sides but not the
-    intrinsics, which moves the edges of the image against those of the resized truth.
-    """
-    before = int(camera.width), int(camera.height)
-    width, height = _zoomed_size(*before, factor)
-    x, y = width / before[0], height / before[1]
-    result = copy.deepcopy(camera)
-    result.fx, result.cx, result.fy, result.cy = camera.fx * x, camera.cx * x, camera.fy * y, camera.cy * y
-    result.width, result.height = torch.full_like(camera.width, width), torch.full_like(camera.height, height)
-    return result
-
-
-def _zoomed_size(width: int, height: int, factor: float) -> tuple[int, int]:
-    """Width and height of an image with sides ``factor`` times as long, in whole pixels."""
-    return max(round(width * factor), 1), max(round(height * factor), 1)
 
 
 def view_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None = None, downscale: int = 1) -> View:

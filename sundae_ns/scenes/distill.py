@@ -27,7 +27,8 @@ from sundae_ns.gaussians import FEATURES, initial_features, mend
 from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.gpu.kernels import naming_full_memory
 from sundae_ns.model import SundaeModelConfig
-from sundae_ns.rendering import LocalField, View
+from sundae_ns.rendering.render import LocalField
+from sundae_ns.rendering.views import View
 from sundae_ns.storage.accounting import stored_bytes
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, weights_of

@@ -24,7 +24,7 @@ from sundae_ns.evaluation import (
 )
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
-from sundae_ns.rendering import compensate, draw, scale_plan
+from sundae_ns.rendering.render import compensate, draw, scale_plan
 from sundae_ns.scenes.models import Opened
 from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module
 

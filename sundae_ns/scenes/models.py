@@ -273,9 +273,6 @@ def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
         value.data = new
 
 
-# ---------------------------------------------------------------------------------------------------- runs and captures
-
-
 def load_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> Scene:
     """The scene of a finished run with some of its training cameras, and what says how its capture is read.
 

@@ -195,7 +195,7 @@ LEAST_OPACITY = 0.005
 
 Contribute = Callable[[int | None], Tensor]
 """Renders the training views and returns the contribution of the pruner's primitives ``[N]``; the argument is ``count``
-of :func:`sundae_ns.rendering.contribution`."""
+of :func:`sundae_ns.rendering.render.contribution`."""
 
 
 @dataclass(frozen=True)

@@ -259,7 +259,7 @@ class TrainingStep(NamedTuple):
         *,
         depth: bool = False,
     ) -> tuple[dict[str, Any], Rasterization]:
-        """The first half: primitives, one splatting pass, and the head; see :func:`sundae_ns.rendering.render_view`."""
+        """The first half: primitives, one splatting pass, and the head; see :func:`render_view`."""
         return render_view(self.source, view, background, settings, depth=depth)
 
     def terms(

@@ -12,8 +12,8 @@ from torch import Tensor
 from sundae_ns.api.packing import scene_of, sensitivity_of, views_of_arrays
 from sundae_ns.api.scene import Scene
 from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.rendering import LocalField, View
-from sundae_ns.rendering.render import render_view
+from sundae_ns.rendering.render import LocalField, render_view
+from sundae_ns.rendering.views import View
 from sundae_ns.storage.pack import PackedScene
 
 

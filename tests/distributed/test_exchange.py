@@ -26,7 +26,8 @@ from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.gaussians.surgery import keep
 from sundae_ns.rasterization import rasterize, select_backend
 from sundae_ns.rasterization.reference import project
-from sundae_ns.rendering import ColorSettings, LocalField, View
+from sundae_ns.rendering.render import ColorSettings, LocalField
+from sundae_ns.rendering.views import View
 from sundae_ns.training.nerfstudio_configs import FusedAdamConfig
 from sundae_ns.training.state import Extension, FieldState
 

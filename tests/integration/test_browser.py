@@ -25,7 +25,7 @@ from viser import transforms
 
 from harness.viewer_page import Server, ViewerPage
 from sundae_ns.pruning import kept_count, prune_field
-from sundae_ns.rendering import LocalField, render_view
+from sundae_ns.rendering.render import LocalField, render_view
 from sundae_ns.viewer import previewed_rule
 
 pytestmark = [pytest.mark.browser, needs_chromium]

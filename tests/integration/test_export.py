@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians.gaussians import Field
-from sundae_ns.rendering import LocalField, render_view
+from sundae_ns.rendering.render import LocalField, render_view
 from sundae_ns.scenes.models import load_model
 from sundae_ns.storage.ply import read_ply
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import shutil
@@ -17,7 +18,6 @@ import yaml
 
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.evaluation import Measured, psnr
-from sundae_ns.rendering import zoomed
 from sundae_ns.scenes import models as opening
 from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, sizes
 from sundae_ns.scenes.models import Opened, load_model
@@ -81,7 +81,8 @@ def test_the_head_is_timed_at_the_size_at_which_it_runs(tiny: Any) -> None:
 
     # Frames of other scales are corrected at the trained one, thumbnails not at all.
     for factor, expected in ((1.0, {whole}), (0.875, {whole}), (0.5, {whole}), (2.0, {whole}), (0.25, set())):
-        camera = zoomed(run.cameras[0], factor)
+        camera = copy.deepcopy(run.cameras[0])
+        camera.rescale_output_resolution(factor)
         assert sizes_seen(partial(model.get_outputs_for_camera, camera)) == expected
         assert sizes_seen(partial(frame_times, model, [camera], warmup=0, repeats=1)) == expected
     assert frame_times(model, [camera], warmup=0, repeats=1).head == 0

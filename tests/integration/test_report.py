@@ -22,7 +22,7 @@ from PIL import Image
 from sundae_ns.api.packing import contents_of
 from sundae_ns.cli import main
 from sundae_ns.evaluation import COLUMNS, flip_available, quality_of
-from sundae_ns.rendering import render_view
+from sundae_ns.rendering.render import render_view
 from sundae_ns.scenes.models import load_model, load_run
 from sundae_ns.storage.pack import write_scene
 

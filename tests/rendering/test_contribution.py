@@ -17,8 +17,7 @@ from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.model import SundaeModel
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterization import blending_weights, rasterize
-from sundae_ns.rendering import LocalField, TrainingView, contribution
-from sundae_ns.rendering.render import pass_options
+from sundae_ns.rendering.render import LocalField, TrainingView, contribution, pass_options
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[[SundaeModel], Any]

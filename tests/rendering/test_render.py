@@ -18,7 +18,7 @@ from sundae_ns.errors import MemoryExhaustedError
 from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.method_configs import sundae
 from sundae_ns.model import SundaeModel
-from sundae_ns.rendering import LocalField, render_view
+from sundae_ns.rendering.render import LocalField, render_view
 from sundae_ns.rendering.views import crop_image
 
 Build = Callable[..., SundaeModel]

@@ -21,8 +21,10 @@ from sundae_ns.gaussians.gaussians import Field
 from sundae_ns.gpu.cuda_graphs import RECORD_AT
 from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization import Capacity, RecordableGsplat
-from sundae_ns.rendering import LocalField, RenderSettings, View, frames, render_view
+from sundae_ns.rendering import frames
 from sundae_ns.rendering.frames import FrameReplay
+from sundae_ns.rendering.render import LocalField, RenderSettings, render_view
+from sundae_ns.rendering.views import View
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]

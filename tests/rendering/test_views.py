@@ -14,8 +14,8 @@ from torch import Tensor
 
 from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.model import SundaeModel
-from sundae_ns.rendering import StepResolution
-from sundae_ns.rendering.views import view_of, zoomed
+from sundae_ns.rendering.render import StepResolution
+from sundae_ns.rendering.views import view_of
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -33,22 +33,6 @@ def test_a_primitive_lands_where_the_pinhole_says(build: Build, camera: MakeCame
     row, column = divmod(int(alpha.argmax()), 40)
     # In front of the camera by 3; x to the right, y up, pixel centres at one half.
     assert (column, row) == (int(20 + 30 * 0.55 / 3), int(16 - 30 * 0.25 / 3))
-
-
-@pytest.mark.parametrize("factor", [0.01, 0.4, 1.0, 1.37])
-@torch.no_grad()
-def test_a_zoomed_camera_has_the_zoomed_view(build: Build, camera: MakeCamera, factor: float) -> None:
-    """Of a picture whose sides are rounded by unlike shares."""
-    model, given = build().eval(), camera(41, 33)
-    expected, found = model.view_of(given).zoomed(factor), model.view_of(zoomed(given, factor))
-    assert (found.width, found.height) == (expected.width, expected.height)
-    torch.testing.assert_close(found.K, expected.K)
-    # The same is seen from edge to edge.
-    sides = torch.tensor([[found.width], [found.height], [1.0]])
-    torch.testing.assert_close(found.K / sides, model.view_of(given).K / torch.tensor([[41.0], [33.0], [1.0]]))
-    assert torch.equal(found.viewmat, expected.viewmat)
-    # What is given stays as it is.
-    assert (int(given.width), int(given.height), float(given.fx), float(given.cy)) == (41, 33, 30.0, 16.5)
 
 
 @pytest.mark.parametrize(("step", "mirrored"), [(10, True), (11, False)])

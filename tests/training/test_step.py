@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.model import SundaeModel
-from sundae_ns.rendering import View
+from sundae_ns.rendering.views import View
 from sundae_ns.training.step import StepInputs
 
 Build = Callable[..., SundaeModel]
