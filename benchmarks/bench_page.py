@@ -2,16 +2,11 @@
 
     python benchmarks/bench_page.py scene.sundae               # images of at most 320 pixels
     python benchmarks/bench_page.py scene.sundae --side 800 --half
-    python benchmarks/bench_page.py scene.sundae --dawn 800x533 1920x1080     # time the passes, without a browser
 
 It needs a Chromium, which renders in software here. The cameras and the sizes that the head was trained at are scaled
 together, so both renderers run the head at the size of the image. The page's images are bytes: rounding alone gives
 58.9 dB. With ``--half`` the page's renderer also runs under Node in half precision, on an adapter that has it (``make
 browser`` installs what it needs). Lines belong in results/page.jsonl, and ``make browser`` checks them.
-
-``--dawn`` runs the page's renderer under Node, on the GPU that Dawn finds by Vulkan. Each size has a line with the head
-off and one with it on: milliseconds, and PSNR of the first two cameras. Images are cropped to the size. ``--folder``
-writes all that this needs to a folder instead, for ``node FOLDER/timing.mjs FOLDER`` on another machine.
 """
 
 from __future__ import annotations
@@ -20,12 +15,10 @@ import argparse
 import base64
 import copy
 import json
-import platform
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -50,15 +43,6 @@ CAMERAS = 6
 SIDE = 320
 """Longest side of an image, pixels."""
 WEB = Path(__file__).parents[1] / "web"
-FRAMES = 60
-COMPARED = 2
-"""Cameras whose images are compared where passes are timed."""
-ROWS = 135
-"""Most rows of such an image that are compared: images of full size are many megabytes."""
-PROCESSORS = {"x86_64": "x64", "aarch64": "arm64"}
-"""Node's names."""
-SECONDS_OF_FRAMES = 20.0
-"""Longest time for one kind of frames: a software adapter takes seconds for each."""
 
 
 def sized(scene: PackedScene, intrinsics: Tensor, sizes: Tensor, picks: Tensor, share: float) -> PackedScene:
@@ -88,16 +72,6 @@ def scaled(scene: PackedScene, side: int) -> PackedScene:
     return sized(scene, intrinsics * shares.repeat(1, 2), targets, picks, float(shares.mean()))
 
 
-def cropped(scene: PackedScene, width: int, height: int) -> PackedScene:
-    """The scene with six of its cameras at one size, which shows the middle of their images; as :func:`scaled`."""
-    picks, intrinsics, sizes = picked(scene)
-    target = torch.tensor([width, height], dtype=sizes.dtype)
-    shares = (target / sizes).amax(1, keepdim=True)
-    lenses = intrinsics * shares
-    lenses[:, 2:] -= (sizes * shares - target) / 2
-    return sized(scene, lenses, target.expand_as(sizes), picks, float(shares.mean()))
-
-
 def write_changed(out: Path, scene: Path, small: PackedScene) -> PackedScene:
     """Write a file with the cameras of ``small``; levels and steps are copied: the page decodes those of the file."""
     header = container.read_header(scene)
@@ -112,10 +86,10 @@ def write_changed(out: Path, scene: Path, small: PackedScene) -> PackedScene:
     return read_scene(out)
 
 
-def truths(scene: PackedScene, only: slice = slice(None)) -> list[dict[str, NDArray[np.float32]]]:
-    """``rgb`` and ``base_rgb`` of each camera, or of some of them, by Python."""
+def truths(scene: PackedScene) -> list[dict[str, NDArray[np.float32]]]:
+    """``rgb`` and ``base_rgb`` of each camera by Python."""
     model = model_of(scene_of(scene))
-    cameras = {name: value[only] for name, value in arrays_of_views(scene_of(scene).views).items()}
+    cameras = arrays_of_views(scene_of(scene).views)
     images = []
     for pose, lens, size in zip(*(cameras[name] for name in ("poses", "intrinsics", "sizes")), strict=True):
         fx, fy, cx, cy = lens.float().reshape(4, 1, 1)
@@ -216,86 +190,13 @@ def half_images(packed: Path) -> tuple[str, list[NDArray[np.float64]]] | None:
         return adapter, [each[..., :3] / 255 for each in pixels]
 
 
-def write_timing(
-    folder: Path, scene: Path, sizes: Sequence[tuple[int, int]], frames: int = FRAMES, *, as_trained: bool = False
-) -> None:
-    """Write what times the page's passes on any machine with Node: ``node FOLDER/timing.mjs FOLDER``.
-
-    Args:
-        folder: takes the program, Dawn for this system, a scene for each size, and rows of Python's images in 16 bits.
-        scene: written by ``sundae pack``.
-        sizes: width and height of the images, pixels.
-        frames: most frames of each kind.
-        as_trained: leave the head at the scale of its training; otherwise it runs at the size of the images.
-    """
-    package = Path("node_modules") / "webgpu"
-    dawn = f"{sys.platform}-{PROCESSORS.get(platform.machine(), platform.machine())}"
-    shutil.copytree(WEB / "tests" / package / "dist" / dawn, folder / package / "dist" / dawn)
-    for name in ("index.js", "package.json", "LICENSE.md"):
-        shutil.copy(WEB / "tests" / package / name, folder / package / name)
-    bundled("timing.ts", folder / "timing.mjs", "--platform=node", "--external:webgpu")
-    scenes, whole = [], read_scene(scene)
-    for width, height in sizes:
-        file, step = f"{width}x{height}.sundae", -(-height // ROWS)
-        small = cropped(whole, width, height)
-        if as_trained:
-            small = replace(small, meta=whole.meta)
-        small = write_changed(folder / file, scene, small)
-        images = truths(small, slice(COMPARED))
-        for camera, image in enumerate(images):
-            for name in ("base_rgb", "rgb") if small.head else ("base_rgb",):
-                rows = (image[name][::step].clip(0, 1) * 65535).round().astype("<u2")
-                rows.tofile(folder / f"{file}.{camera}.{name}")
-        scenes.append({"file": file, "compared": list(range(len(images))), "step": step})
-    task = {"name": scene.name, "frames": frames, "seconds": SECONDS_OF_FRAMES, "scenes": scenes}
-    (folder / "task.json").write_text(json.dumps(task))
-
-
-def timed(
-    scene: Path, sizes: Sequence[tuple[int, int]], frames: int = FRAMES, *, as_trained: bool = False
-) -> list[dict[str, Any]]:
-    """Time the page's passes on this machine's GPU, a row for each size and with the head off and on.
-
-    Raises:
-        SystemExit: the packages of ``web/tests`` are missing, or there is no adapter.
-    """
-    if not has_packages():
-        sys.exit("no Dawn for Node here: make browser installs it where it finds npm")
-    with TemporaryDirectory() as folder:
-        write_timing(Path(folder), scene, sizes, frames, as_trained=as_trained)
-        words = ["node", str(Path(folder) / "timing.mjs"), folder]
-        found = subprocess.run(words, check=False, stdout=subprocess.PIPE, text=True)
-    rows = [json.loads(line) for line in found.stdout.splitlines()]
-    if found.returncode != 0:
-        sys.exit(rows[-1]["error"] if rows and "error" in rows[-1] else "Node failed; see above")
-    return rows
-
-
-def size_of(text: str) -> tuple[int, int]:
-    width, height = map(int, text.split("x"))
-    return width, height
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="written by sundae pack")
     parser.add_argument("--side", type=int, default=SIDE, help="longest side of the images, pixels")
     parser.add_argument("--half", action="store_true", help="render in half precision too")
-    parser.add_argument("--dawn", type=size_of, nargs="+", metavar="SIZE", help="time the passes at sizes like 800x533")
-    parser.add_argument("--frames", type=int, default=FRAMES, help="with --dawn: most frames of each kind")
-    parser.add_argument("--as-trained", action="store_true", help="with --dawn: the head at the scale of its training")
-    parser.add_argument("--folder", type=Path, help="with --dawn: write what it runs to this folder, and do not run it")
     options = parser.parse_args()
-    if options.folder and (not options.dawn or options.folder.exists()):
-        parser.error("--folder names a new folder, and needs --dawn")
-    if options.dawn and options.folder:
-        options.folder.mkdir(parents=True)
-        write_timing(options.folder, options.scene, options.dawn, options.frames, as_trained=options.as_trained)
-    elif options.dawn:
-        for row in timed(options.scene, options.dawn, options.frames, as_trained=options.as_trained):
-            print(json.dumps(row))
-    else:
-        print(json.dumps(compared(options.scene, options.side, half=options.half)))
+    print(json.dumps(compared(options.scene, options.side, half=options.half)))
 
 
 if __name__ == "__main__":

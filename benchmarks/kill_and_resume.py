@@ -6,7 +6,7 @@
     python benchmarks/kill_and_resume.py --kinds training --device cuda --gpus 2           # at any time, any process
 
 - ``training``: while saving, while pruning, at any time.
-- ``trials``: the same in the trials of a head and of a length, with a viewer connected that moves its camera.
+- ``trials``: the same in the trials of a head and of a length.
 - ``commands``: prune, pack and export over an older result: while the file is written, before it is renamed, at any
   time. Afterwards the older result or the whole new one must be there, and the same command must succeed.
 
@@ -45,7 +45,6 @@ import sundae_ns as sn
 from harness import killing
 from harness.processes import Bench, command_here, train_here
 from harness.still_life import write_still_life
-from harness.watcher import Watcher, free_port
 from sundae_ns.errors import CheckpointError
 from sundae_ns.rendering.views import view_of
 from sundae_ns.scenes.models import load_model
@@ -64,8 +63,6 @@ class Training:
     save_every: int
     places: dict[str, killing.Place]
     options: str
-    watched: bool = False
-    """Whether a viewer is connected."""
 
     def words(self, scene: Path) -> list[str]:
         """Arguments of ``ns-train``."""
@@ -85,8 +82,7 @@ TRAININGS = {
         160,
         9,
         killing.TRIALS,
-        "--vis viewer+tensorboard --pipeline.model.pruning.prune-at 40 --pipeline.model.head.mode auto",
-        watched=True,
+        "--vis tensorboard --pipeline.model.pruning.prune-at 40 --pipeline.model.head.mode auto",
     ),
 }
 KILLS = {"training": 20, "trials": 10, "commands": 24}
@@ -133,7 +129,6 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
     parsed = tyro.cli(AnnotatedBaseConfigUnion, args=what.words(scene))
     parsed.machine.device_type, parsed.machine.num_devices = options.device, options.gpus
     exact = options.device == "cpu"
-    watchers: list[Watcher] = []
 
     def configured(name: str) -> TrainerConfig:
         config = deepcopy(parsed)
@@ -141,9 +136,6 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
         return config
 
     def started(config: TrainerConfig, place: str | None = None, nth: int = 1) -> BaseProcess:
-        if what.watched:
-            config.viewer.websocket_port = free_port()
-            watchers.append(Watcher(config.viewer.websocket_port))
         return bench.start(train_here, config, bench.log, place, nth)
 
     def trained(config: TrainerConfig) -> float:
@@ -206,8 +198,6 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
             tally[name] += held
         lost += not (killed and one_prune and same and clean)
         shutil.rmtree(config.output_dir)
-    for watcher in watchers:
-        watcher.stop()
     about = {
         "steps": what.steps,
         "save_every": what.save_every,
@@ -216,10 +206,8 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
         **({"decisions after kills": decisions} if kind == "trials" and not exact else {}),
         "same seed, same result": repeatable if exact else None,
         **({} if exact else {"psnr, undisturbed": undisturbed, "psnr, resumed": resumed_psnr}),
-        **({"images in viewers": sum(watcher.images for watcher in watchers)} if what.watched else {}),
     }
-    blind = what.watched and not about["images in viewers"]
-    return {**about, **tally, "lost": lost + (not repeatable) + blind}
+    return {**about, **tally, "lost": lost + (not repeatable)}
 
 
 # ------------------------------------------------------------------------------------------------------------- commands
@@ -327,7 +315,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder to work in; a temporary one by default")
     options = parser.parse_args()
     if options.gpus > 1 and (options.device == "cpu" or options.kinds != ["training"]):
-        parser.error("several ranks need --device cuda --kinds training: they have no viewer")
+        parser.error("several ranks need --device cuda --kinds training")
     root = options.out or Path(tempfile.mkdtemp(prefix="kill-and-resume-"))
     root.mkdir(parents=True, exist_ok=True)
     bench = Bench(options.device, root / "log")
