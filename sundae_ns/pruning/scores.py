@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from sundae_ns.errors import ConfigError
+from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.filters import high_pass, response_magnitude
 from sundae_ns.gaussians.gaussians import as_field, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
@@ -33,9 +33,13 @@ def score(
 
     Raises:
         ConfigError: the score needs a contribution that is not given.
+        DataError: a function returns another shape.
     """
     if callable(rule.score):
-        return rule.score(params).double()
+        values = rule.score(params)
+        if values.shape != (len(params["means"]),):
+            raise DataError(f"a score has shape {list(values.shape)} for {len(params['means'])} primitives: return [N]")
+        return values.double()
     if rule.score == "response":
         return response(params, rule, graph).sqrt()
     if contribution is None:

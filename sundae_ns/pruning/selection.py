@@ -63,11 +63,7 @@ def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
 def neighbor_order(points: Tensor) -> Tensor:
     """An order in which neighbours follow each other: the leaves of a balanced tree, int64 on the CPU ``[N]``.
 
-    Similar to a Morton curve, but cells are split at the median of their widest axis. A cluster of any size is
-    resolved, where a Morton code could put it into one cell.
-
-    Args:
-        points: finite positions ``[N, 3]``, N at least 1.
+    Unlike a Morton code it resolves a cluster of any size. Points ``[N, 3]`` are finite, N is at least 1.
     """
     return build_tree(points.detach()).order.cpu().long()
 

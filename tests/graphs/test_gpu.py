@@ -71,6 +71,8 @@ def test_same_bandwidth_and_close_responses(cloud: Callable) -> None:
     magnitude = [response_magnitude(high_pass(graph, x)) for graph, x in ((on_gpu, points.cuda()), (on_cpu, points))]
     known = ~magnitude[1].isnan()
     assert torch.equal(~magnitude[0].cpu().isnan(), known)
+    # Among neighbours at equal distances each device may take others.
+    known &= (on_gpu.indices.cpu().sort(dim=1).values == on_cpu.indices.sort(dim=1).values).all(dim=1)
     scale = magnitude[1][known].max().clamp_min(1e-38) if known.any() else 1.0
     torch.testing.assert_close(magnitude[0].cpu()[known] / scale, magnitude[1][known] / scale, rtol=1e-4, atol=1e-6)
 

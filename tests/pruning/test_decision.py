@@ -358,6 +358,7 @@ def test_prune_leaves_what_the_decision_says_and_the_field_alone(rule: PruneRule
 
 
 def test_invalid_input_raises_one_line() -> None:
+    ones = torch.ones(60)
     cases: list[tuple[type[Exception], str, Any]] = [
         (DataError, "none of 60", lambda: decide_share({k: v * torch.nan for k, v in field().items()}, PAPER)),
         (ConfigError, "training views", lambda: decide_share(field(), PruneRule())),
@@ -365,6 +366,7 @@ def test_invalid_input_raises_one_line() -> None:
         (ConfigError, "keep_ratio", lambda: decide_share(field(), PruneRule(), 0.0)),
         (ConfigError, "gamma", lambda: decide_share(field(), PruneRule(gamma=2.0))),
         (ConfigError, "score is 'opacity': use one of detail-c", lambda: PruneRule(score="opacity").validate()),
+        (DataError, r"score has shape \[3\] for 60", lambda: decide(field(), PruneRule(score=lambda _: ones[:3]), 6)),
         (ConfigError, "num_neighbors is 0: use at least 1", lambda: PruneRule(num_neighbors=0).validate()),
     ]
     for error, message, call in cases:

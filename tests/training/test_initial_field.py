@@ -124,7 +124,8 @@ def test_files_of_other_programs_start_a_model(
     expected = similarity(given, *_frame())["means"]
     torch.testing.assert_close(model.means.detach(), expected, rtol=0, atol=0.001)
     assert model.gauss_params["scales"].isfinite().all()
-    assert len(caplog.messages) == (name != "a.compressed.ply")
+    mended = [message for message in caplog.messages if "clamped" in message]
+    assert len(mended) == (name != "a.compressed.ply")
 
 
 def test_a_finished_run_opens_without_what_it_started_from(
