@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from sundae_ns.cli.options import Flag, check_folder, check_least
+from sundae_ns.cli.options import Overwrite, check_folder, check_least
 from sundae_ns.cli.process import percent_of, quoted, run_logged, word
 from sundae_ns.data import write_demo_capture
 from sundae_ns.errors import writing
@@ -25,14 +25,13 @@ METHOD = "sundae-tiny"
 
 
 def demo(
-    out: Annotated[Path, tyro.conf.Positional] = Path(".demo"), steps: int | None = None, overwrite: Flag = False
+    out: Annotated[Path, tyro.conf.Positional] = Path(".demo"), steps: int | None = None, overwrite: Overwrite = False
 ) -> int:
     """Write the embedded capture, train it with ns-train, evaluate it, and print the results.
 
     Args:
         out: folder for the capture, the run and the images.
         steps: number of training steps; by default that of sundae-tiny.
-        overwrite: replace an earlier demo in the folder.
     """
     check_folder(out, reads=[], overwrite=overwrite)
     check_least(steps=(steps, 1))

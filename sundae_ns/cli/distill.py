@@ -12,13 +12,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from sundae_ns.api.files import SUFFIXES, load, save
 from sundae_ns.api.virtual import virtual_views
 from sundae_ns.cli.inputs import cameras_of
-from sundae_ns.cli.options import Flag, Out, Source, check_exclusive, check_file, check_suffix
+from sundae_ns.cli.options import Out, Overwrite, Scene, check_exclusive, check_file, check_suffix
 from sundae_ns.errors import ConfigError, writing
 from sundae_ns.rasterization import fastest_device
 
 
 def distill(
-    source: Source,
+    source: Scene,
     out: Out,
     keep: float | None = None,
     count: int | None = None,
@@ -26,7 +26,7 @@ def distill(
     head: bool = True,
     seed: int = 0,
     cameras: Path | None = None,
-    overwrite: Flag = False,
+    overwrite: Overwrite = False,
 ) -> int:
     """Prune a scene of any program, and train the rest on the images of the full one; no photos are needed.
 
@@ -34,7 +34,6 @@ def distill(
     that no step sees show that it pays. Ctrl-C saves; the same command goes on.
 
     Args:
-        source: a .ply, .spz, .sog, .glb, .splat, .ksplat or gsplat's .pt, a packed scene, or a run.
         out: file to write, in the format of its suffix: .sundae, or without a head .ply, .spz or .sog.
         keep: share of the primitives to keep, in (0, 1]; by default 0.1.
         count: number of primitives to keep, in place of a share.
@@ -43,7 +42,6 @@ def distill(
         seed: random seed.
         cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, whose cameras the
             steps begin from in place of virtual ones.
-        overwrite: replace an existing file, once the new one is complete.
     """
     check_exclusive(keep=keep, count=count)
     if check_suffix(out, SUFFIXES) not in (".sundae", ".html") and head:

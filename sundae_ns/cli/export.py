@@ -14,7 +14,7 @@ from sundae_ns.api.packing import packed_bytes, stated_start
 from sundae_ns.api.page import write_page
 from sundae_ns.api.views import with_start
 from sundae_ns.cli.inputs import Cleaning, copies_rows, open_packed
-from sundae_ns.cli.options import Direction, Flag, Out, Source, check_file, check_folder
+from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file, check_folder
 from sundae_ns.errors import ConfigError
 from sundae_ns.storage.formats import check_format
 from sundae_ns.storage.pack import container
@@ -23,13 +23,13 @@ from sundae_ns.storage.run_folder import files_of
 
 
 def export(
-    scene: Source,
+    scene: Scene,
     out: Out,
     upright: bool = False,
     start_view: str | None = None,
     up: Direction | None = None,
     data: Path | None = None,
-    overwrite: Flag = False,
+    overwrite: Overwrite = False,
     cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
 ) -> int:
     """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz, .sog or .glb.
@@ -38,8 +38,6 @@ def export(
     marked as such.
 
     Args:
-        scene: a run (its folder or config.yml), a packed scene, or a .ply, .spz, .sog, .glb, .splat, .ksplat or
-            gsplat's .pt.
         out: file to write; its suffix selects the format: .html, .ply or .glb (exact), .spz or .sog (quantised,
             much smaller). A name without a suffix is a folder of page and scene, for a web server.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
@@ -48,7 +46,6 @@ def export(
             default that of a packed scene, else the first camera.
         up: direction about which a page turns, for example 0 0 1; by default that of the scene, else of its cameras.
         data: folder of the capture, if it moved; for a page of a run.
-        overwrite: replace an existing file, once the new one is complete.
     """
     page = out.suffix.lower() in (".html", "")
     if not page:

@@ -12,10 +12,21 @@ from sundae_ns.errors import ConfigError, StorageError
 
 Source = Annotated[Path, tyro.conf.Positional]
 """The file or the folder that a command reads."""
+Scene = Annotated[
+    Path,
+    tyro.conf.Positional,
+    tyro.conf.arg(
+        help="a packed scene, a run (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat, .ksplat or "
+        "gsplat's .pt."
+    ),
+]
+"""A scene that a command reads."""
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 """The option ``--out`` or ``-o``: what a command writes."""
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-"""An option without a ``--no-`` form, such as ``--overwrite``."""
+"""An option without a ``--no-`` form."""
+Overwrite = Annotated[Flag, tyro.conf.arg(help="replace an earlier output, once the new one is complete.")]
+"""The option ``--overwrite`` of every command that writes."""
 Direction = tuple[float, float, float]
 """The option ``--up``."""
 

@@ -21,7 +21,7 @@ from sundae_ns.api.files import load
 from sundae_ns.api.packing import contents_of
 from sundae_ns.api.views import with_start
 from sundae_ns.cli.inputs import Cleaning
-from sundae_ns.cli.options import Direction, Flag, Out, check_exclusive, check_file, check_least
+from sundae_ns.cli.options import Direction, Out, Overwrite, check_exclusive, check_file, check_least
 from sundae_ns.cli.train import has_gpu
 from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.storage.config_file import check_run
@@ -53,7 +53,7 @@ def pack(
     up: Direction | None = None,
     data: Path | None = None,
     json: bool = False,
-    overwrite: Flag = False,
+    overwrite: Overwrite = False,
     precision: Annotated[PackConfig, tyro.conf.arg(name="")] = PackConfig(),  # noqa: B008
     cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
 ) -> int:
@@ -73,7 +73,6 @@ def pack(
         up: direction that is upwards, for example 0 0 1; by default that of a run's capture.
         data: folder of the capture, if it moved.
         json: print one JSON object in place of the table.
-        overwrite: replace an existing file, once the new one is complete.
     """
     check_exclusive(target_bytes=target_bytes, target_drop=target_drop)
     check_least(max_cameras=(max_cameras, 0), finetune=(finetune, 0), target_bytes=(target_bytes, 1))

@@ -12,7 +12,7 @@ from sundae_ns.api.cleaning import kept, within
 from sundae_ns.api.files import SUFFIXES, load_with_mask, save
 from sundae_ns.api.virtual import virtual_views
 from sundae_ns.cli.inputs import Cleaning, cameras_of, copies_rows
-from sundae_ns.cli.options import Flag, Out, Source, check_exclusive, check_file, check_suffix
+from sundae_ns.cli.options import Out, Overwrite, Scene, check_exclusive, check_file, check_suffix
 from sundae_ns.gpu.kernels import naming_full_memory
 from sundae_ns.pruning import PruneRule
 from sundae_ns.rasterization import fastest_device
@@ -20,14 +20,14 @@ from sundae_ns.storage.ply import keep_vertices
 
 
 def prune(
-    source: Source,
+    source: Scene,
     out: Out,
     keep: float | None = None,
     count: int | None = None,
     target_drop: float | None = None,
     views: int | None = None,
     cameras: Path | None = None,
-    overwrite: Flag = False,
+    overwrite: Overwrite = False,
     rule: Annotated[PruneRule, tyro.conf.arg(name="")] = pruning.DEFAULT_RULE,
     cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
 ) -> int:
@@ -37,7 +37,6 @@ def prune(
     to the scene's own images. On a CPU a million primitives with three bands of harmonics take about 1.7 GB.
 
     Args:
-        source: a .ply, .spz, .sog, .glb, .splat, .ksplat or gsplat's .pt, a packed scene, or a run.
         out: file to write, in the format of its suffix: .ply, .spz, .sog, .glb or .sundae. A .ply of a .ply keeps all
             properties and comments.
         keep: share of the primitives to keep, of those that a box and the floaters leave, in (0, 1]; by default 0.1.
@@ -47,7 +46,6 @@ def prune(
         views: number of virtual cameras, for scenes that come without cameras; by default 128, on a GPU 256.
         cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, in place of the
             scene's own or virtual cameras.
-        overwrite: replace an existing file, once the new one is complete.
     """
     check_exclusive(keep=keep, count=count, target_drop=target_drop)
     if target_drop is None:

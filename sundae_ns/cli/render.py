@@ -13,7 +13,7 @@ from sundae_ns.api.film import film_views
 from sundae_ns.api.scene import image_of
 from sundae_ns.api.scene import render as render_view
 from sundae_ns.api.views import CameraFile, read_cameras, view_in_front, with_start
-from sundae_ns.cli.options import Direction, Flag, Out, Source, check_file
+from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file
 from sundae_ns.errors import ConfigError
 from sundae_ns.evaluation.video import write_video
 from sundae_ns.rasterization import fastest_device
@@ -25,7 +25,7 @@ SECONDS = 12.0
 
 
 def render(
-    scene: Source,
+    scene: Scene,
     out: Out,
     camera: Path | None = None,
     view: int | None = None,
@@ -34,7 +34,7 @@ def render(
     seconds: float | None = None,
     fps: float | None = None,
     up: Direction | None = None,
-    overwrite: Flag = False,
+    overwrite: Overwrite = False,
 ) -> int:
     """Render a scene to an image, or along a path to a video.
 
@@ -42,7 +42,6 @@ def render(
     around it if there are none.
 
     Args:
-        scene: a packed scene, a run, or a .ply, .spz, .sog, .glb, .splat, .ksplat or gsplat's .pt.
         out: image (.png, .jpg or .webp) or video (.mp4) to write.
         camera: a transforms.json or a camera path of the viewer; by default the cameras stored with the scene.
         view: index of the camera for an image; by default the start view of the scene, if it has one.
@@ -51,7 +50,6 @@ def render(
         seconds: length of a film without --camera; by default 12.
         fps: frames a second of a video; by default those of the camera path, else 24.
         up: direction that is upwards, for example 0 -1 0; by default that of the scene, else of its cameras, else z.
-        overwrite: replace an existing file, once the new one is complete.
     """
     suffix = out.suffix.lower()
     video = suffix == ".mp4"

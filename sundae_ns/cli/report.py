@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
-from sundae_ns.cli.options import Flag, Out, check_folder, check_least
+from sundae_ns.cli.options import Out, Overwrite, check_folder, check_least
 from sundae_ns.errors import ConfigError, SundaeError, writing
 from sundae_ns.evaluation import Lpips, Measured, csv_text, flip_available, lpips_weights
 from sundae_ns.evaluation.count_curve import read_count_curve
@@ -36,7 +36,7 @@ def report(
     lpips_net: Net = "alex",
     warmup: int = 3,
     repeats: int = 5,
-    overwrite: Flag = False,
+    overwrite: Overwrite = False,
 ) -> int:
     """Measure quality, speed and size of finished runs on their test views; write a web page of sliders, and tables.
 
@@ -47,7 +47,6 @@ def report(
         lpips_net: net of LPIPS, which is measured if its weights are on disk; values of different nets do not compare.
         warmup: untimed renderings of each view before timing.
         repeats: timed renderings of each view; 0 measures no times.
-        overwrite: replace the files of an earlier report in the folder.
     """
     check_folder(out, reads=[*runs, data], overwrite=overwrite)
     if not runs:

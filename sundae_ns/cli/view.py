@@ -10,7 +10,7 @@ from typing import Any
 
 from sundae_ns.api.page import page_of
 from sundae_ns.cli.inputs import open_packed
-from sundae_ns.cli.options import Source
+from sundae_ns.cli.options import Scene
 from sundae_ns.errors import ConfigError
 
 IDLE_SECONDS = 15.0
@@ -75,15 +75,13 @@ def _hosts(port: int) -> set[str]:
     return {f"{name}:{port}" for name in names} | (set(names) if port == 80 else set())
 
 
-def view(scene: Source, port: int = 0, open_browser: bool = True, data: Path | None = None) -> int:
+def view(scene: Scene, port: int = 0, open_browser: bool = True, data: Path | None = None) -> int:
     """Show a scene with its head in the browser, until Ctrl-C.
 
     Serves the page of sundae export on 127.0.0.1 and opens it. From another machine, forward the port to the same
     number: ssh -L 8000:127.0.0.1:8000 with --port 8000.
 
     Args:
-        scene: a packed scene, a run (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat, .ksplat or
-            gsplat's .pt.
         port: port on 127.0.0.1; 0 takes a free one.
         open_browser: open the default browser; otherwise only print the address.
         data: folder of the capture of a run, if it moved.

@@ -6,10 +6,14 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from sundae_ns.errors import CheckpointError
 from sundae_ns.evaluation import COLUMNS, Configuration, Measured, ViewQuality, csv_text
+from sundae_ns.evaluation.count_curve import CountCurve, CurvePoint, read_count_curve
 from sundae_ns.evaluation.measured import markdown, number
 
 
@@ -78,3 +82,24 @@ def test_each_configuration_has_a_row_of_the_table(measured: Callable[..., Measu
     assert text.endswith("- Left out: this and that\n")
     assert number(None, 2) == number(float("nan"), 2) == "-"
     assert number(1234.567, 1) == "1,234.6"
+
+
+POINT: dict[str, Any] = {"count": 200, "bytes": None, "psnr": 30.0, "ssim": 0.91, "psnr_loss": 0.25, "ssim_loss": 0.0}
+POINT |= {"psnr_error": 0.02, "ssim_error": 0.0005}
+COUNT: dict[str, Any] = {"chosen": 240, "full": 1000, "reason": "the fewest that are as good", "curve": [POINT]}
+
+
+def test_the_record_of_trials_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    assert read_count_curve(tmp_path) is None
+    path = tmp_path / "trials.json"
+    path.write_text(json.dumps({"count": COUNT}))
+    assert read_count_curve(tmp_path) == CountCurve(240, 1000, COUNT["reason"], (CurvePoint(**POINT),))
+    damaged = [
+        {**COUNT, "chosen": "many"},
+        {**COUNT, "curve": [{"count": 3}]},
+        {**COUNT, "curve": [{**POINT, "psnr": "x"}]},
+    ]
+    for content in ("", "[]", *(json.dumps({"count": each}) for each in damaged)):
+        path.write_text(content)
+        with pytest.raises(CheckpointError, match=r"trials\.json cannot be read .*; remove it, or train the run again"):
+            read_count_curve(tmp_path)
