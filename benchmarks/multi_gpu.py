@@ -127,6 +127,7 @@ def measure(rank: int, ranks: int, folder: Path, options: argparse.Namespace, ex
         dist.all_gather_object(memory, memory[0])
     with trainer.ranks.whole() as first:
         if first:
+            trainer.model.lpips = lambda *_: None  # would download its weights
             trainer.pipeline.eval()
             quality = trainer.pipeline.get_average_eval_image_metrics()
             name = f"{options.data.name}, " + (f"tiled to {options.primitives}" if tiled else "whole run")

@@ -49,26 +49,17 @@ def saved(folder: Path, *steps: int) -> None:
         checkpoint.write(state(step), folder / name(step))
 
 
-def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
-    saved(tmp_path / "models", 7)
-    loaded = checkpoint.read(tmp_path / "models" / name(7))
-    assert loaded["step"] == 7
-    assert torch.equal(loaded["pipeline"]["_model.gauss_params.means"], torch.full((50, 3), 7.0))
-
-
-def test_newest_is_by_step_not_by_letters(tmp_path: Path) -> None:
-    saved(tmp_path, 999, 1_000_000_000)
-    (tmp_path / "step-best.ckpt").write_text("a user's own file")
-    assert checkpoint.newest_whole(tmp_path) == (tmp_path / name(1_000_000_000), [])
-
-
-def test_a_run_s_folder_stands_for_its_checkpoints(tmp_path: Path) -> None:
+def test_what_is_saved_is_loaded_and_the_newest_is_by_step(tmp_path: Path) -> None:
     models = tmp_path / "nerfstudio_models"
-    saved(models, 7, 8)
-    for place in (tmp_path, models):
-        assert checkpoint.newest_whole(place) == (models / name(8), [])
-        assert checkpoint.newest_step(place) == 8
-        assert checkpoint.folder_of(place) == models
+    saved(models, 999, 1_000_000_000)
+    (models / "step-best.ckpt").write_text("a user's own file")
+    for folder in (tmp_path, models):
+        assert checkpoint.newest_whole(folder) == (models / name(1_000_000_000), [])
+        assert checkpoint.newest_step(folder) == 1_000_000_000
+        assert checkpoint.folder_of(folder) == models
+    loaded = checkpoint.read(models / name(999))
+    assert loaded["step"] == 999
+    assert torch.equal(loaded["pipeline"]["_model.gauss_params.means"], torch.full((50, 3), 999.0))
 
 
 def cut(path: Path) -> None:
@@ -184,32 +175,18 @@ def test_a_second_training_in_a_folder_changes_nothing_there(tmp_path: Path) -> 
     assert sorted(os.listdir(run)) == ["config.yml", "training.lock"]
 
 
-def test_runs_of_the_same_second_have_different_names() -> None:
-    names = set()
-    for _ in range(3):
-        config = deepcopy(sundae_tiny.config)
-        config.set_timestamp()
-        names.add(config.timestamp)
-    assert len(names) == 3
-    config.timestamp = "mine"
-    config.set_timestamp()
-    assert config.timestamp == "mine"
-
-
-def test_a_training_with_a_viewer_ends_by_itself() -> None:
+def test_methods_train_with_it_and_end_by_themselves() -> None:
     for method in vars(method_configs).values():
         if isinstance(method, MethodSpecification):
-            assert method.config.viewer.quit_on_train_completion, method.config.method_name
-
-
-def test_methods_train_with_it() -> None:
-    config = sundae_tiny.config
-    assert isinstance(config, SundaeTrainerConfig)
-    assert config._target is SundaeTrainer
+            config = method.config
+            assert isinstance(config, SundaeTrainerConfig)
+            assert config._target is SundaeTrainer
+            assert config.viewer.quit_on_train_completion, config.method_name
 
 
 def test_config_in_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
     config = SundaeTrainerConfig(method_name="m", experiment_name="e", timestamp="t", output_dir=tmp_path)
+    config.set_timestamp()  # the user's own stays
     config.save_config()
     assert (tmp_path / "e" / "m" / "t" / "config.yml").read_text().startswith("!!python/object:sundae_ns.trainer.")
     (tmp_path / "file").write_text("")

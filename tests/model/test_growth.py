@@ -1,4 +1,4 @@
-"""Continuous pruning while the field grows."""
+"""Prunes of a model: continuous ones while the field grows, and of colours without harmonics."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+import torch
 from torch import Tensor
 
+from sundae_ns.gaussians.gaussians import Field, sh_to_rgb
 from sundae_ns.model import SundaeModel
+from sundae_ns.pruning import decide
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[[SundaeModel], Any]
@@ -98,3 +101,20 @@ def test_nothing_grows_after_the_prune(build: Build, training_of: TrainingOf, pr
     assert (max(counts[:prune_at], default=0) > N) == (prune_at > 0)
     assert len(set(counts[prune_at:])) == 1
     assert counts[-1] == round(0.5 * (N if prune_at == 0 else counts[prune_at - 1]))
+
+
+def test_a_prune_merges_colours(build: Build, training_of: TrainingOf, datamanager: Any) -> None:
+    """Without harmonics the first band holds logits of colours; prunes work on the colours."""
+    model = build(sh_degree=0)
+    training = training_of(model)
+    with torch.no_grad():
+        model.gauss_params["features_dc"].mul_(4)
+    assert model.state.field.encoding == "logits"
+    harmonics = Field({name: value.detach().clone() for name, value in model.state.field.as_harmonics().items()})
+    count = model.num_points // 2
+    expected = decide(harmonics, model.config.pruning, count, model.contribution(datamanager, count)).values
+    assert expected is not None
+    training.act("pruning", 3)
+    assert torch.equal(model.means, expected["means"])
+    found = model.gauss_params["features_dc"].detach().sigmoid()
+    torch.testing.assert_close(found, sh_to_rgb(expected["features_dc"]), rtol=0, atol=2e-3)
