@@ -35,7 +35,6 @@ def show_log() -> None:
     if not any(isinstance(handler, ConsoleHandler) for handler in log.handlers):
         log.addHandler(ConsoleHandler())
         log.setLevel(logging.INFO)
-        log.propagate = False
 
 
 def warn(text: str) -> None:
