@@ -108,7 +108,8 @@ def stated_start(scene: Scene) -> dict[str, Any]:
             "size": [view.width, view.height],
         }
     for name, value in stated.items():
-        if {"NaN", "Infinity"} & set(re.findall(r"\w+", json.dumps(value))) or fault(value, _PROPERTIES[name]):
+        finite = not re.search("NaN|Infinity", json.dumps(value))
+        if not finite or fault(value, _PROPERTIES[name]) is not None:
             named = "start view" if name == "start" else "up axis"
             raise ConfigError(f"the {named} of the scene has values that readers refuse; give another one")
     return stated
@@ -121,8 +122,7 @@ def start_of(stated: Mapping[str, Any]) -> tuple[Direction | None, View | None]:
     view = None
     if "start" in good:
         start = good["start"]
-        pose = torch.tensor(start["pose"], dtype=torch.float64)
-        view = View.from_pose(pose, start["intrinsics"], *start["size"])
+        view = View.from_pose(torch.tensor(start["pose"], dtype=torch.float64), start["intrinsics"], *start["size"])
     return unit(good["up"]) if "up" in good else None, view
 
 
