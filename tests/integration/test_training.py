@@ -52,11 +52,12 @@ def test_prune_keeps_exactly_the_share(tiny: Any) -> None:
     assert found["step"] == tiny.prune_at
     assert found["before"] > tiny.points, "densification added nothing"
     assert found["after"] == round(tiny.keep_ratio * found["before"])
-    assert found["peak"] == found["before"]
+    assert found["peak"] >= found["before"]  # densification also drops some
     assert found["seconds"] > 0
     assert found["sigma"] > 0
     counts = {step: len(field(load(tiny.checkpoint(step)))["means"]) for step in (30, 60, 90, 119)}
-    assert counts == {30: found["before"], 60: found["after"], 90: found["after"], 119: found["after"]}
+    assert found["before"] <= counts.pop(30) <= found["peak"]
+    assert counts == {60: found["after"], 90: found["after"], 119: found["after"]}
     assert f"kept {found['after']:,} of {found['before']:,} primitives" in " ".join(tiny.output.split())
 
 
@@ -296,8 +297,9 @@ def check_warm(tiny: Any, params: dict[str, Tensor], start: dict[str, Tensor], t
     for name in SPLAT_NAMES:
         assert torch.equal(start[name].cpu(), params[name]), name
     (found,) = json.loads((trainer.base_dir / "prune.json").read_text())
-    kept = round(tiny.keep_ratio * len(params["means"]))
-    assert (found["before"], found["after"]) == (len(params["means"]), kept)
+    kept = round(tiny.keep_ratio * found["before"])  # the last refinement may drop some before
+    assert 0.95 * len(params["means"]) < found["before"] <= len(params["means"])
+    assert found["after"] == kept
     assert trainer.pipeline.model.num_points == kept
     assert trainer.pipeline.model.state.pruning["num_prunes"] == 1
     assert trainer.pipeline.model.state.head_enabled
