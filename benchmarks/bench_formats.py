@@ -29,11 +29,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 import sundae_ns as sn
-from sundae_ns.api.packing import packed_bytes
-from sundae_ns.rendering.views import view_of
-from sundae_ns.scenes.models import Opened, load_model, load_run
-from sundae_ns.storage.accounting import bytes_of, bytes_of_module
-from sundae_ns.storage.atomic import replacing
+from sundae_ns.core.files import replacing
+from sundae_ns.io.accounting import bytes_of, bytes_of_module
+from sundae_ns.plugin.camera_models import view_of
+from sundae_ns.plugin.finished_runs import Opened, load_model, load_run
+from sundae_ns.scene.packing import packed_bytes
 
 COLUMNS = (
     *("capture", "method", "format", "program", "bytes", "psnr", "ssim", "primitives"),

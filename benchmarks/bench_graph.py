@@ -34,10 +34,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sundae_ns.evaluation.timing import now
-from sundae_ns.filters import high_pass
-from sundae_ns.graphs import NeighborGraph, build_graph
-from sundae_ns.storage.formats import read_field
+from sundae_ns.core.timing import now
+from sundae_ns.graph.filters import high_pass
+from sundae_ns.graph.graph import NeighborGraph, build_graph
+from sundae_ns.io.formats import read_field
 
 NEIGHBORS = 16
 TIE = 1e-12

@@ -33,22 +33,15 @@ import torch
 from rich.progress import Progress, track
 from torch import Tensor
 
-from sundae_ns.api.packing import contents_of
-from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.evaluation import psnr, ssim
-from sundae_ns.scenes.finetune import RATE, finetune
-from sundae_ns.scenes.models import load_model, load_run
-from sundae_ns.storage.config_file import load_config
-from sundae_ns.storage.pack import (
-    FINETUNED,
-    Codecs,
-    PackConfig,
-    PackedScene,
-    PackReport,
-    fit_scene,
-    read_scene,
-    write_fitted,
-)
+from sundae_ns.core.metrics import psnr, ssim
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io.config_file import load_config
+from sundae_ns.io.pack.codecs import Codecs
+from sundae_ns.io.pack.config import FINETUNED, PackConfig
+from sundae_ns.io.pack.packed_scene import PackedScene, PackReport, fit_scene, read_scene, write_fitted
+from sundae_ns.plugin.finetune import RATE, finetune
+from sundae_ns.plugin.finished_runs import load_model, load_run
+from sundae_ns.scene.packing import contents_of
 
 FIRST_IMAGE = """
 import sys

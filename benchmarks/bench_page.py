@@ -31,11 +31,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from harness.chromium import WEBGPU, Browser, find_chromium, wait_for
-from sundae_ns.api.packing import arrays_of_views, scene_of
-from sundae_ns.api.page import write_page
-from sundae_ns.scenes.models import model_of
-from sundae_ns.storage.pack import PackedScene, container, read_scene
-from sundae_ns.storage.pack.scene import CAMERAS as STORED
+from sundae_ns.io.pack import container
+from sundae_ns.io.pack.packed_scene import CAMERAS as STORED
+from sundae_ns.io.pack.packed_scene import PackedScene, read_scene
+from sundae_ns.plugin.finished_runs import model_of
+from sundae_ns.scene.packing import arrays_of_views, scene_of
+from sundae_ns.scene.page import write_page
 
 SECONDS = 400.0
 """Longest wait for the page: shaders compile in software."""

@@ -29,12 +29,12 @@ from nerfstudio.engine.optimizers import Optimizers
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.evaluation import median_ms
-from sundae_ns.gpu.cuda_graphs import record, warm_up
+from sundae_ns.core.timing import median_ms
+from sundae_ns.cuda.cuda_graphs import record, warm_up
+from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.method_configs import sundae_tiny
-from sundae_ns.rasterization import BackendName, rasterize, select_backend
-from sundae_ns.training import step
+from sundae_ns.rasterize.interface import BackendName, rasterize, select_backend
+from sundae_ns.train import step
 
 SIZES = ((533, 800), (824, 1240), (1893, 1061))
 """Height and width of the images of the loss and of the heads, pixels."""

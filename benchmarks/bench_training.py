@@ -33,7 +33,7 @@ from nerfstudio.scripts.train import _set_random_seed
 
 from harness.job import configure, without_lpips
 from harness.plan import Job, parser_of
-from sundae_ns.evaluation import psnr, ssim
+from sundae_ns.core.metrics import psnr, ssim
 
 ARMS: dict[str, list[str]] = {
     "splatfacto": ["splatfacto"],

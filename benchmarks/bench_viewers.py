@@ -33,10 +33,10 @@ from bench_page import SECONDS, SIDE, bundled, has_packages, psnr, scaled, truth
 from numpy.typing import NDArray
 
 from harness.chromium import Browser, find_chromium, wait_for
-from sundae_ns.api.files import save_for_viewers
-from sundae_ns.api.packing import arrays_of_views, scene_of
-from sundae_ns.gaussians import FEATURES
-from sundae_ns.storage.pack import PackedScene, read_scene
+from sundae_ns.core.gaussians import FEATURES
+from sundae_ns.io.pack.packed_scene import PackedScene, read_scene
+from sundae_ns.scene.load_save import save_for_viewers
+from sundae_ns.scene.packing import arrays_of_views, scene_of
 
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <script type="module" src="viewers.js"></script>"""

@@ -40,8 +40,8 @@ print(json.dumps({
 PLY = """
 import sys, torch
 from pathlib import Path
-from sundae_ns.gaussians import from_points
-from sundae_ns.storage.ply import write_ply
+from sundae_ns.scene.initialization import from_points
+from sundae_ns.io.ply import write_ply
 points = torch.rand(200, 3)
 write_ply(Path(sys.argv[1]), from_points(points, points, sh_degree=1, num_features=0))
 """

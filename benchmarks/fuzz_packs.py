@@ -28,12 +28,12 @@ from typing import Any, NamedTuple
 import torch
 
 from harness.pack_changes import Json, Pack, mutated
-from sundae_ns.api.packing import scene_of
-from sundae_ns.api.page import page_of
-from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.errors import SundaeError
-from sundae_ns.gaussians import from_points
-from sundae_ns.storage.pack import PackedScene, read_scene, write_scene
+from sundae_ns.core.errors import SundaeError
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
+from sundae_ns.scene.initialization import from_points
+from sundae_ns.scene.packing import scene_of
+from sundae_ns.scene.page import page_of
 
 WEB = Path(__file__).parents[1] / "web"
 SECONDS = 60

@@ -45,10 +45,10 @@ import sundae_ns as sn
 from harness import killing
 from harness.processes import Bench, command_here, train_here
 from harness.still_life import write_still_life
-from sundae_ns.errors import CheckpointError
-from sundae_ns.rendering.views import view_of
-from sundae_ns.scenes.models import load_model
-from sundae_ns.storage import checkpoint
+from sundae_ns.core.errors import CheckpointError
+from sundae_ns.io import checkpoint
+from sundae_ns.plugin.camera_models import view_of
+from sundae_ns.plugin.finished_runs import load_model
 
 SPREAD = 3.0
 """Decibels that a resumed run on CUDA may be below the worse of two undisturbed ones."""

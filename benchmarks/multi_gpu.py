@@ -26,9 +26,9 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_meth
 from nerfstudio.scripts.train import _set_random_seed
 
 from harness.plan import parser_of
-from sundae_ns.storage import checkpoint
-from sundae_ns.storage.formats import read_field
-from sundae_ns.training.schedules import set_schedule
+from sundae_ns.io import checkpoint
+from sundae_ns.io.formats import read_field
+from sundae_ns.train.schedules import set_schedule
 
 WARM = 100
 """Images before the clock starts on a tiled field: kernels load, and memory is allocated."""

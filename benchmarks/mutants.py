@@ -60,13 +60,13 @@ class Room(NamedTuple):
 
 
 ROOMS = {
-    "pruning": Room(("pruning/[!_]*.py",), ("pruning/test_*.py", "training/test_schedules.py")),
+    "pruning": Room(("pruning/[!_]*.py",), ("pruning/test_*.py", "train/test_schedules.py")),
     "schedules": Room(
-        ("training/pruning.py", "training/choice.py"),
-        ("training/test_schedules.py", "training/test_choice.py", "training/test_golden_trials.py"),
+        ("train/pruning.py", "train/choice.py"),
+        ("train/test_schedules.py", "train/test_choice.py", "train/test_golden_trials.py"),
     ),
-    "surgery": Room(("gaussians/surgery.py", "gaussians/merging.py"), ("gaussians/test_*.py",)),
-    "packing": Room(("storage/pack/[!_]*.py",), ("storage/pack/test_*.py", "fuzz/test_readers.py")),
+    "surgery": Room(("core/surgery.py", "core/merging.py"), ("core/test_*.py",)),
+    "packing": Room(("io/pack/[!_]*.py",), ("io/pack/test_*.py", "fuzz/test_readers.py")),
 }
 
 _COMPARE: dict[type[ast.cmpop], type[ast.cmpop]] = {

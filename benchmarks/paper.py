@@ -23,8 +23,9 @@ from harness.plan import Arm, Job, parser_of, plan_scene
 from harness.results import Result, group, mean_of, percent, quality_page, spread
 from harness.run import Options, Runner, check_out, compare
 from harness.script import run_script
-from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.evaluation.measured import METRICS, number, table
+from sundae_ns.core.errors import ConfigError, DataError
+from sundae_ns.core.tables import number, table
+from sundae_ns.report.measured import METRICS
 
 DATASETS: Mapping[str, Mapping[str, int]] = {
     "Mip-NeRF 360": {"bicycle": 4, "bonsai": 2, "counter": 2, "garden": 4, "kitchen": 2, "room": 2, "stump": 4},

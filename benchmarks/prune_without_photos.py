@@ -31,10 +31,10 @@ import torch
 from torch import Tensor
 
 import sundae_ns as sn
-from sundae_ns.errors import SundaeError
-from sundae_ns.rendering.views import view_of
-from sundae_ns.scenes.models import load_model
-from sundae_ns.storage.atomic import replacing
+from sundae_ns.core.errors import SundaeError
+from sundae_ns.core.files import replacing
+from sundae_ns.plugin.camera_models import view_of
+from sundae_ns.plugin.finished_runs import load_model
 
 COLUMNS = (
     *("capture", "tool", "rule", "training", "share", "primitives", "bytes", "bytes_sog"),

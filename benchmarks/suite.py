@@ -23,9 +23,10 @@ from harness.plan import Arm, Job, Words, jobs_of_shard, parser_of, plan_scene
 from harness.results import Result, group, mean_of, percent, quality_page, spread
 from harness.run import Options, Runner, check_out, compare, first_jobs
 from harness.script import run_script
-from sundae_ns.errors import DataError
-from sundae_ns.evaluation.measured import MEGABYTE, METRICS, number, table
-from sundae_ns.storage.pack import FINETUNE_STEPS
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.tables import MEGABYTE, number, table
+from sundae_ns.io.pack.config import FINETUNE_STEPS
+from sundae_ns.report.measured import METRICS
 
 ARMS = (
     *("splatfacto", "sundae", "sundae-with-head", "sundae-no-head", "sundae-no-head-bytes"),

@@ -19,7 +19,7 @@ from typing import Any
 
 from harness.results import spread
 from harness.stored import MB, METHODS, lines_of
-from sundae_ns.evaluation.measured import number, table
+from sundae_ns.core.tables import number, table
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))

@@ -11,12 +11,12 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from sundae_ns.compensation import HeadConfig
-from sundae_ns.datamanager import SundaeDatamanagerConfig
-from sundae_ns.model import SundaeModelConfig
-from sundae_ns.trainer import SundaeTrainerConfig
-from sundae_ns.training import nerfstudio_configs as configs
-from sundae_ns.training.pruning import PruningConfig
+from sundae_ns.head.head import HeadConfig
+from sundae_ns.plugin import optimizer_configs as configs
+from sundae_ns.plugin.datamanager import SundaeDatamanagerConfig
+from sundae_ns.plugin.model import SundaeModelConfig
+from sundae_ns.plugin.trainer import SundaeTrainerConfig
+from sundae_ns.train.pruning import PruningConfig
 
 
 def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:

@@ -22,44 +22,44 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sundae_ns.api.cleaning import crop as crop
-    from sundae_ns.api.cleaning import remove_floaters as remove_floaters
-    from sundae_ns.api.files import load as load
-    from sundae_ns.api.files import save as save
-    from sundae_ns.api.page import show as show
-    from sundae_ns.api.pruning import prune as prune
-    from sundae_ns.api.scene import Quality as Quality
-    from sundae_ns.api.scene import Rendering as Rendering
-    from sundae_ns.api.scene import Scene as Scene
-    from sundae_ns.api.scene import measure as measure
-    from sundae_ns.api.scene import render as render
-    from sundae_ns.api.views import views_of as views_of
-    from sundae_ns.api.virtual import virtual_views as virtual_views
-    from sundae_ns.errors import SundaeError as SundaeError
-    from sundae_ns.pruning import PruneRule as PruneRule
-    from sundae_ns.rendering.views import View as View
-    from sundae_ns.scenes.distill import distill as distill
+    from sundae_ns.core.camera import View as View
+    from sundae_ns.core.errors import SundaeError as SundaeError
+    from sundae_ns.plugin.distill import distill as distill
+    from sundae_ns.pruning.rule import PruneRule as PruneRule
+    from sundae_ns.scene.cameras import views_of as views_of
+    from sundae_ns.scene.cleaning import crop as crop
+    from sundae_ns.scene.cleaning import remove_floaters as remove_floaters
+    from sundae_ns.scene.load_save import load as load
+    from sundae_ns.scene.load_save import save as save
+    from sundae_ns.scene.page import show as show
+    from sundae_ns.scene.prune_scene import prune as prune
+    from sundae_ns.scene.scene import Quality as Quality
+    from sundae_ns.scene.scene import Rendering as Rendering
+    from sundae_ns.scene.scene import Scene as Scene
+    from sundae_ns.scene.scene import measure as measure
+    from sundae_ns.scene.scene import render as render
+    from sundae_ns.scene.virtual_cameras import virtual_views as virtual_views
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "PruneRule": "sundae_ns.pruning",
-    "Quality": "sundae_ns.api.scene",
-    "Rendering": "sundae_ns.api.scene",
-    "Scene": "sundae_ns.api.scene",
-    "SundaeError": "sundae_ns.errors",
-    "View": "sundae_ns.rendering.views",
-    "crop": "sundae_ns.api.cleaning",
-    "distill": "sundae_ns.scenes.distill",
-    "load": "sundae_ns.api.files",
-    "measure": "sundae_ns.api.scene",
-    "prune": "sundae_ns.api.pruning",
-    "remove_floaters": "sundae_ns.api.cleaning",
-    "render": "sundae_ns.api.scene",
-    "save": "sundae_ns.api.files",
-    "show": "sundae_ns.api.page",
-    "views_of": "sundae_ns.api.views",
-    "virtual_views": "sundae_ns.api.virtual",
+    "PruneRule": "sundae_ns.pruning.rule",
+    "Quality": "sundae_ns.scene.scene",
+    "Rendering": "sundae_ns.scene.scene",
+    "Scene": "sundae_ns.scene.scene",
+    "SundaeError": "sundae_ns.core.errors",
+    "View": "sundae_ns.core.camera",
+    "crop": "sundae_ns.scene.cleaning",
+    "distill": "sundae_ns.plugin.distill",
+    "load": "sundae_ns.scene.load_save",
+    "measure": "sundae_ns.scene.scene",
+    "prune": "sundae_ns.scene.prune_scene",
+    "remove_floaters": "sundae_ns.scene.cleaning",
+    "render": "sundae_ns.scene.scene",
+    "save": "sundae_ns.scene.load_save",
+    "show": "sundae_ns.scene.page",
+    "views_of": "sundae_ns.scene.cameras",
+    "virtual_views": "sundae_ns.scene.virtual_cameras",
 }
 """Public names and the modules that hold them."""
 

@@ -19,9 +19,9 @@ import pytest
 import torch
 from filelock import FileLock
 
-from sundae_ns.errors import BackendError
-from sundae_ns.gpu import kernels
-from sundae_ns.gpu.kernels import Argument, Launch
+from sundae_ns.core.errors import BackendError
+from sundae_ns.cuda import kernels
+from sundae_ns.cuda.kernels import Argument, Launch
 
 CompileKernels = Callable[..., dict[str, Launch]]
 Once = Callable[[str, Callable[[Path], None]], Path]
@@ -30,7 +30,7 @@ Once = Callable[[str, Callable[[Path], None]], Path]
 gc.set_threshold(100_000)
 
 ALL_SEEDS = os.environ.get("SUNDAE_ALL_SEEDS") == "1"
-_FIRST = ("integration/test_commands.py", "distributed/test_whole_runs.py", "integration", "distributed", "cli")
+_FIRST = ("integration/test_commands.py", "plugin/test_whole_runs.py", "integration", "plugin", "cli")
 """Long files and folders with long files, the longest first. Workers that start with these end together.
 
 While one worker trains the tiny run, which most of tests/integration waits for, another needs something else to do."""

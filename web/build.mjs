@@ -7,7 +7,7 @@ import { fileURLToPath } from "node:url";
 import { build } from "esbuild";
 
 const here = fileURLToPath(new URL(".", import.meta.url));
-const target = process.argv[2] ?? `${here}../sundae_ns/api/page.html`;
+const target = process.argv[2] ?? `${here}../sundae_ns/scene/page.html`;
 
 /** Shaders without comments, indentation and empty lines. */
 const shaders = {

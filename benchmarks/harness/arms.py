@@ -16,7 +16,7 @@ import tyro
 import yaml
 
 from harness.plan import WARM_UP, Arm, Kind, Words
-from sundae_ns.errors import ConfigError
+from sundae_ns.core.errors import ConfigError
 
 DEFAULT_FILE = Path(__file__).with_name("arms.yaml")
 """The default arms; also an example of a file of arms."""
@@ -139,7 +139,7 @@ def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Ar
     """
     from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
-    from sundae_ns.model import SundaeModelConfig
+    from sundae_ns.plugin.model import SundaeModelConfig
 
     method = entry.method or default
     config, model = _config_of(entry, method), _methods()[method].pipeline.model

@@ -28,26 +28,21 @@ from nerfstudio.utils import profiler, writer
 from harness.alone import watched_gpu
 from harness.plan import Job, Words, done_file, job_folder
 from harness.script import run_script
-from sundae_ns.api.files import load
-from sundae_ns.api.packing import contents_of
-from sundae_ns.errors import BackendError, CheckpointError, PackError, SundaeError
-from sundae_ns.evaluation import Lpips, Measured, lpips_weights
-from sundae_ns.model import SundaeModelConfig
-from sundae_ns.scenes.finetune import finetune
-from sundae_ns.scenes.measure import measure_scene
-from sundae_ns.scenes.models import Opened, load_model, load_run, model_of
-from sundae_ns.storage.atomic import write_text
-from sundae_ns.storage.pack import (
-    FINETUNE_STEPS,
-    FINETUNED,
-    Codecs,
-    PackConfig,
-    PackedScene,
-    fit_scene,
-    write_fitted,
-)
-from sundae_ns.trainer import SundaeTrainerConfig
-from sundae_ns.training.schedules import set_schedule
+from sundae_ns.core.errors import BackendError, CheckpointError, PackError, SundaeError
+from sundae_ns.core.files import write_text
+from sundae_ns.core.metrics import Lpips, lpips_weights
+from sundae_ns.io.pack.codecs import Codecs
+from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED, PackConfig
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, write_fitted
+from sundae_ns.plugin.finetune import finetune
+from sundae_ns.plugin.finished_runs import Opened, load_model, load_run, model_of
+from sundae_ns.plugin.model import SundaeModelConfig
+from sundae_ns.plugin.trainer import SundaeTrainerConfig
+from sundae_ns.report.measure import measure_scene
+from sundae_ns.report.measured import Measured
+from sundae_ns.scene.load_save import load
+from sundae_ns.scene.packing import contents_of
+from sundae_ns.train.schedules import set_schedule
 
 NEVER = 10**9
 """A step that no training reaches."""

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import sundae_ns.core.files
+import sundae_ns.io.checkpoint
 import sundae_ns.pruning.decision
-import sundae_ns.storage.atomic
-import sundae_ns.storage.checkpoint
-import sundae_ns.training.pruning
-from sundae_ns.training import trials
+import sundae_ns.train.pruning
+from sundae_ns.train import trials
 
 Place = Callable[[int], None]
 """Prepares this process to die the n-th time that it comes there."""
@@ -59,7 +59,7 @@ def half_saved(original: Callable[..., Any]) -> Callable[..., Any]:
 
 def half_recorded(original: Callable[..., Any]) -> Callable[..., Any]:
     def call(path: Path, text: str) -> None:
-        with sundae_ns.storage.atomic.replacing(path) as partial:
+        with sundae_ns.core.files.replacing(path) as partial:
             partial.write_text(text[: len(text) // 2])
             die()
 
@@ -74,7 +74,7 @@ def half_written(original: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-_checkpoint, _atomic = sundae_ns.storage.checkpoint, sundae_ns.storage.atomic
+_checkpoint, _atomic = sundae_ns.io.checkpoint, sundae_ns.core.files
 SAVES: dict[str, Place] = {
     "save: half written": lambda n: after(n, _checkpoint.torch, "save", half_saved),
     "save: not yet on the disk": lambda n: after(3 * n, _atomic, "flush", at_once),
@@ -84,7 +84,7 @@ TRAINING: dict[str, Place] = {
     **SAVES,
     "prune: deciding": lambda n: after(1, sundae_ns.pruning.decision, "decide", at_once),
     "prune: sliced": lambda n: after(1, sundae_ns.pruning.decision, "keep", when_done),
-    "prune: half recorded": lambda n: after(1, sundae_ns.training.pruning, "write_text", half_recorded),
+    "prune: half recorded": lambda n: after(1, sundae_ns.train.pruning, "write_text", half_recorded),
 }
 TRIALS: dict[str, Place] = {
     "trial: started": lambda n: after(n, trials.TrialEngine, "start", when_done),

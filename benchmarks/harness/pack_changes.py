@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from sundae_ns.errors import SundaeError
+from sundae_ns.core.errors import SundaeError
 
 Json = Any
 

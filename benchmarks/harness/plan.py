@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.data.layouts import how_to_make_one
-from sundae_ns.errors import ConfigError, DataError
 
 Kind = Literal["branch", "whole"]
 """How an arm trains: from a warm-up that others share, or by itself from scratch."""

@@ -61,7 +61,9 @@ class Bench:
         if device == "cpu":
             # This process has threads (a progress bar's, torch's): a run forked off it could wait for ever for a lock
             # of theirs.
-            self.context.set_forkserver_preload(["nerfstudio.scripts.train", "sundae_ns.model", "sundae_ns.trainer"])
+            self.context.set_forkserver_preload(
+                ["nerfstudio.scripts.train", "sundae_ns.plugin.model", "sundae_ns.plugin.trainer"]
+            )
         self.log = log
 
     def start(self, work: Any, *arguments: Any) -> BaseProcess:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from harness.plan import Arm
-from sundae_ns.errors import DataError
-from sundae_ns.evaluation import csv_text
-from sundae_ns.evaluation.measured import MEGABYTE, METRICS, number, table
-from sundae_ns.storage.atomic import write_text
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.files import write_text
+from sundae_ns.core.tables import MEGABYTE, number, table
+from sundae_ns.report.measured import METRICS, csv_text
 
 Result = Mapping[str, Any]
 """Content of a file in ``done/``: the job's description as ``job``, its figures as ``measured``."""

@@ -21,9 +21,9 @@ from harness.plan import Job, done_file, job_folder, jobs_of_shard
 from harness.results import Result, read_results, write_results
 from sundae_ns.cli.options import check_folder
 from sundae_ns.cli.process import percent_of, run_logged
-from sundae_ns.errors import ConfigError, StorageError, SundaeError, writing
-from sundae_ns.evaluation.measured import table
-from sundae_ns.storage.atomic import write_text
+from sundae_ns.core.errors import ConfigError, StorageError, SundaeError, writing
+from sundae_ns.core.files import write_text
+from sundae_ns.core.tables import table
 
 STOPPED = 130
 """Exit code after an interrupt, as in shells."""

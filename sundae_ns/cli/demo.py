@@ -14,12 +14,13 @@ from rich.progress import Progress
 
 from sundae_ns.cli.options import Overwrite, check_folder, check_least
 from sundae_ns.cli.process import percent_of, quoted, run_logged, word
-from sundae_ns.data import write_demo_capture
-from sundae_ns.errors import writing
-from sundae_ns.evaluation import Lpips
-from sundae_ns.evaluation.measured import METRICS, number, table
-from sundae_ns.storage.atomic import write_bytes, write_text
-from sundae_ns.storage.run_folder import prunes_of
+from sundae_ns.core.errors import writing
+from sundae_ns.core.files import write_bytes, write_text
+from sundae_ns.core.metrics import Lpips
+from sundae_ns.core.tables import number, table
+from sundae_ns.data.demo_capture import write_demo_capture
+from sundae_ns.io.run_folder import prunes_of
+from sundae_ns.report.measured import METRICS
 
 METHOD = "sundae-tiny"
 
@@ -54,10 +55,10 @@ def demo(
         progress.add_task("Evaluating", total=None)
         # nerfstudio prints messages while it imports and loads.
         with open(out / "measure.log", "w", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
-            from sundae_ns.api.packing import packed_bytes
-            from sundae_ns.api.page import write_page
-            from sundae_ns.scenes.measure import measure_scene
-            from sundae_ns.scenes.models import load_model, load_run
+            from sundae_ns.plugin.finished_runs import load_model, load_run
+            from sundae_ns.report.measure import measure_scene
+            from sundae_ns.scene.packing import packed_bytes
+            from sundae_ns.scene.page import write_page
 
             measured = measure_scene(load_model(run), label="demo", lpips=Lpips(), visible=False, warmup=1, repeats=3)
             write_text(out / "eval.json", json.dumps(measured.as_json(), indent=2) + "\n")

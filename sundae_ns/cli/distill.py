@@ -9,12 +9,12 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sundae_ns.api.files import SUFFIXES, load, save
-from sundae_ns.api.virtual import virtual_views
 from sundae_ns.cli.inputs import cameras_of
 from sundae_ns.cli.options import Out, Overwrite, Scene, check_exclusive, check_file, check_suffix
-from sundae_ns.errors import ConfigError, writing
-from sundae_ns.rasterization import fastest_device
+from sundae_ns.core.errors import ConfigError, writing
+from sundae_ns.rasterize.interface import fastest_device
+from sundae_ns.scene.load_save import SUFFIXES, load, save
+from sundae_ns.scene.virtual_cameras import virtual_views
 
 
 def distill(
@@ -48,8 +48,8 @@ def distill(
         raise ConfigError(f"{out} cannot hold a head; name it .sundae, or leave the head out with --no-head")
     check_file(out, reads=[source, cameras], overwrite=overwrite)
     scene = load(source).to(fastest_device())
-    from sundae_ns.scenes.distill import Distillation
-    from sundae_ns.training.progress import Interruption
+    from sundae_ns.plugin.distill import Distillation
+    from sundae_ns.train.progress import Interruption
 
     partial = out.with_name(f"{out.name}.partial")
     console = Console(stderr=True)

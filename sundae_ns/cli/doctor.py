@@ -22,8 +22,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from sundae_ns.cli.options import Flag
-from sundae_ns.errors import BackendError
-from sundae_ns.evaluation import lpips_weights
+from sundae_ns.core.errors import BackendError
+from sundae_ns.core.metrics import lpips_weights
 
 PACKAGES = ("sundae-ns", "nerfstudio", "gsplat", "torch", "torchvision", "numpy", "scipy", "tyro")
 
@@ -160,7 +160,7 @@ def _nvcc() -> str:
 
 
 def _gsplat(compile_kernels: bool) -> str:
-    from sundae_ns.rasterization import select_backend
+    from sundae_ns.rasterize.interface import select_backend
 
     if not torch.cuda.is_available():
         raise Missing("need a CUDA device")
@@ -187,9 +187,10 @@ def _kernels() -> str:
     """This package's own: neighbour search, the loss, and the fused parts of the head."""
     if not torch.cuda.is_available():
         raise Missing("need a CUDA device; a CPU uses equivalent code")
-    from sundae_ns.compensation import CompensationHead, HeadConfig, fused
-    from sundae_ns.gpu import loss
-    from sundae_ns.graphs import neighbors
+    from sundae_ns.cuda import loss
+    from sundae_ns.graph import neighbors
+    from sundae_ns.head import fused
+    from sundae_ns.head.head import CompensationHead, HeadConfig
 
     device = torch.device("cuda", 0)
     try:
@@ -204,7 +205,7 @@ def _kernels() -> str:
 
 def _rasterizer() -> str:
     """Which one ``auto`` selects."""
-    from sundae_ns.rasterization import numba_problem
+    from sundae_ns.rasterize.interface import numba_problem
 
     if torch.cuda.is_available():
         return "auto selects gsplat, if its kernels work"

@@ -8,18 +8,18 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from sundae_ns.api.cleaning import within
-from sundae_ns.api.files import load, load_with_mask, save_for_viewers
-from sundae_ns.api.packing import packed_bytes, stated_start
-from sundae_ns.api.page import write_page
-from sundae_ns.api.views import with_start
 from sundae_ns.cli.inputs import Cleaning, copies_rows, open_packed
 from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file, check_folder
-from sundae_ns.errors import ConfigError
-from sundae_ns.storage.formats import check_format
-from sundae_ns.storage.pack import container
-from sundae_ns.storage.ply import keep_vertices
-from sundae_ns.storage.run_folder import files_of
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.io.formats import check_format
+from sundae_ns.io.pack import container
+from sundae_ns.io.ply import keep_vertices
+from sundae_ns.io.run_folder import files_of
+from sundae_ns.scene.cameras import with_start
+from sundae_ns.scene.cleaning import within
+from sundae_ns.scene.load_save import load, load_with_mask, save_for_viewers
+from sundae_ns.scene.packing import packed_bytes, stated_start
+from sundae_ns.scene.page import write_page
 
 
 def export(

@@ -13,17 +13,17 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from sundae_ns.api.cleaning import crop_mask, floater_mask, kept
-from sundae_ns.api.files import load, packed_file
-from sundae_ns.api.scene import Scene
-from sundae_ns.api.views import views_of
-from sundae_ns.api.virtual import VIEWS
 from sundae_ns.cli.options import Flag
-from sundae_ns.errors import DataError
-from sundae_ns.rendering.views import View
-from sundae_ns.storage.config_file import check_run, find_config
-from sundae_ns.storage.formats import kind_of, kind_of_primitives
-from sundae_ns.storage.ply import has_own_columns
+from sundae_ns.core.camera import View
+from sundae_ns.core.errors import DataError
+from sundae_ns.io.config_file import check_run, find_config
+from sundae_ns.io.formats import kind_of, kind_of_primitives
+from sundae_ns.io.ply import has_own_columns
+from sundae_ns.scene.cameras import views_of
+from sundae_ns.scene.cleaning import crop_mask, floater_mask, kept
+from sundae_ns.scene.load_save import load, packed_file
+from sundae_ns.scene.scene import Scene
+from sundae_ns.scene.virtual_cameras import VIEWS
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     if kind_of(path) == "packed" or kind_of_primitives(path) is not None or path.suffix == ".sundae":
         return packed_file(path)
     check_run(path)  # before nerfstudio is imported, which takes seconds
-    from sundae_ns.api.packing import packed_bytes
-    from sundae_ns.scenes.models import load_run
+    from sundae_ns.plugin.finished_runs import load_run
+    from sundae_ns.scene.packing import packed_bytes
 
     with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
         scene = load_run(path, data=data)
@@ -101,7 +101,7 @@ def cameras_of(scene: Scene, cameras: Path | None, most: int | None) -> Sequence
     if not ((cameras.is_dir() or cameras.name == "config.yml") and find_config(cameras) is not None):
         return views_of(cameras, scene)
     check_run(cameras)
-    from sundae_ns.scenes.models import load_run
+    from sundae_ns.plugin.finished_runs import load_run
 
     with redirect_stdout(StringIO()):
         return load_run(cameras, max_cameras=most or VIEWS["cpu"]).views

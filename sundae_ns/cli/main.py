@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from typing import NoReturn
 
-from sundae_ns.errors import ConfigError, SundaeError, writing
+from sundae_ns.core.errors import ConfigError, SundaeError, writing
 
 ENVIRONMENT = {
     # Where another program takes one of two cores, threads that spin while they wait make a training step on a CPU ten

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.errors import ConfigError, StorageError
+from sundae_ns.core.errors import ConfigError, StorageError
 
 Source = Annotated[Path, tyro.conf.Positional]
 """The file or the folder that a command reads."""

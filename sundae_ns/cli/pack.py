@@ -17,29 +17,22 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from sundae_ns.api.files import load
-from sundae_ns.api.packing import contents_of
-from sundae_ns.api.views import with_start
 from sundae_ns.cli.inputs import Cleaning
 from sundae_ns.cli.options import Direction, Out, Overwrite, check_exclusive, check_file, check_least
 from sundae_ns.cli.train import has_gpu
-from sundae_ns.errors import ConfigError, SundaeError
-from sundae_ns.storage.config_file import check_run
-from sundae_ns.storage.formats import PRIMITIVES, kind_of_primitives
-from sundae_ns.storage.pack import (
-    FINETUNE_STEPS,
-    FINETUNED,
-    Codecs,
-    PackConfig,
-    PackedScene,
-    fit_scene,
-    pack_bytes,
-    write_fitted,
-)
-from sundae_ns.storage.run_folder import files_of
+from sundae_ns.core.errors import ConfigError, SundaeError
+from sundae_ns.io.config_file import check_run
+from sundae_ns.io.formats import PRIMITIVES, kind_of_primitives
+from sundae_ns.io.pack.codecs import Codecs
+from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED, PackConfig
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes, write_fitted
+from sundae_ns.io.run_folder import files_of
+from sundae_ns.scene.cameras import with_start
+from sundae_ns.scene.load_save import load
+from sundae_ns.scene.packing import contents_of
 
 if TYPE_CHECKING:
-    from sundae_ns.scenes.targets import Judge
+    from sundae_ns.plugin.targets import Judge
 
 
 def pack(
@@ -103,7 +96,7 @@ def pack(
     ):
         task = progress.add_task("Reading the run", total=3 + finetune)
         if kind is None:
-            from sundae_ns.scenes.models import load_run  # takes seconds
+            from sundae_ns.plugin.finished_runs import load_run  # takes seconds
 
             scene = load_run(run, max_cameras=max_cameras, data=data)
         else:
@@ -111,12 +104,12 @@ def pack(
         source = contents_of(with_start(cleaning.cleaned(scene, progress=False), start_view, up))
         progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
         if finetune:
-            from sundae_ns.scenes.finetune import finetune as tune
+            from sundae_ns.plugin.finetune import finetune as tune
 
             packs.append(tune(run, source, config, finetune, data=data, progress=lambda _: progress.advance(task)))
         progress.update(task, description="Packing")
         if target_bytes is not None or target_drop is not None:
-            from sundae_ns.scenes.targets import Search, fewest_bytes, least_drop
+            from sundae_ns.plugin.targets import Search, fewest_bytes, least_drop
 
             # Not what is fitted already without a fine-tune: its positions are rounded.
             searches = [Search(source, precision, judge), *(Search(*each, judge) for each in packs)]
@@ -157,7 +150,7 @@ def _judge_of(run: Path, data: Path | None) -> Callable[[], Judge]:
 
     @cache
     def judge() -> Judge:
-        from sundae_ns.scenes.targets import Judge
+        from sundae_ns.plugin.targets import Judge
 
         return Judge(run, data)
 
@@ -168,7 +161,7 @@ def _measured(
     judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Codecs]], finetune: int, notes: list[str]
 ) -> tuple[str, dict[str, Any]]:
     """A line and figures of the quality of a pack; a second pack is that without the fine-tune. Adds to the notes."""
-    from sundae_ns.scenes.targets import is_worth
+    from sundae_ns.plugin.targets import is_worth
 
     try:
         opened = judge()

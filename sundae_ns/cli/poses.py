@@ -16,7 +16,7 @@ import tyro
 
 from sundae_ns.cli.options import Out, Source, check_least
 from sundae_ns.cli.process import quoted, word
-from sundae_ns.errors import ConfigError, DataError, StorageError, SundaeError, one_line
+from sundae_ns.core.errors import ConfigError, DataError, StorageError, SundaeError, one_line
 
 T = TypeVar("T")
 
@@ -59,8 +59,7 @@ def poses(
         raise StorageError(f"{out} exists; choose another folder, or remove it")
     if photos.is_dir() and out.resolve().is_relative_to(photos.resolve()):
         raise StorageError(f"{out} lies in {photos}, which the command reads; choose another folder")
-    from sundae_ns.poses import Request, find_poses
-    from sundae_ns.poses.reconstruct import pycolmap
+    from sundae_ns.data.reconstruct import Request, find_poses, pycolmap
 
     pycolmap()
     request = Request(photos, out, options.matching, options.frames, masks)
@@ -94,8 +93,8 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
         DataError: the photos or masks cannot be used.
     """
     from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside, masks_of
-    from sundae_ns.poses.reconstruct import check_installed
-    from sundae_ns.poses.video import SUFFIXES, is_video, video_size
+    from sundae_ns.data.reconstruct import check_installed
+    from sundae_ns.data.video import SUFFIXES, is_video, video_size
 
     check_installed()
     if not photos.exists():

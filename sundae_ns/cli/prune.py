@@ -7,16 +7,16 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.api import pruning
-from sundae_ns.api.cleaning import kept, within
-from sundae_ns.api.files import SUFFIXES, load_with_mask, save
-from sundae_ns.api.virtual import virtual_views
 from sundae_ns.cli.inputs import Cleaning, cameras_of, copies_rows
 from sundae_ns.cli.options import Out, Overwrite, Scene, check_exclusive, check_file, check_suffix
-from sundae_ns.gpu.kernels import naming_full_memory
-from sundae_ns.pruning import PruneRule
-from sundae_ns.rasterization import fastest_device
-from sundae_ns.storage.ply import keep_vertices
+from sundae_ns.cuda.kernels import naming_full_memory
+from sundae_ns.io.ply import keep_vertices
+from sundae_ns.pruning.rule import PruneRule
+from sundae_ns.rasterize.interface import fastest_device
+from sundae_ns.scene import prune_scene as pruning
+from sundae_ns.scene.cleaning import kept, within
+from sundae_ns.scene.load_save import SUFFIXES, load_with_mask, save
+from sundae_ns.scene.virtual_cameras import virtual_views
 
 
 def prune(

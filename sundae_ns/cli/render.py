@@ -8,17 +8,17 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
-from sundae_ns.api.files import load
-from sundae_ns.api.film import film_views
-from sundae_ns.api.scene import image_of
-from sundae_ns.api.scene import render as render_view
-from sundae_ns.api.views import CameraFile, read_cameras, view_in_front, with_start
 from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file
-from sundae_ns.errors import ConfigError
-from sundae_ns.evaluation.video import write_video
-from sundae_ns.rasterization import fastest_device
-from sundae_ns.rendering.views import View
-from sundae_ns.storage.atomic import replacing, write_image
+from sundae_ns.core.camera import View
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.core.files import replacing, write_image
+from sundae_ns.rasterize.interface import fastest_device
+from sundae_ns.report.video import write_video
+from sundae_ns.scene.camera_path import film_views
+from sundae_ns.scene.cameras import CameraFile, read_cameras, view_in_front, with_start
+from sundae_ns.scene.load_save import load
+from sundae_ns.scene.scene import image_of
+from sundae_ns.scene.scene import render as render_view
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 SECONDS = 12.0

@@ -17,16 +17,15 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from sundae_ns.cli.options import Out, Overwrite, check_folder, check_least
-from sundae_ns.errors import ConfigError, SundaeError, writing
-from sundae_ns.evaluation import Lpips, Measured, csv_text, flip_available, lpips_weights
-from sundae_ns.evaluation.count_curve import read_count_curve
-from sundae_ns.evaluation.measured import markdown
-from sundae_ns.evaluation.metrics import Net
-from sundae_ns.storage.atomic import write_files
+from sundae_ns.core.errors import ConfigError, SundaeError, writing
+from sundae_ns.core.files import write_files
+from sundae_ns.core.metrics import Lpips, Net, flip_available, lpips_weights
+from sundae_ns.report.measured import Measured, csv_text, markdown
+from sundae_ns.train.curve import read_count_curve
 
 if TYPE_CHECKING:
-    from sundae_ns.evaluation.page import ShownRun, ShownView
-    from sundae_ns.scenes.models import Opened
+    from sundae_ns.plugin.finished_runs import Opened
+    from sundae_ns.report.report_page import ShownRun, ShownView
 
 
 def report(
@@ -52,9 +51,9 @@ def report(
     if not runs:
         raise ConfigError("there is nothing to report on; give the folders of finished runs")
     check_least(warmup=(warmup, 0), repeats=(repeats, 0))
-    from sundae_ns.evaluation.page import ShownRun, report_page, views_for_each
-    from sundae_ns.scenes.measure import measure_scene
-    from sundae_ns.scenes.models import load_model
+    from sundae_ns.plugin.finished_runs import load_model
+    from sundae_ns.report.measure import measure_scene
+    from sundae_ns.report.report_page import ShownRun, report_page, views_for_each
 
     words = ["sundae", "report", *map(str, runs), "-o", str(out), "--lpips-net", lpips_net]
     words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
@@ -134,7 +133,7 @@ def _label(opened: Opened, taken: Collection[str]) -> str:
 @torch.no_grad()
 def _views(opened: Opened, measured: Measured, most: int) -> list[ShownView]:
     """The views of a run that the page shows, ``most`` or fewer; memory holds one at a time at its full size."""
-    from sundae_ns.evaluation.page import choose_views, shown_view
+    from sundae_ns.report.report_page import choose_views, shown_view
 
     full, base = measured.full.views, measured.base.views if measured.has_head else None
     names = [path.name for path in opened.datamanager.eval_dataset.image_filenames]

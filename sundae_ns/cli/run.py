@@ -18,13 +18,14 @@ from sundae_ns.cli.options import Out, Source, check_folder
 from sundae_ns.cli.poses import PoseOptions, check_poses
 from sundae_ns.cli.process import quoted, run_command, word
 from sundae_ns.cli.train import TrainOptions, finetune_words, has_gpu, pack_run
+from sundae_ns.core.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
+from sundae_ns.core.files import put_aside, write_text
+from sundae_ns.data.capture_files import placed_in
 from sundae_ns.data.layouts import is_model, is_posed, no_transforms, posed_layout
-from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
-from sundae_ns.poses import placed_in
-from sundae_ns.storage.atomic import put_aside, write_text
-from sundae_ns.storage.config_file import schedule_length
-from sundae_ns.storage.pack import FINETUNED_SIZE, container, tuned_steps
-from sundae_ns.storage.run_folder import LOCK, reserve, steps_left
+from sundae_ns.io.config_file import schedule_length
+from sundae_ns.io.pack import container
+from sundae_ns.io.pack.config import FINETUNED_SIZE, tuned_steps
+from sundae_ns.io.run_folder import LOCK, reserve, steps_left
 
 SETTINGS = "run.json"
 """File with the settings of the first command; a repeated one must share them."""

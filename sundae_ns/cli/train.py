@@ -14,9 +14,9 @@ import tyro
 
 from sundae_ns.cli.options import Flag, Out, Source, check_least
 from sundae_ns.cli.process import run_command, word
+from sundae_ns.core.errors import STOPPED, ConfigError, DataError
 from sundae_ns.data.layouts import posed_layout
-from sundae_ns.errors import STOPPED, ConfigError, DataError
-from sundae_ns.storage.run_folder import new_name, unfinished_run
+from sundae_ns.io.run_folder import new_name, unfinished_run
 
 PACKED = "scene.sundae"
 """Name of the packed scene in the folder of its run."""
@@ -139,7 +139,7 @@ def pack_run(run: Path, out: Path, *more: str, finetune: bool) -> int:
         more: further words.
         finetune: fine-tune the pack; one that fails, for example because the GPU's memory is full, is left out.
     """
-    from sundae_ns.storage.pack import FINETUNE_STEPS
+    from sundae_ns.io.pack.config import FINETUNE_STEPS
 
     words = ["sundae", "pack", word(run), "-o", word(out), *more]
     if finetune:
@@ -152,7 +152,7 @@ def pack_run(run: Path, out: Path, *more: str, finetune: bool) -> int:
 
 def finetune_words() -> list[str]:
     """Words of ns-train that leave the last steps to the fine-tune of :func:`pack_run`."""
-    from sundae_ns.storage.pack import FINETUNE_STEPS
+    from sundae_ns.io.pack.config import FINETUNE_STEPS
 
     return ["--finetune-steps", str(FINETUNE_STEPS)]
 

@@ -8,10 +8,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from sundae_ns.api.page import page_of
 from sundae_ns.cli.inputs import open_packed
 from sundae_ns.cli.options import Scene
-from sundae_ns.errors import ConfigError
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.scene.page import page_of
 
 IDLE_SECONDS = 15.0
 """A connection that sends or takes nothing for so long is closed."""

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from sundae_ns.core.errors import DataError, one_line, reading, regular
 from sundae_ns.data.lenses import DISTORTION, FISHEYE624, INTRINSICS, kind_of_model, lens_of, with_focal_lengths
-from sundae_ns.errors import DataError, one_line, reading, regular
 
 _MAX_SIDE = 65535  # pixels: JPEG's limit
 _LARGEST = 1e12  # its square must stay in the range of float32

@@ -26,9 +26,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.data.capture import beside, finite, side
 from sundae_ns.data.lenses import COLMAP_LENSES, Lens, colmap_lens, colmap_model
-from sundae_ns.errors import DataError, reading, regular
 
 _CAMERA, _IMAGE, _COUNT = (struct.Struct(layout) for layout in ("<iiQQ", "<i7di", "<Q"))
 _POINT = np.dtype([("number", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])

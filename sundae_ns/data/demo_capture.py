@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 from pathlib import Path
 
-from sundae_ns.errors import DataError
+from sundae_ns.core.errors import DataError
 
 ARCHIVE = Path(__file__).with_name("demo_capture.zip")
 """48 training and 8 test images of 128 x 128 pixels, and 5,000 points."""

@@ -6,9 +6,9 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+from sundae_ns.core.errors import DataError
 from sundae_ns.data.capture import beside, check_image, entries, read_json
 from sundae_ns.data.colmap import read_images
-from sundae_ns.errors import DataError
 
 LONGEST_SIDE = 1600
 """Longest side in pixels that images are trained at where smaller ones are there, as nerfstudio does."""

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from PIL import Image
 
-from sundae_ns.errors import DataError
+from sundae_ns.core.errors import DataError
 
 PERSPECTIVE, FISHEYE, FISHEYE624 = "OPENCV", "OPENCV_FISHEYE", "FISHEYE624"
 """Names of the three kinds of lenses that nerfstudio undistorts."""

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
+from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.data.capture import check_image, undecodable
-from sundae_ns.errors import DataError, reading, regular
 
 HEIF = (".heic", ".heif")
 """Photos of phones, for which Pillow needs the package pillow-heif."""

@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.gaussians.gaussians import Field, as_field, mend, num_primitives
-from sundae_ns.gaussians.surgery import grow, keep, per_primitive, rewrite
-from sundae_ns.graphs import NeighborGraph
+from sundae_ns.core.errors import ConfigError, DataError
+from sundae_ns.core.gaussians import Field, as_field, mend, num_primitives
+from sundae_ns.core.surgery import grow, keep, per_primitive, rewrite
+from sundae_ns.graph.graph import NeighborGraph
 from sundae_ns.pruning.merge import field_graph, merged, pair_labels
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import score
@@ -82,7 +82,7 @@ def decide(
         rule: how to score, select and merge.
         count: number of primitives to keep, at least 1; all finite primitives are kept if they are fewer.
         contribution: blending weights, summed over the training views, any device ``[N]``; see
-            :func:`sundae_ns.rendering.render.contribution`. Needed if ``rule.uses_contribution``.
+            :func:`sundae_ns.scene.render.contribution`. Needed if ``rule.uses_contribution``.
         graph: :func:`field_graph` of the finite primitives by the same rule; built if not given and needed.
 
     Raises:
@@ -201,7 +201,7 @@ class FieldPruner:
 
     @torch.no_grad()
     def cut(self, rule: PruneRule, count: int, contribution: Tensor | None = None) -> Decision:
-        """Decide, remove and merge; see :func:`sundae_ns.pruning.decide` for arguments and errors."""
+        """Decide, remove and merge; see :func:`sundae_ns.pruning.decision.decide` for arguments and errors."""
         decision = decide(self.params, rule, count, contribution)
         keep(self.params, self.optimizers, self.states, decision.mask)
         if decision.values is not None:

@@ -12,10 +12,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from sundae_ns.gaussians.covariance import chunks, covariances_of, lower_entries, outer_entries, overlap, pair_overlap
-from sundae_ns.gaussians.gaussians import as_field, rgb_to_logit, sh_to_rgb
-from sundae_ns.gaussians.merging import merge
-from sundae_ns.graphs import NeighborGraph, build_graph
+from sundae_ns.core.covariance import chunks, covariances_of, lower_entries, outer_entries, overlap, pair_overlap
+from sundae_ns.core.gaussians import as_field, rgb_to_logit, sh_to_rgb
+from sundae_ns.core.merging import merge
+from sundae_ns.graph.graph import NeighborGraph, build_graph
 from sundae_ns.pruning.rule import PruneRule
 
 LEAST_WIDTH = 0.25
@@ -90,7 +90,7 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
         count: number of groups, 1 to N.
 
     Returns:
-        Labels as :func:`sundae_ns.gaussians.merging.merge` takes them, int64, on the graph's device ``[N]``: the index
+        Labels as :func:`sundae_ns.core.merging.merge` takes them, int64, on the graph's device ``[N]``: the index
         of a member, in each merge that of the heavier group; -1 for primitives that are dropped.
     """
     device, n = graph.indices.device, graph.N
@@ -272,7 +272,7 @@ def merged(
     params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, weight: Tensor, labels: Tensor | None = None
 ) -> dict[str, Tensor]:
     """Merge the primitives of each Voronoi cell of the graph into its kept one; see :func:`voronoi_labels`, and
-    :func:`sundae_ns.gaussians.merging.merge` for the result.
+    :func:`sundae_ns.core.merging.merge` for the result.
 
     A field that stores logits averages colours, not logits.
 

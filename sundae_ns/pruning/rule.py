@@ -8,7 +8,7 @@ from typing import Literal, get_args, get_origin, get_type_hints
 
 from torch import Tensor
 
-from sundae_ns.errors import ConfigError
+from sundae_ns.core.errors import ConfigError
 
 ScoreName = Literal["detail-contribution", "response"]
 

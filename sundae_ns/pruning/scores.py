@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.filters import high_pass, response_magnitude
-from sundae_ns.gaussians.gaussians import as_field, sh_to_rgb
-from sundae_ns.graphs import NeighborGraph
+from sundae_ns.core.errors import ConfigError, DataError
+from sundae_ns.core.gaussians import as_field, sh_to_rgb
+from sundae_ns.graph.filters import high_pass, response_magnitude
+from sundae_ns.graph.graph import NeighborGraph
 from sundae_ns.pruning.merge import field_graph
 from sundae_ns.pruning.rule import PruneRule
 

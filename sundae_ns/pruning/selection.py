@@ -14,8 +14,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import DataError
-from sundae_ns.graphs.neighbors import build_tree
+from sundae_ns.core.errors import DataError
+from sundae_ns.graph.neighbors import build_tree
 
 LEAST_SHARE = 1e-200  # least score of a systematic sample, as a share of the largest; lower scores are raised to it
 

@@ -9,7 +9,7 @@ import pytest
 from harness.arms import DEFAULT_FILE, Entry, choose_arms, read_entries
 from harness.job import configure
 from harness.plan import Arm, Job, plan_scene
-from sundae_ns.errors import ConfigError
+from sundae_ns.core.errors import ConfigError
 
 DEFAULTS = [
     *("sundae", "sundae-with-head", "band", "sundae-no-head", "sundae-no-head-bytes", "band-no-head"),

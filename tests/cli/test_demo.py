@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sundae_ns.cli.demo import demo
-from sundae_ns.errors import SundaeError
+from sundae_ns.core.errors import SundaeError
 
 
 @pytest.mark.parametrize(("steps", "message"), [(0, "steps is 0; give at least 1"), (300, "made"), (None, "made")])

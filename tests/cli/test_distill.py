@@ -12,7 +12,7 @@ import torch
 
 import sundae_ns as sn
 from sundae_ns.cli import main
-from sundae_ns.scenes.distill import Distillation
+from sundae_ns.plugin.distill import Distillation
 
 
 def run(*words: Any) -> int:

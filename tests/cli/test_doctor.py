@@ -13,7 +13,7 @@ import torch
 from command_line import run
 
 from sundae_ns.cli import doctor
-from sundae_ns.errors import BackendError
+from sundae_ns.core.errors import BackendError
 
 
 def check(name: str, compile_kernels: bool = False) -> tuple[bool, str, str]:
@@ -35,9 +35,9 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     """A CUDA device that only torch's answers simulate."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Imaginary 9000")
-    monkeypatch.setattr("sundae_ns.graphs.neighbors.Kernel", lambda *_: None)
-    monkeypatch.setattr("sundae_ns.compensation.fused.head_kernels", lambda *_: {})
-    monkeypatch.setattr("sundae_ns.gpu.loss.loss_kernels", lambda *_: None)
+    monkeypatch.setattr("sundae_ns.graph.neighbors.Kernel", lambda *_: None)
+    monkeypatch.setattr("sundae_ns.head.fused.head_kernels", lambda *_: {})
+    monkeypatch.setattr("sundae_ns.cuda.loss.loss_kernels", lambda *_: None)
 
 
 def select(problem: str | None = None) -> object:
@@ -54,7 +54,7 @@ def test_without_cuda_auto_selects_the_compiled_loops(no_cuda: None, monkeypatch
     assert "auto selects cpu" in check("rasteriser")[1]
     for name in ("gsplat kernels", "our kernels"):
         assert check(name, True)[:2] == (False, check(name)[1])
-    monkeypatch.setattr("sundae_ns.rasterization.numba_problem", lambda: "numba does not import (x; y)")
+    monkeypatch.setattr("sundae_ns.rasterize.interface.numba_problem", lambda: "numba does not import (x; y)")
     found, said, remedy = check("rasteriser")
     assert not found
     assert "auto selects reference" in said
@@ -65,12 +65,12 @@ def test_without_cuda_auto_selects_the_compiled_loops(no_cuda: None, monkeypatch
 def test_kernels_of_gsplat(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "Imaginary 9000" in check("CUDA")[1]
     monkeypatch.setattr(doctor, "kernels_built", lambda: False)
-    monkeypatch.setattr("sundae_ns.rasterization.select_backend", select("its kernels do not run (no nvcc)"))
+    monkeypatch.setattr("sundae_ns.rasterize.interface.select_backend", select("its kernels do not run (no nvcc)"))
     found, said, remedy = check("gsplat kernels")
     assert (found, said.partition(";")[0]) == (False, "not built yet"), "they are built only on request"
     assert remedy.startswith("sundae doctor --compile")
     assert check("gsplat kernels", True)[:2] == (False, "its kernels do not run (no nvcc)")
-    monkeypatch.setattr("sundae_ns.rasterization.select_backend", select())
+    monkeypatch.setattr("sundae_ns.rasterize.interface.select_backend", select())
     assert check("gsplat kernels", True)[0]
     assert "auto selects gsplat" in check("rasteriser")[1]
 

@@ -21,12 +21,12 @@ from short_prunes import SHORT
 from torch import Tensor
 
 import sundae_ns as sn
-from sundae_ns.api import pruning
-from sundae_ns.gaussians import from_points
-from sundae_ns.gaussians.gaussians import SH_C0, SPLAT_NAMES
-from sundae_ns.storage.formats import read_primitives, write_for_viewers
-from sundae_ns.storage.pack import PackedScene, read_scene, write_scene
-from sundae_ns.storage.ply import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply
+from sundae_ns.core.gaussians import SH_C0, SPLAT_NAMES
+from sundae_ns.io.formats import read_primitives, write_for_viewers
+from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
+from sundae_ns.io.ply import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply
+from sundae_ns.scene import prune_scene as pruning
+from sundae_ns.scene.initialization import from_points
 
 MODEL = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "black"}
 

@@ -13,10 +13,10 @@ import torch
 
 from sundae_ns.cli import main
 from sundae_ns.cli.options import check_file, check_folder
-from sundae_ns.errors import StorageError
-from sundae_ns.gaussians import from_points
-from sundae_ns.storage.pack import PackedScene, write_scene
-from sundae_ns.storage.ply import write_ply
+from sundae_ns.core.errors import StorageError
+from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
+from sundae_ns.io.ply import write_ply
+from sundae_ns.scene.initialization import from_points
 
 LONG = "x" * 300
 Refused = Callable[..., str]

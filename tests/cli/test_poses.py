@@ -16,7 +16,7 @@ from fake_colmap import FakeColmap
 from PIL import Image
 from run_commands import photo, write_video
 
-from sundae_ns.storage import run_folder
+from sundae_ns.io import run_folder
 
 PHOTOS = 6
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from sundae_ns.cli.process import quoted, run_command, run_logged, word
-from sundae_ns.errors import SundaeError
+from sundae_ns.core.errors import SundaeError
 
 CHILD = """
 import pathlib, signal, subprocess, sys

@@ -102,7 +102,7 @@ def test_damaged_settings(commands: Commands, capsys: pytest.CaptureFixture[str]
 HOLDER = """
 import sys
 from pathlib import Path
-from sundae_ns.storage.run_folder import reserve
+from sundae_ns.io.run_folder import reserve
 reserve(Path("out"))
 print(flush=True)
 sys.stdin.read()

@@ -17,7 +17,7 @@ from PIL import Image
 from sundae_ns import method_configs
 from sundae_ns.cli import main
 from sundae_ns.cli.train import methods
-from sundae_ns.storage.run_folder import LOCK, unfinished_run
+from sundae_ns.io.run_folder import LOCK, unfinished_run
 
 
 class Replaced(Exception):
@@ -135,7 +135,7 @@ def run_of(folder: Path, capture: Path, step: int, *, source: Path | None = None
     """Write a run of 30,000 steps with a checkpoint of a step."""
     (folder / "nerfstudio_models").mkdir(parents=True)
     part = "\n".join(f"- {part}" for part in capture.absolute().parts)
-    text = "!!python/object:sundae_ns.trainer.SundaeTrainerConfig\nschedule_length: 30000\n"
+    text = "!!python/object:sundae_ns.plugin.trainer.SundaeTrainerConfig\nschedule_length: 30000\n"
     text += f"data: !!python/object/apply:pathlib.PosixPath\n{part}\n"
     if source is not None:
         text += "load_dir: !!python/object/apply:pathlib.PosixPath\n" + "".join(f"- {one}\n" for one in source.parts)

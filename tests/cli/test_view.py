@@ -19,7 +19,7 @@ from packed_scenes import KINDS, write_kind
 
 from sundae_ns.cli import main
 from sundae_ns.cli import view as command
-from sundae_ns.errors import ConfigError
+from sundae_ns.core.errors import ConfigError
 
 SECONDS = 60
 """Time limit of what takes milliseconds, so only a hang reaches it."""

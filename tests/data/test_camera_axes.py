@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.data.camera_axes import world_to_camera, world_to_camera_floats
+from sundae_ns.core.camera import world_to_camera, world_to_camera_floats
 
 
 def random_pose(seed: int) -> Tensor:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from sundae_ns.data import check_image, check_transforms, write_demo_capture
-from sundae_ns.data.demo_capture import ARCHIVE
-from sundae_ns.errors import DataError
+from sundae_ns.core.errors import DataError
+from sundae_ns.data.capture import check_image, check_transforms
+from sundae_ns.data.demo_capture import ARCHIVE, write_demo_capture
 
 TRAIN, TEST, SIDE = 48, 8, 128
 

@@ -11,8 +11,9 @@ import pytest
 from colmap_models import write_model
 from PIL import Image
 
-from sundae_ns.data import check_colmap
+from sundae_ns.core.errors import DataError
 from sundae_ns.data.capture import beside
+from sundae_ns.data.colmap import check_colmap
 from sundae_ns.data.layouts import (
     is_posed,
     larger_model,
@@ -22,7 +23,6 @@ from sundae_ns.data.layouts import (
     posed_layout,
     unused_masks,
 )
-from sundae_ns.errors import DataError
 
 
 def photos(folder: Path, count: int = 3, size: tuple[int, int] = (20, 16)) -> list[str]:

@@ -12,10 +12,10 @@ import pytest
 from PIL import Image
 
 from sundae_ns.cli.poses import check_poses
+from sundae_ns.core.errors import DataError
 from sundae_ns.data import photos as module
+from sundae_ns.data import reconstruct
 from sundae_ns.data.photos import find_photos, left_out, masks_beside, masks_of, photo_of
-from sundae_ns.errors import DataError
-from sundae_ns.poses import reconstruct
 
 
 def photo(path: Path, kind: str = "png") -> Path:

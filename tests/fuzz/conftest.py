@@ -22,7 +22,7 @@ from colmap_models import write_model
 from small_captures import HEIGHT, SIZE, VIEWS, WIDTH
 
 from harness.still_life import write_still_life
-from sundae_ns.errors import SundaeError
+from sundae_ns.core.errors import SundaeError
 
 FEW_SEEDS = 10
 """Seeds of each generator in a normal run."""

@@ -22,10 +22,10 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from PIL import Image
 from small_captures import HEIGHT, SIZE, VIEWS, WIDTH, bytes_of, load, meta_of, write_text_model
 
-from sundae_ns.compensation import HeadConfig
+from sundae_ns.core.errors import DataError
 from sundae_ns.data.colmap import check_colmap
-from sundae_ns.errors import DataError
-from sundae_ns.model import SundaeModelConfig
+from sundae_ns.head.head import HeadConfig
+from sundae_ns.plugin.model import SundaeModelConfig
 
 Change = Callable[[dict[str, Any]], object]
 

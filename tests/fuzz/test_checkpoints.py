@@ -18,12 +18,12 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import Optimizers
 from torch.amp import GradScaler
 
-from sundae_ns.compensation import HeadConfig
-from sundae_ns.distributed import Ranks
-from sundae_ns.model import SundaeModel, SundaeModelConfig
-from sundae_ns.storage.formats import read_field
-from sundae_ns.trainer import SundaeTrainer
-from sundae_ns.training.nerfstudio_configs import FusedAdamConfig
+from sundae_ns.head.head import HeadConfig
+from sundae_ns.io.formats import read_field
+from sundae_ns.plugin.distributed import Ranks
+from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
+from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
+from sundae_ns.plugin.trainer import SundaeTrainer
 
 
 def small_model() -> SundaeModel:

@@ -24,11 +24,11 @@ from foreign_files import FOREIGN, small_field
 from hypothesis import HealthCheck, given, settings
 from plyfile import PlyData, PlyElement
 
-from sundae_ns.errors import PackError
-from sundae_ns.gaussians import from_points
-from sundae_ns.storage.formats import read_field, read_primitives, write_for_viewers
-from sundae_ns.storage.pack import PackedScene, read_scene, write_scene
-from sundae_ns.storage.ply import read_point_cloud
+from sundae_ns.core.errors import PackError
+from sundae_ns.io.formats import read_field, read_primitives, write_for_viewers
+from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
+from sundae_ns.io.ply import read_point_cloud
+from sundae_ns.scene.initialization import from_points
 
 Reader = Callable[[Path], Any]
 HEADER = b"ply\nformat %s 1.0\nelement vertex %s\n%send_header\n"

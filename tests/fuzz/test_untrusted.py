@@ -20,11 +20,12 @@ from typing import Any
 import pytest
 import torch
 
-from sundae_ns.gaussians import from_points
-from sundae_ns.storage import checkpoint
-from sundae_ns.storage.formats import read_field, write_for_viewers
-from sundae_ns.storage.pack import PackedScene, container, read_scene, write_scene
-from sundae_ns.storage.ply import read_ply, write_ply
+from sundae_ns.io import checkpoint
+from sundae_ns.io.formats import read_field, write_for_viewers
+from sundae_ns.io.pack import container
+from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
+from sundae_ns.io.ply import read_ply, write_ply
+from sundae_ns.scene.initialization import from_points
 
 PLACES = (
     "../../outside",
@@ -144,7 +145,7 @@ def test_reading_a_capture_writes_nothing(tmp_path: Path, verdict: Any) -> None:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
     from harness.still_life import write_still_life
-    from sundae_ns.parsing import LightNerfstudioParser, check_capture
+    from sundae_ns.plugin.dataparsers import LightNerfstudioParser, check_capture
 
     data = write_still_life(tmp_path / "scene", train_views=3, test_views=1, width=16, height=16, points=30, samples=1)
     for place in PLACES:

@@ -24,9 +24,10 @@ from torch import Tensor
 from viser import transforms
 
 from harness.viewer_page import Server, ViewerPage
-from sundae_ns.pruning import kept_count, prune_field
-from sundae_ns.rendering.render import LocalField, render_view
-from sundae_ns.viewer import previewed_rule
+from sundae_ns.plugin.viewer import previewed_rule
+from sundae_ns.pruning.decision import prune_field
+from sundae_ns.pruning.rule import kept_count
+from sundae_ns.scene.render import LocalField, render_view
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 SIDE = 256

@@ -13,9 +13,9 @@ import pytest
 import torch
 from PIL import Image
 
-from sundae_ns.errors import DataError
-from sundae_ns.gaussians.gaussians import SPLAT_NAMES
-from sundae_ns.storage.ply import is_nerfstudio_ply, read_ply
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.gaussians import SPLAT_NAMES
+from sundae_ns.io.ply import is_nerfstudio_ply, read_ply
 
 
 def test_ns_eval(tiny: Any, call_here: Any, tmp_path: Path) -> None:

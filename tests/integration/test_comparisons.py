@@ -25,9 +25,9 @@ from harness.arms import choose_arms
 from harness.job import perform
 from harness.plan import Job, parser_of, plan_scene
 from harness.results import read_results
-from sundae_ns.scenes.measure import measure_scene
-from sundae_ns.scenes.models import load_model
-from sundae_ns.storage.pack import read_header
+from sundae_ns.io.pack.container import read_header
+from sundae_ns.plugin.finished_runs import load_model
+from sundae_ns.report.measure import measure_scene
 
 ROOT = Path(__file__).parents[2]
 SCALE, WARMUP = 0.02, 12

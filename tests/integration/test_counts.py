@@ -12,11 +12,11 @@ import torch
 from nerfstudio.engine.trainer import Trainer
 from trial_runs import PRUNE_AT, STEPS, tidy, tiny_run, tiny_scene
 
-from sundae_ns.evaluation.count_curve import read_count_curve
-from sundae_ns.pruning import kept_count
-from sundae_ns.training import trials
-from sundae_ns.training.choice import HeldOutQuality
-from sundae_ns.training.pruning import PruningConfig
+from sundae_ns.pruning.rule import kept_count
+from sundae_ns.train import trials
+from sundae_ns.train.choice import HeldOutQuality
+from sundae_ns.train.curve import read_count_curve
+from sundae_ns.train.pruning import PruningConfig
 
 VIEWS = 40
 TRIAL, HEAD_TRIAL = 2, 5

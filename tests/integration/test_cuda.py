@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from sundae_ns.errors import MemoryExhaustedError
-from sundae_ns.storage import checkpoint
+from sundae_ns.core.errors import MemoryExhaustedError
+from sundae_ns.io import checkpoint
 
 pytestmark = pytest.mark.gpu
 SPREAD = 1.0

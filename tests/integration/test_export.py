@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.evaluation import psnr
-from sundae_ns.gaussians.gaussians import Field
-from sundae_ns.rendering.render import LocalField, render_view
-from sundae_ns.scenes.models import load_model
-from sundae_ns.storage.ply import read_ply
+from sundae_ns.core.gaussians import Field
+from sundae_ns.core.metrics import psnr
+from sundae_ns.io.ply import read_ply
+from sundae_ns.plugin.finished_runs import load_model
+from sundae_ns.scene.render import LocalField, render_view
 
 PROGRAM = shutil.which("splat-transform")
 

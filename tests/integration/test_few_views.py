@@ -9,7 +9,7 @@ import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
-from sundae_ns.training import initialize
+from sundae_ns.train import initialize
 
 
 def test_a_whole_run_and_its_resume(

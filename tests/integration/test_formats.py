@@ -13,8 +13,8 @@ import pytest
 import torch
 
 import sundae_ns as sn
-from sundae_ns.rendering.views import view_of
-from sundae_ns.scenes.models import load_model
+from sundae_ns.plugin.camera_models import view_of
+from sundae_ns.plugin.finished_runs import load_model
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "bench_formats.py"
 TRANSFORM = """#!{python}

@@ -16,12 +16,13 @@ import pytest
 import torch
 import yaml
 
-from sundae_ns.errors import CheckpointError, DataError
-from sundae_ns.evaluation import Measured, psnr
-from sundae_ns.scenes import models as opening
-from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, sizes
-from sundae_ns.scenes.models import Opened, load_model
-from sundae_ns.storage import checkpoint
+from sundae_ns.core.errors import CheckpointError, DataError
+from sundae_ns.core.metrics import psnr
+from sundae_ns.io import checkpoint
+from sundae_ns.plugin import finished_runs as opening
+from sundae_ns.plugin.finished_runs import Opened, load_model
+from sundae_ns.report.measure import compensation, frame_times, measure_scene, sizes
+from sundae_ns.report.measured import Measured
 
 
 def figures_of(run: Opened) -> Measured:

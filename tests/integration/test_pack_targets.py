@@ -12,22 +12,16 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from sundae_ns.api.packing import contents_of
-from sundae_ns.api.scene import Quality
 from sundae_ns.cli import main
-from sundae_ns.errors import PackError
-from sundae_ns.scenes.models import load_run
-from sundae_ns.scenes.targets import COARSEST, Judge, Search, Try, fewest_bytes, least_drop, scaled
-from sundae_ns.storage.pack import (
-    FINETUNED,
-    Codecs,
-    PackConfig,
-    PackedScene,
-    fit_scene,
-    pack_bytes,
-    read_scene,
-)
-from sundae_ns.storage.pack.quantize import Transform
+from sundae_ns.core.errors import PackError
+from sundae_ns.io.pack.codecs import Codecs
+from sundae_ns.io.pack.config import FINETUNED, PackConfig
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes, read_scene
+from sundae_ns.io.pack.quantize import Transform
+from sundae_ns.plugin.finished_runs import load_run
+from sundae_ns.plugin.targets import COARSEST, Judge, Search, Try, fewest_bytes, least_drop, scaled
+from sundae_ns.scene.packing import contents_of
+from sundae_ns.scene.scene import Quality
 
 
 def packed(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from sundae_ns.api.files import load
 from sundae_ns.cli import main
-from sundae_ns.evaluation import psnr
-from sundae_ns.scenes.models import load_model
-from sundae_ns.storage.formats import read_field
+from sundae_ns.core.metrics import psnr
+from sundae_ns.io.formats import read_field
+from sundae_ns.plugin.finished_runs import load_model
+from sundae_ns.scene.load_save import load
 
 
 class Packed(NamedTuple):

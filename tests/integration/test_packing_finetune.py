@@ -14,23 +14,18 @@ import yaml
 from nerfstudio.configs.method_configs import all_methods
 from torch import Tensor
 
-from sundae_ns.api.packing import contents_of
 from sundae_ns.cli import main
 from sundae_ns.cli.pack import pack
-from sundae_ns.errors import CheckpointError, ConfigError, MemoryExhaustedError
-from sundae_ns.evaluation import psnr
-from sundae_ns.scenes import finetune as packing_finetune
-from sundae_ns.scenes.finetune import Through, TunedStep, finetune, rate_factor
-from sundae_ns.scenes.models import load_model, load_run
-from sundae_ns.storage import checkpoint
-from sundae_ns.storage.pack import (
-    FINETUNED,
-    PackConfig,
-    fit_scene,
-    read_header,
-    read_scene,
-    write_fitted,
-)
+from sundae_ns.core.errors import CheckpointError, ConfigError, MemoryExhaustedError
+from sundae_ns.core.metrics import psnr
+from sundae_ns.io import checkpoint
+from sundae_ns.io.pack.config import FINETUNED, PackConfig
+from sundae_ns.io.pack.container import read_header
+from sundae_ns.io.pack.packed_scene import fit_scene, read_scene, write_fitted
+from sundae_ns.plugin import finetune as packing_finetune
+from sundae_ns.plugin.finetune import Through, TunedStep, finetune, rate_factor
+from sundae_ns.plugin.finished_runs import load_model, load_run
+from sundae_ns.scene.packing import contents_of
 
 COARSE = PackConfig(
     position_bits=12,

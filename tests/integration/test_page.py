@@ -24,12 +24,13 @@ from numpy.typing import NDArray
 from packed_scenes import KINDS, write_bomb, write_kind
 from pages import SAID, SECONDS, SIZE, STOP, TICKING, WEBGL, Quiet, hold, opened, rested, touch
 
-from sundae_ns.api.files import packed_file
-from sundae_ns.api.packing import contents_of, stated_start
-from sundae_ns.api.page import page_of, write_page
 from sundae_ns.cli.view import serve
-from sundae_ns.scenes.models import load_run
-from sundae_ns.storage.pack import container, read_scene, write_scene
+from sundae_ns.io.pack import container
+from sundae_ns.io.pack.packed_scene import read_scene, write_scene
+from sundae_ns.plugin.finished_runs import load_run
+from sundae_ns.scene.load_save import packed_file
+from sundae_ns.scene.packing import contents_of, stated_start
+from sundae_ns.scene.page import page_of, write_page
 
 pytestmark = needs_chromium
 image, psnr, truths = bench_page.image, bench_page.psnr, bench_page.truths

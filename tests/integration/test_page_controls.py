@@ -17,8 +17,8 @@ from packed_scenes import KINDS, write_kind
 from pages import SECONDS, SIZE, STOP, WEBGL, Quiet, hold, opened, rested, touch
 from PIL import Image
 
-from sundae_ns.api.files import packed_file
-from sundae_ns.api.page import write_page
+from sundae_ns.scene.load_save import packed_file
+from sundae_ns.scene.page import write_page
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 image, psnr, truths = bench_page.image, bench_page.psnr, bench_page.truths

@@ -11,9 +11,9 @@ from chromium import bench_page, browser, needs_chromium
 from packed_scenes import KINDS, write_kind
 from pages import SAID, SECONDS, STOP, WEBGL, opened, rested
 
-from sundae_ns.api.files import packed_file
-from sundae_ns.api.page import write_page
-from sundae_ns.storage.pack import read_scene
+from sundae_ns.io.pack.packed_scene import read_scene
+from sundae_ns.scene.load_save import packed_file
+from sundae_ns.scene.page import write_page
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 image, psnr, truths = bench_page.image, bench_page.psnr, bench_page.truths

@@ -15,7 +15,7 @@ import pytest
 from colmap_models import write_model
 
 from sundae_ns.cli import main
-from sundae_ns.trainer import SundaeTrainerConfig
+from sundae_ns.plugin.trainer import SundaeTrainerConfig
 
 CallHere = Callable[..., str]
 
@@ -68,7 +68,7 @@ def commands_of(page: Path, *programs: str) -> Iterator[list[str]]:
 @pytest.mark.parametrize("page", [page for page in PAGES if list(commands_of(page))], ids=lambda page: page.name)
 def test_commands_run_as_they_stand(page: Path, tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sundae_ns.scenes.distill.CAMERAS", 8)
+    monkeypatch.setattr("sundae_ns.plugin.distill.CAMERAS", 8)
     monkeypatch.setattr("sundae_ns.cli.render.SECONDS", 1)
     shutil.copytree(tiny.folder, "RUN")
     shutil.copytree(tiny.scene, "CAPTURE")

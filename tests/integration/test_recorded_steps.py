@@ -10,10 +10,10 @@ import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 
-from sundae_ns.errors import BackendError
-from sundae_ns.storage import checkpoint
-from sundae_ns.training.capture import RecordedStep
-from sundae_ns.training.step import StepResult
+from sundae_ns.core.errors import BackendError
+from sundae_ns.io import checkpoint
+from sundae_ns.train.graphed_step import RecordedStep
+from sundae_ns.train.step import StepResult
 
 MakeTrainer = Callable[[Callable[[TrainerConfig], Any]], Trainer]
 

@@ -11,9 +11,9 @@ import pytest
 import yaml
 from nerfstudio.plugins.types import MethodSpecification
 
-from sundae_ns.compensation import HeadConfig
-from sundae_ns.datamanager import SundaeDatamanager
-from sundae_ns.model import SundaeModel
+from sundae_ns.head.head import HeadConfig
+from sundae_ns.plugin.datamanager import SundaeDatamanager
+from sundae_ns.plugin.model import SundaeModel
 
 METHODS = {
     "sundae": None,
@@ -105,7 +105,7 @@ def test_import_is_light_and_errors_of_ns_train_are_one_line() -> None:
         "import sundae_ns.method_configs as configs\n"
         "assert configs.sundae.config.method_name == 'sundae'\n"
         "assert 'nerfstudio.configs.method_configs' not in sys.modules\n"
-        "from sundae_ns.errors import DataError\n"
+        "from sundae_ns.core.errors import DataError\n"
         "raise DataError('the cause; the mend')\n"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

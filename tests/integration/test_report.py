@@ -19,12 +19,13 @@ from csv_rows import read_rows
 from nerfstudio.configs.method_configs import method_configs
 from PIL import Image
 
-from sundae_ns.api.packing import contents_of
 from sundae_ns.cli import main
-from sundae_ns.evaluation import COLUMNS, flip_available, quality_of
-from sundae_ns.rendering.render import render_view
-from sundae_ns.scenes.models import load_model, load_run
-from sundae_ns.storage.pack import write_scene
+from sundae_ns.core.metrics import flip_available, quality_of
+from sundae_ns.io.pack.packed_scene import write_scene
+from sundae_ns.plugin.finished_runs import load_model, load_run
+from sundae_ns.report.measured import COLUMNS
+from sundae_ns.scene.packing import contents_of
+from sundae_ns.scene.render import render_view
 
 
 def sundae(*arguments: object) -> int:
@@ -100,7 +101,7 @@ def test_the_page_shows_the_views_with_their_figures(report: Path, tiny: Any) ->
 def test_the_page_of_many_views_is_limited(
     tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sundae_ns.evaluation.page.MOST_VIEWS", 2)
+    monkeypatch.setattr("sundae_ns.report.report_page.MOST_VIEWS", 2)
     assert sundae("report", tiny.folder, "-o", tmp_path / "out", "--repeats", 0) == 0
     said, page = " ".join(capsys.readouterr().out.split()), tmp_path / "out" / "report.html"
     assert "MB, 2 of 3 views" in said

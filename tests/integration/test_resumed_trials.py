@@ -11,9 +11,9 @@ import pytest
 import torch
 from trial_runs import STEPS, same, tidy, tiny_run, tiny_scene
 
-from sundae_ns.training import choice, trials
-from sundae_ns.training.choice import HeldOutQuality
-from sundae_ns.training.pruning import PruningConfig
+from sundae_ns.train import choice, trials
+from sundae_ns.train.choice import HeldOutQuality
+from sundae_ns.train.pruning import PruningConfig
 
 
 @pytest.fixture(autouse=True)

@@ -20,10 +20,10 @@ from PIL import Image
 
 from sundae_ns.cli import main
 from sundae_ns.cli.process import run_command
-from sundae_ns.errors import StorageError
-from sundae_ns.storage.formats import kind_of
-from sundae_ns.storage.run_folder import reserve
-from sundae_ns.trainer import SundaeTrainer
+from sundae_ns.core.errors import StorageError
+from sundae_ns.io.formats import kind_of
+from sundae_ns.io.run_folder import reserve
+from sundae_ns.plugin.trainer import SundaeTrainer
 
 STEPS, STOP_AT = 40, 25
 Run = Callable[..., int]

@@ -14,8 +14,9 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from trial_runs import LENGTH, PRUNE_AT, STEPS, same, tidy, tiny_run, tiny_scene
 
-from sundae_ns.training import averaging, choice, nerfstudio_configs, trials
-from sundae_ns.training.choice import HeldOutQuality
+from sundae_ns.plugin import optimizer_configs as nerfstudio_configs
+from sundae_ns.train import averaging, choice, trials
+from sundae_ns.train.choice import HeldOutQuality
 
 DECIDED = PRUNE_AT + 2 * LENGTH
 """Step of the decision, after trials of no head and of a head."""

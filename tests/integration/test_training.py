@@ -18,12 +18,12 @@ from nerfstudio.utils.eval_utils import eval_setup
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
-from sundae_ns.datamanager import SundaeDatamanager
-from sundae_ns.errors import CheckpointError, MemoryExhaustedError
-from sundae_ns.gaussians.gaussians import SPLAT_NAMES
+from sundae_ns.core.errors import CheckpointError, MemoryExhaustedError
+from sundae_ns.core.gaussians import SPLAT_NAMES
+from sundae_ns.io.ply import MODEL_FRAME, write_ply
 from sundae_ns.method_configs import sundae_tiny
-from sundae_ns.model import SundaeModel
-from sundae_ns.storage.ply import MODEL_FRAME, write_ply
+from sundae_ns.plugin.datamanager import SundaeDatamanager
+from sundae_ns.plugin.model import SundaeModel
 
 
 def load(path: Any) -> dict[str, Any]:

@@ -16,12 +16,12 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.eval_utils import eval_setup
 from trial_runs import LENGTH, PRUNE_AT, tidy, tiny_run, tiny_scene
 
-from sundae_ns.api.packing import contents_of
-from sundae_ns.callbacks import NerfstudioRun
-from sundae_ns.scenes.measure import sizes
-from sundae_ns.scenes.models import load_run
-from sundae_ns.training import choice, trials
-from sundae_ns.training.choice import HeldOutQuality
+from sundae_ns.plugin.callbacks import NerfstudioRun
+from sundae_ns.plugin.finished_runs import load_run
+from sundae_ns.report.measure import sizes
+from sundae_ns.scene.packing import contents_of
+from sundae_ns.train import choice, trials
+from sundae_ns.train.choice import HeldOutQuality
 
 DECIDED = PRUNE_AT + 3 * LENGTH
 """Step of the decision if all candidates are tried."""

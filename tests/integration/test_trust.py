@@ -11,7 +11,7 @@ from typing import Any
 import kill_and_resume
 import pytest
 
-from sundae_ns.errors import DataError
+from sundae_ns.core.errors import DataError
 
 
 def test_killed_anywhere_it_goes_on_as_if_never_killed(

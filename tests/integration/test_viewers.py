@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from chromium import bench_viewers, needs_chromium, needs_packages
 
-from sundae_ns.api.packing import contents_of
-from sundae_ns.scenes.models import load_run
-from sundae_ns.storage.pack import write_scene
+from sundae_ns.io.pack.packed_scene import write_scene
+from sundae_ns.plugin.finished_runs import load_run
+from sundae_ns.scene.packing import contents_of
 
 pytestmark = [pytest.mark.browser, needs_chromium, needs_packages]
 

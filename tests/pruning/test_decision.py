@@ -16,23 +16,14 @@ from torch import Tensor
 from torch.nn import Parameter
 
 import sundae_ns.pruning.decision
-from sundae_ns.errors import ConfigError, DataError, SundaeError
-from sundae_ns.gaussians import mend
-from sundae_ns.gaussians.covariance import covariances, quaternions, rotation_matrices
-from sundae_ns.gaussians.gaussians import Field
-from sundae_ns.pruning import (
-    Decision,
-    FieldPruner,
-    PruneRule,
-    band_rule,
-    decide,
-    field_graph,
-    kept_count,
-    prune_field,
-    response,
-)
-from sundae_ns.pruning.merge import voronoi_labels
-from sundae_ns.training.pruning import PruningConfig
+from sundae_ns.core.covariance import covariances, quaternions, rotation_matrices
+from sundae_ns.core.errors import ConfigError, DataError, SundaeError
+from sundae_ns.core.gaussians import Field, mend
+from sundae_ns.pruning.decision import Decision, FieldPruner, decide, prune_field
+from sundae_ns.pruning.merge import field_graph, voronoi_labels
+from sundae_ns.pruning.rule import PruneRule, band_rule, kept_count
+from sundae_ns.pruning.scores import response
+from sundae_ns.train.pruning import PruningConfig
 
 SHARE = 0.2
 DEFAULT = PruneRule()

@@ -14,12 +14,14 @@ from prunes import field as random_field
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
-from sundae_ns.errors import ConfigError
-from sundae_ns.gaussians import from_points
-from sundae_ns.gaussians.gaussians import Field, rgb_to_sh, sh_to_rgb
-from sundae_ns.graphs import NeighborGraph, build_graph
-from sundae_ns.pruning import PruneRule, field_graph, merge, prune_field
-from sundae_ns.pruning.merge import pair_labels, voronoi_labels
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.core.gaussians import Field, rgb_to_sh, sh_to_rgb
+from sundae_ns.graph.graph import NeighborGraph, build_graph
+from sundae_ns.pruning import merge
+from sundae_ns.pruning.decision import prune_field
+from sundae_ns.pruning.merge import field_graph, pair_labels, voronoi_labels
+from sundae_ns.pruning.rule import PruneRule
+from sundae_ns.scene.initialization import from_points
 
 PAIRS = PruneRule(selection="pairs")
 

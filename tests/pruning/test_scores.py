@@ -6,10 +6,10 @@ import pytest
 import torch
 from prunes import PAPER, field
 
-from sundae_ns.errors import DataError
-from sundae_ns.gaussians.gaussians import rgb_to_sh
-from sundae_ns.pruning import PruneRule, response
-from sundae_ns.pruning.scores import attribute_signal, pixel_detail, score
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.gaussians import rgb_to_sh
+from sundae_ns.pruning.rule import PruneRule
+from sundae_ns.pruning.scores import attribute_signal, pixel_detail, response, score
 
 
 def test_scores_by_hand() -> None:

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sundae_ns.errors import DataError
-from sundae_ns.pruning import kept_count
+from sundae_ns.core.errors import DataError
+from sundae_ns.pruning.rule import kept_count
 from sundae_ns.pruning.selection import inclusion_probabilities, neighbor_order, select_band, select_systematic
 
 VALUES = st.one_of(st.floats(0, 1e30), st.sampled_from([0.0, 1.0, math.nan, math.inf, -math.inf, 1e-300]))

@@ -11,8 +11,8 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from sundae_ns.gaussians.gaussians import SH_C0
-from sundae_ns.storage.ply import write_ply
+from sundae_ns.core.gaussians import SH_C0
+from sundae_ns.io.ply import write_ply
 
 _CHUNK = 256
 _STORED = Path(__file__).parents[1] / "storage" / "foreign"

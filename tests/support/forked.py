@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 CONTEXT: Any = multiprocessing.get_context("forkserver")
-PRELOADED = ["nerfstudio.scripts.train", "pytest", "sundae_ns.model", "sundae_ns.trainer"]
+PRELOADED = ["nerfstudio.scripts.train", "pytest", "sundae_ns.plugin.model", "sundae_ns.plugin.trainer"]
 
 
 def _run(program: str, arguments: list[str], output: Connection) -> None:

@@ -16,11 +16,11 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils import writer
 from torch import Tensor
 
-from sundae_ns.callbacks import NerfstudioRun
-from sundae_ns.compensation import HeadConfig
-from sundae_ns.model import SundaeModel, SundaeModelConfig
-from sundae_ns.training.nerfstudio_configs import FusedAdamConfig
-from sundae_ns.training.pruning import PruningConfig
+from sundae_ns.head.head import HeadConfig
+from sundae_ns.plugin.callbacks import NerfstudioRun
+from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
+from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
+from sundae_ns.train.pruning import PruningConfig
 
 
 def _points(n: int = 60) -> tuple[Tensor, Tensor]:

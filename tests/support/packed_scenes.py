@@ -9,9 +9,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.gaussians import from_points
-from sundae_ns.storage.pack import PackConfig, PackedScene, Sensitivity, write_scene
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io.pack.codecs import Sensitivity
+from sundae_ns.io.pack.config import PackConfig
+from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
+from sundae_ns.scene.initialization import from_points
 
 WIDTH, HEIGHT = 50, 37
 FOCAL = 45.0

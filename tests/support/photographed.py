@@ -10,9 +10,9 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
-from sundae_ns.rendering.views import View
-from sundae_ns.training.exposure import FIRST_STEPS, REFRESHED_EVERY, PhotoGains
-from sundae_ns.training.state import TrainingRun
+from sundae_ns.core.camera import View
+from sundae_ns.train.exposure import FIRST_STEPS, REFRESHED_EVERY, PhotoGains
+from sundae_ns.train.state import TrainingRun
 
 COUNT = 48
 ANGLES = torch.arange(COUNT) * 2 * math.pi / COUNT

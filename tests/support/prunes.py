@@ -7,9 +7,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from sundae_ns.gaussians import mend
-from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning import Decision, PruneRule, band_rule, decide, kept_count
+from sundae_ns.core.gaussians import mend
+from sundae_ns.graph.graph import NeighborGraph
+from sundae_ns.pruning.decision import Decision, decide
+from sundae_ns.pruning.rule import PruneRule, band_rule, kept_count
 
 PAPER = band_rule(PruneRule(signal="positions"), 0.5)
 

@@ -14,8 +14,8 @@ import pytest
 import torch
 from PIL import Image
 
-from sundae_ns.gaussians import from_points
-from sundae_ns.storage.pack import PackedScene, fit_scene, pack_bytes
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
+from sundae_ns.scene.initialization import from_points
 
 PHOTOS = 8
 STEPS = ["sundae poses", "ns-train", "sundae pack", "sundae report", "sundae export"]
@@ -63,7 +63,7 @@ class Commands:
             folder = Path(root, experiment, words[1], stamp)
             (folder / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
             (folder / "config.yml").write_text(
-                f"!!python/object:sundae_ns.trainer.SundaeTrainerConfig\nschedule_length: {self.length}\n"
+                f"!!python/object:sundae_ns.plugin.trainer.SundaeTrainerConfig\nschedule_length: {self.length}\n"
             )
             if code in self.saved_at:
                 checkpoint = folder / "nerfstudio_models" / f"step-{self.saved_at[code]:09d}.ckpt"

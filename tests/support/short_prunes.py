@@ -6,7 +6,7 @@ import pytest
 
 STEPS, VIEWS, SIDE = 4, 8, 64
 SHORT = f"""
-from sundae_ns.api import pruning, virtual
+from sundae_ns.scene import prune_scene as pruning, virtual_cameras as virtual
 pruning.REFIT_STEPS["cpu"], virtual.VIEWS["cpu"], virtual.SIDE = {STEPS}, {VIEWS}, {SIDE}
 """
 """What the fixture does, as lines of a program of its own."""
@@ -15,7 +15,8 @@ pruning.REFIT_STEPS["cpu"], virtual.VIEWS["cpu"], virtual.SIDE = {STEPS}, {VIEWS
 @pytest.fixture
 def short_prunes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Prunes by few small views and few steps; they train nothing by themselves."""
-    from sundae_ns.api import pruning, virtual
+    from sundae_ns.scene import prune_scene as pruning
+    from sundae_ns.scene import virtual_cameras as virtual
 
     monkeypatch.setitem(pruning.REFIT_STEPS, "cpu", STEPS)
     monkeypatch.setitem(virtual.VIEWS, "cpu", VIEWS)

@@ -10,7 +10,7 @@ import torch
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 
 VIEWS, WIDTH, HEIGHT = 4, 20, 16
 SIZE = WIDTH, HEIGHT

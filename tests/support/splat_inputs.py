@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.rasterization.types import Inputs
+from sundae_ns.rasterize.types import Inputs
 
 
 def geometry(

@@ -1,4 +1,4 @@
-// The layers of the compensation head (sundae_ns/compensation/unet.py). Images are [C / 4, H, W] of four channels in
+// The layers of the compensation head (sundae_ns/head/unet.py). Images are [C / 4, H, W] of four channels in
 // `number`, which is f16 or f32; sums of a convolution are f32.
 
 struct Layer {

@@ -1,5 +1,5 @@
 // The container of docs/formats.md: named arrays behind a JSON header, all bytes under checksums.
-// Its twin is sundae_ns/storage/pack/container.py; both refuse the same files.
+// Its twin is sundae_ns/io/pack/container.py; both refuse the same files.
 
 import { type JsonObject, LIMITS, parsed, violation } from "./schema";
 

@@ -1,4 +1,4 @@
-// Whole numbers from streams of the entropy coder; the twin of sundae_ns/storage/pack/entropy.py, which explains it.
+// Whole numbers from streams of the entropy coder; the twin of sundae_ns/io/pack/entropy.py, which explains it.
 // Both compute with the same integers, so they decode the same numbers.
 
 import { damaged } from "./container";

@@ -1,4 +1,4 @@
-// A packed scene as arrays; the twin of sundae_ns/storage/pack/scene.py and of its checks.
+// A packed scene as arrays; the twin of sundae_ns/io/pack/packed_scene.py and of its checks.
 
 import { cellsOf, positions, rotations, transformed } from "./codecs";
 import { checkRatio, damaged, readAll, readHeader } from "./container";

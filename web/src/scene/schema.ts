@@ -1,6 +1,6 @@
-// The one description of headers and sections, and the checks by it; the twin of sundae_ns/storage/pack/container.py.
+// The one description of headers and sections, and the checks by it; the twin of sundae_ns/io/pack/container.py.
 
-import format from "../../../sundae_ns/storage/pack/format.json";
+import format from "../../../sundae_ns/io/pack/format.json";
 
 export type Json = null | boolean | number | string | Json[] | { [key: string]: Json };
 export type JsonObject = { [key: string]: Json };

@@ -1,0 +1,1 @@
+"""What everything stands on: errors, Gaussians, cameras, metrics, whole files."""

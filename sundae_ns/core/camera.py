@@ -1,0 +1,181 @@
+"""Camera poses from nerfstudio's convention to the rasteriser's.
+
+nerfstudio stores camera-to-world with OpenGL axes (x right, y up, view along -z). The rasteriser takes world-to-camera
+with OpenCV axes (x right, y down, view along z). Both functions invert the rigid motion and flip y and z.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+OPENGL_TO_OPENCV = (1.0, -1.0, -1.0)
+"""Sign of each camera axis."""
+
+
+def world_to_camera(pose: Tensor) -> Tensor:
+    """World-to-camera matrices ``[..., 4, 4]``, OpenCV axes, of camera-to-world ``[..., 3, 4]``, OpenGL axes.
+
+    Differentiable.
+    """
+    rotation = pose[..., :3] * pose.new_tensor(OPENGL_TO_OPENCV)
+    top = torch.cat([rotation.mT, -rotation.mT @ pose[..., 3:]], dim=-1)
+    bottom = pose.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*pose.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def world_to_camera_floats(pose: Sequence[float]) -> list[float]:
+    """The 16 entries of :func:`world_to_camera` row by row, from the 12 of ``pose``, without a tensor or a kernel."""
+    x, y, z = pose[3::4]
+    matrix: list[float] = []
+    for axis, sign in enumerate(OPENGL_TO_OPENCV):
+        a, b, c = (sign * value for value in pose[axis::4])
+        matrix += [a, b, c, -(a * x + b * y + c * z)]
+    return [*matrix, 0.0, 0.0, 0.0, 1.0]
+
+
+class Window(NamedTuple):
+    """A rectangle of an image, in pixels."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    mirrored: bool = False
+    """Whether it is seen in a mirror: left and right change places."""
+
+
+def camera_center(viewmat: Tensor) -> Tensor:
+    """Position of a camera ``[3]``, from its world-to-camera transform ``[4, 4]``."""
+    return -viewmat[:3, :3].T @ viewmat[:3, 3]
+
+
+class View(NamedTuple):
+    """One camera in the rasteriser's form."""
+
+    viewmat: Tensor
+    """World-to-camera, OpenCV axes ``[4, 4]``."""
+    K: Tensor
+    """Intrinsics in pixels ``[3, 3]``."""
+    width: int
+    height: int
+
+    focal: float
+    """Focal length in pixels, the mean of both axes. Kept beside K, because reading K back waits for the GPU."""
+
+    @classmethod
+    def from_pose(cls, pose: Tensor, intrinsics: Sequence[float], width: int, height: int) -> View:
+        """A pinhole camera from a pose as nerfstudio and Blender write it.
+
+        Args:
+            pose: camera-to-world with OpenGL axes (x right, y up, view along -z), ``[3, 4]`` or ``[4, 4]``.
+            intrinsics: focal lengths and principal point fx, fy, cx, cy, pixels.
+            width: of the image, pixels.
+            height: of the image, pixels.
+
+        >>> import torch, sundae_ns as sn
+        >>> sn.View.from_pose(torch.eye(4), (50.0, 50.0, 32.0, 24.0), 64, 48).center
+        tensor([0., 0., 0.])
+        """
+        fx, fy, cx, cy = (float(value) for value in intrinsics)
+        K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], device=pose.device)
+        return cls(world_to_camera(pose[:3].float()), K, int(width), int(height), (fx + fy) / 2)
+
+    @classmethod
+    def from_fov(cls, pose: Tensor, fov: float, width: int, height: int) -> View:
+        """As :meth:`from_pose`, with the vertical field of view in degrees and the principal point in the middle."""
+        focal = height / 2 / math.tan(math.radians(fov) / 2)
+        return cls.from_pose(pose, (focal, focal, width / 2, height / 2), width, height)
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Sequence[float] | Tensor,
+        target: Sequence[float] | Tensor,
+        up: Sequence[float] | Tensor = (0.0, 0.0, 1.0),
+        *,
+        fov: float = 60.0,
+        width: int = 640,
+        height: int = 480,
+    ) -> View:
+        """A camera at one place that looks at another, on the CPU.
+
+        Args:
+            eye: centre of the camera, world units ``[3]``.
+            target: point in the middle of the image ``[3]``.
+            up: direction that is upwards in the image ``[3]``; any other one if it is the viewing direction.
+            fov: vertical field of view, degrees.
+            width: of the image, pixels.
+            height: of the image, pixels.
+
+        >>> import sundae_ns as sn
+        >>> sn.View.look_at((0, -2, 0), (0, 0, 0)).center
+        tensor([ 0., -2.,  0.])
+        """
+        eye, target, up = (torch.as_tensor(v, dtype=torch.float64, device="cpu") for v in (eye, target, up))
+        return cls.from_fov(poses_looking_at(eye, target, up), fov, width, height)
+
+    @property
+    def center(self) -> Tensor:
+        """Camera centre, world units ``[3]``."""
+        return camera_center(self.viewmat)
+
+    @property
+    def pose(self) -> Tensor:
+        """Camera-to-world with OpenGL axes ``[3, 4]``; the counterpart of :meth:`from_pose`."""
+        rotation = self.viewmat[:3, :3].T * self.viewmat.new_tensor(OPENGL_TO_OPENCV)
+        return torch.cat([rotation, self.center[:, None]], dim=1)
+
+    def to(self, device: torch.device | str) -> View:
+        """The camera on another device."""
+        return self._replace(viewmat=self.viewmat.to(device), K=self.K.to(device))
+
+    def zoomed(self, factor: float) -> View:
+        """The camera with the same field of view and sides ``factor`` times as long."""
+        width, height = (max(round(side * factor), 1) for side in (self.width, self.height))
+        # Scale by the rounded sizes, so that the edges of both images agree. Row by row, because a tensor of numbers
+        # would be copied to the device.
+        K = torch.stack([self.K[0] * (width / self.width), self.K[1] * (height / self.height), self.K[2]])
+        return View(self.viewmat, K, width, height, self.focal * factor)
+
+    def cut(self, window: Window) -> View:
+        """The camera of a window of the image. Of a mirrored one it sees what a mirror would show."""
+        viewmat, K = self.viewmat, self.K.clone()
+        K[0, 2] -= window.left
+        K[1, 2] -= window.top
+        if window.mirrored:
+            viewmat = viewmat.clone()
+            viewmat[0].neg_()
+            K[0, 2].neg_().add_(window.width)
+        return View(viewmat, K, window.width, window.height, self.focal)
+
+
+def poses_looking_at(eyes: Tensor, targets: Tensor, up: Tensor) -> Tensor:
+    """Poses of cameras that look at points, camera-to-world with OpenGL axes; arguments as for :meth:`View.look_at`.
+
+    Args:
+        eyes: centres of the cameras ``[..., 3]``.
+        targets: points in the middle of their images ``[..., 3]``.
+        up: direction that is upwards in the images ``[3]``.
+
+    Returns:
+        ``[..., 3, 4]``, dtype of the eyes.
+    """
+    back = torch.nn.functional.normalize(eyes - targets, dim=-1)
+    right = torch.linalg.cross(up.expand_as(back), back)
+    other = torch.linalg.cross(torch.roll(back, 1, dims=-1) + back.new_tensor([1.0, 0.0, 0.0]), back)
+    right = torch.where(right.norm(dim=-1, keepdim=True) < 1e-6, other, right)
+    right = torch.nn.functional.normalize(right, dim=-1)
+    return torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)
+
+
+def crop_image(image: Tensor, window: Window | None) -> Tensor:
+    """A window of an image ``[H, W, C]``; None for the whole image."""
+    if window is None:
+        return image
+    part = image[window.top : window.top + window.height, window.left : window.left + window.width]
+    return part.flip(1) if window.mirrored else part

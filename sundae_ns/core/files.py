@@ -1,0 +1,120 @@
+"""Atomic writes: a file is written under another name, flushed to disk, and renamed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from glob import escape
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from filelock import lock_descriptor
+
+from sundae_ns.core.errors import writing
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+PARTIAL = ".partial"
+"""Suffix of files that are not complete yet."""
+_WINDOWS = os.name == "nt"  # renames no open file, opens no folder, and flushes only what it may write
+
+
+def locked(file: IO[Any]) -> bool | None:
+    """Lock an open file without waiting, for as long as a process has it open: the system drops locks of the dead.
+
+    Returns:
+        True if this process holds the lock, False if another one does, None if the file system has no locks.
+    """
+    try:
+        return lock_descriptor(file.fileno(), blocking=False)
+    except OSError:
+        return None
+
+
+@contextmanager
+def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
+    """Yield a path to write to; after the block, flush that file to disk and rename it to ``path``.
+
+    If the process is killed or the machine loses power, ``path`` is either the earlier file or the complete new one. If
+    the block raises, its file is removed and ``path`` is unchanged.
+
+    Args:
+        path: the file to write; a missing folder of it is made.
+        partial: temporary file in the same folder. By default named after this process, and such files of killed
+            processes are removed.
+
+    Raises:
+        StorageError: the disk is full or not writable.
+    """
+    owned = partial is None and not _WINDOWS
+    partial = partial or path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
+    try:
+        with writing(f"cannot write {path}"), ExitStack() as stack:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if owned:
+                _remove_abandoned(path)
+                locked(stack.enter_context(partial.open("wb")))
+            yield partial
+            flush(partial)
+            partial.replace(path)
+            flush(path.parent)
+    finally:
+        with suppress(OSError):
+            partial.unlink()
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Remove partial files of killed processes, which hold no lock."""
+    for other in path.parent.glob(f"{escape(path.name)}.*{PARTIAL}"):
+        if other.name[len(path.name) + 1 : -len(PARTIAL)].isdigit():  # else of a file with a longer name
+            with suppress(OSError), other.open("rb") as file:
+                if locked(file):
+                    other.unlink()
+
+
+def write_files(contents: Mapping[Path, bytes]) -> None:
+    """Write files that belong together: all, or none if the disk is full or not writable, a ``StorageError``."""
+    with ExitStack() as stack:
+        partials = [stack.enter_context(replacing(path)) for path in contents]
+        for partial, content in zip(partials, contents.values(), strict=True):
+            partial.write_bytes(content)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically; ``StorageError`` if the disk is full or not writable."""
+    write_files({path: content})
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8 as :func:`write_bytes` does."""
+    write_files({path: text.encode()})
+
+
+def write_image(path: Path, image: Image.Image) -> None:
+    """Write an image as :func:`write_bytes` does, in the format of its suffix."""
+    kind = path.suffix.lower()[1:]
+    with replacing(path) as partial:
+        image.save(partial, format={"jpg": "jpeg"}.get(kind, kind))
+
+
+def put_aside(path: Path) -> None:
+    """Rename a damaged file or folder, if there is one, to ``NAME.damaged``, in place of an earlier one."""
+    aside = path.with_name(f"{path.name}.damaged")
+    if path.exists():
+        if aside.is_dir():
+            shutil.rmtree(aside)
+        path.replace(aside)
+
+
+def flush(path: Path) -> None:
+    """Wait until a file, or the entries of a folder, are on the disk."""
+    if _WINDOWS and path.is_dir():
+        return
+    handle = os.open(path, os.O_RDWR if _WINDOWS else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,231 @@
+"""A field: the parameters of its primitives, their shapes and activations, and the mending of values not finite.
+
+A field is a mapping from the names below to tensors that share their first dimension, the number of primitives N.
+Values are stored before activation, as 3DGS and splatfacto do:
+
+=================  ==============  ===============================================================
+name               shape           meaning
+=================  ==============  ===============================================================
+``means``          ``[N, 3]``      centres, world units
+``scales``         ``[N, 3]``      log of the standard deviations, world units
+``quats``          ``[N, 4]``      rotation as wxyz quaternion, not normalised
+``features_dc``    ``[N, 3]``      spherical harmonics, degree 0
+``features_rest``  ``[N, K, 3]``   spherical harmonics, degrees 1 and up
+``opacities``      ``[N, 1]``      logit of the opacity
+``features``       ``[N, F]``      splatted feature vectors (c_i in the paper's neural image); optional
+=================  ==============  ===============================================================
+"""
+
+from __future__ import annotations
+
+from collections import UserDict
+from collections.abc import Mapping, MutableMapping
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
+
+Encoding = Literal["harmonics", "logits"]
+"""How a field stores colours. ``harmonics``: ``features_dc`` and ``features_rest`` are coefficients of spherical
+harmonics. ``logits``: ``features_dc`` holds logits of view-independent colours, as splatfacto does at SH degree 0."""
+
+SPLAT_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
+"""Parameters of every 3DGS field, named as in splatfacto's checkpoints."""
+
+_COLUMNS = {"means": 3, "scales": 3, "quats": 4, "features_dc": 3, "opacities": 1}
+
+MAX_SH_DEGREE = 4  # highest SH degree of a field
+FEATURES = "features"  # name of the parameter that SUNDAE adds to each primitive
+LARGEST_LOGIT = 16.0
+"""Logit for opacities of 0 and 1. Its float32 opacity is the last below 1, so that its logarithms stay finite."""
+
+LEAST_SCALES = (-80.0, -43.0)
+"""Range of the log-scale for widths of 0: as narrow as the narrowest of the field, and with a square that is a normal
+float32, unless a tiny scene needs less."""
+
+_QUATERNION_RANGE = 1e-6, 1e18  # largest components of quaternions that can be normalised in float32
+
+
+def num_primitives(params: Mapping[str, Tensor]) -> int:
+    """Number of primitives N in a field."""
+    return params["means"].shape[0]
+
+
+def sh_degree(features_rest: Tensor) -> int:
+    """SH degree of coefficients ``[N, K, 3]`` of degrees 1 and up, K = (degree + 1)^2 - 1."""
+    return round((features_rest.shape[1] + 1) ** 0.5) - 1
+
+
+def sh_degree_of(coefficients: int) -> int | None:
+    """SH degree with (degree + 1)^2 - 1 = ``coefficients`` per channel of degrees 1 and up; None if no degree has."""
+    return next((d for d in range(MAX_SH_DEGREE + 1) if (d + 1) ** 2 - 1 == coefficients), None)
+
+
+def odd_shapes(params: Mapping[str, Tensor]) -> list[str]:
+    """Descriptions of the parameters with a wrong shape, for an error message; N is the length of ``means``.
+
+    Args:
+        params: has all of :data:`SPLAT_NAMES`; ``features`` are not checked.
+    """
+    n = params["means"].shape[0] if params["means"].ndim else 0
+    rest = params["features_rest"].shape
+    known = len(rest) > 1 and sh_degree_of(rest[1]) is not None
+    wanted: dict[str, tuple[int | str, ...]] = {name: (n, columns) for name, columns in _COLUMNS.items()}
+    wanted["features_rest"] = (n, rest[1] if known else "(degree + 1)^2 - 1", 3)
+    return [
+        f"{name} has shape {list(params[name].shape)}; it must be [{', '.join(map(str, shape))}]"
+        for name, shape in wanted.items()
+        if tuple(params[name].shape) != shape
+    ]
+
+
+def rgb_to_sh(rgb: Tensor) -> Tensor:
+    """SH coefficient of degree 0 ``[..., 3]`` whose colour is ``rgb`` ``[..., 3]`` in [0, 1]."""
+    return (rgb - 0.5) / SH_C0
+
+
+def sh_to_rgb(sh: Tensor) -> Tensor:
+    """View-independent colour ``[..., 3]`` of an SH coefficient of degree 0 ``[..., 3]``; not clamped."""
+    return sh * SH_C0 + 0.5
+
+
+def rgb_to_logit(rgb: Tensor) -> Tensor:
+    """Logit ``[..., 3]`` of a colour ``[..., 3]``, clamped to [0.001, 0.999]."""
+    return torch.logit(rgb.clamp(1e-3, 1 - 1e-3))
+
+
+def finite_mask(params: Mapping[str, Tensor]) -> Tensor:
+    """True where every parameter of a primitive is finite: bool ``[N]``."""
+    n = num_primitives(params)
+    mask = torch.ones(n, dtype=torch.bool, device=params["means"].device)
+    for value in params.values():
+        mask &= torch.isfinite(value.detach().flatten(1)).all(dim=1)
+    return mask
+
+
+class Field(UserDict[str, Any]):
+    """Named parameters ``[N, ...]`` (see :mod:`sundae_ns.core.gaussians`) and the encoding of their colours.
+
+    A view of the mapping that it is given: surgery that replaces a parameter here replaces it there too. ``len`` counts
+    parameters, :attr:`num_primitives` counts primitives.
+
+    Args:
+        params: tensors, or ``Parameter``s of a field in training.
+        encoding: how colours are stored.
+    """
+
+    def __init__(self, params: MutableMapping[str, Any], encoding: Encoding = "harmonics") -> None:
+        # Not by UserDict, which would copy the mapping.
+        self.data = params  # type: ignore[assignment]
+        self.encoding: Encoding = encoding
+
+    @property
+    def num_primitives(self) -> int:
+        """Number of primitives N."""
+        return num_primitives(self)
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree of the stored colours."""
+        return sh_degree(self["features_rest"])
+
+    def rows(self, mask: Tensor) -> Field:
+        """The primitives under a mask, bool ``[N]``, as a field of its own."""
+        return Field({name: value[mask] for name, value in self.items()}, self.encoding)
+
+    def replaced(self, values: Mapping[str, Tensor]) -> Field:
+        """A field of the same tensors but for these values, in a mapping of its own that surgery does not change."""
+        return Field({**self, **values}, self.encoding)
+
+    def as_harmonics(self) -> Field:
+        """The field with colours as spherical harmonics; itself if it stores them so."""
+        if self.encoding == "harmonics":
+            return self
+        colors = rgb_to_sh(self["features_dc"].detach().sigmoid())
+        return Field({**self, "features_dc": colors}, "harmonics")
+
+
+def as_field(params: Mapping[str, Any]) -> Field:
+    """A mapping of parameters as a field; a plain mapping stores colours as harmonics."""
+    return params if isinstance(params, Field) else Field(dict(params))
+
+
+class Mended(NamedTuple):
+    """A field whose values are finite, and what that took."""
+
+    field: Field
+    """The primitives that have a meaning ``[M, ...]``; the tensors of the source if nothing changed."""
+    mask: Tensor
+    """True for these primitives of the source, bool ``[N]``."""
+    limits: int
+    """Number of these primitives with an opacity of exactly 0 or 1, which was clamped."""
+    flat: int
+    """Number of these primitives with a width of 0, which was clamped."""
+    unrotated: int
+    """Number of these primitives with an all-zero quaternion, which became the identity."""
+
+    @property
+    def dropped(self) -> int:
+        """Number of primitives that were left out: NaN, or infinite where that has no meaning."""
+        return len(self.mask) - self.field.num_primitives
+
+    @property
+    def clamped(self) -> bool:
+        """Whether a value was replaced."""
+        return self.limits + self.flat + self.unrotated > 0
+
+    def summary(self) -> str:
+        """What was clamped and dropped, as part of a sentence; empty if nothing was."""
+        kinds = {"opacity 0 or 1": self.limits, "width 0": self.flat, "rotation 0": self.unrotated}
+        named = " and ".join(f"{number:,} with {name}" for name, number in kinds.items() if number)
+        parts = [f"clamped {named} to finite values"] if named else []
+        if self.dropped:
+            parts.append(f"dropped {self.dropped:,} that were not finite (NaN or infinite)")
+        return f"{len(self.mask):,} primitives: {', '.join(parts)}" if parts else ""
+
+
+@torch.no_grad()
+def mend(params: Mapping[str, Any]) -> Mended:
+    """The primitives of a field that have a meaning, with finite values.
+
+    - A logit of plus or minus infinity is an opacity of 1 or 0, and becomes plus or minus :data:`LARGEST_LOGIT`.
+    - A log-scale of minus infinity is a width of 0, and becomes the least of the field within :data:`LEAST_SCALES`.
+    - An all-zero quaternion does not rotate, as in the renderers of 3DGS, and becomes the identity. One that is too
+      short or too long to be normalised in float32 is rescaled.
+    - A primitive with any other value that is NaN or infinite is left out.
+
+    Args:
+        params: the field, N primitives; it does not change.
+    """
+    field = as_field(params)
+    values: dict[str, Tensor] = {}
+    opacities, scales, quats = (field[name].detach() for name in ("opacities", "scales", "quats"))
+    n, device = field.num_primitives, field["means"].device
+    nothing = torch.zeros(n, dtype=torch.bool, device=device)
+    limits, flat, unrotated = nothing, nothing, nothing
+    infinite = opacities.isinf()
+    if bool(infinite.any()):
+        limits = infinite.flatten(1).any(dim=1)
+        values["opacities"] = torch.where(infinite, opacities.clamp(-LARGEST_LOGIT, LARGEST_LOGIT), opacities)
+    narrow = scales.isneginf()
+    if bool(narrow.any()):
+        flat = narrow.any(dim=1)
+        narrowest = torch.where(scales.isfinite(), scales, LEAST_SCALES[1]).amin().clamp(*LEAST_SCALES)
+        values["scales"] = torch.where(narrow, narrowest, scales)
+    if n:
+        largest = quats.abs().amax(dim=1)
+        least, most = _QUATERNION_RANGE
+        odd = ((largest < least) | (largest > most)) & largest.isfinite()
+        if bool(odd.any()):
+            unrotated = largest == 0
+            rescaled = quats / torch.where(odd, largest, 1.0).clamp_min(torch.finfo(quats.dtype).tiny)[:, None]
+            # The identity: w is 1, the others stay 0.
+            rescaled[:, 0] += unrotated.to(rescaled)
+            values["quats"] = torch.where(odd[:, None], rescaled, quats)
+    mended = field.replaced(values) if values else field
+    mask = finite_mask(mended)
+    whole = bool(mask.all())
+    counts = (int((kind & mask).sum()) for kind in (limits, flat, unrotated))
+    return Mended(mended if whole else mended.rows(mask), mask, *counts)

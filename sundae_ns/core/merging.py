@@ -1,0 +1,125 @@
+"""Merging: replace groups of primitives by one primitive with the same moments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from sundae_ns.core.covariance import chunks, covariances, mean_projected_area, scales_and_quaternions
+
+MAX_OPACITY = 0.99  # upper limit of merged opacities, at which the logit still has a gradient
+
+
+@torch.no_grad()
+def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[str, Tensor]:
+    """Replace each group of primitives by one with the same moments.
+
+    With weights w normalised within a group:
+
+    - centre and covariance are those of the mixture: ``m = sum w_i m_i``, ``S = sum w_i (S_i + (m_i - m)(m_i - m)^T)``;
+    - SH coefficients and features are ``sum w_i c_i``;
+    - opacity follows from ``t A = sum t_i A_i``, with optical depth ``t = -log(1 - alpha)`` and mean projected area A:
+      a wall of many small primitives absorbs as much light from afar as before. Limited to ``MAX_OPACITY``. Volumes in
+      place of areas would suit fog, but primitives are flat.
+
+    Args:
+        params: the field, all finite, N primitives.
+        label: index of the primitive that each one is merged into, int64 ``[N]``: its own index for a primitive that
+            stays, -1 for one that is dropped, else the index of one that stays.
+        weight: weight of each primitive in its group, not negative ``[N]``.
+
+    Returns:
+        Parameters ``[M, ...]`` of the primitives that stay, in order, with dtype and device of ``params``; computed in
+        float64 there, in the same order each time. A primitive whose group is itself alone, has no weight or overflows
+        is unchanged, bit for bit.
+    """
+    source = {name: value.detach() for name, value in params.items()}
+    device = source["means"].device
+    label, w = label.to(device), weight.detach().to(device).double().nan_to_num(0.0, posinf=0.0).clamp_min(0)
+    n = len(label)
+    stays = label == torch.arange(n, device=device)
+    place = stays.cumsum(0) - 1
+    members = (label >= 0).nonzero().squeeze(1)
+    group = place[label[members]]
+    count = int(stays.sum())
+
+    def total(values: Callable[[slice], Tensor], *shape: int) -> Tensor:
+        # In chunks: values of all members in float64 would take several times the memory of the field.
+        result = torch.zeros(count, *shape, dtype=torch.float64, device=device)
+        for some in chunks(len(members)):
+            if result.is_cuda:  # there index_add_ adds in any order
+                result.index_put_((group[some],), values(some), accumulate=True)
+            else:
+                result.index_add_(0, group[some], values(some))
+        return result
+
+    def of(name: str, some: slice) -> Tensor:
+        return source[name][members[some]].double()
+
+    w = w[members]
+    # Divide by the largest weight of the group first, so that no sum underflows.
+    largest = w.new_zeros(count).scatter_reduce_(0, group, w, "amax")
+    w = torch.where(largest[group] > 0, w / largest[group], 0.0)
+    normalized = w / total(lambda some: w[some])[group].clamp_min(torch.finfo(torch.float64).tiny)
+
+    def mean(name: str) -> Tensor:
+        shape = source[name].shape[1:]
+        flat = total(lambda some: normalized[some, None] * of(name, some).flatten(1), shape.numel())
+        return flat.reshape(count, *shape)
+
+    kept = {name: value[stays] for name, value in source.items()}
+    origin = kept["means"].double()
+
+    def offset(some: slice) -> Tensor:
+        return of("means", some) - origin[group[some]]
+
+    shift = total(lambda some: normalized[some, None] * offset(some), 3)
+
+    def moments(some: slice) -> Tensor:
+        spread = offset(some) - shift[group[some]]
+        own = covariances(of("scales", some).exp(), of("quats", some)) + spread[:, :, None] * spread[:, None, :]
+        return normalized[some, None, None] * own
+
+    covariance = total(moments, 3, 3)
+    # A covariance that overflows has no axes; its primitive stays unchanged.
+    bounded = covariance.isfinite().all(dim=2).all(dim=1)
+    deviations, quats = scales_and_quaternions(torch.where(bounded[:, None, None], covariance, 0.0))
+    # A width of zero has no logarithm; limit each axis to the thinnest axis of the members.
+    thinnest = torch.full_like(largest, torch.inf)
+    for some in chunks(len(members)):
+        thinnest.scatter_reduce_(0, group[some], of("scales", some).exp().amin(dim=1), "amin")
+    deviations = deviations.maximum(thinnest[:, None])
+
+    def cover(some: slice) -> Tensor:
+        depth = softplus(of("opacities", some).squeeze(1), threshold=40.0)
+        return depth * mean_projected_area(of("scales", some).exp())
+
+    merged_depth = total(cover) / mean_projected_area(deviations)
+
+    merged = {name: mean(name) for name in source if name not in _WITH_MOMENTS}
+    merged["means"] = origin + shift
+    merged["scales"] = deviations.log()
+    merged["quats"] = quats
+    merged["opacities"] = _logit_of_depth(merged_depth)[:, None]
+    changed = (torch.bincount(group, minlength=count) > 1) & (largest > 0) & bounded
+    for value in merged.values():
+        changed &= value.reshape(count, -1).isfinite().all(dim=1)
+    result = {}
+    for name, value in kept.items():
+        value = value.clone()
+        value[changed] = merged[name][changed].to(value.dtype)
+        result[name] = value
+    return result
+
+
+_WITH_MOMENTS = ("means", "scales", "quats", "opacities")
+
+
+def _logit_of_depth(depth: Tensor) -> Tensor:
+    """Logit of the opacity ``1 - exp(-depth)``, which is ``log(exp(depth) - 1)``; opacity at most ``MAX_OPACITY``."""
+    max_depth = -torch.log1p(torch.tensor(-MAX_OPACITY, dtype=depth.dtype))
+    depth = depth.clamp(torch.finfo(depth.dtype).tiny, float(max_depth))
+    return depth + torch.log(-torch.expm1(-depth))

@@ -1,0 +1,214 @@
+"""Image metrics, each in one named variant.
+
+PSNR is over all pixels and channels, with a peak of 1. SSIM is pytorch_msssim's, as in splatfacto: an 11 x 11 Gaussian
+window with sigma 1.5, no padding ("valid"), averaged over pixels and colour channels. Other libraries pad or normalise
+the variance differently; their values differ in the fourth digit. FLIP needs the optional package of its authors.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import urllib.request
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from pytorch_msssim import ssim as _windowed_ssim
+from torch import Tensor
+
+from sundae_ns.core.errors import DataError, one_line
+
+SSIM_WINDOW = 11
+"""Side of SSIM's Gaussian window, pixels (Wang et al. 2004)."""
+MOST_PSNR = 100.0
+"""Highest PSNR that a decision or a fit of colours gives, dB; 8-bit images carry no more."""
+Net = Literal["alex", "vgg", "squeeze"]
+logger = logging.getLogger(__name__)
+
+
+def check_pair(pred: Tensor, target: Tensor) -> None:
+    """Raise DataError unless both are images ``[H, W, 3]`` of one size."""
+    if pred.shape != target.shape or pred.dim() != 3 or pred.shape[-1] != 3:
+        raise DataError(
+            f"Images have shapes {list(pred.shape)} and {list(target.shape)}; give two of one size, [H, W, 3]."
+        )
+
+
+def psnr(pred: Tensor, target: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio ``-10 log10(MSE)``, in dB; infinite for equal images.
+
+    Args:
+        pred: ``[H, W, 3]``, nominally in [0, 1]; not clamped here.
+        target: ``[H, W, 3]`` in [0, 1].
+
+    Returns:
+        A scalar of the inputs' dtype and device; differentiable.
+
+    Raises:
+        DataError: the shapes differ, or are not ``[H, W, 3]``.
+    """
+    check_pair(pred, target)
+    return -10 * torch.log10(torch.mean((pred - target) ** 2))
+
+
+@torch.no_grad()
+def fitted_psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """PSNR after the affine map of colours (12 numbers) that brings an image nearest to its target.
+
+    What is left if light and exposure of the photo differ from the others'.
+
+    Args:
+        pred: ``[H, W, 3]``, nominally in [0, 1]; not clamped here.
+        target: ``[H, W, 3]`` in [0, 1].
+        mask: pixels that count, bool ``[H, W]``; None for all.
+
+    Returns:
+        A float64 scalar on the inputs' device, dB, at most :data:`MOST_PSNR`; NaN if the image is not finite.
+
+    Raises:
+        DataError: the shapes differ, or are not ``[H, W, 3]``.
+    """
+    check_pair(pred, target)
+    chosen = ... if mask is None else mask
+    colors, truth = pred[chosen].reshape(-1, 3).double(), target[chosen].reshape(-1, 3).double()
+    if not bool(torch.isfinite(colors).all()):
+        return colors.new_full((), float("nan"))
+    rows = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1)
+    # A ridge far below 8-bit steps keeps images of one colour solvable.
+    normal = rows.T @ rows + 1e-6 * len(rows) * torch.eye(4, dtype=rows.dtype, device=rows.device)
+    error = rows @ torch.linalg.solve(normal, rows.T @ truth) - truth
+    return (-10 * error.square().mean().clamp_min(1e-30).log10()).clamp_max(MOST_PSNR)
+
+
+def ssim(pred: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity (Wang et al. 2004); takes, returns and raises the same as :func:`psnr`.
+
+    NaN if a side is shorter than the window: pytorch_msssim would not smooth along it and return another quantity.
+    """
+    check_pair(pred, target)
+    if min(pred.shape[:2]) < SSIM_WINDOW:
+        return pred.new_full((), float("nan"))
+    return _windowed_ssim(pred.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], data_range=1.0)
+
+
+def flip_available() -> bool:
+    """Whether the package that computes FLIP is installed."""
+    return importlib.util.find_spec("flip_evaluator") is not None
+
+
+@torch.no_grad()
+def flip(pred: Tensor, target: Tensor) -> Tensor | None:
+    """Mean FLIP error (Andersson et al. 2020) of two sRGB images ``[H, W, 3]``, in [0, 1]; lower is better.
+
+    Images are clamped to [0, 1]. The authors' package computes it on the CPU, at 67 pixels per degree.
+
+    Returns:
+        A float32 scalar on the inputs' device; None if the package is not installed.
+
+    Raises:
+        DataError: the shapes differ, or are not ``[H, W, 3]``.
+    """
+    check_pair(pred, target)
+    if not flip_available():
+        return None
+    from flip_evaluator import evaluate
+
+    reference, test = (np.ascontiguousarray(image.float().clamp(0, 1).cpu().numpy()) for image in (target, pred))
+    _, mean, _ = evaluate(reference, test, "LDR", applyMagma=False)
+    return torch.tensor(mean, dtype=torch.float32, device=pred.device)
+
+
+def lpips_weights(net: Net = "alex") -> tuple[str, Path]:
+    """URL of torchvision's weights of a backbone, and the file in which torch.hub caches them.
+
+    torchmetrics ships the linear layers on top.
+    """
+    from torchvision import models
+
+    names = {"alex": "AlexNet_Weights", "vgg": "VGG16_Weights", "squeeze": "SqueezeNet1_1_Weights"}
+    url = getattr(models, names[net]).DEFAULT.url
+    return url, Path(torch.hub.get_dir()) / "checkpoints" / url.rpartition("/")[2]
+
+
+class Lpips:
+    """Learned perceptual image patch similarity (Zhang et al. 2018), built at its first use.
+
+    torchmetrics' variant with ``normalize=True``, for images in [0, 1]. Values of different nets do not compare: most
+    papers report VGG, splatfacto and gsplat report AlexNet. It is no ``nn.Module``, so checkpoints do not hold the net.
+
+    Args:
+        net: the backbone, ``alex``, ``vgg`` or ``squeeze``. Missing weights are downloaded.
+    """
+
+    def __init__(self, net: Net = "alex") -> None:
+        self.net: Net = net
+        self._metric: Any = None
+        self._failed = False
+
+    @torch.no_grad()
+    def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
+        """Distance of two images ``[H, W, 3]``, clamped to [0, 1]; lower is better.
+
+        Returns:
+            A float32 scalar on the inputs' device. None if a side is shorter than 32 pixels, below which a backbone
+            pools its input to nothing, or if the weights are missing; the first such call logs a warning.
+
+        Raises:
+            DataError: the shapes differ, or are not ``[H, W, 3]``.
+        """
+        check_pair(pred, target)
+        if self._failed or min(pred.shape[:2]) < 32:
+            return None
+        try:
+            self._metric = self._built() if self._metric is None else self._metric
+        except Exception as error:  # network, disk or a damaged file: a missing metric must not end a run
+            self._failed = True
+            url, path = lpips_weights(self.net)
+            cause = f"its {self.net} weights are missing ({one_line(error)})"
+            logger.warning("LPIPS is left out because %s; put %s into %s.", cause, url, path.parent)
+            return None
+        # Calling the metric returns the value of this pair alone; earlier calls do not count.
+        return self._metric.to(pred.device)(*(x.float().clamp(0, 1).permute(2, 0, 1)[None] for x in (pred, target)))
+
+    def _built(self) -> Any:
+        url, path = lpips_weights(self.net)
+        if not path.is_file():  # torch.hub downloads without a time limit: ask first whether the server answers
+            urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=5).close()
+        from torchmetrics.image import LearnedPerceptualImagePatchSimilarity
+
+        return LearnedPerceptualImagePatchSimilarity(net_type=self.net, normalize=True)
+
+
+@dataclass(frozen=True)
+class ViewQuality:
+    """Metrics of one image; None is a metric that was not measured."""
+
+    psnr: float
+    """dB."""
+    ssim: float
+    """NaN for images smaller than its window."""
+    flip: float | None = None
+    lpips: float | None = None
+    psnr_fitted: float | None = None
+    """dB, after the affine map of colours that fits best (:func:`fitted_psnr`)."""
+
+
+def quality_of(
+    image: Tensor, truth: Tensor, lpips: Callable[[Tensor, Tensor], Any] | None = None, *, visible: bool = True
+) -> ViewQuality:
+    """Every metric of one image ``[H, W, 3]`` against its truth.
+
+    Args:
+        image: rendered.
+        truth: the true image.
+        lpips: LPIPS of two images, None where it cannot be computed; None leaves it out.
+        visible: whether to compute FLIP, which takes a second for an image.
+    """
+    found: dict[str, Any] = {"psnr": psnr(image, truth), "psnr_fitted": fitted_psnr(image, truth)}
+    found |= {"ssim": ssim(image, truth), "lpips": None if lpips is None else lpips(image, truth)}
+    found |= {"flip": flip(image, truth)} if visible else {}
+    return ViewQuality(**{name: float(value) for name, value in found.items() if value is not None})

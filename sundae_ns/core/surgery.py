@@ -1,0 +1,248 @@
+"""Surgery on a field in training, with optimizer state and running states, and snapshots of a field or a network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, MutableMapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
+
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.gaussians import num_primitives
+
+Snapshot = dict[str, dict[str, Tensor]]
+"""By parameter: its ``value`` and the tensors of its optimizer state, all on the CPU."""
+
+
+def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> None:
+    """Check that parameters share their first dimension and that the optimizers of their names hold these tensors.
+
+    Parameters without an optimizer and optimizers of other names, such as a network's, are allowed.
+
+    Raises:
+        DataError: a parameter has another length, or an optimizer holds another tensor or more than one.
+    """
+    n = num_primitives(params)
+    for name, value in params.items():
+        if value.ndim == 0 or value.shape[0] != n:
+            raise DataError(f"parameter {name!r} has shape {list(value.shape)} in a field of {n} primitives: resize it")
+        if name not in optimizers:
+            continue
+        held = [p for group in optimizers[name].param_groups for p in group["params"]]
+        if len(held) != 1 or held[0] is not value:
+            raise DataError(
+                f"the optimizer of {name!r} does not hold exactly the field's tensor: build it from params[{name!r}]"
+            )
+
+
+def per_primitive(value: Any, n: int) -> bool:
+    """Return whether a value is a tensor with a row for each of ``n`` primitives."""
+    return isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] == n
+
+
+def replace_parameter(
+    params: MutableMapping[str, Parameter],
+    optimizers: Mapping[str, Optimizer],
+    name: str,
+    value: Tensor,
+    state: Mapping[str, Any],
+) -> None:
+    """Replace one parameter, in the field and in its optimizer.
+
+    Args:
+        optimizers: by parameter name, with one parameter each; may lack ``name``.
+        value: the new values; ``requires_grad`` stays.
+        state: optimizer state of the new parameter; empty resets it.
+    """
+    new = Parameter(value, requires_grad=params[name].requires_grad)
+    optimizer = optimizers.get(name)
+    if optimizer is not None:
+        optimizer.state.pop(params[name], None)
+        if state:
+            optimizer.state[new] = dict(state)
+        optimizer.param_groups[0]["params"] = [new]
+    params[name] = new
+
+
+def moments_of(optimizers: Mapping[str, Optimizer], name: str, value: Tensor) -> dict[str, Tensor]:
+    """The optimizer state of a parameter that has its shape: Adam's moments, without the step count."""
+    state = optimizers[name].state.get(value, {}) if name in optimizers else {}
+    return {key: held for key, held in state.items() if isinstance(held, Tensor) and held.shape == value.shape}
+
+
+def change_parameter(
+    params: MutableMapping[str, Parameter],
+    optimizers: Mapping[str, Optimizer],
+    name: str,
+    change: Callable[[Tensor], Tensor],
+) -> None:
+    """Replace one parameter and its moments by a function of them; other optimizer state stays.
+
+    Args:
+        optimizers: by parameter name, with one parameter each; may lack ``name``.
+        change: returns the new values or moments ``[M, ...]`` of old ones ``[N, ...]``.
+    """
+    old = params[name]
+    state = optimizers[name].state.get(old, {}) if name in optimizers else {}
+    moments = {key: change(held) for key, held in moments_of(optimizers, name, old).items()}
+    replace_parameter(params, optimizers, name, change(old.detach()), {**state, **moments})
+
+
+@torch.no_grad()
+def keep(
+    params: MutableMapping[str, Parameter],
+    optimizers: Mapping[str, Optimizer],
+    states: Iterable[MutableMapping[str, Any]],
+    mask: Tensor,
+) -> None:
+    """Keep the primitives under a mask and remove all others, in place on the mappings.
+
+    Replaces every parameter by a new, shorter ``Parameter`` with the same ``requires_grad`` and without a gradient. The
+    optimizer of the same name holds the new one, with its per-primitive state (Adam's moments) sliced and its step
+    count kept. New objects are needed: after resizing through ``.data``, the backward pass of a live graph fails on the
+    old shape. The caller must refresh other holders of the old objects, such as nerfstudio's ``Optimizers.parameters``.
+
+    Args:
+        params: the field, name to parameter ``[N, ...]``.
+        optimizers: optimizers with one parameter each; names that are not in ``params`` are ignored.
+        states: running states; their tensors with first dimension N are sliced, all else stays.
+        mask: True for primitives to keep, bool, any device ``[N]``.
+
+    Raises:
+        DataError: the mask has a wrong shape or dtype or keeps nothing, or the optimizers do not hold the parameters.
+            All arguments are unchanged then.
+    """
+    n = num_primitives(params)
+    if mask.dtype != torch.bool or mask.shape != (n,):
+        raise DataError(f"mask is {mask.dtype} {list(mask.shape)} for {n} primitives: pass torch.bool [{n}]")
+    if not mask.any():
+        raise DataError(f"the mask removes all {n} primitives: keep at least one")
+    check_wiring(params, optimizers)
+
+    def kept(value: Tensor) -> Tensor:
+        return value[mask.to(value.device)]
+
+    for name in list(params):
+        change_parameter(params, optimizers, name, kept)
+    for state in states:
+        state.update({key: kept(value) for key, value in state.items() if per_primitive(value, n)})
+
+
+@torch.no_grad()
+def rewrite(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], values: Mapping[str, Tensor]) -> None:
+    """Overwrite parameters in place.
+
+    Where a value changes, the first moment of Adam becomes 0, because it averages gradients at the old value. The
+    second moment stays: with a zero second moment, the next step would be over three times the learning rate in every
+    direction, for any gradient (``0.1 g / sqrt(0.001 g^2)``). Adam forgets the old second moment within a thousand
+    steps. Unchanged values keep both moments.
+
+    Args:
+        params: the field, changed in place; the optimizers keep the same tensors.
+        optimizers: optimizers by parameter name.
+        values: new values by parameter name, each with the shape of its parameter.
+
+    Raises:
+        DataError: a name is unknown, a shape differs, or the optimizers do not hold the parameters.
+    """
+    check_wiring(params, optimizers)
+    for name, value in values.items():
+        if name not in params or params[name].shape != value.shape:
+            shape = list(params[name].shape) if name in params else "no such parameter"
+            raise DataError(f"cannot write {list(value.shape)} to {name!r} ({shape}): pass one row per primitive")
+    for name, value in values.items():
+        parameter = params[name]
+        value = value.to(parameter)
+        if name in optimizers and "exp_avg" in optimizers[name].state.get(parameter, {}):
+            optimizers[name].state[parameter]["exp_avg"].masked_fill_(parameter != value, 0)
+        parameter.copy_(value)
+
+
+def snapshot(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> Snapshot:
+    """Copy a field and the state of its optimizers, by parameter name; a parameter may have none."""
+    saved = {}
+    for name, value in params.items():
+        state = optimizers[name].state.get(value, {}) if name in optimizers else {}
+        tensors = {"value": value, **{key: held for key, held in state.items() if isinstance(held, Tensor)}}
+        saved[name] = {key: held.detach().cpu().clone() for key, held in tensors.items()}
+    return saved
+
+
+@torch.no_grad()
+def restore(
+    params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], saved: Mapping[str, dict[str, Tensor]]
+) -> None:
+    """Restore a snapshot with any number of primitives, in place on the mappings.
+
+    Replaces the parameter objects, as :func:`keep` does.
+    """
+    for name, entries in saved.items():
+        value = entries["value"].to(params[name].device, copy=True)
+        state = _state(entries, value, optimizers[name]) if name in optimizers else {}
+        replace_parameter(params, optimizers, name, value, state)
+
+
+@torch.no_grad()
+def narrow(params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], name: str, width: int) -> None:
+    """Keep the first ``width`` columns of one parameter ``[N, C, ...]`` and of its moments."""
+    change_parameter(params, optimizers, name, lambda value: value[:, :width].clone())
+
+
+def module_snapshot(parameters: Iterable[Tensor], optimizer: Optimizer) -> Snapshot:
+    """Copy the parameters of a network and the state of its optimizer; keys are the parameters' positions."""
+    named = {str(place): value for place, value in enumerate(parameters)}
+    return snapshot(named, dict.fromkeys(named, optimizer))
+
+
+@torch.no_grad()
+def restore_module(parameters: Iterable[Tensor], optimizer: Optimizer, saved: Mapping[str, dict[str, Tensor]]) -> None:
+    """Restore a :func:`module_snapshot` in place; keeps the parameter objects."""
+    for place, value in enumerate(parameters):
+        entries = saved[str(place)]
+        value.copy_(entries["value"])
+        optimizer.state.pop(value, None)
+        if len(entries) > 1:
+            optimizer.state[value] = _state(entries, value, optimizer)
+
+
+def _state(entries: Mapping[str, Tensor], value: Tensor, optimizer: Optimizer) -> dict[str, Tensor]:
+    """Optimizer state of a snapshot, on the device of ``value``."""
+    # Adam keeps its step count on the CPU, unless it is fused.
+    on_host = () if optimizer.param_groups[0].get("fused") else ("step",)
+    return {
+        key: held.to("cpu" if key in on_host else value.device, copy=True)
+        for key, held in entries.items()
+        if key != "value"
+    }
+
+
+@torch.no_grad()
+def grow(
+    params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], count: int, min_opacity: float
+) -> None:
+    """Add ``count`` primitives: the most opaque ones become two at one place, which render alike.
+
+    Opacities ``o' = 1 - sqrt(1 - o)`` preserve the opacity at the centre, scales ``s' = s o / (2 o' - o'^2 / sqrt(2))``
+    the integral along a ray (3DGS-MCMC, Kheradmand et al., 2024, equation 9 for two copies). Replaces the parameter
+    objects, as :func:`keep` does.
+
+    Args:
+        optimizers: by parameter name; the moments of the copies are 0.
+        min_opacity: lower limit of the new opacities.
+    """
+    while count > 0:
+        opacities = params["opacities"].detach().sigmoid().flatten()
+        rows = opacities.sort(descending=True, stable=True).indices[:count]
+        old = opacities[rows].double()
+        new = 1 - (1 - old).sqrt()
+        params["scales"].data[rows] += (old / (2 * new - new.square() / 2**0.5)).log().to(params["scales"])[:, None]
+        limited = new.to(opacities).clamp(min_opacity, 1 - torch.finfo(opacities.dtype).eps)
+        params["opacities"].data[rows] = torch.logit(limited)[:, None]
+        for name in list(params):
+            change_parameter(params, optimizers, name, lambda value, rows=rows: torch.cat([value, value[rows]]))  # type: ignore[misc]
+            for moment in moments_of(optimizers, name, params[name]).values():
+                moment[-len(rows) :] = 0
+        count -= len(rows)

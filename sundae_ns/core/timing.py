@@ -1,0 +1,54 @@
+"""Wall-clock times that include the device's work, and peak memory."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from statistics import median
+
+import torch
+
+from sundae_ns.core.errors import ConfigError
+
+
+def now(device: torch.device | str) -> float:
+    """Seconds on the host's wall clock, from an arbitrary start, after the device has finished its queued work."""
+    device = torch.device(device)
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    elif device.type == "mps":
+        torch.mps.synchronize()
+    return time.perf_counter()
+
+
+def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: int = 5, repeats: int = 20) -> float:
+    """Median milliseconds of a function on a device, from its call until the device is idle again.
+
+    ``warmup`` untimed calls come before the ``repeats`` timed ones.
+
+    Raises:
+        ConfigError: ``warmup`` is negative, or ``repeats`` less than 1.
+    """
+    if warmup < 0 or repeats < 1:
+        raise ConfigError(f"{warmup} warm-up calls and {repeats} timed calls; give at least 0 and 1.")
+    for _ in range(warmup):
+        fn()
+    times = []
+    for _ in range(repeats):
+        start = now(device)
+        fn()
+        times.append(1e3 * (now(device) - start))
+    return median(times)
+
+
+def peak_memory(device: torch.device) -> int:
+    """Peak memory so far in bytes: allocated by torch on a CUDA device, else resident on the host; 0 if unknown."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return 0
+    # Linux reports kibibytes, macOS bytes.
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

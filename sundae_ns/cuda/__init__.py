@@ -1,0 +1,1 @@
+"""CUDA: kernels of csrc compiled and launched, captured graphs, loss, Adam."""

@@ -1,0 +1,166 @@
+"""Recording and replay of GPU work as CUDA graphs, and a cache of recorded graphs."""
+
+from __future__ import annotations
+
+import gc
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Generic, TypeVar
+
+import torch
+
+from sundae_ns.core.errors import BackendError
+
+MAX_GRAPHS = 4
+"""Graphs cached at a time: each holds its own images and activations."""
+
+RECORD_AT = 3
+"""Requests in a row after which a key is recorded: a viewer that is being resized never repeats a size."""
+
+_Result = TypeVar("_Result")
+
+_abandoned: list[torch.cuda.CUDAGraph] = []  # unfinished graphs, kept alive because torch may still refer to them
+_thread = threading.local()
+_one_at_a_time = threading.Lock()
+
+
+@contextmanager
+def warm_up(device: torch.device) -> Iterator[None]:
+    """Context to run work once before it is recorded: it allocates and selects kernels, which cannot be recorded."""
+    side = _side_stream(device)
+    side.wait_stream(torch.cuda.current_stream(device))
+    try:
+        with torch.cuda.stream(side), _mark_recording():
+            yield
+    finally:
+        torch.cuda.current_stream(device).wait_stream(side)
+
+
+def is_recording() -> bool:
+    """Whether this thread is warming up or recording; code that it calls must not record a graph of its own."""
+    return getattr(_thread, "recording", False)
+
+
+@contextmanager
+def _mark_recording() -> Iterator[None]:
+    before, _thread.recording = is_recording(), True
+    try:
+        yield
+    finally:
+        _thread.recording = before
+
+
+@contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Disable garbage collection: destroying a graph meanwhile would break the graph being recorded."""
+    before = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if before:
+            gc.enable()
+
+
+def _side_stream(device: torch.device) -> torch.cuda.Stream:
+    # One stream for all graphs, because memory cached for one stream does not serve another; one per thread, because
+    # work of another thread on the same stream would be recorded too.
+    streams: dict[torch.device, torch.cuda.Stream] = _thread.__dict__.setdefault("streams", {})
+    if device not in streams:
+        streams[device] = torch.cuda.Stream(device)
+    return streams[device]
+
+
+def record(
+    run: Callable[[], _Result], device: torch.device, share_memory_with: torch.cuda.CUDAGraph | None = None
+) -> tuple[torch.cuda.CUDAGraph, _Result]:
+    """Record the GPU work of ``run`` without executing it.
+
+    Args:
+        run: must have run before (:func:`warm_up`), must not wait for the GPU, and must read only memory that stays in
+            place.
+        device: CUDA device.
+        share_memory_with: a graph whose memory pool this one reuses; they must be replayed in this order.
+
+    Returns:
+        The graph, and the result of ``run``: tensors that each replay writes.
+
+    Raises:
+        BackendError: the work cannot be recorded. Nothing was executed, and later work is not affected.
+        torch.cuda.OutOfMemoryError: the device has too little memory for the results.
+    """
+    graph = torch.cuda.CUDAGraph()
+    # A training loop beside a viewer may allocate meanwhile: record this thread's work only.
+    pool = torch.cuda.graph_pool_handle() if share_memory_with is None else share_memory_with.pool()
+    # Name the stream: torch's own belongs to the device that was current at its first recording.
+    side = _side_stream(device)
+    errors: list[RuntimeError] = []
+    with _one_at_a_time, torch.cuda.device(device), _mark_recording(), _no_garbage_collection():
+        generator = torch.cuda.default_generators[torch.cuda.current_device()]
+        before = generator.clone_state() if hasattr(generator, "clone_state") else None  # not in torch 2.1
+        try:
+            # After a failed recording torch stays on its stream, and later work would not be ordered with gsplat's.
+            with torch.cuda.stream(side):
+                with torch.cuda.graph(graph, pool=pool, stream=side, capture_error_mode="thread_local"):
+                    try:
+                        result = run()
+                    except RuntimeError as error:
+                        errors.append(error)
+                        raise
+        except RuntimeError as error:
+            if error not in errors:  # ending the recording failed too
+                errors.append(error)
+                _abandon(graph, pool)
+                if before is not None:
+                    # Else torch refuses random numbers: its generator waits for a recording that does not exist.
+                    generator.graphsafe_set_state(before)
+            first = errors[0]
+            if isinstance(first, torch.cuda.OutOfMemoryError):
+                raise first from None
+            cause = str(first).partition("\n")[0]
+            raise BackendError(f"{device} cannot record this as a CUDA graph: {cause}") from first
+    return graph, result
+
+
+def _abandon(graph: torch.cuda.CUDAGraph, pool: tuple[int, int]) -> None:
+    """Tell torch's allocator that a recording which cannot be ended is over; else it would never release memory."""
+    # Torch has no public function. Without this one, the allocator keeps asking the graph which allocations it owns.
+    with suppress(AttributeError, RuntimeError):
+        torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), pool)
+    _abandoned.append(graph)
+
+
+class GraphCache(Generic[_Result]):
+    """Recorded graphs by key: the least recently used one is dropped."""
+
+    def __init__(self) -> None:
+        self._graphs: OrderedDict[Hashable, _Result] = OrderedDict()
+        self._last: Hashable = None
+        self._repeats = 0
+
+    def __len__(self) -> int:
+        return len(self._graphs)
+
+    def get(self, key: Hashable, make: Callable[[], _Result]) -> _Result | None:
+        """The graph for ``key``, recorded by ``make`` at its :data:`RECORD_AT`-th request in a row; None before."""
+        self._repeats = self._repeats + 1 if key == self._last else 1
+        self._last = key
+        if key not in self._graphs:
+            if self._repeats < RECORD_AT:
+                return None
+            if len(self._graphs) >= MAX_GRAPHS:
+                self._graphs.popitem(last=False)
+            self._graphs[key] = make()
+        self._graphs.move_to_end(key)
+        return self._graphs[key]
+
+    def put(self, key: Hashable, graph: _Result) -> None:
+        """Replace the graph of a cached key."""
+        self._graphs[key] = graph
+
+    def clear(self) -> None:
+        """Drop all graphs, and forget the last key."""
+        self._graphs.clear()
+        self._last, self._repeats = None, 0

@@ -1,0 +1,141 @@
+"""Frames of a video: the sharpest of each stretch."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sundae_ns.core.errors import DataError, regular, writing
+from sundae_ns.data.photos import LEAST_PHOTOS
+
+SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path is a file with the suffix of a video."""
+    return path.is_file() and path.suffix.lower() in SUFFIXES
+
+
+def video_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels of the frames of a video.
+
+    Raises:
+        DataError: it cannot be decoded, or has too few frames.
+    """
+    with _opened(path) as video:
+        length = _length(video, path)
+        whole, frame = video.read()
+        if not whole:
+            raise DataError(f"{path} has no frame that can be decoded; convert it to .mp4 (H.264)")
+    if length < LEAST_PHOTOS:
+        raise DataError(f"{path} has {length} frames, and camera poses need {LEAST_PHOTOS} or more; give a longer one")
+    height, width = frame.shape[:2]
+    return width, height
+
+
+def write_frames(path: Path, folder: Path, count: int, advance: Callable[[int], None]) -> None:
+    """Write the sharpest frame of each of ``count`` stretches of a video, as ``00001.jpg`` and so on.
+
+    Args:
+        path: the video.
+        folder: for the frames; it is there only once it is whole.
+        count: number of frames; a shorter video gives all of its own.
+        advance: called with the number of further frames.
+
+    Raises:
+        DataError: the video cannot be decoded.
+        StorageError: the disk is full or not writable.
+    """
+    import cv2
+
+    partial = folder.with_name(f"{folder.name}.partial")
+    with writing(f"cannot write {folder}"):
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        with _opened(path) as video:
+            written = 0
+            for frame in _sharpest(video, _length(video, path), count):
+                written += 1
+                name = partial / f"{written:05d}.jpg"
+                coded, content = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
+                if not coded:
+                    raise DataError(f"frame {written} of {path} cannot be saved as JPEG; make the video smaller")
+                with name.open("wb") as file:
+                    file.write(content.tobytes())
+                advance(1)
+        if written < LEAST_PHOTOS:
+            raise DataError(f"{path} ends after {written} frames that can be decoded; convert it to .mp4 (H.264)")
+        partial.replace(folder)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        regular(path)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror}); check the path") from error
+    # Quiet: our error says what is wrong. OpenCV reads both when it is imported first.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    import cv2
+
+    video = cv2.VideoCapture(str(path.absolute()))
+    try:
+        if not video.isOpened():
+            raise DataError(f"{path} is not a video that OpenCV decodes; convert it to .mp4 (H.264)")
+        yield video
+    finally:
+        video.release()
+
+
+def _length(video: Any, path: Path) -> int:
+    """Number of frames: as the file states, or counted where it states none."""
+    import cv2
+
+    stated = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    if stated > 0:
+        return stated
+    with _opened(path) as other:
+        count = 0
+        while other.grab():
+            count += 1
+    return count
+
+
+def _sharpest(video: Any, length: int, count: int) -> Iterator[np.ndarray]:
+    """The sharpest of 12 frames ``[H, W, 3]`` of each of ``count`` equal stretches of a video of ``length`` frames."""
+    count = min(count, length)
+    every = max(1, length // (count * 12))
+    best: tuple[float, np.ndarray] | None = None
+    stretch, at = 0, 0
+    while video.grab():
+        # A file may hold more frames than it states; they belong to the last stretch.
+        found = min(at * count // length, count - 1)
+        if found != stretch:
+            if best is not None:
+                yield best[1]
+            stretch, best = found, None
+        if best is None or at % every == 0:
+            whole, frame = video.retrieve()
+            if whole and (best is None or sharpness(frame) > best[0]):
+                best = sharpness(frame), frame
+        at += 1
+    if best is not None:
+        yield best[1]
+
+
+def sharpness(frame: np.ndarray) -> float:
+    """Variance of the Laplacian of a frame ``[H, W, 3]`` uint8, at a width of at most 960 pixels."""
+    import cv2
+
+    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    if grey.shape[1] > 960:
+        size = 960, max(1, grey.shape[0] * 960 // grey.shape[1])
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(grey, cv2.CV_64F).var())

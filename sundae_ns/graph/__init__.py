@@ -1,0 +1,1 @@
+"""The graph on the Gaussians: neighbours, edges, spectral filters."""

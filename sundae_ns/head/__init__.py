@@ -1,0 +1,1 @@
+"""The head: a U-Net on splatted features that corrects the image."""

@@ -1,0 +1,1 @@
+"""Formats, a module each, and the files of a run."""

@@ -1,0 +1,49 @@
+"""Stored bytes of the primitives and of the head. MB means 1e6 bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import chain
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from sundae_ns.head.head import CompensationHead, HeadConfig
+
+BYTES_PER_FLOAT = 4
+
+
+def bytes_of(params: Mapping[str, Tensor]) -> int:
+    """Bytes of a field's parameters in fp32, feature vectors included, for any dtype in memory."""
+    return sum(value.numel() for value in params.values()) * BYTES_PER_FLOAT
+
+
+def bytes_of_module(module: nn.Module) -> int:
+    """Bytes of a module's parameters and buffers, each in its own dtype; a shared tensor counts once."""
+    return sum(tensor.numel() * tensor.element_size() for tensor in chain(module.parameters(), module.buffers()))
+
+
+def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
+    """Bytes of a field and its head, whose weights are not allocated; the one count that decides in training."""
+    if head is None or head.mode == "off":
+        return bytes_of(params)
+    with torch.device("meta"):
+        return bytes_of(params) + bytes_of_module(CompensationHead(head))
+
+
+def megabytes(count: int) -> str:
+    """Format bytes in MB = 1e6 bytes: ``31.10 MB``."""
+    return f"{count / 1e6:.2f} MB"
+
+
+class Sizes(NamedTuple):
+    """Stored bytes of a compensated field."""
+
+    primitives: int
+    head: int = 0
+
+    @property
+    def total(self) -> int:
+        """Bytes of both."""
+        return self.primitives + self.head

@@ -1,0 +1,388 @@
+"""Checkpoints: whole files, the state beside the tensors, the checks before loading, and states of random generators.
+
+A checkpoint is a zip archive of ``torch.save``, as nerfstudio writes it:
+
+    data.pkl   {"step", "pipeline", "optimizers", "schedulers", "scalers", "random"}
+    data/N     bytes of tensor N, stored, not deflated
+
+``pipeline`` has the tensors by ``_model.gauss_params.NAME`` and ``_model.networks.head.NAME``, and
+``_model._extra_state``, see :func:`extra_state`. Files are read weights-only, so that no code of theirs runs, and only
+after their checksums were verified.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import re
+import zipfile
+from collections.abc import Mapping
+from numbers import Integral
+from pathlib import Path
+from typing import Any, BinaryIO, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sundae_ns.core.errors import CheckpointError, StorageError, one_line, regular
+from sundae_ns.core.files import replacing
+from sundae_ns.core.gaussians import SPLAT_NAMES, Encoding, Field, odd_shapes
+
+EXTRA_STATE = "_extra_state"
+FORMAT = 2
+_PREFIX = "gauss_params."
+_NAME = re.compile(r"step-(\d+)\.ckpt")
+_PARTIAL = "partial--1.{}.tmp"
+"""Name of an unfinished checkpoint of a process; nerfstudio, which parses a step from every name, reads -1."""
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Checkpoints of a folder by step, the newest last; other file names are ignored."""
+    found = {path: match for path in folder.glob("*.ckpt") if (match := _NAME.fullmatch(path.name))}
+    return sorted(found, key=lambda path: int(found[path][1]))
+
+
+def folder_of(place: Path) -> Path:
+    """The folder of a run's checkpoints, given that folder or the run's."""
+    below = place / "nerfstudio_models"
+    return below if below.is_dir() and not any(place.glob("*.ckpt")) else place
+
+
+def newest_step(place: Path) -> int | None:
+    """Step of a checkpoint by its name, or of the newest whole one of a run or its folder; None if there is none."""
+    if not place.is_file():
+        try:
+            place, file, _ = _open_newest(place)
+        except CheckpointError:
+            return None
+        file.close()
+    match = _NAME.fullmatch(place.name)
+    return None if match is None else int(match[1])
+
+
+def write(state: Mapping[str, Any], path: Path) -> None:
+    """Write a checkpoint atomically; a ``StorageError`` names the newest older checkpoint that is whole."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Through a Python file, because torch's own writer hides the reason of a failed write.
+        with replacing(path, path.with_name(_PARTIAL.format(os.getpid()))) as partial, partial.open("wb") as file:
+            torch.save(_compact(dict(state)), file)
+    except OSError as error:
+        older = [other for other in checkpoints(path.parent) if other != path]
+        kept = f"{older[-1].name} is whole, resume from it with --load-dir" if older else "no older checkpoint"
+        reason = str(error) if isinstance(error, StorageError) else f"cannot write {path}: {error.strerror or error}"
+        raise StorageError(f"{reason} ({kept})") from error
+
+
+def _compact(value: Any) -> Any:
+    """The value with tensors that own all of their memory: torch would save the whole memory of a part."""
+    if isinstance(value, Tensor):
+        whole = value.untyped_storage().nbytes() > value.numel() * value.element_size()
+        return value.detach().cpu().clone() if whole else value
+    if isinstance(value, dict):
+        return {key: _compact(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_compact(one) for one in value]
+    return value
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read a checkpoint of nerfstudio's trainer on the CPU, without running code from it.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, cut short, or of another kind.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path} does not exist; give a .ckpt file, or the folder of them")
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise _unreadable(path, error.strerror or one_line(error)) from error
+    with file:
+        if (damage := damage_of(file)) is not None:
+            raise _unreadable(path, damage)
+        return _loaded(file, path)
+
+
+def _loaded(file: BinaryIO, path: Path) -> dict[str, Any]:
+    """The contents of an open checkpoint without damage."""
+    try:
+        loaded = load_tensors(file)
+        state = loaded.get("pipeline") if isinstance(loaded, dict) else None
+        if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
+            raise ValueError("it holds no model")
+        if not isinstance(loaded.get("step"), Integral):
+            raise ValueError("it does not say after which step it was saved")
+    except Exception as error:  # torch.load raises many kinds with one meaning for the user
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        if isinstance(error, pickle.UnpicklingError):
+            reason = "it holds more than tensors and plain values, or nothing that can be read"
+        raise _unreadable(path, reason) from error
+    return loaded
+
+
+def _unreadable(path: Path, reason: str) -> CheckpointError:
+    return CheckpointError(f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file")
+
+
+def newest_whole(folder: Path) -> tuple[Path, list[str]]:
+    """The newest whole checkpoint of a folder or a run, and a line for each newer damaged one.
+
+    A training may replace it at any time: :func:`read_newest` reads it too.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    path, file, passed_over = _open_newest(folder)
+    file.close()
+    return path, passed_over
+
+
+def read_newest(folder: Path) -> tuple[Path, dict[str, Any]]:
+    """The newest whole checkpoint of a folder or a run, and its contents, also while a training replaces it.
+
+    Raises:
+        CheckpointError: there is none, or it is of another kind.
+    """
+    path, file, _ = _open_newest(folder)
+    with file:
+        return path, _loaded(file, path)
+
+
+def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
+    """As :func:`newest_whole`, with the open file, which stays readable after a training has removed it."""
+    found = checkpoints(folder_of(folder))
+    while True:
+        passed_over: list[str] = []
+        for path in reversed(found):
+            try:
+                file = regular(path).open("rb")
+            except OSError as error:
+                passed_over.append(f"{path.name} is not whole ({error.strerror or one_line(error)})")
+                continue
+            reason = damage_of(file)
+            if reason is None:
+                return path, file, passed_over
+            file.close()
+            passed_over.append(f"{path.name} is not whole ({reason})")
+        before, found = found, checkpoints(folder_of(folder))
+        if found == before:  # else a training has replaced them since they were listed
+            break
+    skipped = f" ({'; '.join(passed_over)})" if passed_over else ""
+    raise CheckpointError(f"{folder} holds no whole checkpoint{skipped}; give the folder of a run that saved one")
+
+
+def extra_state(
+    *,
+    step: int,
+    num_features: int,
+    encoding: Encoding,
+    running: Mapping[str, Mapping[str, Any]],
+    extensions: Mapping[str, Mapping[str, Any]],
+    trained_focal: tuple[float, float] | None,
+    head_enabled: bool,
+) -> dict[str, Any]:
+    """State of a model beside its tensors: plain numbers, strings, and tensors.
+
+    Args:
+        step: training step.
+        num_features: configured length of the feature vectors; 0 without a head.
+        encoding: how the field stores colours.
+        running: running states of ``densification`` and ``pruning``.
+        extensions: states of the extensions, by name.
+        trained_focal: shortest and longest focal length that the head was trained at, pixels.
+        head_enabled: whether images get the head's correction at this step; readers of finished scenes need it.
+    """
+    return {
+        "method": "sundae",
+        "format": FORMAT,
+        "step": step,
+        "num_features": num_features,
+        "encoding": encoding,
+        "running": {name: dict(value) for name, value in running.items()},
+        "extensions": {name: dict(value) for name, value in extensions.items()},
+        "trained_focal": None if trained_focal is None else list(trained_focal),
+        "head_enabled": head_enabled,
+    }
+
+
+def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Encoding) -> Mapping[str, Any]:
+    """The state beside the tensors in a model's ``state``, checked against the model's features and encoding.
+
+    Raises:
+        CheckpointError: a checkpoint of another method, format, feature width or encoding of colours.
+    """
+    extra = state.get(EXTRA_STATE)
+    if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
+        kind = "a splatfacto checkpoint" if _PREFIX + "means" in state else "the checkpoint of another method"
+        raise CheckpointError(
+            f"this is {kind}, not one of sundae; start from it with --pipeline.model.warm-start PATH, not --load-dir"
+        )
+    _check_format(extra)
+    features = extra.get("num_features")
+    if features != num_features:
+        raise CheckpointError(
+            f"the checkpoint has feature vectors of length {features}, the model of length {num_features}; "
+            f"give --pipeline.model.head.num-features {features} (0 means a model without a head)"
+        )
+    if extra.get("encoding") != encoding:
+        raise CheckpointError(
+            f"the checkpoint stores colours as {extra.get('encoding')}, the model as {encoding}; load it with the "
+            "--pipeline.model.sh-degree that it was trained with (0 stores logits)"
+        )
+    parts = [extra.get("running"), extra.get("extensions")]
+    if not all(isinstance(part, Mapping) for part in parts) or "trained_focal" not in extra:
+        raise CheckpointError("the checkpoint does not say where training stopped; give another")
+    return extra
+
+
+def _check_format(extra: Mapping[str, Any]) -> None:
+    if extra.get("format") != FORMAT:
+        raise CheckpointError(
+            f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}; "
+            "use the version that wrote it"
+        )
+
+
+def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) -> None:
+    """Check that a ``state``, whose extra state was checked, fits the ``state_dict`` that a model has.
+
+    Raises:
+        CheckpointError: a tensor is missing or has another shape, or the running states do not fit.
+    """
+    mend = "load it with the options that it was trained with"
+    for name, value in expected.items():
+        if not isinstance(value, Tensor) or name == EXTRA_STATE:
+            continue
+        if not isinstance(state.get(name), Tensor):
+            raise CheckpointError(f"the checkpoint has no {name}; {mend}")
+        per_primitive = name.startswith(_PREFIX)
+        theirs, ours = state[name].shape, value.shape
+        if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_primitive else (theirs != ours):
+            hint = ", such as its --pipeline.model.head.size" if name.startswith("networks.head.") else ""
+            raise CheckpointError(
+                f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {mend}{hint}"
+            )
+    rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
+    if len(rows) != 1 or rows[0] == 0:
+        raise CheckpointError(f"the checkpoint has parameters of {rows} primitives; give another")
+    extra, n = state[EXTRA_STATE], rows[0]
+    pruning, strategy = extra["running"].get("pruning"), extra["running"].get("densification")
+    numbers = [extra.get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
+    if not all(isinstance(value, int) for value in numbers) or not isinstance(strategy, Mapping):
+        raise CheckpointError("the checkpoint does not say where training stopped; give another")
+    for name, value in strategy.items():
+        if isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] != n:
+            raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} primitives; give another")
+
+
+def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
+    """The stored field of a checkpoint from :func:`read`, without features, float32 on the CPU.
+
+    Raises:
+        CheckpointError: it holds no Gaussian field, or is a SUNDAE checkpoint of another format.
+    """
+    state = model_state(loaded)
+    stored = {name: state.get(_PREFIX + name) for name in SPLAT_NAMES}
+    field = {name: value.float() for name, value in stored.items() if isinstance(value, Tensor)}
+    if len(field) < len(stored):
+        raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
+    for odd in odd_shapes(field):
+        raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")
+    return Field(field, _encoding(field, state.get(EXTRA_STATE)))
+
+
+def model_state(loaded: Mapping[str, Any]) -> dict[str, Any]:
+    """State of the model in a checkpoint, by its own names."""
+    return {
+        name.removeprefix("_model.").removeprefix("module."): value
+        for name, value in loaded["pipeline"].items()
+        if name.startswith("_model.")
+    }
+
+
+def _encoding(field: Mapping[str, Tensor], extra: Any) -> Encoding:
+    """How the field of a checkpoint stores colours; splatfacto, which does not say, stores logits at SH degree 0."""
+    if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
+        return "logits" if field["features_rest"].shape[1] == 0 else "harmonics"
+    _check_format(extra)
+    for encoding in get_args(Encoding):
+        if extra.get("encoding") == encoding:
+            return encoding  # type: ignore[no-any-return]
+    raise CheckpointError("the checkpoint does not say how it stores colours; give another")
+
+
+# ------------------------------------------------------------------------------------------ archives of any torch.save
+
+
+def damage_of(file: BinaryIO) -> str | None:
+    """Why a file is no whole archive of tensors; None if its checksums, which torch does not verify, are right."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            entries = archive.infolist()
+            packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
+            if packed or sum(entry.file_size for entry in entries) > os.fstat(file.fileno()).st_size:
+                return "it would unpack to more than its size"
+            broken = archive.testzip()
+            return None if broken is None else f"{broken} in it is damaged"
+    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
+        return getattr(error, "strerror", None) or one_line(error)
+
+
+def load_tensors(file: BinaryIO) -> Any:
+    """The tensors and plain values of an open archive without :func:`damage_of`, on the CPU.
+
+    Raises:
+        Exception: of many kinds, which all mean that it holds something else.
+    """
+    file.seek(0)
+    with _numpy_numbers_allowed():
+        loaded = torch.load(file, map_location="cpu", weights_only=True)
+    _check_tensors(loaded)
+    return loaded
+
+
+def _check_tensors(value: Any) -> None:
+    """Refuse sparse or quantized tensors, and tensors larger than their storage, whose copy would fill memory."""
+    if isinstance(value, Tensor):
+        if value.layout is not torch.strided or value.is_quantized or value.is_meta:
+            raise ValueError("it holds a tensor that is sparse, quantized or without values")
+        if value.numel() * value.element_size() > value.untyped_storage().nbytes():
+            raise ValueError("it holds a tensor that claims more than it has")
+    elif isinstance(value, (Mapping, list, tuple)):
+        for inner in value.values() if isinstance(value, Mapping) else value:
+            _check_tensors(inner)
+
+
+def _numpy_numbers_allowed() -> Any:
+    """A context in which torch reads the numpy floats that stock nerfstudio leaves in a scheduler's state."""
+    scalar: Any = np.float64(0.0).__reduce__()[0]
+    names = [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    types: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
+    return torch.serialization.safe_globals([scalar, *names, *types])
+
+
+# -------------------------------------------------------------------------------------------------- random generators
+
+
+def random_state() -> dict[str, Any]:
+    """State of all random generators that training uses, as plain numbers and tensors."""
+    kind, keys, position, has_gauss, gauss = np.random.get_state()
+    return {
+        "python": random.getstate(),
+        "numpy": (str(kind), [int(key) for key in keys], int(position), int(has_gauss), float(gauss)),
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+    }
+
+
+def set_random_state(state: Mapping[str, Any]) -> None:
+    """Counterpart of :func:`random_state`; CUDA generators are left alone if the number of devices differs."""
+    random.setstate(state["python"])
+    kind, keys, position, has_gauss, gauss = state["numpy"]
+    np.random.set_state((kind, np.array(keys, dtype=np.uint32), position, has_gauss, gauss))
+    torch.set_rng_state(state["torch"])
+    if len(state["cuda"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(list(state["cuda"]))

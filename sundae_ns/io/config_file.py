@@ -1,0 +1,201 @@
+"""A run's ``config.yml`` as objects of nerfstudio, without running it. nerfstudio's own reader calls what it names."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from enum import Enum
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import yaml
+from yaml.constructor import ConstructorError
+
+from sundae_ns.core.errors import CheckpointError, reading, regular
+from sundae_ns.io.formats import refuse
+
+_REMEDY = "give the folder of a finished run, or its config.yml"
+_PATHS = {"PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath"}
+_GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
+
+
+class _ConfigLoader(yaml.SafeLoader):
+    """Makes configurations only; calls no constructor and no function that a file names."""
+
+
+@cache
+def _trusted_packages() -> frozenset[str]:
+    """Packages whose classes a configuration may name; nerfstudio imports plug-ins anyway."""
+    plugins = {point.value.partition(":")[0] for group in _GROUPS for point in entry_points(group=group)}
+    return frozenset({"nerfstudio", "sundae_ns", "gsplat", "torch"} | {name.partition(".")[0] for name in plugins})
+
+
+def _named(name: str, node: yaml.Node) -> Any:
+    """The class or function of a dotted name, which a trusted package must define."""
+    module, _, attribute = name.rpartition(".")
+    found = None
+    if module.partition(".")[0] in _trusted_packages():
+        with suppress(ImportError):
+            found = getattr(importlib.import_module(module), attribute, None)
+    home = str(getattr(found, "__module__", "")).partition(".")[0]
+    if home not in _trusted_packages() or not isinstance(found, (type, FunctionType)):
+        raise ConstructorError(None, None, f"it names {name}", node.start_mark)
+    return found
+
+
+def _make_object(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Iterator[Any]:
+    kind = _named(suffix, node)
+    if not isinstance(kind, type) or not dataclasses.is_dataclass(kind) or not isinstance(node, yaml.MappingNode):
+        raise ConstructorError(None, None, f"{suffix} is no configuration", node.start_mark)
+    made = kind.__new__(kind)
+    yield made
+    state = loader.construct_mapping(node, deep=True)
+    # Setting a configuration up calls its target.
+    if not isinstance(state.get("_target", type), type):
+        raise ConstructorError(None, None, f"the target of {suffix} is no class", node.start_mark)
+    for field in dataclasses.fields(kind):  # options newer than the run
+        if field.name not in state and field.default_factory is not dataclasses.MISSING:
+            state[field.name] = field.default_factory()
+    vars(made).update(state)
+
+
+def _make_value(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
+    """A path, or a member of an enumeration; other calls are refused."""
+    arguments = loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else []
+    module, _, name = suffix.rpartition(".")
+    if module.partition(".")[0] == "pathlib" and name in _PATHS and all(isinstance(a, str) for a in arguments):
+        return Path(*arguments)
+    if suffix == "builtins.getattr":  # as Python before 3.11.4 saves a member of an enumeration
+        kind, name = arguments if len(arguments) == 2 else (None, "")
+        if isinstance(kind, type) and issubclass(kind, Enum) and isinstance(name, str) and name in kind.__members__:
+            return kind[name]
+        raise ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
+    kind = _named(suffix, node)
+    if not isinstance(kind, type) or not issubclass(kind, Enum) or len(arguments) != 1:
+        raise ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
+    return kind(arguments[0])
+
+
+_PYTHON = "tag:yaml.org,2002:python/"
+_ConfigLoader.add_constructor(_PYTHON + "tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))
+_ConfigLoader.add_multi_constructor(_PYTHON + "name:", lambda loader, suffix, node: _named(suffix, node))
+_ConfigLoader.add_multi_constructor(_PYTHON + "object:", _make_object)
+_ConfigLoader.add_multi_constructor(_PYTHON + "object/apply:", _make_value)
+
+
+def find_capture(config: Any, folder: Path) -> None:
+    """If a run's capture is gone, look for it at the same place relative to the run, which may have moved too."""
+    datamanager: Any = getattr(getattr(config, "pipeline", None), "datamanager", None)
+    data = getattr(datamanager, "data", None)
+    if not isinstance(data, Path) or data.exists():
+        return
+    names = ("output_dir", "experiment_name", "method_name", "timestamp")
+    before = Path(*(str(getattr(config, name, "")) for name in names))
+    moved = Path(os.path.normpath(folder / os.path.relpath(data, before)))
+    if moved.exists():
+        datamanager.data = moved
+
+
+def config_of(run: Path) -> Path:
+    """Path of the ``config.yml`` of a run, given its folder or that file; it need not exist."""
+    return run / "config.yml" if run.is_dir() else run
+
+
+def find_config(path: Path) -> Path | None:
+    """The ``config.yml`` of a run, given it, the run's folder, the folder of its checkpoints, or one of these."""
+    folder = path if path.is_dir() else path.parent
+    folders = [folder, folder.parent] if folder.name == "nerfstudio_models" else [folder]
+    return next((each / "config.yml" for each in folders if (each / "config.yml").is_file()), None)
+
+
+def load_config(path: Path) -> Any:
+    """A run's ``config.yml`` as objects of nerfstudio, with the options that were saved.
+
+    Only classes of nerfstudio, of this package, of torch, and of installed plug-ins are known; nothing is called.
+
+    Raises:
+        CheckpointError: it cannot be read, is no configuration, or asks for something else.
+    """
+    config = _load(path, _ConfigLoader)
+    find_capture(config, path.absolute().parent)
+    return config
+
+
+def _load(path: Path, loader: type[yaml.SafeLoader]) -> Any:
+    kind = "a run's config.yml, or of another version"
+    with reading(path, kind, CheckpointError, mend=_REMEDY, missing=_REMEDY):
+        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
+
+
+# --------------------------------------------------------------------------------- plain values, which import no class
+
+
+class _ValueLoader(yaml.SafeLoader):
+    """Makes plain values only: mappings for configurations, text for names, lists for tuples and calls."""
+
+
+def _make_plain(loader: _ValueLoader, suffix: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    return loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else suffix
+
+
+_ValueLoader.add_multi_constructor(_PYTHON, _make_plain)
+
+
+def _value(path: Path, *keys: str) -> Any:
+    """A plain value of a ``config.yml``, or None; ``CheckpointError`` if the file cannot be read."""
+    value = _load(path, _ValueLoader)
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value
+
+
+def model_options(path: Path) -> dict[str, Any]:
+    """Options of the model in a run's ``config.yml``; ``CheckpointError`` if it is no configuration of a run."""
+    options = _value(path, "pipeline", "model")
+    if not isinstance(options, dict):
+        raise CheckpointError(f"{path} is not a run's config.yml; give the folder of a run")
+    return options
+
+
+def parser_options(path: Path) -> dict[str, Any]:
+    """As :func:`model_options`, those of the data parser; empty for a run without one."""
+    options = _value(path, "pipeline", "datamanager", "dataparser")
+    return options if isinstance(options, dict) else {}
+
+
+def capture_and_source(path: Path) -> tuple[Path | None, Path | None]:
+    """Paths of a run's capture and of the checkpoints that it resumes; ``CheckpointError`` if it cannot be read."""
+    options = _value(path)
+    parts = (options.get(name) if isinstance(options, dict) else None for name in ("data", "load_dir"))
+    capture, source = (Path(*map(str, names)) if isinstance(names, list) and names else None for names in parts)
+    return capture, source
+
+
+def schedule_length(path: Path) -> int:
+    """Number of steps of a run's schedule; ``CheckpointError`` if it is no configuration of a run of ours."""
+    length = _value(path, "schedule_length")
+    if not isinstance(length, int):
+        raise CheckpointError(f"{path} states no length of its schedule; give a run of sundae")
+    return length
+
+
+def check_run(run: Path) -> None:
+    """Refuse a path that is no run, nor its ``config.yml``, before the slow import of nerfstudio.
+
+    Raises:
+        CheckpointError: it is a file of another kind, or has no ``config.yml`` of a run.
+    """
+    refuse(
+        run,
+        packed="give the run that was packed",
+        primitives="give the folder of a run; sundae prune and sundae export read such files",
+    )
+    model_options(config_of(run))

@@ -1,0 +1,110 @@
+"""Similarity transforms of a field, and the order of its centres along a space-filling curve (Morton, 1966)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sundae_ns.core.covariance import quaternions
+from sundae_ns.core.gaussians import sh_degree
+from sundae_ns.rasterize.reference import harmonic_basis
+
+MAX_BITS = 21
+"""Maximum number of bits per coordinate; three fit in 64 bits."""
+
+_SPREADS = (
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def multiply_quaternions(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product of wxyz quaternions ``[..., 4]``: rotates by ``b``, then by ``a``."""
+    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    w = aw * bw - (av * bv).sum(dim=-1, keepdim=True)
+    return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av.expand_as(bv), bv)], dim=-1)
+
+
+def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tensor:
+    """SH coefficients of the rotated function: ``f'(R d) = f(d)``.
+
+    A rotation maps the functions of each degree onto themselves. Its matrix follows exactly from their values on 64
+    directions before and after the rotation.
+
+    Args:
+        features_rest: ``[N, K, 3]`` coefficients of degrees 1 and up, K = (degree + 1)^2 - 1.
+        rotation: ``[3, 3]``.
+    """
+    max_degree = sh_degree(features_rest)
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
+    before = harmonic_basis(max_degree, directions)
+    after = harmonic_basis(max_degree, directions @ rotation.double().cpu().T)
+    rotated = features_rest.clone()
+    for degree in range(1, max_degree + 1):
+        columns = slice(degree**2, (degree + 1) ** 2)
+        matrix = torch.linalg.lstsq(after[:, columns], before[:, columns]).solution
+        rows = slice(degree**2 - 1, (degree + 1) ** 2 - 1)
+        rotated[:, rows] = torch.einsum("ij,njc->nic", matrix.to(features_rest), features_rest[:, rows])
+    return rotated
+
+
+def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) -> dict[str, Tensor]:
+    """A field moved by ``x -> scale * (R x + t)``; ``transform`` ``[3, 4]`` holds rotation R and translation t.
+
+    Opacities, SH coefficients of degree 0 and features are the tensors of ``params``.
+    """
+    rotation, translation = transform[:, :3].to(params["means"]), transform[:, 3].to(params["means"])
+    moved = dict(params)
+    moved["means"] = scale * (params["means"] @ rotation.T + translation)
+    turn = quaternions(rotation.double()[None])[0].to(rotation)
+    moved["scales"] = params["scales"] + math.log(scale)
+    moved["quats"] = multiply_quaternions(turn, params["quats"])
+    moved["features_rest"] = rotate_spherical_harmonics(params["features_rest"], rotation)
+    return moved
+
+
+def interleave(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Codes ``[N]`` of cells ``[N, 3]`` with coordinates below 2^21; the first coordinate takes the lowest bit."""
+    code = np.zeros(len(cells), np.uint64)
+    for axis in range(3):
+        x = cells[:, axis].astype(np.uint64)
+        for shift, mask in _SPREADS:
+            x = (x | (x << np.uint64(shift))) & np.uint64(mask)
+        code |= x << np.uint64(axis)
+    return code
+
+
+def separate(codes: NDArray[np.uint64], axis: int) -> NDArray[np.uint64]:
+    """One coordinate ``[N]`` of the cells of codes ``[N]``."""
+    x = codes >> np.uint64(axis)
+    x &= np.uint64(_SPREADS[-1][1])
+    masks = [mask for _, mask in _SPREADS[-2::-1]] + [(1 << MAX_BITS) - 1]
+    for (shift, _), mask in zip(_SPREADS[::-1], masks, strict=True):
+        x |= x >> np.uint64(shift)
+        x &= np.uint64(mask)
+    return x
+
+
+def scene_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Permutation ``[N]`` that sorts finite centres ``[N, 3]`` along a space-filling curve.
+
+    Coordinates are centred on their medians and compressed by an inverse hyperbolic sine, so that a few far primitives
+    do not push all others into one cell.
+    """
+    centred = means.astype(np.float64) - np.median(means, axis=0)
+    spread = np.median(np.abs(centred))
+    if spread == 0:
+        spread = np.abs(centred).mean() or 1.0
+    bent = np.arcsinh(centred / spread)
+    low, extent = bent.min(axis=0), np.ptp(bent, axis=0).max() or 1.0
+    cells = ((bent - low) / extent * (2**MAX_BITS - 1)).astype(np.uint64)
+    return np.argsort(interleave(cells), kind="stable")

@@ -1,0 +1,301 @@
+"""Kinds of files, and one reader and one writer for files of primitives of all formats."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, SundaeError, regular
+from sundae_ns.core.gaussians import SPLAT_NAMES, Field, Mended, mend, sh_degree_of
+from sundae_ns.io import checkpoint
+from sundae_ns.io.coordinates import similarity
+from sundae_ns.io.gltf import read_glb, write_glb
+from sundae_ns.io.ply import (
+    MAX_SH_DEGREE,
+    MODEL_FRAME,
+    check_field,
+    is_nerfstudio_ply,
+    ply_comments,
+    read_ply,
+    write_ply,
+)
+from sundae_ns.io.sog import read_sog, write_sog
+from sundae_ns.io.splat import read_gsplat, read_ksplat, read_splat
+from sundae_ns.io.spz import clamped, read_spz, write_spz
+
+Kind = Literal["packed", "ply", "spz", "sog", "glb", "splat", "ksplat", "gsplat"]
+PRIMITIVES: dict[Kind, str] = {
+    "ply": ".ply file",
+    "spz": ".spz file",
+    "sog": ".sog file",
+    "glb": ".glb file",
+    "splat": ".splat file",
+    "ksplat": ".ksplat file",
+    "gsplat": "checkpoint of gsplat",
+}
+"""Kinds of files that hold primitives alone, and their names."""
+FORMATS = (".ply", ".spz", ".sog", ".glb")  # that write_for_viewers writes
+ANTIALIASED = "SplatRenderMode: mip"
+"""Header comment of a .ply whose scene was trained with antialiasing."""
+_FIRST_BYTES: dict[bytes, Kind] = {
+    b"\x89SUNDAE\n": "packed",
+    b"ply\n": "ply",
+    b"ply\r": "ply",
+    b"\x1f\x8b": "spz",
+    b"NGSP": "spz",
+    b"PK\x03\x04": "sog",
+    b"glTF": "glb",
+}
+_HEADERLESS: dict[str, Kind] = {".splat": "splat", ".ksplat": "ksplat"}
+_ZIPS: dict[str, Kind] = {".sog": "sog", ".pt": "gsplat"}
+_BY_SUFFIX: dict[str, Kind] = {".ply": "ply", ".spz": "spz", ".glb": "glb", **_ZIPS, **_HEADERLESS}
+_UNREAD = {
+    ".lcc": "is a scene of XGRIDS; convert it to .ply with SuperSplat or splat-transform",
+    ".rad": "is a scene of Spark; convert the .ply that it was made of",
+    ".gltf": "is a glTF scene in several files; export it as .glb",
+    ".pth": "is a checkpoint of another trainer; give its .ply, such as point_cloud/iteration_*/point_cloud.ply",
+}
+# In nerfstudio, z points up; in a 3DGS .ply, -y does.
+_UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
+_log = logging.getLogger(__name__)
+
+
+# --------------------------------------------------------------------------------------------------------------- kinds
+
+
+def kind_of(path: Path) -> Kind | None:
+    """Kind of the file at a path by its first bytes; None for any other file, a folder or a missing file."""
+    try:
+        with regular(path).open("rb") as file:
+            first = file.read(max(map(len, _FIRST_BYTES)))
+    except OSError:
+        return None
+    kind = next((kind for begin, kind in _FIRST_BYTES.items() if first.startswith(begin)), None)
+    if kind == "sog":  # a checkpoint is a zip file too
+        return _ZIPS.get(path.suffix.lower())
+    return _HEADERLESS.get(path.suffix.lower()) if kind is None else kind
+
+
+def kind_of_primitives(path: Path) -> Kind | None:
+    """Kind of a file of primitives, of a missing or damaged one by its suffix; None for all others.
+
+    A .sog may be a folder of images, or the ``meta.json`` in it.
+    """
+    if path.name == "meta.json" or ((path / "meta.json").is_file() and not (path / "config.yml").exists()):
+        return "sog"
+    kind = kind_of(path)
+    if kind is None and not path.is_dir():
+        kind = _BY_SUFFIX.get(path.suffix.lower())
+    return kind if kind in PRIMITIVES else None
+
+
+def unread(path: Path) -> str | None:
+    """What a scene is that this program does not read, and how to convert it; None for any other path.
+
+    >>> unread(Path("garden.lcc"))
+    'is a scene of XGRIDS; convert it to .ply with SuperSplat or splat-transform'
+    """
+    if path.is_dir():
+        # The folder of a training by the authors of 3DGS.
+        clouds = sorted(path.glob("point_cloud/iteration_*/point_cloud.ply"), key=lambda each: each.stat().st_mtime)
+        return f"is a folder of 3DGS; give {clouds[-1]}" if clouds else None
+    return _UNREAD.get(path.suffix.lower())
+
+
+def refuse(path: Path, *, packed: str | None = None, primitives: str | None = None) -> None:
+    """Raise ``CheckpointError`` for a packed scene or a file of primitives, with the advice for it; None accepts it."""
+    kind = kind_of(path)
+    if kind == "packed" and packed is not None:
+        raise CheckpointError(f"{path} is a packed scene; {packed}")
+    if kind in PRIMITIVES and primitives is not None:
+        raise CheckpointError(f"{path} is a {PRIMITIVES[kind]}; {primitives}")
+    if kind is None and (other := unread(path)) is not None:
+        raise CheckpointError(f"{path} {other}")
+
+
+# ------------------------------------------------------------------------------------------------------------- reading
+
+
+class StoredPrimitives(NamedTuple):
+    """The primitives of a file."""
+
+    mended: Mended
+    """Those that have a meaning, with finite values, float32 on the CPU; and what was clamped or dropped."""
+    antialiased: bool
+    """Whether the file is marked as trained with antialiasing."""
+    in_model_frame: bool
+    """Whether coordinates are those of nerfstudio's model."""
+
+
+def read_primitives(path: Path) -> StoredPrimitives:
+    """Read a file of primitives of any program. Nothing in it is executed.
+
+    Raises:
+        DataError: the file is missing, damaged, of another kind, or has no finite primitive.
+    """
+    kind, antialiased, in_model_frame = kind_of_primitives(path), False, False
+    if kind == "glb":
+        params, antialiased, in_model_frame = read_glb(path)
+    elif kind in ("spz", "sog"):
+        params, antialiased = read_spz(path) if kind == "spz" else read_sog(path)
+    elif kind in ("splat", "ksplat", "gsplat"):
+        params = {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}[kind](path)
+    else:
+        params, antialiased = read_ply(path), ANTIALIASED in ply_comments(path)
+        in_model_frame = is_nerfstudio_ply(path)
+    return StoredPrimitives(usable(params, path, DataError, "export it again"), antialiased, in_model_frame)
+
+
+def usable(
+    params: Mapping[str, Tensor],
+    path: Path,
+    failure: type[SundaeError] = CheckpointError,
+    remedy: str = "give another file",
+) -> Mended:
+    """The primitives of a file that have a meaning, with finite values; logs what was changed.
+
+    Raises:
+        failure: no primitive has a meaning.
+    """
+    mended = mend(params)
+    if not mended.field.num_primitives:
+        raise failure(f"{path} has {len(mended.mask):,} primitives, and none is finite; {remedy}")
+    if summary := mended.summary():
+        _log.warning("%s: %s", path, summary)
+    return mended
+
+
+class FinishedField(NamedTuple):
+    """A field to start from or to look at."""
+
+    params: dict[str, Tensor]
+    """Finite, without features, float32 on the CPU, colours as harmonics."""
+    in_model_frame: bool
+    """Whether coordinates are those of nerfstudio's model (checkpoints, ``ns-export``), not the capture's (others)."""
+    dropped: int
+    """Number of primitives left out because they have no meaning (``gaussians.mend``)."""
+
+
+def read_field(path: Path) -> FinishedField:
+    """Read a finished field: a splatfacto or SUNDAE checkpoint, a packed scene without its head, or primitives.
+
+    Args:
+        path: ``.ckpt`` file, a folder of them (the newest counts), or a file of primitives or packed scene.
+
+    Raises:
+        CheckpointError: there is no such file, it holds no Gaussian field, or has another format.
+        PackError: the packed scene is damaged.
+    """
+    wanted = "give a .ckpt file, the folder of them, or a .ply"
+    if not path.exists():
+        raise CheckpointError(f"{path} does not exist; {wanted}")
+    if kind_of_primitives(path) is not None:
+        try:
+            mended, _, in_model_frame = read_primitives(path)
+        except DataError as error:
+            raise CheckpointError(str(error)) from error
+        return FinishedField(dict(mended.field), in_model_frame, mended.dropped)
+    if kind_of(path) == "packed":
+        return _packed_field(path)
+    refuse(path)
+    if not path.is_dir():
+        loaded = checkpoint.read(path)
+    elif checkpoint.checkpoints(checkpoint.folder_of(path)):
+        path, loaded = checkpoint.read_newest(path)
+    else:
+        raise CheckpointError(f"{path} holds no checkpoint; {wanted}")
+    mended = usable(checkpoint.field_of(loaded, path), path)
+    return FinishedField(dict(mended.field.as_harmonics()), True, mended.dropped)
+
+
+def _packed_field(path: Path) -> FinishedField:
+    from sundae_ns.io.pack.packed_scene import read_scene  # its decoder needs a compiler, which other files do not
+
+    packed = read_scene(path)
+    model, source = packed.meta.get("model"), packed.meta.get("source")
+    logits = isinstance(model, dict) and model.get("sh_degree") == 0
+    field = Field({name: packed.field[name] for name in SPLAT_NAMES}, "logits" if logits else "harmonics")
+    in_model_frame = not isinstance(source, dict) or source.get("model_frame") is not False
+    return FinishedField(dict(field.as_harmonics()), in_model_frame, 0)
+
+
+# ------------------------------------------------------------------------------------------------------------- writing
+
+
+class ViewerFile(NamedTuple):
+    """Summary of a written file."""
+
+    primitives: int
+    dropped: int
+    """Primitives left out because they are not finite."""
+    degree: int
+    """SH degree of the file."""
+    clamped: int
+    """Primitives with values beyond the range of a .spz, which stores the nearest value."""
+    cut: bool
+    """Whether the field has a higher SH degree than the file."""
+    bytes: int
+
+
+def check_format(path: Path) -> None:
+    """Raise ``ConfigError`` unless the suffix of a file names a supported format."""
+    if path.suffix.lower() not in FORMATS:
+        raise ConfigError(f"{path} has no supported suffix; name it {' or '.join((*FORMATS, '.html'))}")
+
+
+def write_for_viewers(
+    path: Path,
+    params: Mapping[str, Tensor],
+    *,
+    antialiased: bool = False,
+    upright: bool = False,
+    in_model_frame: bool = True,
+) -> ViewerFile:
+    """Write a field in the format of the file's suffix, atomically.
+
+    Drops primitives without a meaning (``gaussians.mend``), and SH coefficients above the format's degree.
+
+    Args:
+        path: its folder must exist.
+        params: the field; see :mod:`sundae_ns.core.gaussians`. A :class:`Field` says how it stores colours.
+        antialiased: mark the scene as trained with antialiasing.
+        upright: rotate the scene from nerfstudio's axes to those of a 3DGS .ply, so that viewers show it upright;
+            a .glb is in any case.
+        in_model_frame: the field is in the coordinates of nerfstudio's model, as a .ply then says.
+
+    Raises:
+        ConfigError: the suffix is not supported.
+        DataError: the field has wrong shapes, or the format cannot store it.
+        StorageError: the disk is full or not writable.
+    """
+    check_format(path)
+    check_field(params)
+    mended = mend(params)
+    field = {name: value.detach().cpu() for name, value in mended.field.as_harmonics().items()}
+    kind = path.suffix.lower()
+    if upright and kind != ".glb":
+        field = similarity(field, _UPRIGHT, 1.0)
+    coefficients = field["features_rest"].shape[1]
+    if kind != ".ply":
+        field["features_rest"] = field["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
+    if kind == ".ply":
+        comments = [MODEL_FRAME] if in_model_frame and not upright else []
+        write_ply(path, field, comments=comments + ([ANTIALIASED] if antialiased else []))
+    elif kind == ".glb":
+        write_glb(path, field, antialiased=antialiased, in_model_frame=in_model_frame)
+    else:
+        (write_spz if kind == ".spz" else write_sog)(path, field, antialiased=antialiased)
+    kept = field["features_rest"].shape[1]
+    return ViewerFile(
+        primitives=len(field["means"]),
+        dropped=mended.dropped,
+        degree=sh_degree_of(kept) or 0,
+        clamped=clamped(field) if kind == ".spz" else 0,
+        cut=kept < coefficients,
+        bytes=path.stat().st_size,
+    )

@@ -1,0 +1,72 @@
+"""Options of packing: precision of each attribute."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sundae_ns.core.errors import ConfigError
+
+
+@dataclass
+class PackConfig:
+    """Precision of each attribute."""
+
+    position_bits: int = 13
+    """Bits of each coordinate within a block, 4 to 16."""
+    block: int = 1024
+    """Primitives per block of positions; smaller blocks are more exact and take more bytes."""
+    scale_step: float = 0.05
+    """Step of log-scales."""
+    rotation_step: float = 0.008
+    """Step of the components x, y and z of unit quaternions."""
+    color_step: float = 0.03
+    """Step of the view-independent colour, in units of the SH coefficients."""
+    opacity_step: float = 0.2
+    """Step of the logit of the opacity."""
+    harmonics_step: float = 0.02
+    """Step of the view-dependent colour, in units of the SH coefficients."""
+    feature_step: float = 0.09
+    """Step of features."""
+    head_step: float = 0.02
+    """Step of the head's weights, in units of the largest weight of their output channel."""
+
+    def validate(self) -> None:
+        """Check every option.
+
+        Raises:
+            ConfigError: names the first invalid option and its valid values.
+        """
+        limits = {"position_bits": (4, 16), "block": (16, 1 << 20), **dict.fromkeys(STEPS, (0.0001, 1))}
+        for name, (minimum, maximum) in limits.items():
+            value = getattr(self, name)
+            if not minimum <= value <= maximum:
+                raise ConfigError(f"{name.replace('_', '-')} is {value}; give {minimum} to {maximum}")
+
+
+STEPS = ("scale_step", "rotation_step", "color_step", "opacity_step", "harmonics_step", "feature_step", "head_step")
+
+FINETUNED: dict[str, int | float] = {
+    "position_bits": 12,
+    "scale_step": 0.1,
+    "rotation_step": 0.018,
+    "color_step": 0.07,
+    "opacity_step": 0.4,
+    "harmonics_step": 0.06,
+    "feature_step": 0.2,
+    "head_step": 0.14,
+}
+"""Coarser options for scenes that were fine-tuned with them (``sundae_ns.plugin.finetune``)."""
+FINETUNE_STEPS = 1500
+"""Steps of a fine-tune that make up for them: packs lose at most about 0.1 dB more (``curve.csv``)."""
+LEAST_LENGTHS = 20
+"""A run whose last steps are a fine-tune has at least this many times its steps: measured with a twentieth."""
+FINETUNED_SIZE = 0.6
+"""Bytes of such a pack as a share of one without: 0.58 to 0.61 on six captures."""
+
+
+def tuned_steps(length: int, steps: int = FINETUNE_STEPS) -> int:
+    """Number of steps at the end of a schedule of ``length`` steps that a fine-tune takes the place of.
+
+    0 for shorter schedules, whose fine-tune comes after the last step.
+    """
+    return steps if length >= LEAST_LENGTHS * steps else 0

@@ -1,0 +1,376 @@
+"""The container of a packed scene: named arrays behind a JSON header, all bytes under checksums, none executable.
+
+    offset   bytes
+    0        8        magic 89 53 55 4E 44 41 45 0A
+    8        4        version, u4 little-endian
+    12       4        length H of the header, u4, at most 4 MiB
+    16       32       SHA-256 of the header
+    48       H        JSON in UTF-8; "sections" lists name, dtype, shape, parts and sha256 of each section, in order
+    48 + H            the sections, each the concatenation of its parts
+
+A section is one little-endian array. Each of its parts is a plane: one byte of every number of one row (of the first
+dimension, if there are several). A plane is a raw deflate stream (RFC 1951), or is stored if that is not shorter.
+All sections together unpack to at most ``SPARE`` bytes plus ``MAX_RATIO`` bytes per byte of the file, which readers
+check before they allocate; a section ``padding`` makes that true where needed.
+
+``format.json`` describes the header as JSON Schema, for this module and for ``web/src/scene/schema.ts``. It has three
+keywords of its own: items of a list differ in the entry ``uniqueBy``; ``counts`` are whole numbers from 0 to a maximum;
+an ``orthonormal`` list is a direction ``[3]`` or the rows of a pose ``[3, 4]``, of about unit length, at right angles,
+and right-handed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jsonschema
+import numpy as np
+from numpy.typing import NDArray
+
+from sundae_ns.core.errors import PackError, regular
+
+FORMAT: dict[str, Any] = json.loads(resources.files(__package__).joinpath("format.json").read_text(encoding="utf-8"))
+"""``limits`` of files, schemas of ``container``, ``header`` and ``model``, and ``sections`` by codec and part."""
+LIMITS: dict[str, int] = FORMAT["limits"]
+VERSION, MAX_HEADER, SPARE, MAX_RATIO = (LIMITS[name] for name in ("version", "header", "spare", "ratio"))
+MAGIC = b"\x89SUNDAE\n"
+PADDING = "padding"
+_PREAMBLE = struct.Struct("<8sII32s")
+_THREADS = 2
+_ORTHONORMAL_TOLERANCE = 0.1  # of products of rows; poses of captures may be as far off
+
+Array = NDArray[Any]
+Floats = NDArray[np.float32]
+Levels = NDArray[np.int32]
+Coded = tuple[dict[str, Any], Levels, dict[str, Array]]
+"""The stored form of an attribute: its entry in the header, its levels ``[N, C]``, and its other sections by name."""
+
+
+class DamagedError(PackError):
+    """What is wrong with a packed scene, in words that do not name the file."""
+
+
+class Section(NamedTuple):
+    """An array in the file."""
+
+    name: str
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    parts: tuple[int, ...]
+    sha256: str
+    offset: int
+
+    @property
+    def size(self) -> int:
+        """Bytes of the array."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    @property
+    def planes(self) -> int:
+        """Number of planes of the array."""
+        return _rows(self.shape) * self.dtype.itemsize
+
+
+class Header(NamedTuple):
+    """The header of a file."""
+
+    meta: dict[str, Any]
+    """The JSON object, ``sections`` included."""
+    sections: dict[str, Section]
+    size: int
+    """Bytes of the file."""
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Turn a ``DamagedError`` or ``OSError`` into a ``PackError`` that names the file."""
+    try:
+        yield
+    except DamagedError as error:
+        raise PackError(f"{path} is not a whole packed scene ({error}); get it again, or pack it again") from error
+    except OSError as error:
+        raise PackError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+
+
+# -------------------------------------------------------------------------------------------------------------- schema
+
+
+def _unique_by(_: Any, key: str | int, items: list[Any], __: Any) -> Iterator[jsonschema.ValidationError]:
+    if len({item[key] for item in items}) < len(items):
+        yield jsonschema.ValidationError(f"two items have the same {key}")
+
+
+def _orthonormal(_: Any, __: bool, value: list[Any], ___: Any) -> Iterator[jsonschema.ValidationError]:
+    rows = np.array([row[:3] for row in value] if isinstance(value[0], list) else [value], np.float64)
+    crooked = np.abs(rows @ rows.T - np.eye(len(rows))).max() > _ORTHONORMAL_TOLERANCE
+    if crooked or (len(rows) == 3 and np.linalg.det(rows) <= 0):
+        yield jsonschema.ValidationError("the rows are not those of a rotation")
+
+
+def _counts(_: Any, most: int, values: list[Any], __: Any) -> Iterator[jsonschema.ValidationError]:
+    # A header may hold a million; "items" would take half a minute.
+    if not all(type(value) in (int, float) and 0 <= value <= most and value == int(value) for value in values):
+        yield jsonschema.ValidationError(f"they are not whole numbers from 0 to {most}")
+
+
+_Validator = jsonschema.validators.extend(
+    jsonschema.Draft202012Validator, {"uniqueBy": _unique_by, "orthonormal": _orthonormal, "counts": _counts}
+)
+
+
+def fault(value: Any, schema: Mapping[str, Any], prefix: str = "") -> str | None:
+    """The first violation of a schema as dotted keys after ``prefix``; None for a valid value.
+
+    Whole numbers may be written as ``3.0``, which JavaScript does not tell from ``3``.
+    """
+    # The first error only: own keywords come last in a schema, and rely on those before.
+    error = next(_Validator(schema).iter_errors(value), None)
+    if error is None:
+        return None
+    keys = [prefix] if prefix else []
+    keys += map(str, error.absolute_path)
+    if error.validator == "required":
+        keys.append(next(key for key in error.validator_value if key not in error.instance))
+    return ".".join(keys)
+
+
+def check(value: Any, schema: str, prefix: str = "") -> None:
+    """Raise ``DamagedError`` if a part of the header violates a schema of ``FORMAT``."""
+    wrong = fault(value, FORMAT[schema], prefix)
+    if wrong is not None:
+        raise DamagedError(f"its header has no valid {wrong or schema}")
+
+
+def parsed(content: bytes) -> Any:
+    """A JSON value of UTF-8; ``ValueError`` if it is none, is nested too deeply, or has numbers beyond float64."""
+
+    def finite(text: str) -> int | float:
+        value = int(text) if text.lstrip("-").isdigit() else float(text)
+        if not math.isfinite(float(value)):
+            raise ValueError(f"{text} is beyond float64")
+        return value
+
+    def nested(value: Any, depth: int) -> None:
+        if isinstance(value, (list, dict)):
+            if depth == 0:
+                raise RecursionError
+            for inner in value.values() if isinstance(value, dict) else value:
+                nested(inner, depth - 1)
+
+    try:
+        value = json.loads(content.decode(), parse_int=finite, parse_float=finite, parse_constant=finite)
+        nested(value, LIMITS["depth"])
+    except (OverflowError, RecursionError) as error:
+        raise ValueError("a number is beyond float64, or it is nested too deeply") from error
+    return value
+
+
+def fits(array: Array, section: Mapping[str, Any], lengths: Mapping[str, int]) -> bool:
+    """Whether an array has dtype and shape of a section.
+
+    Args:
+        array: the section's array.
+        section: of ``FORMAT["sections"]``.
+        lengths: sides that the shape names; None there matches any length.
+    """
+    sides = [lengths.get(side, side) for side in section["shape"]]
+    same = all(side is None or side == length for side, length in zip(sides, array.shape, strict=False))
+    return array.dtype.str == section["dtype"] and array.ndim == len(sides) and same
+
+
+def in_range(array: Array, section: Mapping[str, Any]) -> bool:
+    """Whether all values are finite and in the range of a section; a list is a range for each column."""
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        return False
+    lowest, highest = np.array(section.get("minimum", -np.inf)), np.array(section.get("maximum", np.inf))
+    return bool(((array >= lowest) & (array <= highest)).all())
+
+
+# ------------------------------------------------------------------------------------------------------------- writing
+
+
+def _rows(shape: tuple[int, ...]) -> int:
+    return shape[0] if len(shape) > 1 else 1
+
+
+def split_planes(array: Array) -> list[bytes]:
+    """The planes of an array."""
+    if array.size == 0:
+        return []
+    flat = np.ascontiguousarray(array).reshape(_rows(array.shape), -1)
+    planes = flat.view(np.uint8).reshape(flat.shape[0], flat.shape[1], array.dtype.itemsize)
+    return [plane.tobytes() for plane in planes.transpose(0, 2, 1).reshape(-1, flat.shape[1])]
+
+
+def _deflated(plane: bytes) -> bytes:
+    deflate = zlib.compressobj(9, wbits=-15)
+    stream = deflate.compress(plane) + deflate.flush()
+    return stream if len(stream) < len(plane) else plane
+
+
+def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0) -> tuple[bytes, dict[str, int]]:
+    """The bytes of a file, and the number of bytes of each of its sections.
+
+    Args:
+        meta: JSON values for the header, without the key ``sections``.
+        arrays: arrays of the dtypes that ``format.json`` lists.
+        unpacked: bytes that a reader decodes from the arrays, if more than their own size.
+
+    Raises:
+        PackError: the header is too long for a reader.
+    """
+    named = {name: np.asarray(array) for name, array in arrays.items()}
+    little = {name: array.astype(array.dtype.newbyteorder("<"), copy=False) for name, array in named.items()}
+    parts = {name: [_deflated(plane) for plane in split_planes(array)] for name, array in little.items()}
+    body = sum(len(part) for planes in parts.values() for part in planes)
+    size = max(unpacked, sum(array.nbytes for array in little.values()))
+    lacking = (size - SPARE) // MAX_RATIO + 1 - body
+    if lacking > 0:
+        little[PADDING] = np.zeros(lacking, np.uint8)
+        parts[PADDING] = [little[PADDING].tobytes()]
+    sections = [
+        {
+            "name": name,
+            "dtype": array.dtype.newbyteorder("<").str,
+            "shape": list(array.shape),
+            "parts": [len(part) for part in parts[name]],
+            "sha256": hashlib.sha256(b"".join(parts[name])).hexdigest(),
+        }
+        for name, array in little.items()
+    ]
+    front = _front({**meta, "sections": sections})
+    content = b"".join([front, *(part for planes in parts.values() for part in planes)])
+    return content, {name: sum(map(len, planes)) for name, planes in parts.items()}
+
+
+def _front(meta: Mapping[str, Any]) -> bytes:
+    """All bytes of a file before its sections."""
+    header = json.dumps(meta, allow_nan=False, separators=(",", ":")).encode()
+    if len(header) > MAX_HEADER:
+        raise PackError(
+            f"the header takes {len(header):,} bytes, but readers accept {MAX_HEADER:,}; give fewer cameras"
+        )
+    return _PREAMBLE.pack(MAGIC, VERSION, len(header), hashlib.sha256(header).digest()) + header
+
+
+def restated(content: bytes, entries: Mapping[str, Any]) -> bytes:
+    """A checked file with other entries of its header, which must not be ``sections``; its sections stay as they are.
+
+    The file may not become so much shorter that its sections unpack to too much; an entry more is always right.
+    """
+    end = _PREAMBLE.size + _PREAMBLE.unpack_from(content)[2]
+    return _front({**parsed(content[_PREAMBLE.size : end]), **entries}) + content[end:]
+
+
+# ------------------------------------------------------------------------------------------------------------- reading
+
+
+def read_header(path: Path) -> Header:
+    """Read and check the header, without the sections.
+
+    Raises:
+        PackError: the file is not a packed scene, of another version, truncated, altered, or states impossible sizes.
+    """
+    with naming(path), regular(path).open("rb") as file:
+        size = path.stat().st_size
+        preamble = file.read(_PREAMBLE.size)
+        if preamble[: len(MAGIC)] != MAGIC:
+            raise PackError(f"{path} is not a packed scene; give a file that sundae pack wrote")
+        if len(preamble) < _PREAMBLE.size:
+            raise DamagedError("it ends before its header")
+        _, version, length, digest = _PREAMBLE.unpack(preamble)
+        if version != VERSION:
+            remedy = "pack the run again" if version < VERSION else "update this program"
+            raise PackError(f"{path} has version {version} of the format, this program reads {VERSION}; {remedy}")
+        if length > min(MAX_HEADER, size - _PREAMBLE.size):
+            raise DamagedError("it ends in its header")
+        text = file.read(length)
+        if hashlib.sha256(text).digest() != digest:
+            raise DamagedError("the checksum of its header is wrong")
+        try:
+            meta = parsed(text)
+        except ValueError as error:
+            raise DamagedError("its header is not JSON") from error
+        return Header(meta, _sections(meta, _PREAMBLE.size + length, size), size)
+
+
+def _sections(meta: Any, offset: int, size: int) -> dict[str, Section]:
+    check(meta, "container")
+    sections: dict[str, Section] = {}
+    for entry in meta["sections"]:
+        shape, parts = (tuple(map(int, entry[key])) for key in ("shape", "parts"))
+        section = Section(entry["name"], np.dtype(entry["dtype"]), shape, parts, entry["sha256"], offset)
+        longest = section.size // section.planes if section.size else 0
+        if len(parts) != (section.planes if section.size else 0) or max(parts, default=0) > longest:
+            raise DamagedError(f"its header states impossible parts of {section.name}")
+        sections[section.name] = section
+        offset += sum(parts)
+    if offset != size:
+        raise DamagedError(f"its header states {offset:,} bytes, it has {size:,}")
+    check_ratio(sum(section.size for section in sections.values()), size)
+    return sections
+
+
+def check_ratio(unpacked: int, size: int) -> None:
+    """Raise ``DamagedError`` if a file of ``size`` bytes may not unpack to ``unpacked`` bytes."""
+    if unpacked > SPARE + MAX_RATIO * size:
+        raise DamagedError(f"{size:,} bytes would unpack to {unpacked:,}")
+
+
+def read_sections(path: Path, header: Header) -> dict[str, Array]:
+    """Read all sections except padding; ``PackError`` if one is altered or truncated."""
+    with naming(path):
+        content = memoryview(path.read_bytes())
+        for section in header.sections.values():
+            stored = content[section.offset : section.offset + sum(section.parts)]
+            if hashlib.sha256(stored).hexdigest() != section.sha256:
+                raise DamagedError(f"the checksum of {section.name} is wrong")
+
+        def decode(section: Section) -> Array:
+            planes, start = [], section.offset
+            for part in section.parts:
+                planes.append(_inflated(content[start : start + part], section.size // section.planes))
+                start += part
+            return _join(planes, section)
+
+        wanted = [section for section in header.sections.values() if section.name != PADDING]
+        with ThreadPoolExecutor(_THREADS) as pool:
+            return dict(zip([section.name for section in wanted], pool.map(decode, wanted), strict=True))
+
+
+def _inflated(part: memoryview, size: int) -> bytes:
+    """A plane of ``size`` bytes; nothing may follow its stream."""
+    if len(part) == size:
+        return bytes(part)
+    inflate = zlib.decompressobj(wbits=-15)
+    try:
+        plane = inflate.decompress(part, size + 1)
+    except zlib.error as error:
+        raise DamagedError("a section cannot be decompressed") from error
+    if len(plane) != size or not inflate.eof or inflate.unused_data:
+        raise DamagedError("a section cannot be decompressed")
+    return plane
+
+
+def _join(planes: Sequence[bytes], section: Section) -> Array:
+    """The array of planes of :func:`split_planes`."""
+    if not planes:
+        return np.zeros(section.shape, section.dtype)
+    size = section.dtype.itemsize
+    if len(planes) == 1:
+        return np.frombuffer(planes[0], section.dtype).reshape(section.shape)
+    rows = _rows(section.shape)
+    table = np.empty((rows, math.prod(section.shape) // rows, size), np.uint8)
+    for i, plane in enumerate(planes):
+        table[i // size, :, i % size] = np.frombuffer(plane, np.uint8)
+    return table.reshape(-1).view(section.dtype).reshape(section.shape)

@@ -1,0 +1,294 @@
+"""Entropy coding of whole numbers: a binary arithmetic coder whose probabilities adapt and are mixed (Mahoney, PAQ).
+
+Each number is a few binary decisions. Each decision has a probability in every one of :data:`CONTEXTS` contexts, and a
+small logistic regression mixes them. Encoder and decoder run the same loop, and it computes with integers below 2^53
+only, so every machine and the web page (``web/src/scene/entropy.ts``) decode the same numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sundae_ns.io.pack.container import Array, DamagedError, Levels
+from sundae_ns.rasterize.cpu.parallel import compiled, inlined
+
+LARGEST = (1 << 24) - 1
+"""Largest magnitude of a number."""
+CONTEXTS = 4
+NEIGHBOURS = 4
+"""Earlier rows from which the contexts of a row are made."""
+WINDOW = 128
+"""Neighbours are searched among this many earlier rows."""
+_MASK = 0xFFFFFFFF
+_NODES = 128
+_SIDE = 64
+_LAST = 24
+_CLASSES = 16
+_EVEN = 1 << 15
+
+Stream = NDArray[np.uint8]
+Near = NDArray[np.int32]
+"""Rows ``[N, NEIGHBOURS]`` before each row, the nearest first; -1 for none."""
+
+
+_SQUASH = np.rint(4096 / (1 + np.exp(-np.arange(-2047, 2048) / 256))).clip(1, 4095).astype(np.int32)
+"""Probabilities of 12 bits ``[4095]`` for -2047 to 2047 in 256ths of their logits.
+
+The format fixes these numbers: other machines' exponentials must round to them (a test holds their hash).
+"""
+_STRETCH = np.searchsorted(_SQUASH, np.arange(4096), side="left").clip(0, 4094).astype(np.int32) - 2047
+_RATES = (65536 * 5 // (5 * np.arange(256) + 8)).astype(np.int32)
+
+
+@inlined  # with _decided: a call for each decision took a third of the time
+def _coded(coder, stream, chance, bit):  # type: ignore[no-untyped-def]
+    """Write a bit that is 1 with ``chance`` of 65536, or read it if ``bit`` is -1; return it."""
+    low, high = coder[0], coder[1]
+    reach = high - low
+    middle = low + (reach >> 16) * chance + (((reach & 0xFFFF) * chance) >> 16)
+    if bit < 0:
+        bit = 1 if coder[2] <= middle else 0
+        reading = True
+    else:
+        reading = False
+    if bit == 1:
+        high = middle
+    else:
+        low = middle + 1
+    while (low ^ high) >> 24 == 0:
+        place = coder[3]
+        if reading:
+            byte = stream[place] if place < len(stream) else 0
+            coder[2] = ((coder[2] << 8) & _MASK) | byte
+        else:
+            stream[place] = high >> 24
+        coder[3] = place + 1
+        low = (low << 8) & _MASK
+        high = ((high << 8) & _MASK) | 255
+    coder[0], coder[1] = low, high
+    return bit
+
+
+@compiled
+def _chances(contexts, decisions):  # type: ignore[no-untyped-def]
+    """Chances in all contexts, counts of their decisions, weights of the mix, places of contexts, and scratch."""
+    model = np.full(contexts * _NODES, _EVEN, np.int32)
+    counts = np.zeros(contexts * _NODES, np.uint8)
+    weights = np.full((decisions * _NODES, CONTEXTS), 0x5000, np.int32)
+    return model, counts, weights, np.zeros(CONTEXTS, np.int64), np.zeros(CONTEXTS, np.int64)
+
+
+@inlined
+def _decided(coder, stream, chances, row, node, bit):  # type: ignore[no-untyped-def]
+    """Code the decision ``node`` with the mix of its chances in the contexts at ``places``, and adapt them."""
+    model, counts, weights, places, scores = chances
+    total = 0
+    for c in range(CONTEXTS):
+        scores[c] = _STRETCH[model[places[c] + node] >> 4]
+        total += scores[c] * weights[row, c]
+    chance = _SQUASH[min(max(total >> 16, -2047), 2047) + 2047]
+    bit = _coded(coder, stream, chance << 4, bit)
+    error = ((bit << 12) - chance) * 10
+    for c in range(CONTEXTS):
+        weights[row, c] = min(max(weights[row, c] + ((scores[c] * error + 0x8000) >> 16), -(1 << 19)), 1 << 19)
+        place = places[c] + node
+        count = counts[place]
+        moved = model[place] + ((((bit * 65535 - model[place]) >> 3) * _RATES[count]) >> 13)
+        model[place] = min(max(moved, 16), 65519)
+        if count < 127:
+            counts[place] = count + 1
+    return bit
+
+
+@compiled
+def _number(coder, stream, chances, first, value, reading):  # type: ignore[no-untyped-def]
+    """Code a number: is it 0, its sign, how many binary digits it has, and these; return it."""
+    bit = -1 if reading else (1 if value == 0 else 0)
+    if _decided(coder, stream, chances, first, 0, bit) == 1:
+        return 0
+    bit = -1 if reading else (1 if value < 0 else 0)
+    negative = _decided(coder, stream, chances, first + 1, 1, bit)
+    size = abs(value)
+    side = _SIDE * negative
+    digits = 0
+    while digits < _LAST - 1:
+        node = side + min(2 + digits, 17)
+        bit = -1 if reading else (1 if size >> (digits + 1) > 0 else 0)
+        if _decided(coder, stream, chances, first + node, node, bit) == 0:
+            break
+        digits += 1
+    found = 1
+    for k in range(digits):
+        bit = -1 if reading else (size >> (digits - 1 - k)) & 1
+        if k < 2 and digits < 15:
+            node = side + 18 + 3 * digits + (k + (found & 1) if k else 0)
+            bit = _decided(coder, stream, chances, first + node, node, bit)
+        else:
+            bit = _coded(coder, stream, _EVEN, bit)
+        found = 2 * found + bit
+    return -found if negative == 1 else found
+
+
+@compiled
+def _magnitude(value):  # type: ignore[no-untyped-def]
+    """Class of a magnitude, 0 to 15: two classes for each doubling."""
+    size = abs(value)
+    if size < 4:
+        return size
+    digits = 0
+    while size >> digits > 3:
+        digits += 1
+    return min(2 * digits + (size >> digits), _CLASSES - 1)
+
+
+@compiled
+def _signed(value):  # type: ignore[no-untyped-def]
+    """Class of a number, 0 to 30."""
+    kind = _magnitude(value)
+    return _CLASSES - 1 + (kind if value > 0 else -kind)
+
+
+@compiled
+def _run(levels, near, stream, coder, reading):  # type: ignore[no-untyped-def]
+    """Code levels ``[N, C]`` row after row."""
+    n, width = levels.shape
+    each = 63 + _CLASSES * _CLASSES
+    chances = _chances(width * each, width)
+    places = chances[3]
+    for i in range(n):
+        total = 0
+        for k in range(width):
+            around, nearest, amount = 0, 0, 0
+            for q in range(NEIGHBOURS):
+                j = near[i, q]
+                if j >= 0:
+                    value = levels[j, k]
+                    around += value
+                    amount += abs(value)
+                    if q == 0:
+                        nearest = value
+            start = k * each
+            places[0] = start * _NODES
+            places[1] = (start + 1 + _signed(nearest)) * _NODES
+            places[2] = (start + 32 + _signed(around >> 2)) * _NODES
+            places[3] = (start + 63 + _magnitude(amount >> 1) * _CLASSES + _magnitude(total)) * _NODES
+            levels[i, k] = _number(coder, stream, chances, k * _NODES, levels[i, k], reading)
+            total += abs(levels[i, k])
+
+
+@compiled
+def _search(cells, block, near):  # type: ignore[no-untyped-def]
+    """Fill ``near`` with the nearest earlier rows of the same block, the nearest first."""
+    least = np.zeros(NEIGHBOURS, np.int64)
+    for i in range(len(cells)):
+        found = 0
+        for j in range(i - 1, max(i - WINDOW, i // block * block) - 1, -1):
+            distance = 0
+            for axis in range(cells.shape[1]):
+                distance += (cells[i, axis] - cells[j, axis]) ** 2
+            if found == NEIGHBOURS and distance >= least[found - 1]:
+                continue
+            at = min(found, NEIGHBOURS - 1)
+            while at > 0 and least[at - 1] > distance:
+                least[at], near[i, at] = least[at - 1], near[i, at - 1]
+                at -= 1
+            least[at], near[i, at] = distance, j
+            found = min(found + 1, NEIGHBOURS)
+
+
+@compiled
+def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-untyped-def]
+    """Code ascending Morton codes ``[N]``: the number of digits of each difference, and its digits."""
+    chances = _chances(1 + 3 * 64, 1)
+    places = chances[3]
+    last, before, average = 0, 0, 0
+    for i in range(len(codes)):
+        gap, digits = 0, 0
+        previous = 0 if i % block == 0 else codes[i - 1]
+        if not reading:
+            gap = codes[i] - previous
+            while gap >> digits > 0:
+                digits += 1
+        places[1] = (1 + last) * _NODES
+        places[2] = (65 + before) * _NODES
+        places[3] = (129 + (average >> 2)) * _NODES
+        node = 1
+        for k in range(6):
+            bit = -1 if reading else (digits >> (5 - k)) & 1
+            node = 2 * node + _decided(coder, stream, chances, node, node, bit)
+        digits = min(node - 64, 3 * bits)
+        found = min(digits, 1)
+        for k in range(digits - 2, -1, -1):
+            bit = -1 if reading else (gap >> k) & 1
+            kind = digits - 2 - k
+            if kind < 2:
+                node = 64 + (1 if kind == 0 else found & 3)
+                bit = _decided(coder, stream, chances, node, node, bit)
+            else:
+                bit = _coded(coder, stream, _EVEN, bit)
+            found = 2 * found + bit
+        # A hostile stream must not leave the grid.
+        codes[i] = min(previous + found, (1 << 3 * bits) - 1)
+        last, before = digits, last
+        average += digits - (average >> 2)
+
+
+def encode_gaps(codes: NDArray[np.uint64], block: int, bits: int) -> Stream:
+    """Code Morton codes of cells, which ascend in each block."""
+    return _written(_run_gaps, len(codes) * 12 + 16, codes.astype(np.int64), block, bits)
+
+
+def decode_gaps(stream: Stream, count: int, block: int, bits: int) -> NDArray[np.uint64]:
+    """Morton codes ``[N]`` from :func:`encode_gaps`; ``PackError`` if the stream does not end with its last number."""
+    codes = np.zeros(count, np.int64)
+    _read(_run_gaps, stream, codes, block, bits)
+    return codes.astype(np.uint64)
+
+
+def neighbours_of(cells: Array, block: int) -> Near:
+    """Nearest earlier rows ``[N, NEIGHBOURS]`` in the same block of cells ``[N, 3]`` below 2^21; -1 for none."""
+    near = np.full((len(cells), NEIGHBOURS), -1, np.int32)
+    _search(np.ascontiguousarray(cells, np.int64), block, near)
+    return near
+
+
+def predecessors(count: int) -> Near:
+    """The rows just before each row, for numbers without positions."""
+    rows = np.arange(count, dtype=np.int32)[:, None] - np.arange(1, NEIGHBOURS + 1, dtype=np.int32)
+    return np.maximum(rows, -1)
+
+
+def encode_levels(levels: Array, near: Near) -> Stream:
+    """Code numbers ``[N, C]`` of at most :data:`LARGEST`, given the neighbours of each row."""
+    values = np.ascontiguousarray(levels, np.int32).copy()
+    return _written(_run, values.size * 5 + 16, values, near)
+
+
+def decode_levels(stream: Stream, width: int, near: Near) -> Levels:
+    """Numbers ``[N, C]`` from :func:`encode_levels`; ``PackError`` if the stream does not end with its last number."""
+    levels = np.zeros((len(near), width), np.int32)
+    _read(_run, stream, levels, near)
+    return levels
+
+
+def _written(run: Callable[..., None], size: int, *arguments: Any) -> Stream:
+    """The bytes that a loop writes, at most ``size``."""
+    stream, coder = np.zeros(size, np.uint8), np.array([0, _MASK, 0, 0], np.int64)
+    run(*arguments, stream, coder, False)
+    # One more byte: it and the zeros that a decoder adds are between the two ends.
+    end = int(coder[3])
+    stream[end] = int(coder[1]) >> 24
+    return stream[: end + 1]
+
+
+def _read(run: Callable[..., None], stream: Stream, *arguments: Any) -> None:
+    """Fill the arguments of a loop from a stream; refuse a stream of more or fewer numbers."""
+    coder = np.array([0, _MASK, int.from_bytes(bytes(stream[:4]).ljust(4, b"\0"), "big"), 4], np.int64)
+    run(*arguments, stream.copy(), coder, True)  # the loop takes no read-only arrays
+    # A decoder has read four bytes where the encoder wrote the last one.
+    if int(coder[3]) - 3 != len(stream):
+        raise DamagedError("a stream does not end with its last number")

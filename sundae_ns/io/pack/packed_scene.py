@@ -1,0 +1,305 @@
+"""A scene in one file: field, head and cameras are sections of ``container``, all else is in its header.
+
+``docs/formats.md`` lists the names, shapes and error bounds of all sections.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from dataclasses import field as default
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sundae_ns.core.errors import PackError
+from sundae_ns.core.files import replacing
+from sundae_ns.core.gaussians import FEATURES, SPLAT_NAMES, finite_mask, num_primitives
+from sundae_ns.io.pack import container, entropy, quantize
+from sundae_ns.io.pack.codecs import Codecs, Sensitivity, as_matrix, fit_codecs
+from sundae_ns.io.pack.config import PackConfig
+from sundae_ns.io.pack.container import FORMAT, Array, DamagedError, Levels, fits, in_range
+from sundae_ns.io.pack.entropy import Near
+from sundae_ns.io.pack.quantize import Blocks
+from sundae_ns.io.ply import check_field
+
+CAMERAS: dict[str, dict[str, Any]] = FORMAT["sections"]["cameras"]
+"""dtype, shape and range of the arrays of M cameras: ``poses`` ``[M, 3, 4]``, camera-to-world with OpenGL axes in the
+model's coordinates; ``intrinsics`` ``[M, 4]``, fx, fy, cx, cy in pixels; ``sizes`` ``[M, 2]``, width and height."""
+_MAX_WIDTH: int = FORMAT["header"]["properties"]["attributes"]["properties"][FEATURES]["properties"]["width"]["maximum"]
+Decoded = TypeVar("Decoded")
+
+
+@dataclass(frozen=True, eq=False)
+class PackedScene:
+    """All that is needed to render a scene."""
+
+    field: dict[str, Tensor]
+    """See :mod:`sundae_ns.core.gaussians`; float32 on the CPU."""
+    head: dict[str, Tensor] = default(default_factory=dict)
+    """State of the head; empty without a head."""
+    cameras: dict[str, Tensor] | None = None
+    """Cameras by the names of :data:`CAMERAS`."""
+    meta: dict[str, Any] = default(default_factory=dict)
+    """JSON values: configuration of the model, coordinate frame, and other entries of the caller."""
+    sensitivity: Sensitivity | None = None
+    """What errors do to images; not stored. Without it all errors weigh the same."""
+
+
+class PackReport(NamedTuple):
+    """Size of a packed scene."""
+
+    primitives: int
+    bytes: int
+    """Bytes of the file."""
+    sections: dict[str, int]
+    """Bytes of each section, and of ``header``."""
+
+    @property
+    def bits(self) -> dict[str, float]:
+        """Bits per primitive of each attribute, and of ``head``, ``cameras`` and ``header``."""
+        sums: dict[str, float] = {}
+        for name, count in self.sections.items():
+            attribute = name.partition("/")[0]
+            sums[attribute] = sums.get(attribute, 0.0) + 8 * count / self.primitives
+        return sums
+
+    def summary(self) -> dict[str, Any]:
+        """JSON values: primitives, bytes, and the bits per primitive of each attribute and of all."""
+        bits = {**self.bits, "all": 8 * self.bytes / self.primitives}
+        rounded = {name: round(value, 2) for name, value in bits.items()}
+        return {"primitives": self.primitives, "bytes": self.bytes, "bits": rounded}
+
+
+def _check(params: Mapping[str, Tensor]) -> None:
+    check_field(params, PackError)
+    n = num_primitives(params)
+    if n == 0:
+        raise PackError("the field has no primitives; there is nothing to pack")
+    features = params.get(FEATURES)
+    if features is not None and not (
+        features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MAX_WIDTH
+    ):
+        raise PackError(f"features has shape {list(features.shape)}; it must be [{n}, 1 to {_MAX_WIDTH}]")
+    known = {name: params[name].float() for name in (*SPLAT_NAMES, FEATURES) if name in params}
+    broken = n - int(finite_mask(known).sum())
+    if broken:
+        raise PackError(f"{broken} of {n} primitives are not finite (NaN or infinite); prune the field first")
+
+
+# ------------------------------------------------------------------------------------------------------------- encoding
+
+
+def fit_scene(scene: PackedScene, config: PackConfig | None = None) -> tuple[PackedScene, Codecs]:
+    """Fit codecs to a scene.
+
+    Returns:
+        The scene with its primitives in the stored order and with rounded positions, and the codecs.
+
+    Raises:
+        ConfigError: an option is invalid.
+        PackError: the field has no primitives, wrong shapes or values that are not finite.
+    """
+    config = config or PackConfig()
+    config.validate()
+    _check(scene.field)
+    field, codecs = fit_codecs(scene.field, scene.head, config, scene.sensitivity)
+    return replace(scene, field=field), codecs
+
+
+def write_scene(path: Path, scene: PackedScene, config: PackConfig | None = None) -> PackReport:
+    """Pack a scene into one file: :func:`fit_scene`, then :func:`write_fitted`."""
+    return write_fitted(path, *fit_scene(scene, config))
+
+
+def write_fitted(path: Path, scene: PackedScene, codecs: Codecs) -> PackReport:
+    """Pack a scene, atomically, with codecs that were fitted to it before or after training with rounding.
+
+    Primitives are in the order of :func:`fit_scene`. Their positions are ignored; the codecs hold them.
+
+    Raises:
+        PackError: values are not finite, or the codecs do not fit the scene.
+        StorageError: the disk is full or not writable.
+    """
+    packed, sections = pack_bytes(scene, codecs)
+    with replacing(path) as partial:
+        partial.write_bytes(packed)
+    sections["header"] = len(packed) - sum(sections.values())
+    return PackReport(num_primitives(scene.field), len(packed), sections)
+
+
+def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int]]:
+    """The bytes of the file that :func:`write_fitted` writes, and the number of bytes of each section."""
+    _check(scene.field)
+    config, blocks = codecs.config, codecs.blocks
+    n = num_primitives(scene.field)
+    wanted = {"means", "features_rest", *codecs.field}
+    if n != len(blocks.codes) or set(scene.field) != wanted or bool(scene.head) != (codecs.head is not None):
+        raise PackError("the codecs were fitted to another scene; fit them again")
+    arrays: dict[str, Array] = {"means/low": blocks.low, "means/high": blocks.high}
+    arrays["means/gaps"] = entropy.encode_gaps(blocks.codes, config.block, config.position_bits)
+    about: dict[str, Any] = {"means": {"codec": "blocks", "bits": config.position_bits, "block": config.block}}
+    near = entropy.neighbours_of(blocks.cells, config.block)
+    coded = {name: (codec.encode(as_matrix(scene.field[name])), near) for name, codec in codecs.field.items()}
+    if codecs.head is not None:
+        head = codecs.head.encode(scene.head)
+        coded["head"] = head, entropy.predecessors(len(head[1]))
+    with ThreadPoolExecutor(2) as pool:
+        streams = pool.map(lambda one: entropy.encode_levels(one[0][1], one[1]), coded.values())
+        for (name, ((entry, _, parts), _)), stream in zip(coded.items(), streams, strict=True):
+            about[name] = entry
+            arrays |= {f"{name}/levels": stream, **{f"{name}/{part}": array for part, array in parts.items()}}
+    if scene.cameras is not None:
+        for name, section in CAMERAS.items():
+            array = scene.cameras[name].detach().cpu().numpy().astype(section["dtype"])
+            if not in_range(array, section):
+                raise PackError(f"{name} of the cameras have values that readers refuse; give other cameras")
+            arrays[f"cameras/{name}"] = array
+
+    meta = {**scene.meta, "primitives": n, "attributes": about}
+    unpacked = 4 * sum(value.numel() for value in (*scene.field.values(), *scene.head.values()))
+    return container.encode(meta, arrays, unpacked=unpacked)
+
+
+# ------------------------------------------------------------------------------------------------------------- decoding
+
+
+class _Reader:
+    """Header and sections of a file; each section is checked before use. All methods raise ``DamagedError``."""
+
+    def __init__(self, header: container.Header, arrays: Mapping[str, Array]) -> None:
+        self.size = header.size
+        self.meta = header.meta
+        self.arrays = arrays
+
+    def about(self, attribute: str) -> dict[str, Any]:
+        """The header's entry of an attribute."""
+        entry = self.meta["attributes"].get(attribute)
+        if entry is None:
+            raise DamagedError(f"its header has no valid attributes.{attribute}")
+        found: dict[str, Any] = entry
+        return found
+
+    def array(self, attribute: str, part: str, **lengths: int) -> Array:
+        """A section in the dtype, shape and range that the format states; ``lengths`` are sides that it names."""
+        codec = attribute if attribute == "cameras" else self.about(attribute)["codec"]
+        section, name = FORMAT["sections"][codec][part], f"{attribute}/{part}"
+        array = self.arrays.get(name)
+        if array is None or not fits(array, section, lengths):
+            raise DamagedError(f"{name} is missing or has another shape")
+        if not in_range(array, section):
+            raise DamagedError(f"{name} has values that are not finite or out of range")
+        return array
+
+    def decoded(self, attribute: str, part: str, decode: Callable[..., Decoded], *arguments: Any) -> Decoded:
+        """What the entropy coder decodes from a section."""
+        stream = self.array(attribute, part)
+        try:
+            return decode(stream, *arguments)
+        except DamagedError as error:
+            raise DamagedError(f"{attribute}/{part}: {error}") from error
+
+    def levels(self, name: str, near: Near, width: int) -> tuple[Levels, float]:
+        """Levels ``[N, C]`` of an attribute, and their step."""
+        return self.decoded(name, "levels", entropy.decode_levels, width, near), float(self.about(name)["step"])
+
+
+def _decode_head(reader: _Reader) -> dict[str, Tensor]:
+    if "head/levels" not in reader.arrays:
+        return {}
+    about = reader.about("head")
+    sources = {part: reader.array("head", part) for part in ("plain", "steps", "columns")}
+    tensors = {name: tuple(map(int, shape)) for name, shape in about["tensors"]}
+    sizes = {name: math.prod(shape) for name, shape in tensors.items()}
+    count = sum(sizes[name] for name, shape in tensors.items() if len(shape) > 1)
+    if about["weights"] != count:
+        raise DamagedError("the head has another number of weights than it states")
+    container.check_ratio(4 * count, reader.size)
+    near = entropy.predecessors(count)
+    sources["levels"] = reader.decoded("head", "levels", entropy.decode_levels, 1, near).reshape(-1)
+
+    def take(part: str, count: int) -> Tensor:
+        if count > len(sources[part]):
+            raise DamagedError("the head has fewer weights than it states")
+        taken, sources[part] = np.split(sources[part], [count])
+        return torch.from_numpy(taken.astype(np.float32))
+
+    head: dict[str, Tensor] = {}
+    for name, shape in tensors.items():
+        if len(shape) <= 1:
+            head[name] = take("plain", sizes[name]).reshape(shape)
+        else:
+            steps = take("steps", shape[0])[:, None] * take("columns", shape[1])
+            head[name] = quantize.weights_at(take("levels", sizes[name]).reshape(shape), steps)
+            if not torch.isfinite(head[name]).all():
+                raise DamagedError("the head has weights beyond float32")
+    return head
+
+
+def _decode_cameras(reader: _Reader) -> dict[str, Tensor] | None:
+    if "cameras/poses" not in reader.arrays:
+        return None
+    count = len(reader.arrays["cameras/poses"])
+    arrays = {name: reader.array("cameras", name, cameras=count) for name in CAMERAS}
+    arrays["sizes"] = arrays["sizes"].astype(np.int64)
+    return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
+
+
+def read_scene(path: Path) -> PackedScene:
+    """Unpack a file, without executing anything in it, and with memory bounded by its size.
+
+    Raises:
+        PackError: the file is missing, of another version, truncated, altered, or not a valid scene.
+    """
+    header = container.read_header(path)
+    with container.naming(path):
+        n, width, features = _shape(header.meta)
+        container.check_ratio(4 * n * (14 + width + features), header.size)
+        return _decoded(_Reader(header, container.read_sections(path, header)), n, width, features)
+
+
+def _decoded(reader: _Reader, n: int, width: int, features: int) -> PackedScene:
+    bits, size = (int(reader.about("means")[key]) for key in ("bits", "block"))
+    low, high = (reader.array("means", end, blocks=-(-n // size)) for end in ("low", "high"))
+    blocks = Blocks(reader.decoded("means", "gaps", entropy.decode_gaps, n, size, bits), low, high)
+    near = entropy.neighbours_of(blocks.cells, size)
+
+    def means() -> Array:
+        return quantize.dequantize_positions(blocks, bits, size)
+
+    def quats() -> Array:
+        levels, step = reader.levels("quats", near, 3)
+        return np.asarray(quantize.rotations_at(torch.from_numpy(levels), step).numpy())
+
+    def rows(name: str, channels: int) -> Array:
+        levels, step = reader.levels(name, near, channels)
+        mean = reader.array(name, "mean", width=channels)
+        basis = reader.array(name, "basis", square=channels**2).reshape(channels, channels)
+        return quantize.rows_at(levels, mean, basis, step)
+
+    with ThreadPoolExecutor(2) as pool:
+        # The largest jobs come first, so that the threads end together.
+        wide, narrow = {"features_rest": width, FEATURES: features}, {"scales": 3, "features_dc": 3, "opacities": 1}
+        jobs = {name: pool.submit(rows, name, channels) for name, channels in wide.items() if channels}
+        head = pool.submit(_decode_head, reader)
+        jobs["quats"] = pool.submit(quats)
+        jobs |= {name: pool.submit(rows, name, channels) for name, channels in narrow.items()}
+        jobs["means"] = pool.submit(means)
+        field = {name: torch.from_numpy(job.result()) for name, job in jobs.items()}
+    rest = field.get("features_rest")
+    field["features_rest"] = torch.zeros(n, 0, 3) if rest is None else rest.reshape(n, width // 3, 3)
+    ordered = {name: field[name] for name in (*SPLAT_NAMES, FEATURES) if name in field}
+    meta = {name: value for name, value in reader.meta.items() if name not in ("sections", "attributes", "primitives")}
+    return PackedScene(ordered, head.result(), _decode_cameras(reader), meta)
+
+
+def _shape(meta: Mapping[str, Any]) -> tuple[int, int, int]:
+    """Numbers of primitives, of SH values of degrees 1 and up, and of features, from the header alone."""
+    container.check(meta, "header")
+    width, features = (int(meta["attributes"].get(name, {"width": 0})["width"]) for name in ("features_rest", FEATURES))
+    return int(meta["primitives"]), width, features

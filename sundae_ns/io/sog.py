@@ -1,0 +1,285 @@
+"""The .sog of PlayCanvas, version 2: a zip of lossless WebP images with one pixel per primitive, and ``meta.json``.
+
+Written from the format's public description, because no maintained Python package writes it:
+
+    meta.json                  {"version": 2, "count", "antialias", "means", "scales", "quats", "sh0", "shN"}
+    means_l, means_u .webp     low and high bytes of 65,536 levels per axis, after sign(x) log(1 + |x|)
+    scales.webp                log-scales, indices in a codebook of 256 numbers
+    quats.webp                 the three smallest components, 8 bits each; alpha is 252 + the index of the largest
+    sh0.webp                   SH coefficients of degree 0, indices in a codebook; alpha is the opacity
+    shN_labels.webp            index in a palette of at most 65,536 rows, in red and green
+    shN_centroids.webp         the palette: 64 rows of SH coefficients of degrees 1 to 3 in a row of pixels
+
+Codebooks are k-means in one dimension. With more primitives than palette rows, these are centres of a two-level
+k-means. Coordinates are those of a .ply, as in files of ``splat-transform``.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import zipfile
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sundae_ns.core.errors import DataError, reading, regular
+from sundae_ns.core.files import replacing
+from sundae_ns.io.coordinates import scene_order
+from sundae_ns.io.ply import MAX_SH_DEGREE, checked, from_smallest_three
+
+META = "meta.json"
+MAX_PALETTE = 1 << 16  # palette rows that two bytes can index
+_ROW_ENTRIES = 64  # palette rows in a row of the palette's image
+_ENTRIES = 256  # codebook entries that a byte can index
+_COARSE = 256  # coarse cells of a large palette
+_ROUNDS = 30  # Lloyd iterations of a one-dimensional codebook
+_ROW_ROUNDS = 8  # Lloyd iterations of a palette
+_SAMPLE = 1 << 16  # rows that a k-means is fitted to
+_CHUNK = 1 << 14  # rows compared with all centres at once
+_LEVELS = 65535  # highest level of a position, in two bytes
+_MAX_INFLATED = 1 << 26  # bytes of a deflated entry; images are stored
+_FIRST_MODE = 252  # alpha of a rotation without its first component; the next values stand for the other components
+
+
+def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
+    """Write the base colours of a finite field of SH degree at most 3 as a bundled .sog, atomically, in another order.
+
+    Raises:
+        DataError: the field has no primitives, an SH degree above 3, or wrong shapes.
+        StorageError: the disk is full or not writable.
+    """
+    field = checked(path, params)
+    order = scene_order(field["means"].numpy())
+    arrays = {name: value.numpy()[order] for name, value in field.items()}
+    n = len(order)
+
+    bent = np.sign(arrays["means"]) * np.log1p(np.abs(arrays["means"].astype(np.float64)))
+    low, high = bent.min(axis=0), bent.max(axis=0)
+    levels = np.rint((bent - low) / np.where(high > low, high - low, 1.0) * _LEVELS).astype(np.uint16)
+    scale_values, scale_codes = codebook(arrays["scales"])
+    color_values, color_codes = codebook(arrays["features_dc"])
+    alphas = np.rint(255 / (1 + np.exp(-arrays["opacities"].astype(np.float64)))).astype(np.uint8)
+    images = {
+        "means_l": _square((levels & 255).astype(np.uint8)),
+        "means_u": _square((levels >> 8).astype(np.uint8)),
+        "scales": _square(scale_codes),
+        "quats": _square(_smallest_three(arrays["quats"])),
+        "sh0": _square(np.concatenate([color_codes, alphas], axis=1)),
+    }
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "sundae-ns"},
+        "count": n,
+        "antialias": antialiased,
+        **({"model": "antialiased"} if antialiased else {}),  # what splat-transform reads
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scale_values.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": color_values.tolist(), "files": ["sh0.webp"]},
+    }
+    coefficients = arrays["features_rest"].shape[1]
+    if coefficients:
+        rows, labels = palette(arrays["features_rest"].reshape(n, -1))
+        values, codes = codebook(rows.reshape(len(rows), coefficients, 3))
+        padded = np.zeros((math.ceil(len(rows) / _ROW_ENTRIES) * _ROW_ENTRIES, coefficients, 3), np.uint8)
+        padded[: len(rows)] = codes
+        images["shN_centroids"] = padded.reshape(-1, _ROW_ENTRIES * coefficients, 3)
+        images["shN_labels"] = _square(
+            np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1).astype(np.uint8)
+        )
+        meta["shN"] = {
+            "count": len(rows),
+            "bands": math.isqrt(coefficients + 1) - 1,
+            "codebook": values.tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
+    with replacing(path) as unfinished, zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as bundle:
+        # ZipInfo has a fixed date, so that equal fields give equal bytes.
+        bundle.writestr(zipfile.ZipInfo(META), json.dumps(meta))
+        for name, pixels in images.items():
+            bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(pixels))
+
+
+def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
+    """Read a bundled .sog, or a folder of images or the ``meta.json`` in it.
+
+    Returns:
+        A field as of ``ply.read_ply``, and whether it is marked as trained with antialiasing.
+
+    Raises:
+        DataError: a file is missing, damaged, no .sog, or of another version than 2.
+    """
+    with reading(path, "a complete .sog"), ExitStack() as stack:
+        if path.is_dir() or path.name == META:
+            entry = partial(_file_entry, path if path.is_dir() else path.parent)
+        else:
+            entry = partial(_zip_entry, stack.enter_context(zipfile.ZipFile(regular(path))))
+        meta = json.loads(entry(META))
+        if (version := meta.get("version", 1)) != 2:
+            raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
+        arrays = _decoded(entry, meta)
+    field = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
+    return field, bool(meta.get("antialias")) or meta.get("model") == "antialiased"
+
+
+def _file_entry(folder: Path, name: str) -> bytes:
+    if Path(name).name != name:
+        raise ValueError(f"{name} lies elsewhere")
+    return regular(folder / name).read_bytes()
+
+
+def _zip_entry(bundle: zipfile.ZipFile, name: str) -> bytes:
+    """An entry of a bundle, which is stored, not deflated, so that it cannot grow."""
+    info = bundle.getinfo(name)
+    if info.compress_type != zipfile.ZIP_STORED and info.file_size > _MAX_INFLATED:
+        raise ValueError(f"{name} inflates to {info.file_size:,} bytes")
+    return bundle.read(name)
+
+
+def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """The arrays of a field, from the files by their names; the inverse of :func:`write_sog`."""
+    n = int(meta["count"])
+
+    def pixels(entry: Mapping[str, Any], index: int, channels: int) -> NDArray[np.uint8]:
+        return _pixels(file(entry["files"][index])).reshape(-1, 4)[:n, :channels]
+
+    low, high = (np.asarray(meta["means"][end], np.float64) for end in ("mins", "maxs"))
+    levels = pixels(meta["means"], 0, 3) + 256.0 * pixels(meta["means"], 1, 3)
+    bent = low + levels / _LEVELS * (high - low)
+    color = pixels(meta["sh0"], 0, 4)
+    opacity = np.clip(color[:, 3:] / 255.0, 1e-3 / 255, 1 - 1e-6)
+    turns = pixels(meta["quats"], 0, 4)
+    largest = turns[:, 3].astype(np.int64) - _FIRST_MODE
+    if ((largest < 0) | (largest > 3)).any():
+        raise ValueError("a rotation has no valid mode")
+    rest = np.zeros((n, 0, 3), np.float32)
+    if "shN" in meta:
+        entry = meta["shN"]
+        coefficients = (int(entry["bands"]) + 1) ** 2 - 1
+        if not 0 < coefficients <= (MAX_SH_DEGREE + 1) ** 2 - 1:
+            raise ValueError(f"{entry['bands']} bands of harmonics")
+        centres = _pixels(file(entry["files"][0]))[..., :3].reshape(-1, coefficients, 3)
+        label = pixels(entry, 1, 2).astype(np.int64)
+        rest = np.asarray(entry["codebook"], np.float32)[centres[label[:, 0] + 256 * label[:, 1]]]
+    field = {
+        "means": np.sign(bent) * np.expm1(np.abs(bent)),
+        "scales": np.asarray(meta["scales"]["codebook"], np.float32)[pixels(meta["scales"], 0, 3)],
+        "quats": from_smallest_three((turns[:, :3] / 255.0 - 0.5) * math.sqrt(2.0), largest),
+        "features_dc": np.asarray(meta["sh0"]["codebook"], np.float32)[color[:, :3]],
+        "features_rest": rest,
+        "opacities": np.log(opacity / (1 - opacity)),
+    }
+    short = [name for name, value in field.items() if len(value) != n]
+    if n < 1 or short:
+        raise ValueError(f"{', '.join(short) or 'the field'} has fewer than {n:,} primitives")
+    return field
+
+
+def _pixels(file: bytes) -> NDArray[np.uint8]:
+    """A WebP image ``[H, W, 4]``."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(file), formats=["WEBP"]) as image:
+        return np.asarray(image.convert("RGBA"))
+
+
+def codebook(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Numbers in ascending order ``[256]``, by k-means (Lloyd, 1957), and the index of the nearest for each value.
+
+    ``values`` are finite, not empty, of any shape.
+    """
+    ordered = np.sort(values, axis=None).astype(np.float64)
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    # Start with half of the centres at quantiles and half spread evenly, for the few values at the ends.
+    quantiles = np.quantile(ordered, (np.arange(_ENTRIES // 2) + 0.5) / (_ENTRIES // 2))
+    centres = np.sort(np.concatenate([quantiles, np.linspace(ordered[0], ordered[-1], _ENTRIES // 2)]))
+    for _ in range(_ROUNDS):
+        bounds = np.concatenate([[0], np.searchsorted(ordered, _middles(centres)), [len(ordered)]])
+        number = np.diff(bounds)
+        # Sort again: rounding of the sums may swap neighbouring means.
+        centres = np.sort(np.where(number > 0, np.diff(sums[bounds]) / np.maximum(number, 1), centres))
+    numbers = centres.astype(np.float32)
+    return numbers, np.searchsorted(_middles(numbers.astype(np.float64)), values).astype(np.uint8)
+
+
+def _middles(centres: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (centres[1:] + centres[:-1]) / 2
+
+
+def palette(rows: NDArray[np.float32], max_rows: int = MAX_PALETTE) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """A palette ``[P, D]`` of at most ``max_rows`` rows, fitted to rows ``[N, D]``, and the index of each row ``[N]``.
+
+    A k-means of 65,536 centres over a million rows would take hours. So it has two levels: 256 coarse cells, and in
+    each cell centres in proportion to its rows.
+    """
+    n = len(rows)
+    if n <= max_rows:
+        return rows, np.arange(n)
+    generator = torch.Generator().manual_seed(0)
+    vectors = torch.from_numpy(np.ascontiguousarray(rows)).double()
+    cell_of = _nearest_centre(vectors, kmeans(vectors, _COARSE, generator))
+    centres: list[Tensor] = []
+    labels = torch.empty(n, dtype=torch.int64)
+    for cell in cell_of.unique():
+        (members,) = torch.nonzero(cell_of == cell, as_tuple=True)
+        count = min(1 + (max_rows - _COARSE) * len(members) // n, len(members))
+        fine = kmeans(vectors[members], count, generator)
+        labels[members] = sum(map(len, centres)) + _nearest_centre(vectors[members], fine)
+        centres.append(fine)
+    return torch.cat(centres).float().numpy(), labels.numpy()
+
+
+def kmeans(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Centres ``[count, D]`` by Lloyd iterations on a sample of the rows."""
+    sample = rows[torch.randperm(len(rows), generator=generator)[:_SAMPLE]]
+    centres = sample[:count].clone()
+    for _ in range(_ROW_ROUNDS):
+        nearest = _nearest_centre(sample, centres)
+        number = torch.bincount(nearest, minlength=count)[:, None]
+        sums = torch.zeros_like(centres).index_add_(0, nearest, sample)
+        centres = torch.where(number > 0, sums / number.clamp_min(1), centres)
+    return centres
+
+
+def _nearest_centre(rows: Tensor, centres: Tensor) -> Tensor:
+    """Index ``[N]`` of the nearest centre of each row."""
+    # |x - c|^2 minus |x|^2, in float32: a wrong choice between nearly equal centres costs nothing.
+    flat, half = centres.float(), (centres * centres).sum(dim=1).float() / 2
+    return torch.cat([(chunk.float() @ flat.T - half).argmax(dim=1) for chunk in rows.split(_CHUNK)])
+
+
+def _smallest_three(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Unit quaternions wxyz as pixels, both ``[N, 4]``: the three smallest components, and the index of the largest."""
+    largest = np.abs(quats).argmax(axis=1)
+    rows = np.arange(len(quats))
+    positive = quats * np.where(quats[rows, largest] < 0, -1, 1)[:, None]
+    others = positive[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    codes = np.rint((others * math.sqrt(0.5) + 0.5) * 255).clip(0, 255)
+    return np.concatenate([codes, _FIRST_MODE + largest[:, None]], axis=1).astype(np.uint8)
+
+
+def _square(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pixels ``[N, C]`` as a nearly square image ``[H, W, C]``, with zeros at the end of the last row."""
+    n, channels = pixels.shape
+    width = math.isqrt(n - 1) + 1
+    image = np.zeros((math.ceil(n / width) * width, channels), np.uint8)
+    image[:n] = pixels
+    return image.reshape(-1, width, channels)
+
+
+def _webp(pixels: NDArray[np.uint8]) -> bytes:
+    from PIL import Image
+
+    file = io.BytesIO()
+    # exact: keep colours where alpha, here the opacity, is 0.
+    Image.fromarray(pixels).save(file, "WEBP", lossless=True, exact=True)
+    return file.getvalue()

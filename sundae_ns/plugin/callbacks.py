@@ -1,0 +1,198 @@
+"""nerfstudio's training callbacks: they call the extensions, which know nothing of nerfstudio's trainer."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from sundae_ns.io.accounting import BYTES_PER_FLOAT, bytes_of_module, megabytes
+from sundae_ns.io.config_file import find_config
+from sundae_ns.io.run_folder import take_records
+from sundae_ns.plugin.datamanager import SundaeDatamanager
+from sundae_ns.plugin.distributed import Ranks
+from sundae_ns.scene.render import LocalField, RenderSettings, TrainingView
+from sundae_ns.train.state import Extension, FieldState, Photo
+
+
+class NerfstudioRun:
+    """A training by nerfstudio's trainer; see :class:`sundae_ns.train.state.TrainingRun` for the members.
+
+    Args:
+        model: a ``SundaeModel``, which imports this module.
+        attributes: of nerfstudio's callbacks. Trainer and pipeline may be missing, as in a test.
+    """
+
+    def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
+        self.model = model
+        self.state: FieldState = model.state
+        self.background: Tensor = model.background_color.to(model.device)
+        self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
+        self._trainer = cast(Any, attributes.trainer)
+        self._ranks: Ranks = getattr(self._trainer, "ranks", None) or Ranks()
+
+    @property
+    def source(self) -> LocalField:
+        """Where views get their primitives from."""
+        return cast(LocalField, self.model.source)
+
+    @property
+    def settings(self) -> RenderSettings:
+        """Settings of images that are not trained on, at this step."""
+        return cast(RenderSettings, self.model.render_settings(training=False))
+
+    @property
+    def last_step(self) -> int | None:
+        """Step at which training ends."""
+        return None if self._trainer is None else self._trainer.last_step
+
+    @property
+    def schedule_length(self) -> int | None:
+        """Number of steps for which the schedule is made."""
+        return None if self._trainer is None else self._trainer.config.schedule_length or self._trainer.last_step + 1
+
+    @property
+    def images_per_step(self) -> int:
+        """Number of images in a batch."""
+        return self._ranks.count
+
+    @property
+    def folder(self) -> Path | None:
+        """Folder for records, on the first rank."""
+        return None if self._trainer is None or self._ranks.rank > 0 else self._trainer.base_dir
+
+    @property
+    def _datamanager(self) -> SundaeDatamanager:
+        return cast(SundaeDatamanager, self._pipeline.datamanager)
+
+    @property
+    def num_heldout(self) -> int:
+        """Number of held-out training views."""
+        return len(self._datamanager.holdout_indices)
+
+    def view_indices(self) -> list[int]:
+        """Indices of the training views."""
+        return self._datamanager.train_indices
+
+    def training_views(self) -> list[TrainingView]:
+        """All training views."""
+        return training_views(self.model, self._datamanager)
+
+    def hold_out(self, indices: Iterable[int]) -> None:
+        """Hold out these training views from the next step on."""
+        self._datamanager.hold_back(indices)
+
+    def heldout_views(self) -> Iterator[Photo]:
+        """The held-out training views, loaded one at a time."""
+        for camera, batch in self._datamanager.views(self._datamanager.holdout_indices):
+            yield self._photo(camera, batch)
+
+    def photos(self) -> Iterator[Photo]:
+        """All training views; transparent pixels are masked."""
+        for camera, batch in self._datamanager.views(self.view_indices()):
+            photo, image = self._photo(camera, batch), batch["image"]
+            if image.shape[-1] == 4:
+                opaque = (image[..., 3] > (127 if image.dtype == torch.uint8 else 0.5)).to(photo.target.device)
+                photo = photo._replace(mask=opaque if photo.mask is None else photo.mask & opaque)
+            yield photo
+
+    @torch.no_grad()  # a camera optimizer moves views
+    def _photo(self, camera: Cameras, batch: dict[str, Any]) -> Photo:
+        target = self.model.truth(batch, {"background": self.background}, downscale=1)
+        mask = batch["mask"].to(target.device).squeeze(-1) > 0 if "mask" in batch else None
+        return Photo(self.model.view_of(camera), target, mask)
+
+    def evaluate(self) -> dict[str, float]:
+        """Mean ``psnr`` and ``ssim`` over all test views."""
+        if not self._datamanager.eval_dataset:
+            return {}
+        results = self._pipeline.get_average_eval_image_metrics(step=self.state.step)
+        return {name: results[name] for name in ("psnr", "ssim")}
+
+    def save(self) -> None:
+        """Save a checkpoint."""
+        if self._trainer is not None:
+            self._trainer.save_checkpoint(self.state.step)
+
+    def log_scalars(self, name: str, values: Mapping[str, float | int]) -> None:
+        """Write numbers to the run's event file."""
+        writer.put_dict(name=name, scalar_dict=dict(values), step=self.state.step)
+
+    # -------------------------------------------------------------------------------------------------------- callbacks
+
+    def callbacks(self) -> list[TrainingCallback]:
+        """Callbacks that set the step, call the extensions after each step, and let them report at the end."""
+        places = TrainingCallbackLocation
+        return [
+            TrainingCallback([places.BEFORE_TRAIN_ITERATION], self._begin_step),
+            TrainingCallback([places.AFTER_TRAIN_ITERATION], lambda step: self.act(self.model.extensions)),
+            TrainingCallback([places.AFTER_TRAIN], self._finish),
+        ]
+
+    def start(self) -> None:
+        """Hand the optimizers to the state, take over records, and let the extensions check the run."""
+        assert self._optimizers is not None
+        self.state.optimizers, self.state.schedulers = self._optimizers.optimizers, self._optimizers.schedulers
+        if self.folder is not None:
+            resumed = self._trainer.config.load_dir or self._trainer.config.load_checkpoint
+            if resumed and (config := find_config(resumed)) and config.parent.resolve() != self.folder.resolve():
+                take_records(config.parent, self.folder, self.state.schedule_step)
+        for extension in self.model.extensions:
+            extension.before_training(self)
+        self._hand_over()
+
+    def _begin_step(self, step: int) -> None:
+        self.state.step = step
+
+    def act(self, extensions: Sequence[Extension]) -> None:
+        """Let extensions act after a step, in their order."""
+        for extension in extensions:
+            self._ranks.after_step(extension, self)
+        self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Give nerfstudio's own list the parameters of the field: surgery makes new ones."""
+        assert self._optimizers is not None
+        for name, value in self.state.field.items():
+            self._optimizers.parameters[name] = [value]
+
+    def _finish(self, step: int) -> None:
+        with self._ranks.whole() as first:
+            if first:
+                for extension in self.model.extensions:
+                    extension.finish(self)
+                self._summarize()
+        writer.write_out_storage()
+
+    def _summarize(self) -> None:
+        """Print quality, size and the next command."""
+        if self.folder is None:
+            return
+        results = self.evaluate() if self.model.config.evaluate_prune else {}
+        if results:
+            quality = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
+            _say(f"trained: {quality} on {len(self._datamanager.eval_dataset)} test views")
+        head = self.state.head if self.state.head_enabled else None
+        numbers = sum(value.numel() for value in self.state.field.values())
+        size = BYTES_PER_FLOAT * numbers + (0 if head is None else bytes_of_module(head))
+        with_head = f"{'without' if head is None else 'with'} a head"
+        _say(f"{self.source.total:,} primitives, {with_head}: {megabytes(size)} before packing")
+        _say(f"next: {shlex.join(['sundae', 'pack', str(self.folder), '-o', 'scene.sundae'])}")
+
+
+def _say(line: str) -> None:
+    CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def training_views(model: Any, datamanager: SundaeDatamanager) -> list[TrainingView]:
+    """All training views of a datamanager."""
+    with torch.no_grad():  # a camera optimizer moves them
+        return [TrainingView(model.view_of(camera), mask) for camera, mask in datamanager.training_views()]

@@ -1,0 +1,181 @@
+"""Checks of a parsed capture: cameras, projections, and where the cloud lies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from torch import Tensor
+
+from sundae_ns.core.camera import View, world_to_camera, world_to_camera_floats
+from sundae_ns.core.errors import DataError
+from sundae_ns.data.capture import read_json
+from sundae_ns.plugin.placing import STRAY, TYPES, stray_cameras
+from sundae_ns.scene.load_save import FRAME_FILE
+from sundae_ns.train.progress import warn
+
+
+def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None = None) -> str | None:
+    """Check the poses and focal lengths of cameras ``[N]`` of training images with these names, in any units.
+
+    Args:
+        cameras: of the images.
+        names: of the images.
+        points: of the scene ``[M, 3]``, in the same coordinates, if any.
+
+    Returns:
+        A warning on poses that are possible, but make no good scene; None without one.
+
+    Raises:
+        DataError: a projection is none of a lens, an axis is mirrored, or a focal length belongs to no lens.
+    """
+    kinds = cameras.camera_type.flatten()
+    other = ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype))
+    if other.any():
+        at = _first(other)
+        raise DataError(
+            f"the camera of {names[at].name} is of type {CameraType(int(kinds[at])).name}, which no perspective image "
+            "can be made of; cut its images into perspective ones, such as cube faces"
+        )
+    mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
+    if mirrored.any():
+        raise DataError(
+            f"the pose of {names[_first(mirrored)].name} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses "
+            "do); negate one column of its rotation"
+        )
+    shares = cameras.fx / cameras.width.clamp_min(1)
+    wrong = ((shares < 0.01) | (shares > 1000)).flatten()  # views of 178 and of 0.06 degrees
+    if wrong.any():
+        at = _first(wrong)
+        raise DataError(
+            f"the focal length of {names[at].name} is {float(cameras.fx[at]):.3g} px and the image is "
+            f"{int(cameras.width[at])} px wide, which no lens has; give the focal length in pixels"
+        )
+    centres = cameras.camera_to_worlds[:, :, 3]
+    middle = centres.median(dim=0).values
+    distances = (centres - middle).norm(dim=1)
+    if len(names) > 1 and distances.max() == 0:
+        return "all cameras stand at one place, so nothing says how far things are; check the poses"
+    usual = distances.median()
+    known = None if points is None or not len(points) else points.double().cpu().numpy()
+    far = torch.from_numpy(stray_cameras(centres.double().numpy(), lambda: known))
+    if not far.any() and usual > 0:
+        reach = 0.0 if points is None or not len(points) else float((points - middle).norm(dim=1).median())
+        far = (distances > 20 * usual) & (distances > STRAY * reach)
+    if far.any():
+        first = _first(far)
+        times = (
+            f"{float(distances[first] / usual):,.0f} times as far away as most" if usual > 0 else "far from all others"
+        )
+        return (
+            f"the camera of {names[first].name} is {times} ({int(far.sum())} of {len(names)} are); check its pose, or "
+            "remove the view"
+        )
+    return None
+
+
+def stray_tests(train: Cameras, test: Cameras, names: Sequence[Path]) -> str | None:
+    """A warning on test cameras ``[M]``, of images with these names, that stand far from all others; None without."""
+    centres = torch.cat([train.camera_to_worlds[:, :, 3], test.camera_to_worlds[:, :, 3]]).double().cpu()
+    far = torch.from_numpy(stray_cameras(centres.numpy()))[len(train) :]
+    if not far.any():
+        return None
+    return (
+        f"the camera of {names[_first(far)].name}, a test view, stands far from all others ({int(far.sum())} of "
+        f"{len(names)} do); check its pose, or remove the view"
+    )
+
+
+def _first(flags: Tensor) -> int:
+    """Index of the first True."""
+    return int(flags.nonzero()[0])
+
+
+def check_projection(camera: Cameras) -> None:
+    """Raise ``DataError`` for a camera that asks for another projection, as a camera path may; ours are perspective."""
+    kind = CameraType(int(camera.camera_type.flatten()[0]))
+    if kind != CameraType.PERSPECTIVE:
+        raise DataError(
+            f"the camera is of type {kind.name.lower()}, and only perspective images can be drawn; set camera_type to "
+            "perspective in the camera path, for a panorama render the six faces of a cube"
+        )
+
+
+@torch.no_grad()
+def views_of_points(points: Tensor, cameras: Cameras) -> Tensor:
+    """For cameras ``[M]``, whether each sees one of points ``[N, 3]`` or more, bool ``[M]``.
+
+    2,000 of the points are looked for. Distortion is left out; images count with a margin of a tenth of their size on
+    each side.
+    """
+    points, margin = points[torch.isfinite(points).all(dim=1)].cpu(), 0.1
+    chosen = torch.linspace(0, max(len(points) - 1, 0), min(2000, len(points))).long()
+    seen = []
+    parts = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
+    lenses = torch.cat([part.float() for part in parts], dim=-1).cpu()
+    for pose, (fx, fy, cx, cy, width, height) in zip(cameras.camera_to_worlds.cpu(), lenses.tolist(), strict=True):
+        x, y, z = ((points[chosen] - pose[:, 3]) @ pose[:, :3]).unbind(dim=1)
+        across = (x * fx / -z + cx) / width
+        down = (-y * fy / -z + cy) / height
+        inside = (across > -margin) & (across < 1 + margin) & (down > -margin) & (down < 1 + margin)
+        seen.append(((z < 0) & inside).any())
+    return torch.stack(seen)
+
+
+def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
+    """Warn of a cloud ``[N, 3]`` that most views do not show: it and the cameras are in different coordinates."""
+    seen = views_of_points(points, cameras)
+    if seen.float().mean() < 0.5:
+        warn(
+            f"{int((~seen).sum())} of {len(seen)} views show no point of the sparse cloud, so cloud and cameras are "
+            "probably in different coordinates; export both together, or train without the cloud (remove ply_file_path)"
+        )
+
+
+def other_frame(run: Path, transform: Tensor, scale: float) -> str | None:
+    """A warning if a run was trained in other coordinates than its capture is parsed to now; None if it was not.
+
+    Args:
+        run: the run's folder; None without its ``dataparser_transforms.json``.
+        transform: from the capture's coordinates ``[3, 4]``.
+        scale: after the transform.
+    """
+    try:
+        stated = read_json(run / FRAME_FILE)
+        before, size = torch.tensor(stated["transform"], dtype=torch.float64), float(stated["scale"])
+        same = torch.allclose(before * size, transform.double() * scale, rtol=1e-3, atol=1e-3)
+    except (DataError, KeyError, TypeError, ValueError, RuntimeError):
+        return None
+    if same:
+        return None
+    return (
+        f"{run} was trained in other coordinates: its capture has changed, or another version scaled it; if cameras "
+        "stand far apart, resume it with --pipeline.datamanager.robust-frame False"
+    )
+
+
+def view_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None = None, downscale: int = 1) -> View:
+    """The rasteriser's form of a camera of shape ``(1,)``; ``camera`` does not change.
+
+    Args:
+        camera: nerfstudio camera, camera-to-world with OpenGL axes.
+        device: device of the view.
+        pose: camera-to-world in place of the camera's own, ``[..., 3, 4]``; differentiable.
+        downscale: divisor of the resolution.
+    """
+    # nerfstudio's methods of cameras build tensors and cameras at each call; here one copy from the device does.
+    parts = (camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    *flat, fx, fy, cx, cy, width, height = torch.cat([part.detach().flatten() for part in parts]).tolist()
+    dtype = camera.camera_to_worlds.dtype
+    K = [fx / downscale, 0.0, cx / downscale, 0.0, fy / downscale, cy / downscale, 0.0, 0.0, 1.0]
+    size = (int(width) // downscale, int(height) // downscale)
+    if pose is None:
+        # In one tensor: one copy to a GPU.
+        both = torch.tensor([*world_to_camera_floats(flat), *K], dtype=dtype).to(device)
+        viewmat, intrinsics = both[:16].view(4, 4), both[16:].view(3, 3)
+    else:
+        viewmat = world_to_camera(pose.reshape(-1, 3, 4)[0]).to(device)
+        intrinsics = torch.tensor(K, dtype=dtype).to(device).view(3, 3)
+    return View(viewmat, intrinsics, *size, (fx + fy) / 2 / downscale)

@@ -1,0 +1,304 @@
+"""nerfstudio's full-image datamanager with checks of the capture, held-out views, and an order that can be resumed."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
+from sundae_ns.data.capture import check_image, undecodable
+from sundae_ns.data.layouts import larger_model, unused_masks
+from sundae_ns.data.photos import TURNED, exif_orientation, turn, wrong_size
+from sundae_ns.plugin.camera_models import check_cameras, stray_tests, warn_of_cloud
+from sundae_ns.plugin.dataparsers import check_capture, set_parser
+from sundae_ns.plugin.placing import rebound
+from sundae_ns.plugin.undistortion import undistorting
+from sundae_ns.train.progress import warn
+
+DATASET_FRAME = "sundae_dataset_frame"
+"""Metadata key of the training set: transform ``[3, 4]`` and scale from the capture's coordinates to the model's."""
+
+
+def view_index(camera: Cameras) -> int | None:
+    """Index of the training view that :meth:`SundaeDatamanager.next_train` gave; None for other cameras."""
+    return (camera.metadata or {}).get("cam_idx")
+
+
+def _shows_something(batch: Mapping[str, Tensor]) -> bool:
+    """Whether a pixel of an image is neither fully transparent nor masked."""
+    image, mask = batch["image"], batch.get("mask")
+    shown = image[..., 3:] > 0 if image.shape[-1] == 4 else torch.ones_like(image[..., :1], dtype=torch.bool)
+    return bool((shown if mask is None else shown & (mask > 0).to(shown.device)).any())
+
+
+class CheckedDataset(InputDataset):
+    """nerfstudio's dataset; it names an image that cannot be decoded.
+
+    Its cameras are perspective ones, as their images are once they are loaded.
+    """
+
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
+        super().__init__(dataparser_outputs, scale_factor)
+        self.lenses = self.cameras.camera_type
+        """Camera types of the files, by which images are undistorted."""
+        self.cameras.camera_type = torch.full_like(self.lenses, CameraType.PERSPECTIVE.value)
+        self.turned: dict[int, int] = {}
+        """EXIF orientations of images that their cameras see turned."""
+        self._checked = False
+
+    @contextmanager
+    def as_photographed(self) -> Iterator[None]:
+        """Cameras with the types of their files, while nerfstudio loads and undistorts images."""
+        perspective, self.cameras.camera_type = self.cameras.camera_type, self.lenses
+        try:
+            yield
+        finally:
+            self.cameras.camera_type = perspective
+
+    def check_images(self) -> None:
+        """Check the files once: undistortion, which comes with loading, crops the cameras.
+
+        Raises:
+            DataError: an image or a mask cannot be read, or has another size.
+        """
+        if self._checked:
+            return
+        scale = self.scale_factor
+        masks: Sequence[Path | None] = self._dataparser_outputs.mask_filenames or [None] * len(self)
+        widths, heights = self.cameras.width.flatten().tolist(), self.cameras.height.flatten().tolist()
+        for index, (path, mask, *expected) in enumerate(zip(self.image_filenames, masks, widths, heights)):
+            full = check_image(path)
+            if [int(side * scale) for side in full] != expected:
+                orientation = exif_orientation(path)
+                full = full[::-1]
+                if orientation not in TURNED or [int(side * scale) for side in full] != expected:
+                    raise wrong_size(path, full[::-1], (expected[0], expected[1]), orientation)
+                self.turned[index] = orientation
+            if mask is not None and check_image(mask, mask=True) != full:
+                raise DataError(f"{mask} differs in size from its image {path.name}; make it {full[0]} x {full[1]} px")
+        self._checked = True
+
+    def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
+        """Pixels ``[H, W, 3 or 4]``, turned as the camera sees them."""
+        pixels: NDArray[np.uint8] = super().get_numpy_image(image_idx)
+        return turn(pixels, self.turned[image_idx]) if image_idx in self.turned else pixels
+
+    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
+        """Image, and mask if the capture has masks.
+
+        Raises:
+            DataError: a file of this view is damaged.
+        """
+        try:
+            return super().get_data(image_idx, image_type)
+        except Exception as error:  # decoders raise many kinds with one meaning for the user
+            raise undecodable(self.image_filenames[image_idx], error) from error
+
+
+@dataclass
+class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
+    """Full images, in an order that depends on the seed and the step alone."""
+
+    _target: type = field(default_factory=lambda: SundaeDatamanager)
+    robust_frame: bool = False
+    """Centre and scale the scene by the cameras that stand near each other, and shift survey coordinates in float64.
+    False takes all cameras, as nerfstudio does."""
+
+    @property
+    def capture(self) -> Path:
+        """Path of the capture."""
+        return Path(self.dataparser.data if self.data is None else self.data)
+
+    def check(self) -> None:
+        """Check the capture before anything else of a training; see :func:`check_capture`."""
+        check_capture(self.dataparser, self.capture, ("train", "val"))
+
+
+class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
+    """The stock datamanager of whole images, which also caches them on machines without CUDA and can hold out views.
+
+    The view of a step is a function of seed and step, so a resumed run continues in the same order. Training cameras
+    stay on the CPU, where reading their sizes does not wait for the GPU.
+    """
+
+    config: SundaeDatamanagerConfig
+
+    def __init__(
+        self,
+        config: SundaeDatamanagerConfig,
+        device: torch.device | str = "cpu",
+        test_mode: Literal["test", "val", "inference"] = "val",
+        **kwargs: Any,
+    ) -> None:
+        if config.train_cameras_sampling_strategy != "random":
+            raise ConfigError(
+                "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run would "
+                "differ; use random"
+            )
+        set_parser(config.dataparser, config.robust_frame)
+        data = config.capture
+        splits = ("train", "val" if test_mode == "val" else "test")
+        check_capture(config.dataparser, data, splits, images=test_mode != "inference")
+        try:
+            super().__init__(config, device, test_mode, **kwargs)
+        except SundaeError:
+            raise
+        except EOFError as error:
+            raise DataError(
+                "nerfstudio asks whether to make the smaller images of --downscale-factor with ffmpeg, but there is no "
+                "terminal to answer it; start the command once in a terminal and answer y, or train on images of full "
+                "size with --downscale-factor 1"
+            ) from error
+        except Exception as error:  # parsers raise many kinds, assertions too, with one meaning for the user
+            raise DataError(f"{data} cannot be parsed ({one_line(error)}); check the capture") from error
+        self.hold_back(())
+        self._cameras: dict[int, Cameras] = {}
+        self.rank = 0
+        """Rank of this process: at a step, rank r trains on the view that one process takes r steps later."""
+
+    def create_train_dataset(self) -> CheckedDataset:
+        """Training set, with the transform from the capture's coordinates to the model's in its metadata."""
+        outputs = self.train_dataparser_outputs
+        if len(outputs.image_filenames) == 0:
+            raise DataError(f"no training images in {self.config.dataparser.data}; check the path and the split")
+        points = outputs.metadata.get("points3D_xyz")
+        if (warning := check_cameras(outputs.cameras, outputs.image_filenames, points)) is not None:
+            warn(warning)
+        if points is not None:
+            warn_of_cloud(points, outputs.cameras)
+        self._remark(outputs)
+        transform = outputs.dataparser_transform.clone()
+        # nerfstudio states the translation after the scale that a capture has been given.
+        transform[:, 3] /= getattr(self.dataparser, "applied_scale", 1.0)
+        outputs.metadata[DATASET_FRAME] = (transform, float(outputs.dataparser_scale))
+        return super().create_train_dataset()
+
+    def _remark(self, outputs: DataparserOutputs) -> None:
+        """Name what lies in the capture and is not used."""
+        parser: Any = self.config.dataparser
+        folder, is_colmap = self.config.capture, isinstance(parser, ColmapDataParserConfig)
+        folder = folder.parent if folder.is_file() else folder
+        if outputs.mask_filenames is None and (masks := unused_masks(folder)) is not None:
+            how = f"colmap --masks-path {masks}" if is_colmap else "mask_path in each frame of transforms.json"
+            warn(f"{folder / masks} is not used; to leave out what its masks hide, give {how}")
+        if is_colmap and (larger := larger_model(folder, parser.colmap_path)) is not None:
+            warn(larger)
+
+    def create_eval_dataset(self) -> CheckedDataset:
+        """Test set."""
+        dataset = super().create_eval_dataset()
+        names = dataset.image_filenames
+        warning = stray_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names) if names else None
+        if warning is not None:
+            warn(warning)
+        return dataset
+
+    @property
+    def holdout_indices(self) -> list[int]:
+        """Indices of the training views that are held out now."""
+        return sorted({*range(len(self.train_dataset))}.difference(self._served))
+
+    @property
+    def train_indices(self) -> list[int]:
+        """Indices of all training views."""
+        return list(range(len(self.train_dataset)))
+
+    def hold_back(self, indices: Iterable[int]) -> None:
+        """Hold these training views out, from the next step on, until the next call."""
+        held_back = frozenset(indices)
+        self._served = [index for index in self.train_indices if index not in held_back]
+        self._order: tuple[int, list[int]] = (-1, [])  # pass over the views, and its order
+
+    def view_of_step(self, step: int) -> int:
+        """Index of the training view of ``step``: each pass over the views is a new permutation."""
+        epoch, position = divmod(step, len(self._served))
+        if self._order[0] != epoch:
+            indices = list(self._served)
+            random.Random(f"{self.config.train_cameras_sampling_seed}-{epoch}").shuffle(indices)
+            self._order = (epoch, indices)
+        return self._order[1][position]
+
+    def training_views(self) -> Iterator[tuple[Cameras, torch.Tensor | None]]:
+        """All training views: camera of shape ``(1,)`` on the CPU, and mask.
+
+        The mask is bool ``[H, W, 1]``, True for pixels to train on; None for all pixels.
+        """
+        outputs = self.train_dataparser_outputs
+        # Undistortion masks what a fisheye lens has not seen.
+        round_lens = (outputs.cameras.camera_type != CameraType.PERSPECTIVE.value).any()
+        masked = outputs.mask_filenames is not None or bool(round_lens)
+        for index in self.train_indices:
+            # Read the mask first: undistortion changes the camera.
+            mask = self.cached_train[index].get("mask") if masked else None
+            yield self.train_dataset.cameras[index : index + 1], mask
+
+    def views(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, torch.Tensor]]]:
+        """Training views as camera and batch, as nerfstudio's evaluation takes them; loaded one at a time."""
+        return map(self._view, indices)
+
+    def _view(self, index: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
+        batch = dict(self.cached_train[index])  # first: undistortion, which comes with it, changes the camera
+        batch["image"] = batch["image"].to(self.device, non_blocking=True)  # pinned in host memory
+        if index not in self._cameras:  # nerfstudio's slicing is slow
+            camera = self.train_dataset.cameras[index : index + 1]
+            camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
+            self._cameras[index] = camera
+        return self._cameras[index], batch
+
+    def next_train(self, step: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
+        """Camera (on the CPU) and batch of ``step``."""
+        return self._view(self.view_of_step(step + self.rank))
+
+    def _fill_the_gpu(self, cameras: Cameras) -> bool:
+        """Whether images, three bytes a pixel, leave less than half of a GPU's free memory for the training."""
+        device, size = torch.device(self.device), 3 * int((cameras.width * cameras.height).sum())
+        return device.type == "cuda" and size > torch.cuda.mem_get_info(device)[0] / 2
+
+    def _load_images(
+        self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
+    ) -> list[dict[str, torch.Tensor]]:
+        dataset = self.train_dataset if split == "train" else self.eval_dataset
+        dataset.check_images()
+        if split == "train" and self.eval_dataset:
+            self.eval_dataset.check_images()  # report a damaged test view now, not at the prune
+        if cache_images_device == "cpu" and not torch.cuda.is_available():
+            # The stock "cpu" cache pins memory, which needs a driver; "gpu" means the model's device.
+            cache_images_device = "gpu"
+        elif cache_images_device == "gpu" and self._fill_the_gpu(dataset.cameras):
+            CONSOLE.print(
+                f"the {split} images need more than half of the free GPU memory: they stay in main memory, and each "
+                "step copies one",
+                soft_wrap=True,
+            )
+            cache_images_device = "cpu"
+        with dataset.as_photographed():
+            load = rebound(FullImageDatamanager._load_images, _undistort_image=undistorting(dataset.image_filenames))
+            loaded: list[dict[str, torch.Tensor]] = load(self, split, cache_images_device)
+        if split == "train" and loaded and not any(map(_shows_something, loaded)):
+            raise DataError(
+                f"all {len(loaded)} training images are fully transparent or masked, so there is nothing to train on; "
+                "check their alpha channel and their masks"
+            )
+        transparent = sum(batch["image"].shape[-1] == 4 for batch in loaded)
+        if split == "train" and transparent:
+            CONSOLE.print(
+                f"{transparent} of {len(loaded)} training images have an alpha channel: what is transparent is trained "
+                "to be empty space. To leave pixels out instead, give masks (mask_path in transforms.json)",
+                soft_wrap=True,
+            )
+        return loaded

@@ -1,0 +1,362 @@
+"""A small scene trained on the images of a full one: a prune, then steps on fresh virtual views. No photo is needed.
+
+The full field is the teacher: it renders the truth for any camera. So each step has a camera of its own, the chosen
+ones moved and turned a little, and nothing is learnt by heart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from pytorch_msssim import SSIM
+from torch.nn import Parameter
+
+from sundae_ns.core.camera import View
+from sundae_ns.core.errors import BackendError, CheckpointError, ConfigError, reading
+from sundae_ns.core.files import replacing
+from sundae_ns.core.gaussians import FEATURES, Field, mend
+from sundae_ns.cuda.kernels import naming_full_memory
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io.accounting import stored_bytes
+from sundae_ns.plugin.model import SundaeModelConfig
+from sundae_ns.scene.initialization import initial_features
+from sundae_ns.scene.optimise import optimise, rate_factor
+from sundae_ns.scene.prune_scene import prune_with_mask
+from sundae_ns.scene.render import LocalField
+from sundae_ns.scene.scene import Scene, measure, render
+from sundae_ns.scene.virtual_cameras import VIEWS, by_device, of_unit_size, resized, size_of, split, virtual_views
+from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
+from sundae_ns.train.choice import least_gain
+from sundae_ns.train.graphed_step import RecordedStep
+from sundae_ns.train.schedules import NETWORK_BETAS, fused_adam, network_groups, sparse_factor
+from sundae_ns.train.state import FieldState
+from sundae_ns.train.step import StepInputs, StepLosses, TrainingStep
+
+_log = logging.getLogger(__name__)
+
+RATES = {
+    "means": 1.6e-4,
+    "features_dc": 0.0025,
+    "features_rest": 0.0025 / 20,
+    "opacities": 0.05,
+    "scales": 0.005,
+    "quats": 0.001,
+    FEATURES: 0.0025,
+}
+"""Rates of Adam: those of a run right after its prune."""
+STEPS = {"cpu": 3000, "cuda": 8000}
+"""Steps by the device."""
+CAMERAS, HELD_OUT = 256, 16
+"""Virtual cameras that the steps begin from, and most cameras that no step sees."""
+SHIFT, TURN = 0.05, 0.1
+"""How far a camera of a step is from one of these: as a share of its distance from the middle of all, and radians."""
+TRIAL = 0.1
+"""Share of the steps in each of both trials, without and with a head."""
+AVERAGED = 0.1
+"""Share of the steps, at the end, over which weights are averaged."""
+SIDES = {"cpu": 128, "cuda": 512}
+"""Sides of the images by the device, pixels."""
+
+
+class Distillation:
+    """The training of a pruned scene on the images of a full one.
+
+    Args:
+        teacher: the full scene; its own head, if it has one, corrects its images.
+        keep, count, views, steps, seed, head, size: as in :func:`distill`.
+        progress: whether the prune shows a progress bar.
+
+    Raises:
+        ConfigError: an option is out of range.
+        DataError: the scene cannot be seen.
+    """
+
+    def __init__(
+        self,
+        teacher: Scene,
+        *,
+        keep: float | None = None,
+        count: int | None = None,
+        views: Sequence[View] | None = None,
+        steps: int | None = None,
+        seed: int = 0,
+        head: bool = True,
+        size: int | None = None,
+        progress: bool = False,
+    ) -> None:
+        steps = by_device(STEPS, teacher.device) if steps is None else steps
+        if steps < 1:
+            raise ConfigError(f"steps is {steps}; give 1 or more")
+        if keep is None and count is None:
+            keep = 0.1
+        teacher = dataclasses.replace(teacher, field=mend(teacher.field).field)
+        side = size or by_device(SIDES, teacher.device)
+        if views:
+            shown, held_out = split(views)
+            given = shown or views
+        else:
+            given = virtual_views(teacher, CAMERAS, seed=seed, size=side)
+            held_out = virtual_views(teacher, HELD_OUT, seed=seed + 1, size=side)
+        self._size = size_of(teacher)
+        self._teacher, seen = of_unit_size(teacher, [*given, *held_out])
+        self.cameras = [view.to(teacher.device) for view in seen[: len(given)]]
+        self.held_out = [view.to(teacher.device) for view in seen[len(given) :]][:HELD_OUT]
+        self.steps, self._seed = steps, seed
+        """Number of steps to train."""
+        seen = self.cameras[: by_device(VIEWS, teacher.device)]
+        cut = prune_with_mask(self._teacher, keep, count, seen, None, progress=progress, fit=False)
+        config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
+        self._head_config = None
+        if head:
+            on_cpu = teacher.device.type == "cpu"
+            tiny = {"size": "tiny", "pixel_unshuffle": 1, "num_features": 5} if on_cpu else {}
+            self._head_config = HeadConfig(mode="residual", **tiny)  # type: ignore[arg-type]
+        self.state = self._start(cut.scene.field)
+        self.step = 0
+        """Number of steps that were trained."""
+        self.gain: float | None = None
+        """PSNR that the head gained in its trial, dB; None before it, and without one."""
+        self._mean = RunningMean()
+        self._losses = StepLosses(config, SSIM(data_range=1.0, size_average=True, channel=3), 0)
+        self._settings = self._teacher.settings(head=False)
+        self._recorded = RecordedStep(self._losses) if self._settings.backend.name == "gsplat" else None
+
+    def _start(self, field: Field) -> FieldState:
+        params = {name: value.detach().clone() for name, value in field.items() if name != FEATURES}
+        networks = torch.nn.ModuleDict()
+        if self._head_config is not None:
+            generator = torch.Generator().manual_seed(self._seed)
+            width = self._head_config.num_features
+            params[FEATURES] = initial_features(params["features_dc"], width, generator)
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(self._seed)
+                networks["head"] = CompensationHead(self._head_config).to(params["means"].device)
+        trained = {name: Parameter(value) for name, value in params.items()}
+        optimizers: dict[str, torch.optim.Optimizer] = {
+            name: fused_adam([{"params": [value], "lr": RATES[name]}], eps=1e-15) for name, value in trained.items()
+        }
+        if self._head_config is not None:
+            groups = network_groups(networks["head"].parameters(), 1e-3, weight_decay=0.15)
+            optimizers["compensation"] = fused_adam(groups, eps=1e-8, betas=NETWORK_BETAS, decoupled_weight_decay=True)
+        state = FieldState(Field(trained, field.encoding), networks, optimizers, pruning={"num_prunes": 1})
+        focals = [view.focal for view in self.cameras]
+        state.trained_focal = (min(focals), max(focals))
+        return state
+
+    def train(self, after_step: Callable[[int, int], bool]) -> bool:
+        """Decide on the head, if that is due, and train the steps that are left.
+
+        Args:
+            after_step: called after each step with the number of steps so far and of all; False stops.
+
+        Returns:
+            Whether all steps were trained.
+
+        Raises:
+            MemoryExhaustedError: the GPU's memory is full.
+        """
+        trial = max(round(TRIAL * self.steps), 1) if self._head_config is not None and self.gain is None else 0
+        total = self.steps + 2 * trial
+
+        def on_step(done: int) -> bool:
+            self.step = done
+            if self.steps - done < AVERAGED * self.steps and done % AVERAGED_EVERY == 0:
+                self._mean.count_in(weights_of(self.state))
+            return after_step(2 * trial + done, total) or done == self.steps
+
+        with naming_full_memory(lambda: self.state.field.num_primitives):
+            if trial and not self._try_head(trial, lambda done: after_step(done, total)):
+                return False
+            if not self._optimise(self.steps, self.step, on_step):
+                return False
+        self._mean.replace(weights_of(self.state))
+        return True
+
+    def _optimise(self, steps: int, first: int, on_step: Callable[[int], bool]) -> bool:
+        """Train; step ``i`` of ``steps`` is a function of both, so that a resumed training repeats it."""
+        sparse = sparse_factor(self.state.field.num_primitives)
+
+        def factor(name: str, i: int) -> float:
+            if name == "means":
+                return sparse * 0.01 ** (i / steps)
+            return rate_factor(i, steps) if name == "compensation" else 1.0
+
+        return optimise(self._train_step, self.state.optimizers, steps, factor, first=first, on_step=on_step)
+
+    def _try_head(self, steps: int, on_step: Callable[[int], bool]) -> bool:
+        """Train without and with the head from the same start, and keep the head if it pays; False if interrupted."""
+        assert self._head_config is not None
+        state, quality = self.state, []
+        start = state.snapshot(head=True)
+        for trial, starts_at in enumerate((math.inf, -math.inf)):
+            state.head_starts_at = starts_at
+
+            def on_trial_step(done: int, before: int = trial * steps) -> bool:
+                return on_step(before + done)
+
+            if not self._optimise(steps, 0, on_trial_step):
+                return False
+            quality.append(self.quality())
+            state.restore(start)
+        self.gain = quality[1] - quality[0]
+        plain = {name: value for name, value in state.field.items() if name != FEATURES}
+        ratio = stored_bytes(state.field, self._head_config) / stored_bytes(plain, None)
+        if not self.gain >= least_gain(math.log2(ratio)):
+            self._remove_head()
+        return True
+
+    def _remove_head(self) -> None:
+        self.state.remove_head()
+        self._head_config = None
+
+    def _train_step(self, i: int) -> None:
+        state = self.state
+        view = self._camera(i)
+        # A teacher of nerfstudio's model may have been trained over random backgrounds; the student sees the shown one.
+        target = render(self._teacher, view).rgb
+        state.step = i + 1  # a head is enabled in the steps after its start
+        inputs = StepInputs(view, target, None, self._teacher.background)
+        settings = state.render_settings(self._settings.backend, antialiased=self._teacher.antialiased, training=True)
+        if self._recorded is not None:
+            try:
+                self._recorded(state, inputs, settings)
+                return
+            except BackendError as error:
+                _log.warning("the distillation runs kernel by kernel, slower: %s", error)
+                self._recorded = None
+        loss, _, _ = TrainingStep(LocalField(state.field), state, self._losses, state.field)(inputs, settings)
+        loss.backward()
+        for optimizer in state.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+
+    def _camera(self, i: int) -> View:
+        """A camera near one of those to begin from."""
+        generator = torch.Generator().manual_seed((self._seed + 1) * 1_000_003 + i)
+        view = self.cameras[int(torch.randint(len(self.cameras), (1,), generator=generator))]
+        shift = SHIFT * torch.randn(3, generator=generator) * float(view.viewmat[:3, 3].norm())
+        x, y, z = (TURN * torch.randn(3, generator=generator) / 3).tolist()
+        turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
+        viewmat = view.viewmat.clone()
+        viewmat[:3] = turn.to(viewmat) @ viewmat[:3]
+        viewmat[:3, 3] += shift.to(viewmat) / math.sqrt(3)
+        return view._replace(viewmat=viewmat)
+
+    def scene(self) -> Scene:
+        """The scene as it is now, at unit size if its source is no nerfstudio model."""
+        state = self.state
+        head = state.head if state.head_enabled else None
+        field = {name: value.detach() for name, value in state.field.items() if name != FEATURES or head is not None}
+        return dataclasses.replace(
+            self._teacher,
+            field=Field(field, state.field.encoding),
+            head=head,
+            trained_focal=None if head is None else state.trained_focal,
+        )
+
+    def quality(self) -> float:
+        """PSNR of the held-out views against the full field's images, dB."""
+        return measure(self.scene(), self._teacher, self.held_out).psnr
+
+    def result(self) -> Scene:
+        """The scene as it is now, in the coordinates of the full one."""
+        return resized(self.scene(), self._size)
+
+    def save(self, path: Path) -> None:
+        """Write what a resumed training needs, atomically."""
+        state = self.state
+        content = {
+            "options": self._options(),
+            "step": self.step,
+            "gain": self.gain,
+            "head": None if state.head is None else dict(state.head.state_dict()),
+            "field": {name: value.detach() for name, value in state.field.items()},
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in state.optimizers.items()},
+            "mean": self._mean.state_dict(),
+        }
+        with replacing(path) as partial:
+            torch.save(content, partial)
+
+    def load(self, path: Path) -> None:
+        """Go on from a file of :meth:`save`.
+
+        Raises:
+            CheckpointError: it is damaged, or was written with other options or for another scene.
+        """
+        state = self.state
+        try:
+            with reading(path, "a checkpoint", CheckpointError):
+                saved = torch.load(path, map_location=state.device, weights_only=True)
+            if saved["options"] != self._options():
+                raise ValueError("other options")
+            self.step, self.gain = int(saved["step"]), saved["gain"]
+            if saved["head"] is None:
+                self._remove_head()
+            elif state.head is not None:
+                state.head.load_state_dict(saved["head"])
+            for name, value in state.field.items():
+                if value.shape != saved["field"][name].shape:
+                    raise ValueError("another scene")
+                value.data.copy_(saved["field"][name])
+            for name, optimizer in state.optimizers.items():
+                optimizer.load_state_dict(saved["optimizers"][name])
+            self._mean = RunningMean.of(saved["mean"], state.device)
+        except Exception as error:  # torch raises errors of many kinds for a damaged file
+            raise CheckpointError(
+                f"{path} is damaged, or of another scene or other options; remove it to start anew"
+            ) from error
+        if state.head is not None:
+            state.head_starts_at = -math.inf
+
+    def _options(self) -> Mapping[str, Any]:
+        """What a resumed training must share."""
+        counts = [self._teacher.num_primitives, self.state.field.num_primitives, len(self.cameras)]
+        return {"steps": self.steps, "seed": self._seed, "counts": counts}
+
+
+def distill(
+    scene: Scene,
+    *,
+    keep: float | None = None,
+    count: int | None = None,
+    views: Sequence[View] | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    head: bool = True,
+    size: int | None = None,
+) -> Scene:
+    """Prune a scene, and train what is left on the images of the full one. Needs no photos, but nerfstudio.
+
+    Args:
+        scene: of any program; it does not change.
+        keep: share of the finite primitives to keep, in (0, 1]; by default 0.1.
+        count: number of primitives to keep, in place of a share.
+        views: cameras that the steps begin from. Every eighth is held out. By default they are virtual ones.
+        steps: number of training steps, by default 8,000 on a GPU, 3,000 on a CPU; the trials of the head come before
+            them.
+        seed: of all random draws.
+        head: whether to add a compensation head if held-out views show that it pays.
+        size: sides of the images of virtual cameras, pixels; by default 512 on a GPU, 128 on a CPU.
+
+    Returns:
+        The small scene, on the same device.
+
+    Raises:
+        ConfigError: an option is out of range.
+        DataError: the scene cannot be seen.
+        MemoryExhaustedError: the GPU's memory is full.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
+    >>> sn.distill(scene, keep=0.5, views=sn.virtual_views(scene, 4, size=32), steps=4, head=False).num_primitives
+    100
+    """
+    made = Distillation(scene, keep=keep, count=count, views=views, steps=steps, seed=seed, head=head, size=size)
+    made.train(lambda *_: True)
+    return made.result()

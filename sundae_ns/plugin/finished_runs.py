@@ -1,0 +1,387 @@
+"""Finished scenes as models with the test views of their captures: runs of sundae or splatfacto, and packed scenes.
+
+A ``config.yml`` can run code in nerfstudio, so no part of it is packed. A packed scene states plain values of its
+capture; each one is checked, and a new configuration is made from them.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.base_datamanager import DataManagerConfig
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from torch import Tensor
+
+from sundae_ns.core.camera import View
+from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, PackError
+from sundae_ns.head.head import HeadConfig
+from sundae_ns.io import checkpoint
+from sundae_ns.io.config_file import check_run, config_of, load_config
+from sundae_ns.io.formats import kind_of, refuse, unread
+from sundae_ns.io.run_folder import prunes_of
+from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.plugin.dataparsers import check_capture
+from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
+from sundae_ns.scene.cameras import is_number, unit
+from sundae_ns.scene.load_save import load, scene_of_checkpoint
+from sundae_ns.scene.packing import refusal
+from sundae_ns.scene.scene import Scene
+from sundae_ns.train.pruning import PruningConfig
+
+_PARSERS: dict[str, type[DataParserConfig]] = {
+    "blender-data": BlenderDataParserConfig,
+    "colmap": ColmapDataParserConfig,
+    "nerfstudio-data": NerfstudioDataParserConfig,
+}
+_ALPHA_COLORS = ("white", "black", None)
+"""Colours that a packed scene may name for what is transparent in its images."""
+_FOLDER = re.compile(r"(?!.*\.\.)[\w.-]+(/[\w.-]+)*")
+"""Paths that a packed scene may name: below the capture, and without special characters of a shell, because nerfstudio
+passes paths of images to ffmpeg through one."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A finished scene as a model, and the facts in its files; None for what a packed scene does not state."""
+
+    model: SundaeModel
+    """In evaluation mode, on the GPU if there is one."""
+    cameras: list[Cameras]
+    """Test cameras, each of shape ``(1,)``, on the model's device."""
+    truths: list[Tensor]
+    """True images ``[H, W, 3]`` in [0, 1], over the model's background, on the model's device."""
+    datamanager: SundaeDatamanager
+    """The capture's views, training views too."""
+    source: Path
+    """The run's folder, or the packed scene."""
+    capture: Path
+    """The photographs: a folder, or its ``transforms.json``."""
+    method: str
+    variant: str
+    steps: int
+    """Number of training steps."""
+    kept: float | None = None
+    """Share of the primitives that the prunes kept: the product over all prunes."""
+    seed: int | None = None
+    prune_s: float | None = None
+    """Seconds of its prunes."""
+    packed_bytes: int | None = None
+    """Size of the packed file; None for a run."""
+    pipeline: Any = None
+    """nerfstudio's pipeline of a run."""
+
+    @property
+    def scene(self) -> str:
+        """Name of the capture's folder."""
+        return (self.capture.parent if self.capture.suffix == ".json" else self.capture).resolve().name
+
+
+def load_model(path: Path, data: Path | None = None, *, split: Literal["test", "val"] = "test") -> Opened:
+    """Open a finished scene as a model, with its test views. No code in its files runs, and they are only read.
+
+    A field of splatfacto becomes a model of ours without a head: one code path renders and times all methods.
+
+    Args:
+        path: folder of a run of sundae or splatfacto, its ``config.yml``, or a packed scene.
+        data: the capture, if it has moved; a packed scene needs it.
+        split: ``val`` opens a run to train on: without test views, and in the state of its checkpoint.
+
+    Raises:
+        CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
+        DataError: the capture is missing, or cannot be used, or has no test views.
+        PackError: the packed scene is damaged, or has impossible values.
+    """
+    if kind_of(path) == "packed":
+        opened = _open_packed(path, data)
+    else:
+        wanted = "give the folder of a finished run, its config.yml, or a packed scene"
+        refuse(path, primitives=f"it comes without test views; {wanted}")
+        config = config_of(path)
+        if config.name != "config.yml" or not config.is_file():
+            reason = "is no run" if path.exists() else "does not exist"
+            raise CheckpointError(f"{path} {unread(path) or f'{reason}; {wanted}'}")
+        opened = _open_run(config, data, split)
+    if split == "test":
+        model = opened.model.eval()
+        for camera, batch in opened.datamanager.fixed_indices_eval_dataloader:
+            opened.cameras.append(camera.to(model.device))
+            opened.truths.append(model.truth(batch, {"background": model._get_background_color()}))
+        if not opened.cameras:
+            raise DataError(f"{opened.capture} has no test views, so there is nothing to measure {opened.source} on")
+    return opened
+
+
+def _device() -> torch.device:
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def _open_packed(path: Path, data: Path | None) -> Opened:
+    if data is None:
+        raise DataError(f"{path} is a packed scene, which does not name its capture; give the capture with --data")
+    scene = load(path)
+    model = model_of(scene).to(_device())
+    manager = datamanager_of(scene, data).setup(device=model.device, test_mode="test", world_size=1, local_rank=0)
+    stated = scene.meta.get("source")
+    source = stated if isinstance(stated, dict) else {}
+    step = source.get("step")
+    return Opened(
+        model,
+        [],
+        [],
+        manager,
+        source=path,
+        capture=data,
+        method=str(source.get("method") or "sundae"),
+        variant=path.name,
+        steps=step + 1 if isinstance(step, int) else 0,
+        packed_bytes=path.stat().st_size,
+    )
+
+
+def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> Opened:
+    config, stock = _config_of(path)
+    newest, loaded = checkpoint.read_newest(path.parent / config.relative_model_dir)
+    manager = config.pipeline.datamanager = _datamanager_config(config.pipeline.datamanager)
+    foreign = not isinstance(stock, SundaeModelConfig)
+    if foreign:
+        # The grid corrects training images only; test views are rendered without it.
+        shared = {**_shared(stock, SplatfactoModelConfig), "use_bilateral_grid": False}
+        config.pipeline.model = SundaeModelConfig(
+            **shared, pruning=PruningConfig(mode="off"), head=HeadConfig(mode="off")
+        )
+    # The datamanager's path first: it follows a capture that has moved together with the run.
+    capture = data or Path(manager.data or config.data or manager.dataparser.data)
+    if not capture.exists():
+        raise DataError(f"the capture {capture} is missing; give its folder with --data")
+    manager.data = capture
+    pipeline: Any = config.pipeline.setup(device=_device(), test_mode=split)
+    model, step = cast(SundaeModel, pipeline.model), int(loaded["step"])
+    if foreign:
+        put_scene(model, scene_of_checkpoint(newest, loaded, path))
+        model.step = step
+    else:
+        pipeline.load_pipeline(loaded["pipeline"], step)
+    if split == "test":
+        pipeline.eval()
+    prunes, unpruned = prunes_of(path.parent), model.config.pruning.mode == "off"
+    return Opened(
+        model,
+        [],
+        [],
+        pipeline.datamanager,
+        source=path.parent,
+        capture=capture,
+        method=config.method_name or "",
+        variant=config.experiment_name or "",
+        steps=step + 1,
+        kept=1.0 if unpruned else _kept(prunes),
+        seed=config.machine.seed,
+        prune_s=0.0 if unpruned else _seconds(prunes),
+        pipeline=pipeline,
+    )
+
+
+def _config_of(path: Path) -> tuple[TrainerConfig, SplatfactoModelConfig]:
+    """Configuration of a run of sundae or splatfacto and of its model, from its ``config.yml``, which is not run."""
+    config = load_config(path)
+    model = getattr(getattr(config, "pipeline", None), "model", None)
+    if not isinstance(config, TrainerConfig) or not isinstance(model, SplatfactoModelConfig):
+        raise CheckpointError(f"{path} is of a method without Gaussians; give a run of sundae or splatfacto")
+    return config, model
+
+
+def _datamanager_config(stock: DataManagerConfig) -> SundaeDatamanagerConfig:
+    """A datamanager of ours, which also works without CUDA, for the same views."""
+    if isinstance(stock, SundaeDatamanagerConfig):
+        return stock
+    shared = _shared(stock, FullImageDatamanagerConfig)
+    return SundaeDatamanagerConfig(**{**shared, "train_cameras_sampling_strategy": "random"})
+
+
+def _shared(config: Any, kind: type[Any]) -> dict[str, Any]:
+    return {known.name: getattr(config, known.name) for known in fields(kind) if known.init and known.name != "_target"}
+
+
+def _kept(prunes: list[dict[str, Any]]) -> float | None:
+    """Share of the primitives that these prunes kept; None without a whole record."""
+    try:
+        return math.prod(prune["after"] / prune["before"] for prune in prunes) if prunes else None
+    except (KeyError, TypeError, ZeroDivisionError):
+        return None
+
+
+def _seconds(prunes: list[dict[str, Any]]) -> float | None:
+    """Seconds of these prunes; None without a whole record."""
+    try:
+        return sum(float(prune["seconds"]) for prune in prunes) if prunes else None
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def model_of(scene: Scene) -> SundaeModel:
+    """The model of a scene in evaluation mode, on the CPU, with all SH degrees and the head enabled."""
+    degree = 0 if scene.field.encoding == "logits" else max(scene.field.sh_degree, 1)
+    head = HeadConfig(mode="off") if scene.head is None else dataclasses.replace(scene.head.config, start_at=0)
+    config = SundaeModelConfig(
+        sh_degree=degree,
+        sh_degree_interval=1,
+        rasterize_mode="antialiased" if scene.antialiased else "classic",
+        background_color=scene.background_color,
+        head=head,
+    )
+    config.camera_optimizer.mode = "off"
+    # Two points; without any, the model would start from tens of thousands of random points.
+    seeds = (torch.eye(3)[:2], torch.zeros(2, 3))
+    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    model: SundaeModel = config.setup(scene_box=box, num_train_data=0, metadata={}, seed_points=seeds)
+    put_scene(model, scene)
+    model.step = max(degree, 1)  # at which all SH degrees are active and the head is enabled
+    return model.eval()
+
+
+def put_scene(model: SundaeModel, scene: Scene) -> None:
+    """Put a scene in place of a model's field and head; the model has its SH degree or more, and a head of its kind."""
+    place(model, scene.field)
+    if model.head is not None and scene.head is not None:
+        model.head.load_state_dict(scene.head.state_dict())
+    model.state.trained_focal = scene.trained_focal
+
+
+def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
+    """Load a field into a model in place; parameters and coefficients that the field lacks become 0."""
+    for name, value in model.gauss_params.items():
+        new = value.data.new_zeros(len(field["means"]), *value.shape[1:])
+        if name in field:
+            new[:, : field[name].shape[1]] = field[name].detach().to(new)
+        value.data = new
+
+
+def load_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> Scene:
+    """The scene of a finished run with some of its training cameras, and what says how its capture is read.
+
+    Args:
+        run: folder of a run of sundae or splatfacto, or its ``config.yml``, which is not run.
+        max_cameras: highest number of training cameras, evenly chosen; with 0 the capture is not needed.
+        data: the capture, if it has moved.
+
+    Raises:
+        CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
+        DataError: its capture is gone, or cannot be used.
+    """
+    check_run(run)
+    path = config_of(run)
+    config, _ = _config_of(path)
+    scene = load(path)
+    manager = _datamanager_config(copy.deepcopy(config.pipeline.datamanager))
+    manager.data = data or manager.data or config.data
+    source = {"method": config.method_name, **scene.meta["source"]}
+    meta = {**scene.meta, "source": source, "capture": describe_capture(manager)}
+    views, up = _training_views(manager, max_cameras) if max_cameras > 0 else (), scene.up
+    if up is None and views:
+        with suppress(ConfigError):  # cameras that look all around have none
+            up = unit(torch.stack([view.pose[:, 1] for view in views]).double().mean(dim=0).tolist())
+    return dataclasses.replace(scene, views=views, up=up, meta=meta)
+
+
+def _training_views(manager: SundaeDatamanagerConfig, most: int) -> tuple[View, ...]:
+    cameras: Cameras = manager.setup(device="cpu", test_mode="test").train_dataset.cameras
+    chosen = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long()
+    intrinsics = torch.cat([cameras.fx, cameras.fy, cameras.cx, cameras.cy], dim=-1)[chosen].tolist()
+    sizes = torch.cat([cameras.width, cameras.height], dim=-1)[chosen].tolist()
+    rows = zip(cameras.camera_to_worlds[chosen], intrinsics, sizes, strict=True)
+    return tuple(View.from_pose(pose, lens, *size) for pose, lens, size in rows)
+
+
+def describe_capture(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
+    """Plain values to parse, split and scale the same capture again; None for another parser."""
+    parser = manager.dataparser
+    kind = next((name for name, known in _PARSERS.items() if type(parser) is known), None)
+    if kind is None:
+        return None
+    options: dict[str, Any] = {}
+    for name, default in _parser_options(_PARSERS[kind]).items():
+        value = getattr(parser, name, default)
+        if isinstance(value, Path):
+            value = value.as_posix()
+        if isinstance(value, str) and isinstance(default, Path) and not _FOLDER.fullmatch(value):
+            return None  # outside of the capture
+        if name == "alpha_color" and value not in _ALPHA_COLORS:
+            return None
+        options[name] = value
+    stated = {"parser": kind, "options": options, "scale": manager.camera_res_scale_factor}
+    return {**stated, "robust_frame": True} if manager.robust_frame else stated
+
+
+def _parser_options(kind: type[DataParserConfig]) -> dict[str, Any]:
+    """Options of a parser that a finished run needs, with their defaults."""
+    left_out = {"_target", "data", "masks_path", "depths_path", "mask_color", "load_3D_points", "ply_path"}
+    return {field.name: getattr(kind(), field.name) for field in fields(kind) if field.name not in left_out}
+
+
+def datamanager_of(scene: Scene, data: Path) -> SundaeDatamanagerConfig:
+    """Configuration that parses, splits and scales a capture as in the training of a packed scene.
+
+    Raises:
+        DataError: the capture is missing, or cannot be used.
+        PackError: the scene does not say how its capture is read, or states something impossible.
+    """
+    stated: Any = scene.meta.get("capture")
+    parser, scale = stated_capture(stated)
+    check_capture(parser, data, ("train", "test"))
+    return SundaeDatamanagerConfig(
+        dataparser=parser,
+        camera_res_scale_factor=scale,
+        data=data.resolve(),
+        cache_images_type="uint8",
+        robust_frame=stated.get("robust_frame") is True,
+    )
+
+
+def stated_capture(stated: Any) -> tuple[DataParserConfig, float]:
+    """Counterpart of :func:`describe_capture`: the parser, and the scale of its images."""
+    kind = stated.get("parser") if isinstance(stated, dict) else None
+    options = stated.get("options") if isinstance(stated, dict) else None
+    if kind not in _PARSERS or not isinstance(options, dict):
+        raise PackError("the packed scene does not say how its capture is read; measure the run that was packed")
+    scale = stated.get("scale")
+    if not is_number(scale) or not 0 < scale <= 1:
+        raise refusal("an impossible scale of its images")
+    parser: Any = _PARSERS[kind]()
+    if hasattr(parser, "load_3D_points"):
+        parser.load_3D_points = False
+    known, hints = _parser_options(_PARSERS[kind]), get_type_hints(_PARSERS[kind])
+    for name, value in options.items():
+        if name not in known or not _is_possible(value, known[name], hints[name]):
+            raise refusal(f"an impossible option {str(name)[:40]!r} of its capture")
+        setattr(parser, name, Path(value) if isinstance(known[name], Path) else value)
+    return parser, float(scale)
+
+
+def _is_possible(value: Any, default: Any, hint: Any) -> bool:
+    """Whether a value of JSON can stand for an option with this default and type."""
+    if default is None:
+        return value is None or (type(value) is int and value > 0)
+    if isinstance(default, Path):
+        return isinstance(value, str) and _FOLDER.fullmatch(value) is not None
+    if isinstance(default, float):
+        return is_number(value)
+    if isinstance(default, str):
+        return value in (get_args(hint) if get_origin(hint) is Literal else _ALPHA_COLORS)
+    return type(value) is type(default)

@@ -1,0 +1,384 @@
+"""The SUNDAE model for nerfstudio: it connects state, extensions and rendering to splatfacto's interface.
+
+Module path and class names are written into every run's ``config.yml``, so moving them breaks saved runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, MutableMapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, resize_image
+from nerfstudio.utils.rich_utils import CONSOLE
+from pytorch_msssim import SSIM
+from torch import Tensor
+
+from sundae_ns.core.camera import View, Window, crop_image
+from sundae_ns.core.metrics import Lpips, psnr, quality_of
+from sundae_ns.cuda.kernels import naming_full_memory
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io import checkpoint
+from sundae_ns.plugin.callbacks import NerfstudioRun, training_views
+from sundae_ns.plugin.camera_models import check_projection, view_of
+from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanager, view_index
+from sundae_ns.plugin.viewer import ViewerControls, in_viewer
+from sundae_ns.rasterize.interface import select_backend
+from sundae_ns.rasterize.types import Backend
+from sundae_ns.scene.frames import FrameReplay, Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs
+from sundae_ns.scene.render import SHOWN_BACKGROUNDS, LocalField, RenderSettings, StepResolution, contribution
+from sundae_ns.train.build import build
+from sundae_ns.train.curve import CurvePoint
+from sundae_ns.train.exposure import PhotoGains
+from sundae_ns.train.initialize import Start
+from sundae_ns.train.pruning import PruningConfig
+from sundae_ns.train.state import Extension, FieldState
+from sundae_ns.train.step import StepInputs, StepLosses, TrainingStep, training_part
+from sundae_ns.train.trials import Trials
+
+
+@dataclass
+class SundaeModelConfig(SplatfactoModelConfig):
+    """Splatfacto, pruned and compensated. Options of splatfacto keep their meaning."""
+
+    _target: type = field(default_factory=lambda: SundaeModel)
+    pruning: PruningConfig = field(default_factory=PruningConfig)
+    """When to prune, how many primitives to keep, and which."""
+    head: HeadConfig = field(default_factory=HeadConfig)
+    """The compensation head."""
+    rasterizer: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
+    """auto takes gsplat on CUDA and compiled loops on a CPU; reference is slow, in plain PyTorch."""
+    base_loss_weight: float = 0.2
+    """Weight of the loss on the image without the head, which keeps exported .ply files valid."""
+    loss_after_prune: Literal["l1", "rms"] = "rms"
+    """Term beside SSIM: l1 is the paper's; rms, the root of the mean squared error, gains 0.1 to 0.3 dB."""
+    prior_after_prune: float = 0.3
+    """Weight of opacities and scales in the loss of the pruned field, over the number of training images."""
+    average_share: float = 0.1
+    """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
+    photo_gains: Literal["auto", "on", "off"] = "auto"
+    """Even out photos of changing exposure or white balance with their neighbours; auto does if half of them differ."""
+    dense_start_views: int = 300
+    """With at most this many training images, a plane sweep fills a sparse cloud to start from; 0 turns it off."""
+    warm_start: Path | None = None
+    """Start from a finished field, without a warm-up: a splatfacto or sundae .ckpt, its folder, a .sundae or .ply."""
+    warm_start_frame: Literal["auto", "model", "capture"] = "auto"
+    """Coordinates of the warm start: nerfstudio's model, or the capture (COLMAP). auto decides by the kind of file."""
+    stop_split_at: int = 12000
+    """Step at which densification ends, that of the prune; longer growth gains nothing that the prune keeps."""
+    evaluate_prune: bool = True
+    """Evaluate all test views right before and right after the prune, and at the end."""
+
+    @property
+    def num_features(self) -> int:
+        """Length of the feature vectors; 0 without a head."""
+        return 0 if self.head.mode == "off" else self.head.num_features
+
+
+class SundaeModel(SplatfactoModel):
+    """Trains Gaussians, prunes them, and compensates for the loss.
+
+    A subclass of ``SplatfactoModel``, because nerfstudio's exporter and viewer test for it. Everything that ties the
+    original to CUDA or to downloads is replaced: initialisation, view matrix, outputs, LPIPS.
+
+    Raises:
+        ConfigError: options that cannot work.
+        CheckpointError: the warm start cannot be read.
+    """
+
+    config: SundaeModelConfig
+    state: FieldState
+    """Field, head, optimizers, running states, and the clock."""
+    source: LocalField
+    """Where views get their primitives from."""
+    extensions: list[Extension]
+    """Parts of training beside the step, in the order in which they act."""
+
+    def populate_modules(self) -> None:
+        """Build field, head and extensions. The device of the model is not known yet."""
+        config = self.config
+        frame = (self.kwargs.get("metadata") or {}).get(DATASET_FRAME)
+        self.state, self.extensions, self._start = build(config, self.num_train_data, self.seed_points, frame)
+        self.gauss_params, self.networks = cast(Any, self.state.field.data), self.state.networks
+        self.source = LocalField(self.state.field)
+        self.photo_gains = next(one for one in self.extensions if isinstance(one, PhotoGains))
+        self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
+        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
+        self.losses = StepLosses(config, self.ssim, self.num_train_data)
+        self.lpips = Lpips()  # type: ignore[assignment]
+        self.crop_box: OrientedBox | None = None
+        self.background_color = torch.tensor(SHOWN_BACKGROUNDS[config.background_color])
+        self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution, self.count_curve)
+        self.compensated = True
+        """Whether images outside of a viewer get the head's correction."""
+        self._response, self._replay = ShownResponse(), FrameReplay()
+        self._views: dict[tuple[int | None, int], View] = {}
+        """Views of training cameras that do not move, by index and divisor of their sides."""
+
+    # ---------------------------------------------------------------------------------------------------- the field
+
+    def train(self, mode: bool = True) -> SundaeModel:
+        """Switch between training and evaluation; a walk over all modules at each step would take time."""
+        return self if self.training == mode else super().train(mode)
+
+    @property
+    def step(self) -> int:
+        """Training step."""
+        return self.state.step
+
+    @step.setter
+    def step(self, value: int) -> None:
+        self.state.step = value
+
+    @property
+    def head(self) -> CompensationHead | None:
+        """The head; None if the field has none."""
+        return self.state.head
+
+    @cached_property
+    def backend(self) -> Backend:
+        """The rasteriser, chosen once the device is known.
+
+        Raises:
+            BackendError: ``gsplat`` was asked for and cannot run here.
+        """
+        return select_backend(self.config.rasterizer, self.device)
+
+    def get_gaussian_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """One group for each parameter of the field, features included."""
+        return {name: [value] for name, value in self.gauss_params.items()}
+
+    def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """Groups of the field, of the head (``compensation``) and of the cameras."""
+        groups = super().get_param_groups()
+        if self.head is not None:
+            groups["compensation"] = list(self.head.parameters())
+        return groups
+
+    # -------------------------------------------------------------------------------------------------- checkpoints
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Everything beside tensors that a resumed run needs: clock, running states, states of the extensions."""
+        state = self.state
+        return checkpoint.extra_state(
+            step=state.step,
+            num_features=self.config.num_features,
+            encoding=state.field.encoding,
+            running=state.running_states(),
+            extensions={extension.name: extension.state_dict() for extension in self.extensions},
+            trained_focal=state.trained_focal,
+            head_enabled=state.head_enabled,
+        )
+
+    def set_extra_state(self, state: Mapping[str, Any]) -> None:
+        """Counterpart of :meth:`get_extra_state`; tensors move to the device of the field."""
+        self.state.step = int(state["step"])
+        focal = state["trained_focal"]
+        self.state.trained_focal = None if focal is None else (float(focal[0]), float(focal[1]))
+        self.state.load_running_states(state["running"])
+        for extension in self.extensions:
+            extension.load_state_dict(self.state, state["extensions"].get(extension.name, {}))
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
+        """Load a SUNDAE checkpoint with any number of primitives.
+
+        Parameters are resized in place, because optimizers may hold them already.
+
+        Raises:
+            CheckpointError: a checkpoint of another method or format, or of another feature width or head.
+        """
+        extra = checkpoint.check_extra_state(state_dict, self.config.num_features, self.state.field.encoding)
+        for extension in self.extensions:
+            extension.prepare_loading(self.state, extra["extensions"].get(extension.name, {}))
+        checkpoint.check_model_state(state_dict, self.state_dict())
+        n = state_dict["gauss_params.means"].shape[0]
+        for value in self.gauss_params.values():
+            value.data = value.data.new_zeros(n, *value.shape[1:])
+        self._start = Start()
+        # Not SplatfactoModel's own loader, which replaces parameters and resets the step.
+        return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)
+
+    # ---------------------------------------------------------------------------------------------------- rendering
+
+    def view_of(self, camera: Cameras, downscale: int = 1) -> View:
+        """The rasteriser's form of a camera of shape ``(1,)``, moved by the camera optimizer while it trains."""
+        optimizer = self.camera_optimizer
+        pose = optimizer.apply_to_camera(camera) if self.training and optimizer.config.mode != "off" else None
+        return view_of(camera, self.device, pose=pose, downscale=downscale)
+
+    def render_settings(self, *, training: bool) -> RenderSettings:
+        """Settings of images at this step."""
+        return self.state.render_settings(
+            self.backend,
+            antialiased=self.config.rasterize_mode == "antialiased",
+            training=training,
+            absgrad=self.config.use_absgrad,
+        )
+
+    @torch.no_grad()
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]
+        """Render a camera, or the primitives in a box; unlike splatfacto's, this leaves the camera on its device."""
+        if not in_viewer():  # an error would end the viewer
+            check_projection(camera)
+        self.set_crop(obb_box)
+        return self.get_outputs(camera)
+
+    def get_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:  # type: ignore[override]
+        """Render a camera.
+
+        Args:
+            camera: of shape ``(1,)``.
+
+        Returns:
+            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``window``, the
+            part that the images show, or None. See ``rendering.frames.late_outputs`` for those outside of training.
+        """
+        with naming_full_memory(lambda: self.num_points):
+            return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
+
+    def _training_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
+        background, (view, window) = self._get_background_color(), self._training_view(camera)
+        settings, depth = self.render_settings(training=True), self.config.output_depth_during_training
+        images, splatted = self.training_step.images(view, background, settings, depth=depth)
+        self.state.info = splatted.info
+        for extension in self.extensions:
+            extension.before_backward(self.state)
+        del images["feature_image"]
+        return {**images, "background": background, "window": window}
+
+    def _shown_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
+        background, view = self._get_background_color(), self.view_of(camera)
+        crop = None if self.crop_box is None else self.crop_box.within(self.means).squeeze(-1)
+        visible = self.viewer_controls.visible(self.source, crop, compensate=self.compensated)
+        if visible is None:
+            return empty_outputs(view.width, view.height, background)
+        settings = self.render_settings(training=False)
+        splattable = settings.head is not None
+        if not visible.compensate:
+            settings = settings.without_head()
+        images = self._replay.render(visible.source, view, background, settings)
+        whole = self.state.field.replaced({})
+        drawn = whole if visible.mask is None else visible.source.field
+        values = partial(self._response.values, whole, self.viewer_controls.field_key, self.config.pruning)
+        late = late_outputs(images, drawn, whole, visible.mask, view, settings, values, splattable=splattable)
+        late["background"] = background.expand(view.height, view.width, 3)
+        return late
+
+    def contribution(self, datamanager: SundaeDatamanager, count: int | None = None) -> Tensor:
+        """Summed blending weight of each primitive ``[N]``; see :func:`sundae_ns.scene.render.contribution`."""
+        views, settings = training_views(self, datamanager), self.render_settings(training=False)
+        return contribution(self.source, views, self.background_color, settings, count, console=CONSOLE)
+
+    def count_curve(self) -> list[CurvePoint]:
+        """The curve by which trials have chosen the number of primitives; empty without them."""
+        return [point for one in self.extensions if isinstance(one, Trials) for point in one.progress.curve()]
+
+    # ----------------------------------------------------------------------------------------------------- training
+
+    @property
+    def training_step(self) -> TrainingStep:
+        """The training step, which nerfstudio's loop runs in two halves."""
+        return TrainingStep(self.source, self.state, self.losses, self.state.field)
+
+    def _training_view(self, camera: Cameras) -> tuple[View, Window | None]:
+        """The part of a training camera that a step shows. Views are kept: copying one to a GPU waits for it."""
+        at = self.resolution(self.step)
+        key = view_index(camera), at.downscale
+        view = self._views.get(key) or self.view_of(camera, at.downscale)
+        if key[0] is not None and self.camera_optimizer.config.mode == "off":
+            self._views[key] = view
+        return training_part(self.state, view, at)
+
+    def step_inputs(self, camera: Cameras, batch: dict[str, Any]) -> StepInputs:
+        """What a step outside of nerfstudio's loop trains on, from a camera of shape ``(1,)`` and its batch."""
+        background, (view, window) = self._get_background_color(), self._training_view(camera)
+        target = self.target(batch, {"background": background, "window": window})
+        return StepInputs(view, target, self.mask(batch, window), background, window)
+
+    def _get_downscale_factor(self) -> int:
+        return self.resolution(self.step).downscale if self.training else 1
+
+    def resolution(self, step: int) -> StepResolution:
+        """Form of the training images at a step."""
+        config, state = self.config, self.state
+        rising = config.num_downscales - step // config.resolution_schedule if config.warm_start is None else 0
+        # Densification takes its statistics from whole images.
+        parts = state.head_enabled and not state.densifying
+        pixels = config.head.max_train_pixels if parts else 0
+        # Mirrored images help in the long run only.
+        mirror = parts and not state.provisional and config.head.mode != "features"
+        return StepResolution(step, int(2 ** max(rising, 0)), pixels, mirror)
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Callbacks that call the extensions."""
+        self._start.announce()
+        CONSOLE.log(f"rasteriser: {self.backend.name} on {self.device}")  # or an error, before the first step
+        self.viewer_controls.training_field = True
+        run = NerfstudioRun(self, training_callback_attributes)
+        run.start()
+        return run.callbacks()
+
+    # --------------------------------------------------------------------------------------------- losses and metrics
+
+    def get_gt_img(self, image: Tensor, downscale: int | None = None) -> Tensor:
+        """The true image as floats on the model's device; by default at the resolution of this step."""
+        image = image.float() / 255 if image.dtype == torch.uint8 else image
+        factor = self._get_downscale_factor() if downscale is None else downscale
+        smaller: Tensor = image if factor == 1 else resize_image(image, factor)
+        return smaller.to(self.device)
+
+    def truth(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
+        """The true image of outputs, over their background ``[H, W, 3]``; by default at the resolution of this step."""
+        truth = crop_image(self.get_gt_img(batch["image"], downscale), outputs.get("window"))
+        return self.composite_with_background(truth, outputs["background"])
+
+    def target(self, batch: dict[str, Any], outputs: Mapping[str, Any]) -> Tensor:
+        """What outputs are compared with: the truth, in training divided by the gain of its photo ``[H, W, 3]``."""
+        truth = self.truth(batch, outputs)
+        return self.photo_gains.balanced(truth, batch) if self.training else truth
+
+    def mask(self, batch: dict[str, Any], window: Window | None) -> Tensor | None:
+        """Pixels of a batch that count, at the resolution of this step ``[H, W, 1]``; None for all."""
+        mask = None if "mask" not in batch else self._downscale_if_required(batch["mask"]).to(self.device)
+        return None if mask is None else crop_image(mask, window).float()
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> LazyOutputs:  # type: ignore[override]
+        """PSNR with and without the head, and the number of primitives; computed on access, which few steps need."""
+        # They may be read during the next step. Bind the resolution now, and do not keep the autograd graph alive.
+        rgb, base, downscale = outputs["rgb"].detach(), outputs["base_rgb"].detach(), self._get_downscale_factor()
+        target = partial(self.truth, batch, {name: outputs.get(name) for name in ("window", "background")}, downscale)
+        metrics = LazyOutputs({"gaussian_count": self.source.total})
+        metrics["psnr"] = Later(lambda: psnr(rgb.clamp(0, 1), target()))
+        metrics["psnr_base"] = Later(lambda: psnr(base, target()))
+        self.camera_optimizer.get_metrics_dict(metrics)  # type: ignore[arg-type]
+        return metrics
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """Loss of the image and, while the head is enabled, an L1 loss of the base colours."""
+        target, mask = self.target(batch, outputs), self.mask(batch, outputs.get("window"))
+        losses = self.training_step.terms(outputs, target, mask)
+        if self.training:
+            self.camera_optimizer.get_loss_dict(losses)
+            self.photo_gains.observe(outputs["rgb"], target, mask, batch)
+        return losses
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Any], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """PSNR, also with fitted colours, SSIM and, with its weights, LPIPS; each also without the head (``_base``)."""
+        target = self.truth(batch, outputs)
+        metrics = {"gaussian_count": float(self.source.total)}
+        for suffix, image in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
+            found = asdict(quality_of(image, target, self.lpips, visible=False))
+            metrics |= {name + suffix: value for name, value in found.items() if value is not None}
+        return metrics, {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}

@@ -1,0 +1,191 @@
+"""Packs of a given size or quality: one factor makes all steps coarser or finer, and a bisection finds it.
+
+The ratios between the steps come from renderings: at the defaults, one bit less of any attribute costs about the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from sundae_ns.core.errors import PackError, SundaeError
+from sundae_ns.io.pack.codecs import Codecs
+from sundae_ns.io.pack.config import STEPS, PackConfig
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
+from sundae_ns.plugin.finished_runs import load_model, place
+from sundae_ns.scene.scene import Quality, evaluate
+from sundae_ns.train.choice import GAIN_PER_DOUBLING
+
+FINEST, COARSEST = -3.0, 4.0
+"""Ends of the search: powers of two of the factor."""
+
+
+class Judge:
+    """Measures a run, and packs of it, on up to eight of its test views; arguments and errors as :func:`load_model`."""
+
+    def __init__(self, run: Path, data: Path | None) -> None:
+        opened = load_model(run, data)
+        self._model, self.all_views = opened.model, len(opened.cameras)
+        chosen = torch.linspace(0, self.all_views - 1, min(8, self.all_views)).round().long().unique().tolist()
+        self.views = len(chosen)
+        """Number of test views that are measured, of :attr:`all_views`."""
+        self._cameras, self._truths = ([each[i] for i in chosen] for each in (opened.cameras, opened.truths))
+        self.before = self._quality()
+        """Of the run itself."""
+
+    def quality(self, scene: PackedScene, codecs: Codecs) -> Quality:
+        """Quality of a pack."""
+        place(self._model, codecs.rounded(scene.field))
+        if self._model.head is not None and scene.head:
+            self._model.head.load_state_dict(codecs.rounded_head(scene.head))
+        return self._quality()
+
+    def _quality(self) -> Quality:
+        model = self._model
+        return evaluate(lambda camera: model.get_outputs_for_camera(camera)["rgb"], self._cameras, self._truths)
+
+
+def is_worth(psnr: float, size: int, other_psnr: float, other_size: int) -> bool:
+    """Whether a pack of ``size`` bytes is worth more than another, by the PSNR that trials ask for a doubling."""
+    return psnr >= other_psnr + GAIN_PER_DOUBLING * math.log2(size / other_size)
+
+
+def scaled(config: PackConfig, power: float, *, with_positions: bool = True) -> PackConfig:
+    """Options with all steps larger by 2^power, and as many fewer bits of positions, but at least 10."""
+    steps = {name: min(max(getattr(config, name) * 2**power, 1e-4), 1.0) for name in STEPS}
+    if with_positions:
+        steps["position_bits"] = min(max(round(config.position_bits - power), 10), 16)
+    return replace(config, **steps)  # type: ignore[arg-type]
+
+
+class Try(NamedTuple):
+    """One pack of the search."""
+
+    scene: PackedScene
+    codecs: Codecs
+    bytes: int
+
+
+class Search:
+    """Packs of one scene at several factors.
+
+    Args:
+        scene: exact, or fine-tuned with the rounding of codecs.
+        fit: the options at the factor 1, or the codecs of the fine-tune. It trained with their grids and bases, which
+            no factor changes: others would only add an error.
+        judge: opens the run's test views when they are first needed.
+    """
+
+    def __init__(self, scene: PackedScene, fit: PackConfig | Codecs, judge: Callable[[], Judge]) -> None:
+        self.scene, self._fit, self._judge = scene, fit, judge
+
+    @cached_property
+    def default(self) -> Try:
+        """The pack at the factor 1; of a fine-tuned scene, the one that was trained."""
+        return self.at(0.0)
+
+    def at(self, power: float) -> Try:
+        """The pack at a factor of 2^power."""
+        if isinstance(self._fit, PackConfig):
+            scene, codecs = fit_scene(self.scene, scaled(self._fit, power))
+        else:
+            scene, codecs = self.scene, self._fit
+            if power:
+                config = scaled(codecs.config, power, with_positions=False)
+                codecs = codecs.with_steps(config, scene.field, scene.head)
+        return Try(scene, codecs, len(pack_bytes(scene, codecs)[0]))
+
+    def drop(self, tried: Try) -> float:
+        """PSNR of a pack below the run's on some test views, dB; infinite for images that are not finite."""
+        judge = self._judge()
+        lost = judge.before.psnr - judge.quality(tried.scene, tried.codecs).psnr
+        return lost if math.isfinite(lost) else math.inf
+
+    def smaller_than(self, limit: int) -> Try:
+        """The finest pack of at most ``limit`` bytes; that at the factor 1 if it fits too and, by chance, loses less.
+
+        Raises:
+            PackError: even the coarsest is larger.
+        """
+        least = self.at(COARSEST)
+        if least.bytes > limit:
+            try:
+                lost = f" and loses {self.drop(least):.2f} dB"
+            except SundaeError:  # sizes need no capture
+                lost = ""
+            raise PackError(
+                f"the smallest pack has {least.bytes:,} bytes{lost}; give a larger --target-bytes, or prune the run"
+            )
+        finest = self._bisected(lambda tried: tried.bytes <= limit, least, COARSEST, FINEST)
+        try:
+            if self.default.bytes <= limit and self.drop(self.default) < self.drop(finest):
+                return self.default
+        except SundaeError:  # sizes need no capture
+            pass
+        return finest
+
+    def better_than(self, limit: float) -> Try:
+        """The coarsest pack that loses at most ``limit`` dB, no larger than that at the factor 1 if this one fits.
+
+        Raises:
+            PackError: even the finest loses more.
+            DataError: the capture is missing, or cannot be used.
+        """
+
+        def fits(tried: Try) -> bool:
+            return self.drop(tried) <= limit
+
+        if fits(self.default):
+            coarsest = self._bisected(fits, self.default, 0.0, COARSEST)
+            return min(self.default, coarsest, key=lambda tried: tried.bytes)
+        finest = self.at(FINEST)
+        if fits(finest):
+            return self._bisected(fits, finest, FINEST, 0.0)
+        raise PackError(
+            f"the finest pack loses {self.drop(finest):.3f} dB at {finest.bytes:,} bytes; give a larger --target-drop"
+        )
+
+    def _bisected(self, fits: Callable[[Try], bool], best: Try, first: float, last: float) -> Try:
+        """The fitting pack nearest to ``last``, from a fitting one at ``first``."""
+        for _ in range(7):
+            middle = (first + last) / 2
+            tried = self.at(middle)
+            if fits(tried):
+                first, best = middle, tried
+            else:
+                last = middle
+        return best
+
+
+def least_drop(searches: Sequence[Search], limit: int) -> Try:
+    """The pack of at most ``limit`` bytes that loses least, of searches of one run; without test views, the last's."""
+    found = _of_each(searches, lambda search: search.smaller_than(limit))
+    try:
+        return min(found, key=lambda pair: pair[0].drop(pair[1]))[1]
+    except SundaeError:  # sizes need no capture
+        return found[-1][1]
+
+
+def fewest_bytes(searches: Sequence[Search], limit: float) -> Try:
+    """The smallest pack that loses at most ``limit`` dB on the test views, of searches of one run."""
+    found = _of_each(searches, lambda search: search.better_than(limit))
+    return min((tried for _, tried in found), key=lambda tried: tried.bytes)
+
+
+def _of_each(searches: Sequence[Search], look: Callable[[Search], Try]) -> list[tuple[Search, Try]]:
+    """The packs of the searches that find one; ``PackError`` of the last if none does."""
+    found, failure = [], None
+    for search in searches:
+        try:
+            found.append((search, look(search)))
+        except PackError as error:
+            failure = error
+    if failure is not None and not found:
+        raise failure
+    return found

@@ -1,0 +1,218 @@
+"""Controls of nerfstudio's viewer: the head's check box, and a preview of what a prune would keep.
+
+The preview never touches the field, nor the images of training and evaluation. It shows what the prune itself leaves,
+by the same decision; under a rule that merges, with the merged values. The head is disabled in a preview, because it
+was trained on all primitives of the field.
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple, get_args
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.viewer_elements import (
+    ViewerCheckbox,
+    ViewerControl,
+    ViewerDropdown,
+    ViewerSlider,
+    ViewerText,
+)
+from torch import Tensor
+
+from sundae_ns.core.errors import ConfigError, SundaeError, one_line
+from sundae_ns.core.gaussians import mend
+from sundae_ns.graph.graph import NeighborGraph
+from sundae_ns.pruning.decision import Pruned, prune_field
+from sundae_ns.pruning.merge import field_graph
+from sundae_ns.pruning.rule import PruneRule, band_rule, kept_count
+from sundae_ns.scene.frames import FieldKey
+from sundae_ns.scene.render import LocalField
+from sundae_ns.train.curve import CurvePoint, expected_change
+from sundae_ns.train.state import FieldState
+
+RuleName = Literal["as configured", "band: high", "band: low", "band: both"]
+
+ContributionOf = Callable[[Any, int | None], Tensor]
+"""Contribution of the primitives ``[N]``, given nerfstudio's datamanager and the number that a prune will keep."""
+
+
+def in_viewer() -> bool:
+    """Whether the calling thread renders for a browser.
+
+    The trainer evaluates by the same method of the model, and its figures must not depend on a slider.
+    """
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+def stop_rendering(viewer: Any) -> None:
+    """End the threads that render for browsers.
+
+    A thread that still renders when Python exits aborts the process (seen on CUDA, after everything was saved).
+
+    Args:
+        viewer: nerfstudio's; None without one.
+    """
+    machines = [] if viewer is None else list(getattr(viewer, "render_statemachines", {}).values())
+    for machine in machines:
+        machine.running = False
+    for machine in machines:
+        machine.join()
+
+
+def previewed_rule(configured: PruneRule, name: RuleName) -> PruneRule:
+    """The rule of a name in the menu; everything that the name does not say is as configured.
+
+    ``band: both`` is the paper's rule with the configured gamma, ``band: high`` and ``band: low`` are its two ends.
+    These do not merge.
+    """
+    bands = {"band: high": 1.0, "band: low": 0.0, "band: both": configured.gamma}
+    return band_rule(replace(configured, signal="positions"), bands[name]) if name in bands else configured
+
+
+class Visible(NamedTuple):
+    """What an image shows."""
+
+    source: LocalField
+    mask: Tensor | None
+    """Primitives of the field in it, bool ``[N]``; None for all."""
+    compensate: bool
+    """Whether the head may correct the image."""
+
+
+class _FieldVersion:
+    """Identifies a field without keeping it alive: exactly, or to within a hundred steps while it is trained."""
+
+    def __init__(self, state: FieldState, training: bool) -> None:
+        values = list(state.field.values())
+        self._parameters = [weakref.ref(value) for value in values]  # surgery makes new parameters
+        # Each change in place raises a tensor's version, in training at every step; there, count steps instead.
+        steps = [state.step // 100] if training else [value._version for value in values]
+        self._version = [state.field.num_primitives, *steps]
+
+    def matches(self, other: _FieldVersion) -> bool:
+        """Whether both are of one field, which is still alive."""
+        pairs = zip(self._parameters, other._parameters)
+        return self._version == other._version and all(mine() is not None and mine() is its() for mine, its in pairs)
+
+
+class ViewerControls(torch.nn.Module):
+    """The controls, and what the preview has computed of the present field.
+
+    A module without parameters, because nerfstudio looks for viewer elements in modules only.
+
+    Args:
+        state: the field.
+        configured: the rule of the run's prune.
+        contribute: computes contributions.
+        curve: the curve by which trials have chosen the number of primitives; empty without them.
+    """
+
+    def __init__(
+        self,
+        state: FieldState,
+        configured: PruneRule,
+        contribute: ContributionOf,
+        curve: Callable[[], Sequence[CurvePoint]] = list,
+    ) -> None:
+        super().__init__()
+        self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
+        hint = "Show only what a prune to this share would keep; 1 shows everything"
+        self.keep_ratio = ViewerSlider("Keep ratio", 1.0, 0.01, 1.0, 0.01, cb_hook=self._show_expected, hint=hint)
+        hint = "Number of primitives and, where trials have found it, what so few lose if they are trained on"
+        self.expected = ViewerText("Expected", "", disabled=True, hint=hint)
+        rules, hint = list(get_args(RuleName)), "Rule of the previewed prune; the head is disabled in a preview"
+        self.rule = ViewerDropdown("Rule", rules[0], rules, hint=hint)
+        self.control = ViewerControl()  # gives access to the viewer, and so to the training views
+        self.training_field = False
+        """Whether a trainer changes the field."""
+        self._state, self._configured, self._contribute, self._curve = state, configured, contribute, curve
+        self._lock = threading.Lock()
+        self._seen: _FieldVersion | None = None
+        self._graphs: dict[str, NeighborGraph] = {}
+        self._contributions: dict[int | None, Tensor] = {}
+        self._previews: dict[tuple[str, float], Pruned | None] = {}
+
+    @property
+    def field_key(self) -> FieldKey | None:
+        """Identifies the present field; None while it is densified."""
+        if self.training_field and self._state.densifying:
+            return None
+        return self._state.field.num_primitives, self._state.pruning["num_prunes"]
+
+    def _show_expected(self, slider: ViewerSlider) -> None:
+        n = self._state.field.num_primitives
+        count = kept_count(float(slider.value), n)
+        change = expected_change(self._curve(), n, count)
+        figures = "" if change is None else f": {change[0]:+.2f} dB, SSIM {change[1]:+.4f}"
+        self.expected.value = f"{count:,} primitives{figures}"
+
+    def visible(self, source: LocalField, crop: Tensor | None, *, compensate: bool) -> Visible | None:
+        """What the next image shows; None if it shows no primitive.
+
+        Args:
+            source: of all primitives.
+            crop: primitives in the crop box, bool ``[N]``; None for no box.
+            compensate: whether images outside of a viewer get the head's correction.
+        """
+        preview = self.preview()
+        if preview is not None:
+            field, mask = preview.field, preview.decision.mask
+            if crop is not None:
+                field, mask = field.rows(crop[mask]), mask & crop
+            return Visible(LocalField(field, whole=False), mask, compensate=False) if mask.any() else None
+        if in_viewer():
+            compensate = self.compensate.value
+        if crop is None:
+            return Visible(source, None, compensate)
+        return Visible(LocalField(source.field.rows(crop), whole=False), crop, compensate) if crop.any() else None
+
+    def preview(self) -> Pruned | None:
+        """The previewed prune; None outside of the viewer, with the slider at 1, or if the rule cannot be applied.
+
+        Graphs are built once for a field. The pass over the training views is repeated if the rule weights pixels by
+        the count that stays. The caller holds nerfstudio's lock on the field, so training in another thread waits.
+        """
+        name, share = self.rule.value, round(float(self.keep_ratio.value), 6)
+        if share >= 1 or not in_viewer():
+            return None
+        with self._lock:
+            version = _FieldVersion(self._state, self.training_field)
+            if self._seen is None or not self._seen.matches(version):
+                self._seen = version
+                self._graphs, self._contributions, self._previews = {}, {}, {}
+            if (name, share) not in self._previews:
+                pruned: Pruned | None = None
+                try:
+                    pruned = self._prune(previewed_rule(self._configured, name), share)
+                except (SundaeError, torch.cuda.OutOfMemoryError) as error:
+                    # An exception in the viewer's thread would end all rendering.
+                    CONSOLE.log(f"[yellow]No preview of {name}: {one_line(error)}")
+                self._previews = {(name, share): pruned}
+            return self._previews[name, share]
+
+    @torch.no_grad()
+    def _prune(self, rule: PruneRule, share: float) -> Pruned:
+        field = self._state.field
+        usable = mend(field).field
+        n = usable.num_primitives
+        count = kept_count(share, n)
+        if rule.uses_graph and rule.edges not in self._graphs:
+            self._graphs[rule.edges] = field_graph(usable, rule)
+        weights = None
+        if rule.uses_contribution and count < n:
+            detail = count if rule.uses_detail else None
+            if detail not in self._contributions:
+                viewer: Any = getattr(self.control, "viewer", None)
+                if viewer is None:
+                    raise ConfigError(
+                        "there are no training views; open the run with ns-viewer, or choose another rule"
+                    )
+                self._contributions = {detail: self._contribute(viewer.pipeline.datamanager, detail)}
+            weights = self._contributions[detail]
+        return prune_field(field, rule, count, weights, self._graphs.get(rule.edges))

@@ -1,0 +1,1 @@
+"""Rasterisation: one interface and three backends."""

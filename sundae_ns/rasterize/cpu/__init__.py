@@ -1,0 +1,1 @@
+"""The backend for CPUs: loops that numba compiles."""

@@ -1,0 +1,305 @@
+"""Front-to-back blending of tile lists, and its derivatives back to front.
+
+For pixel p and list entry m, with g the gradient of the loss with respect to the blended channels:
+
+- alpha_m = min(0.999, opacity exp(-e_m)), where e_m is half the squared Mahalanobis distance to the centre;
+- T_m = prod over k < m of (1 - alpha_k), w_m = alpha_m T_m, and the image is sum_m w_m c_m;
+- -dL/de_m = w_m <g, c_m> - alpha_m / (1 - alpha_m) * sum over k > m of w_k <g, c_k>, and 0 where alpha is clamped.
+
+A loop over the pixels of a tile handles one primitive at a time, many pixels in SIMD lanes, without branches. The
+backward pass starts from the final transmittance and divides by (1 - alpha) where the forward pass multiplied; the
+position of the last blended entry of each pixel tells which entries were blended.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sundae_ns.rasterize.cpu.lanes import (
+    WIDTH,
+    absolute,
+    any_lane,
+    broadcast,
+    exp_negative,
+    fma,
+    load,
+    logical_and,
+    minimum,
+    select,
+    store,
+    store_sums,
+    zeros,
+)
+from sundae_ns.rasterize.cpu.parallel import as_array, compiled, inlined, parallel_for
+from sundae_ns.rasterize.cpu.tiles import HALF_XX, HALF_YY, OPACITY, TILE, XY, Lists, U, V
+from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+
+_PIXELS = TILE * TILE
+_CHECK_EVERY = 8  # list entries between two checks for opaque tiles
+_FAINTEST = 20.0  # upper bound of negated exponents, far beyond log(255)
+_MIN_PER_THREAD = 8  # tiles
+_CHANNEL_GROUP = 8  # channels whose gradients are summed together
+_MOMENTS = 8  # sums per primitive and tile after the channels: six moments, two absolute gradients
+_MIN_PER_THREAD_TO_SUM = 5_000  # primitives
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, lists: Lists, absgrad: bool
+    ) -> tuple[Tensor, Tensor]:
+        dtype, tiles = lists.table.dtype, lists.columns * lists.rows
+        image = np.zeros((lists.height, lists.width, colors.shape[1]), dtype)
+        alpha = np.zeros((lists.height, lists.width, 1), dtype)
+        transmittances, last = np.empty((tiles, _PIXELS), dtype), np.empty((tiles, _PIXELS), np.int32)
+        arguments = (lists.for_blending(), as_array(colors), image, alpha, transmittances, last)
+        parallel_for(_blend, len(lists.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
+        ctx.save_for_backward(means2d, conics, opacities, colors)
+        ctx.lists, ctx.transmittances, ctx.last, ctx.absgrad = lists, transmittances, last, absgrad
+        return torch.from_numpy(image), torch.from_numpy(alpha)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_image: Tensor, grad_alpha: Tensor) -> tuple[Tensor | None, ...]:
+        means2d, conics, opacities, colors = ctx.saved_tensors
+        lists: Lists = ctx.lists
+        needs_geometry, needs_colors = any(ctx.needs_input_grad[:3]), ctx.needs_input_grad[3]
+        absgrad = ctx.absgrad and needs_geometry
+        padded = -(-colors.shape[1] // _CHANNEL_GROUP) * _CHANNEL_GROUP
+        parts = np.empty((len(lists.slots), padded + _MOMENTS), lists.table.dtype)
+        blended = (as_array(colors), lists.slots, ctx.transmittances, ctx.last)
+        gradients, needs = (as_array(grad_image), as_array(grad_alpha)), (needs_geometry, needs_colors, absgrad)
+        arguments = (lists.for_blending(), blended, gradients, needs, parts)
+        parallel_for(_blend_backward, len(lists.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
+        outputs = tuple(np.zeros(value.shape, lists.table.dtype) for value in ctx.saved_tensors)
+        absolute_grads = np.zeros(means2d.shape if absgrad else (0, 0, 0), lists.table.dtype)
+        summed = (lists.ids, lists.first_slots, lists.table, parts, outputs, absolute_grads)
+        parallel_for(_sum_slots, len(lists.ids), *summed, min_per_thread=_MIN_PER_THREAD_TO_SUM)
+        if ctx.absgrad:
+            means2d.absgrad = torch.from_numpy(absolute_grads) if absgrad else torch.zeros_like(means2d)
+        wanted = (needs_geometry, needs_geometry, needs_geometry, needs_colors)
+        grads = (torch.from_numpy(output) if want else None for output, want in zip(outputs, wanted))
+        return *grads, None, None
+
+
+composite = _Composite.apply
+"""Blend to an image ``[H, W, C]`` and its alpha ``[H, W, 1]``; once differentiable.
+
+It takes centres ``[1, N, 2]`` in pixels, conics ``[N, 3]``, opacities ``[N]`` and colours ``[N, C]``, for their
+gradients; the lists, which hold the geometry that is read; and ``absgrad``: the backward pass sets ``absgrad``
+``[1, N, 2]`` of the centres, as :func:`sundae_ns.rasterize.reference.composite` does.
+"""
+
+
+@inlined
+def _unclamped_alphas(dx: Any, dy: Any, half_xx: Any, xy: Any, half_yy: Any, opacity: Any) -> Any:
+    exponents = fma(fma(dx, half_xx, dy * xy), dx, dy * dy * half_yy)
+    return exp_negative(minimum(exponents, _FAINTEST)) * opacity
+
+
+@compiled
+def _pixel_centres(like: Any) -> Any:
+    """Coordinates of the pixel centres of a tile: x ``[P]`` and y ``[P]``."""
+    across, down = np.empty(_PIXELS, like.dtype), np.empty(_PIXELS, like.dtype)
+    for p in range(_PIXELS):
+        across[p], down[p] = p % TILE + 0.5, p // TILE + 0.5
+    return across, down
+
+
+@compiled
+def _blend(
+    begin: int, end: int, lists: Any, colors: Any, image: Any, alpha_image: Any, transmittances: Any, last: Any
+) -> None:
+    columns, tiles, starts, ranks, spans, ids, table = lists
+    number = table.dtype.type
+    height, width, channels = image.shape
+    across, down = _pixel_centres(table)
+    x = load(across, 0)
+    # Pixels are the fastest axis within a group of WIDTH, then channels.
+    summed, blended = np.empty(_PIXELS, table.dtype), np.empty((_PIXELS // WIDTH, channels, WIDTH), table.dtype)
+    for k in range(begin, end):
+        tile = tiles[k]
+        left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        # Transmittance of each pixel; negative once it is finished, and outside the image.
+        through, blended_last = transmittances[tile], last[tile]
+        for p in range(_PIXELS):
+            inside = left + p % TILE < width and top + p // TILE < height
+            through[p] = number(1) if inside else number(-1)
+        blended_last[:] = 0
+        summed[:] = 0
+        blended[:] = 0
+        start = starts[tile]
+        for entry in range(start, starts[tile + 1]):
+            rank = ranks[entry]
+            color = channels * ids[rank]
+            dx, v = x - (table[rank, U] - number(left)), table[rank, V] - number(top)
+            half_xx, xy, half_yy = table[rank, HALF_XX], table[rank, XY], table[rank, HALF_YY]
+            opacity = table[rank, OPACITY]
+            place = entry - start + 1
+            for step in range(spans[entry, 0], spans[entry, 1]):
+                p = step * WIDTH
+                alphas = minimum(_unclamped_alphas(dx, load(down, p) - v, half_xx, xy, half_yy, opacity), MAX_ALPHA)
+                before = load(through, p)
+                behind = before * (1.0 - alphas)
+                visible = alphas >= MIN_ALPHA
+                blends = logical_and(visible, behind > MIN_TRANSMITTANCE)
+                store(through, p, select(blends, behind, select(visible, 0.0 - absolute(before), before)))
+                if not any_lane(blends):
+                    continue
+                weights = select(blends, alphas * before, 0.0)
+                store(blended_last, p, select(blends, place, load(blended_last, p)))
+                store(summed, p, load(summed, p) + weights)
+                for c in range(channels):
+                    at = p * channels + c * WIDTH
+                    store(blended, at, fma(weights, broadcast(colors, color + c), load(blended, at)))
+            if place % _CHECK_EVERY == 0 and not _any_unfinished(through):
+                break
+        for p in range(_PIXELS):
+            through[p] = abs(through[p])
+        for y in range(min(TILE, height - top)):
+            for x_of_pixel in range(min(TILE, width - left)):
+                p = y * TILE + x_of_pixel
+                for c in range(channels):
+                    image[top + y, left + x_of_pixel, c] = blended[p // WIDTH, c, p % WIDTH]
+                alpha_image[top + y, left + x_of_pixel, 0] = summed[p]
+
+
+@inlined
+def _any_unfinished(through: Any) -> bool:
+    """Whether any pixel of a tile is unfinished."""
+    unfinished = False
+    for p in range(0, _PIXELS, WIDTH):
+        unfinished = unfinished or any_lane(load(through, p) > 0.0)
+    return unfinished
+
+
+@compiled
+def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: Any, needs: Any, parts: Any) -> None:
+    """Write for each slot the gradients of channels, the moments of dL/de, and the absolute gradient of the centre."""
+    columns, tiles, starts, ranks, spans, ids, table = lists
+    colors, slots, transmittances, last = blended
+    grad_image, grad_alpha = gradients
+    needs_geometry, needs_colors, absgrad = needs
+    number = table.dtype.type
+    height, width, channels = grad_image.shape
+    padded = parts.shape[1] - _MOMENTS
+    across, down = _pixel_centres(table)
+    x, none = load(across, 0), zeros(table)
+    through, behind = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
+    weights, grads = np.empty(_PIXELS, table.dtype), np.zeros((_PIXELS // WIDTH, padded, WIDTH), table.dtype)
+    alpha_grads = np.zeros(_PIXELS, table.dtype)
+    for k in range(begin, end):
+        tile = tiles[k]
+        left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        through[:] = transmittances[tile]
+        behind[:] = 0
+        blended_last = last[tile]
+        # Pixels outside the image keep stale values of the previous tile: nothing was blended in them.
+        for y in range(min(TILE, height - top)):
+            for x_of_pixel in range(min(TILE, width - left)):
+                p = y * TILE + x_of_pixel
+                for c in range(channels):
+                    grads[p // WIDTH, c, p % WIDTH] = grad_image[top + y, left + x_of_pixel, c]
+                alpha_grads[p] = grad_alpha[top + y, left + x_of_pixel, 0]
+        start, deepest = starts[tile], blended_last.max()
+        for entry in range(start + deepest, starts[tile + 1]):
+            parts[slots[entry]] = 0
+        for place in range(deepest, 0, -1):
+            entry = start + place - 1
+            rank = ranks[entry]
+            color = channels * ids[rank]
+            dx, v = x - (table[rank, U] - number(left)), table[rank, V] - number(top)
+            half_xx, xy, half_yy = table[rank, HALF_XX], table[rank, XY], table[rank, HALF_YY]
+            opacity = table[rank, OPACITY]
+            m = mx = my = mxx = mxy = myy = absolute_x = absolute_y = none
+            for step in range(spans[entry, 0], spans[entry, 1]):
+                p = step * WIDTH
+                dy = load(down, p) - v
+                unclamped = _unclamped_alphas(dx, dy, half_xx, xy, half_yy, opacity)
+                alphas = minimum(unclamped, MAX_ALPHA)
+                blends = logical_and(alphas >= MIN_ALPHA, load(blended_last, p) >= place)
+                inverse = 1.0 / (1.0 - alphas)
+                before = load(through, p) * inverse
+                weight = select(blends, alphas * before, 0.0)
+                store(weights, p, weight)
+                if not any_lane(blends):
+                    continue
+                store(through, p, select(blends, before, load(through, p)))
+                if needs_geometry:
+                    gain = weight * (load(alpha_grads, p) + _product(grads, p * padded, colors, color, channels))
+                    later = load(behind, p)
+                    store(behind, p, later + gain)
+                    grad_exponent = select(
+                        logical_and(blends, unclamped < MAX_ALPHA), gain - alphas * inverse * later, 0.0
+                    )
+                    grad_x, grad_y = grad_exponent * dx, grad_exponent * dy
+                    m, mx, my = m + grad_exponent, mx + grad_x, my + grad_y
+                    mxx, mxy, myy = fma(grad_x, dx, mxx), fma(grad_x, dy, mxy), fma(grad_y, dy, myy)
+                    if absgrad:
+                        slope_x = fma(dx, number(2) * half_xx, dy * xy)
+                        slope_y = fma(dx, xy, dy * (number(2) * half_yy))
+                        absolute_x = absolute_x + absolute(grad_exponent * slope_x)
+                        absolute_y = absolute_y + absolute(grad_exponent * slope_y)
+            part = slots[entry] * parts.shape[1]
+            if needs_colors:
+                for c in range(0, padded, _CHANNEL_GROUP):
+                    _sum_channels(weights, grads, spans[entry, 0], spans[entry, 1], c, parts, part + c)
+            store_sums(parts, part + padded, m, mx, my, mxx, mxy, myy, absolute_x, absolute_y)
+
+
+@inlined
+def _product(grads: Any, at: int, colors: Any, color: int, channels: int) -> Any:
+    """<g, c> of WIDTH pixels; two sums, whose latencies overlap."""
+    even = odd = zeros(grads)
+    for c in range(0, channels, 2):
+        even = fma(load(grads, at + c * WIDTH), broadcast(colors, color + c), even)
+        if c + 1 < channels:
+            odd = fma(load(grads, at + c * WIDTH + WIDTH), broadcast(colors, color + c + 1), odd)
+    return even + odd
+
+
+@inlined
+def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: int, parts: Any, part: int) -> None:
+    """Write the sums, over the touched pixels of a tile, of weights times the gradients of eight channels."""
+    a = b = c = d = e = f = g = h = zeros(weights)
+    for step in range(first, beyond):
+        weight = load(weights, step * WIDTH)
+        at = (step * grads.shape[1] + channel) * WIDTH
+        a, b = fma(weight, load(grads, at), a), fma(weight, load(grads, at + WIDTH), b)
+        c, d = fma(weight, load(grads, at + 2 * WIDTH), c), fma(weight, load(grads, at + 3 * WIDTH), d)
+        e, f = fma(weight, load(grads, at + 4 * WIDTH), e), fma(weight, load(grads, at + 5 * WIDTH), f)
+        g, h = fma(weight, load(grads, at + 6 * WIDTH), g), fma(weight, load(grads, at + 7 * WIDTH), h)
+    store_sums(parts, part, a, b, c, d, e, f, g, h)
+
+
+@compiled
+def _sum_slots(
+    begin: int, end: int, ids: Any, first_slots: Any, table: Any, parts: Any, outputs: Any, absolute_grads: Any
+) -> None:
+    """Sum the slots of each primitive in float64, and convert moments to gradients."""
+    grad_means2d, grad_conics, grad_opacities, grad_colors = outputs
+    channels, width = parts.shape[1] - _MOMENTS, parts.shape[1]
+    sums = np.empty(width)
+    for rank in range(begin, end):
+        i = ids[rank]
+        sums[:] = 0
+        for slot in range(first_slots[rank], first_slots[rank + 1]):
+            for d in range(width):
+                sums[d] += parts[slot, d]
+        for c in range(grad_colors.shape[1]):
+            grad_colors[i, c] = sums[c]
+        xx, xy, yy = 2 * float(table[rank, HALF_XX]), table[rank, XY], 2 * float(table[rank, HALF_YY])
+        mx, my = sums[channels + 1], sums[channels + 2]
+        grad_means2d[0, i, 0], grad_means2d[0, i, 1] = xx * mx + xy * my, xy * mx + yy * my
+        grad_conics[i, 0] = -0.5 * sums[channels + 3]
+        grad_conics[i, 1] = -sums[channels + 4]
+        grad_conics[i, 2] = -0.5 * sums[channels + 5]
+        grad_opacities[i] = sums[channels] / table[rank, OPACITY]
+        if len(absolute_grads) > 0:
+            absolute_grads[0, i, 0] = sums[channels + 6]
+            absolute_grads[0, i, 1] = sums[channels + 7]

@@ -1,0 +1,191 @@
+"""Arguments and result of a rasterisation, the interface of a backend, and what all backends share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from sundae_ns.core.errors import MemoryExhaustedError
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Arguments of :func:`sundae_ns.rasterize.interface.rasterize`, checked."""
+
+    means: Tensor  # [N, 3]
+    quats: Tensor  # [N, 4]
+    scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    colors: Tensor  # [N, C]
+    viewmat: Tensor  # [4, 4]
+    K: Tensor  # [3, 3]
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    antialiased: bool
+    absgrad: bool = False
+    render_depth: bool = False
+
+
+@dataclass(frozen=True)
+class Rasterization:
+    """One rendered view; all tensors have the dtype and device of the Gaussians, except ``radii``."""
+
+    colors: Tensor
+    """Blended colours ``[H, W, C]``, without background."""
+
+    depth: Tensor | None
+    """Expected camera z ``[H, W, 1]``, world units, 0 where nothing was blended; None unless requested."""
+
+    alpha: Tensor
+    """Accumulated opacity ``[H, W, 1]`` in [0, 1]."""
+
+    radii: Tensor
+    """Screen radius ``[N]`` in whole pixels, int32, 0 where the Gaussian was culled; not differentiable."""
+
+    info: dict[str, Any]
+    """Statistics that the ``DefaultStrategy`` of the installed gsplat reads, in the shapes it expects.
+
+    ``means2d`` ``[1, N, 2]`` in pixels is part of the graph: ``retain_grad()`` works, and the backward pass sets
+    ``.absgrad`` if requested. ``radii`` is ``[1, N]`` under gsplat 1.4 and ``[1, N, 2]`` from 1.5. ``width``,
+    ``height`` and ``n_cameras`` are ints. ``gaussian_ids`` is None, because nothing is packed.
+    """
+
+
+class Backend(Protocol):
+    """A rasteriser. Call it through :mod:`sundae_ns.rasterize.interface`, which checks the arguments."""
+
+    @property
+    def name(self) -> str:
+        """``"gsplat"``, ``"cpu"`` or ``"reference"``."""
+
+    def rasterize(self, inputs: Inputs) -> Rasterization:
+        """Render one view."""
+
+    def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
+        """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""
+
+
+def result_of(image: Tensor, alpha: Tensor, means2d: Tensor, radii: Tensor, inputs: Inputs) -> Rasterization:
+    """The result of a backend.
+
+    Args:
+        image: Blended channels ``[H, W, C]``; the last is camera z if depth was requested.
+        alpha: Accumulated opacity ``[H, W, 1]``.
+        means2d: Centres ``[1, N, 2]``.
+        radii: ``[1, N]``, or one per axis ``[1, N, 2]``.
+        inputs: What was rendered.
+    """
+    depth = None
+    if inputs.render_depth:
+        image, depth = image[..., :-1], image[..., -1:] / alpha.clamp(min=1e-10)  # less than any blended alpha
+    info = strategy_info(means2d, radii, inputs.width, inputs.height)
+    return Rasterization(colors=image, depth=depth, alpha=alpha, radii=largest_axis(radii[0]), info=info)
+
+
+def strategy_info(means2d: Tensor, radii: Tensor, width: int, height: int) -> dict[str, Any]:
+    """The ``info`` of a :class:`Rasterization`, from centres ``[1, N, 2]`` and radii ``[1, N]`` or ``[1, N, 2]``."""
+    counts = {"width": width, "height": height, "n_cameras": 1, "gaussian_ids": None}
+    return {"means2d": means2d, "radii": radii, **counts}
+
+
+def largest_axis(radii: Tensor) -> Tensor:
+    """Radii of either gsplat, ``[N]`` or ``[N, 2]``, as one per Gaussian ``[N]``."""
+    return radii if radii.dim() == 1 else radii.amax(dim=-1)
+
+
+def strategy_radii(radii: Tensor) -> Tensor:
+    """Radii ``[N]`` as strategies of the installed gsplat expect them: ``[1, N]``, or ``[1, N, 2]`` from 1.5 on."""
+    return (radii[:, None].expand(-1, 2) if _radii_per_axis() else radii)[None]
+
+
+@cache
+def _radii_per_axis() -> bool:
+    try:
+        major, minor = version("gsplat").split(".")[:2]
+    except PackageNotFoundError:
+        return False
+    return (int(major), int(minor)) >= (1, 5)
+
+
+@cache
+def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A cached, read-only tensor of numbers; a new one would be copied to the GPU, and waited for, at each use."""
+    with torch.inference_mode(False):  # autograd refuses tensors created in inference mode
+        return torch.tensor(values, dtype=dtype, device=device)
+
+
+# Bounds of a view on a CPU, checked before memory is taken: a small file can describe a view of terabytes.
+MOST_PER_TILE = 8192
+"""Most Gaussians in a tile, on average over the image; a field of 504,143 has at most 400 in tiles of 8 x 8 pixels."""
+PER_GAUSSIAN = 4
+"""Pairs of a tile and a Gaussian allowed beside these for each Gaussian: a small one lies in up to four tiles."""
+ALWAYS = 1 << 22
+"""Pairs beside these that any view may have, which take 40 MB."""
+_NEGLIGIBLE = 1 << 28
+"""Bytes that are taken without a look at the memory."""
+_CONTROL_GROUP, _MEMORY = Path("/sys/fs/cgroup"), Path("/proc/meminfo")
+
+
+def check_pairs(pairs: int, gaussians: int, tiles: int, size: int, *, training: bool) -> None:
+    """Refuse a view whose lists of tiles are longer than any scene needs, or than the memory.
+
+    Args:
+        pairs: number of pairs of a tile and a Gaussian.
+        gaussians: number of visible ones.
+        tiles: number of tiles of the image.
+        size: bytes that a pair takes.
+        training: whether gradients are needed; then only the memory is a bound.
+
+    Raises:
+        MemoryExhaustedError: there are too many pairs.
+    """
+    if not training and pairs > MOST_PER_TILE * tiles + PER_GAUSSIAN * gaussians + ALWAYS:
+        raise MemoryExhaustedError(
+            f"the view has {pairs // tiles:,} primitives in each tile of its image, but a real scene has less than "
+            f"{MOST_PER_TILE:,}; choose another camera"
+        )
+    check_memory(size * pairs, f"{pairs:,} pairs of a tile and a primitive")
+
+
+def check_memory(size: int, what: str) -> None:
+    """Refuse what would take more bytes than are available; ``what`` names it in the error.
+
+    Raises:
+        MemoryExhaustedError: it would take more.
+    """
+    if size < _NEGLIGIBLE:
+        return
+    available = available_memory()
+    if available is not None and size > available:
+        raise MemoryExhaustedError(
+            f"{what} take {size / 1e9:,.1f} GB, but {available / 1e9:,.1f} GB are available; give a smaller image"
+        )
+
+
+def available_memory() -> int | None:
+    """Bytes that this process can still take: of the machine, and of its control group; None if unknown."""
+    available = []
+    try:
+        lines = dict(line.split(":", 1) for line in _MEMORY.read_text(encoding="utf-8").splitlines())
+        available.append(1024 * int(lines["MemAvailable"].split()[0]))
+    except (OSError, KeyError, ValueError):
+        pass
+    try:
+        most, used, parts = (
+            (_CONTROL_GROUP / f"memory.{name}").read_text(encoding="utf-8") for name in ("max", "current", "stat")
+        )
+        # The cache of files is given back when memory is needed.
+        sizes = dict(line.split() for line in parts.splitlines())
+        cached = int(sizes["active_file"]) + int(sizes["inactive_file"])
+        available.append(max(int(most) - int(used) + cached, 0))
+    except (OSError, KeyError, ValueError):  # no control group, one of another kind, or no limit
+        pass
+    return min(available, default=None)

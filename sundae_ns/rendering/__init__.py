@@ -1,1 +1,0 @@
-"""From a field to images: views, one splatting pass, the head, contribution, and recorded frames."""

@@ -1,0 +1,1 @@
+"""Measured runs, and the page that compares them."""

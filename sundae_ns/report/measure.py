@@ -1,0 +1,176 @@
+"""Measurements of a finished scene: quality, bytes and synchronised times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sundae_ns.core.gaussians import FEATURES
+from sundae_ns.core.metrics import Lpips, ViewQuality, quality_of
+from sundae_ns.core.timing import median_ms
+from sundae_ns.io.accounting import Sizes, bytes_of, bytes_of_module
+from sundae_ns.plugin.finished_runs import Opened
+from sundae_ns.plugin.model import SundaeModel
+from sundae_ns.report.measured import HEAD_OFF, HEAD_ON, Configuration, Measured
+from sundae_ns.scene.render import compensate, draw, scale_plan
+
+
+@dataclass(frozen=True)
+class FrameTimes:
+    """Synchronised milliseconds of a frame, median over the cameras."""
+
+    frame: float
+    """The whole image as nerfstudio's commands request it: camera, colours, splatting of colours and features, head."""
+    splat: float
+    """The same without head and features."""
+    head: float
+    """The head alone; 0 if it does not run. Its second splatting pass at another scale counts in ``frame`` only."""
+
+
+@contextmanager
+def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
+    """Enable or disable the head's correction inside a block, except in a viewer, which has its own check box."""
+    before, model.compensated = model.compensated, on
+    try:
+        yield
+    finally:
+        model.compensated = before
+
+
+@torch.no_grad()
+def frame_times(model: SundaeModel, cameras: Sequence[Any], *, warmup: int = 3, repeats: int = 5) -> FrameTimes:
+    """Time the rendering of cameras at their own resolution.
+
+    Args:
+        model: in evaluation mode, on the device to time.
+        cameras: each of shape ``(1,)``.
+        warmup: untimed renders of each camera.
+        repeats: timed renders of each camera.
+    """
+    background = model._get_background_color()
+
+    def milliseconds(fn: Callable[[], object]) -> float:
+        return median_ms(fn, device=model.device, warmup=warmup, repeats=repeats)
+
+    def show(camera: Any) -> Tensor:
+        return model.get_outputs_for_camera(camera)["rgb"]
+
+    frames: list[float] = []
+    splats: list[float] = []
+    heads: list[float] = []
+    for camera in cameras:
+        for on, times in ((True, frames), (False, splats)):
+            with compensation(model, on):
+                times.append(milliseconds(partial(show, camera)))
+        settings = model.render_settings(training=False)
+        zoom, weight = scale_plan(model.view_of(camera), settings.trained_focal)
+        if settings.head is None or weight == 0:
+            heads.append(0.0)
+            continue
+        view = model.view_of(camera).zoomed(zoom)
+        images, splatted = draw(
+            model.source.primitives(view, settings, features=True), view, background, settings, depth=False
+        )
+        run_head = partial(compensate, settings.head, images["base_rgb"], splatted, background)
+        heads.append(milliseconds(run_head))
+    return FrameTimes(median(frames), median(splats), median(heads))
+
+
+def sizes(model: SundaeModel) -> Sizes:
+    """Bytes of everything that a render needs: primitives in fp32 with features, and the head."""
+    return Sizes(bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head))
+
+
+@torch.no_grad()
+def measure_scene(
+    opened: Opened,
+    *,
+    label: str,
+    lpips: Lpips | None = None,
+    visible: bool = True,
+    warmup: int = 3,
+    repeats: int = 5,
+    progress: Callable[[], object] | None = None,
+    command: str = "",
+) -> Measured:
+    """Evaluate and time a scene on its test views, with the head and without.
+
+    The timed call is the one whose image is evaluated, view by view.
+
+    Args:
+        opened: the scene.
+        label: its name in tables.
+        lpips: LPIPS; None leaves it out.
+        visible: whether to compute FLIP, if its package is installed.
+        warmup: untimed renders of each view.
+        repeats: timed renders of each view; 0 leaves times out.
+        progress: called after each view.
+        command: command to record as the origin of the figures.
+    """
+    model = opened.model
+    has_head = model.state.head_enabled
+    ways = {HEAD_ON: True, HEAD_OFF: False} if has_head else {HEAD_OFF: False}
+    times: dict[str, list[float]] = {name: [] for name in (*ways, "head")}
+    views: dict[str, list[ViewQuality]] = {name: [] for name in ways}
+    for camera, truth in zip(opened.cameras, opened.truths, strict=True):
+        for name, on in ways.items():
+            with compensation(model, on):
+                image = model.get_outputs_for_camera(camera)["rgb"]
+            views[name].append(quality_of(image, truth, lpips, visible=visible))
+        if repeats:
+            found = frame_times(model, [camera], warmup=warmup, repeats=repeats)
+            for name, on in ways.items():
+                times[name].append(found.frame if on else found.splat)
+            times["head"].append(found.head)
+        if progress is not None:
+            progress()
+    bare = {name: value for name, value in model.gauss_params.items() if name != FEATURES}
+    # A head that is there but disabled is not needed, and neither are its features.
+    stored = sizes(model) if has_head else Sizes(bytes_of(bare), 0)
+    needed = {HEAD_ON: stored.total, HEAD_OFF: bytes_of(bare)}
+    if opened.packed_bytes is not None:
+        # A packed file is read as a whole, with the head enabled or disabled.
+        stored, needed = Sizes(opened.packed_bytes), dict.fromkeys(needed, opened.packed_bytes)
+    return Measured(
+        label=label,
+        source=str(opened.source),
+        scene=opened.scene,
+        method=opened.method,
+        variant=opened.variant,
+        keep_ratio=opened.kept,
+        seed=opened.seed,
+        steps=opened.steps,
+        primitives=model.num_points,
+        bytes_primitives=stored.primitives,
+        bytes_head=stored.head,
+        resolution=_resolution(opened.cameras),
+        configurations=tuple(
+            Configuration(name, median(times[name]) if repeats else None, needed[name], tuple(views[name]))
+            for name in ways
+        ),
+        ms_head=median(times["head"]) if repeats else None,
+        precision=_precision(model) if has_head else "",
+        lpips_net=lpips.net if lpips is not None else "",
+        prune_s=opened.prune_s,
+        peak_primitives=model.state.pruning["peak"] or None,
+        gpu=torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "",
+        command=command,
+    )
+
+
+def _precision(model: SundaeModel) -> str:
+    """Arithmetic of the head on the model's device."""
+    return "fp32" if model.head is None or model.device.type == "cpu" else model.head.config.precision
+
+
+def _resolution(cameras: Sequence[Any]) -> str:
+    """Width x height of the first camera, and a note if others differ."""
+    found = [f"{int(camera.width)}x{int(camera.height)}" for camera in cameras]
+    return found[0] + (" and others" if len(set(found)) > 1 else "")

@@ -1,0 +1,1 @@
+"""The library: load, save, render, prune, measure."""

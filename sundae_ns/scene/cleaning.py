@@ -1,0 +1,140 @@
+"""Cuts before a scene is published: a box around it, and floaters, which no surface supports."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sundae_ns.core.camera import View
+from sundae_ns.core.errors import ConfigError, DataError
+from sundae_ns.core.gaussians import mend
+from sundae_ns.graph.neighbors import knn
+from sundae_ns.scene.prune_scene import weights_in
+from sundae_ns.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+REACH = 3.0
+"""Two primitives touch if they are nearer than this many times the sum of their largest standard deviations."""
+
+
+def crop(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Scene:
+    """The primitives whose centres are in a box, its faces included; everything else of the scene stays.
+
+    Args:
+        scene: to cut; it does not change.
+        low: lowest x, y and z of the box, world units.
+        high: highest x, y and z.
+
+    Raises:
+        ConfigError: the box is empty or not finite.
+        DataError: no primitive is in the box.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
+    >>> sn.crop(scene, (0, 0, 0), (1, 1, 2)).num_primitives
+    200
+    """
+    return kept(scene, crop_mask(scene, low, high))
+
+
+def remove_floaters(scene: Scene, *, views: Sequence[View] | None = None) -> Scene:
+    """The scene without primitives that no surface supports.
+
+    These are small groups that touch no other primitive (:data:`REACH`), and what none of the views sees. Floaters that
+    touch a surface stay.
+
+    Args:
+        scene: to clean; it does not change.
+        views: cameras of the photographs; by default those stored with the scene. Without any, groups alone count.
+
+    Raises:
+        DataError: no primitive is finite, or the views see none.
+
+    >>> import torch, sundae_ns as sn
+    >>> points = torch.cat([torch.rand(2000, 3), torch.tensor([[9.0, 9.0, 9.0]])])
+    >>> scene = sn.Scene.from_points(points, torch.rand(2001, 3))
+    >>> field = scene.field.replaced({"scales": scene.field["scales"].clamp(max=-3)})
+    >>> sn.remove_floaters(sn.Scene(field)).num_primitives < 2001
+    True
+    """
+    return kept(scene, ~floater_mask(scene, scene.views if views is None else views))
+
+
+def kept(scene: Scene, mask: Tensor) -> Scene:
+    """The scene with the primitives under a mask, bool ``[N]``."""
+    return dataclasses.replace(scene, field=scene.field.rows(mask))
+
+
+def within(mask: Tensor | None, inner: Tensor) -> Tensor:
+    """The entries of a mask ``[N]`` that an inner mask keeps: ``[M]``, for its M true ones. None is true everywhere."""
+    if mask is None:
+        return inner
+    found = mask.clone()
+    found[mask] = inner
+    return found
+
+
+def crop_mask(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Tensor:
+    """True for the primitives in a box, bool ``[N]``; arguments and errors as for :func:`crop`."""
+    if len(low) != 3 or len(high) != 3 or not all(math.isfinite(value) for value in (*low, *high)):
+        raise ConfigError("the box is not six finite numbers; give its lowest x y z, then its highest")
+    if not all(one < other for one, other in zip(low, high, strict=True)):
+        raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
+    means = scene.field["means"].detach()
+    # In float64, where both numbers are exact.
+    inside = (means.double() >= means.new_tensor(low, dtype=torch.float64)).all(dim=1)
+    inside &= (means.double() <= means.new_tensor(high, dtype=torch.float64)).all(dim=1)
+    if not bool(inside.any()):
+        finite = means[means.isfinite().all(dim=1)].double().cpu().numpy()
+        if not len(finite):
+            raise DataError("no primitive is in the box, because none is finite; export the scene again")
+        lowest, highest = (" ".join(f"{value:.3g}" for value in np.quantile(finite, q, axis=0)) for q in (0.05, 0.95))
+        raise DataError(f"no primitive is in the box; most of them lie between {lowest} and {highest}")
+    return inside
+
+
+@torch.no_grad()
+def floater_mask(scene: Scene, views: Sequence[View], *, console: Console | None = None) -> Tensor:
+    """True for floaters, bool ``[N]``; arguments and errors as for :func:`remove_floaters`.
+
+    Args:
+        console: shows a progress bar; None for none.
+    """
+    mended = mend(scene.field)
+    found = ~mended.mask
+    if not mended.field.num_primitives:
+        raise DataError("no primitive is finite; export the scene again")
+    usable = dataclasses.replace(scene, field=mended.field)
+    floats = _unsupported(usable)
+    if views:
+        small = [view.zoomed(min(512 / max(view.width, view.height), 1.0)) for view in views]
+        floats |= weights_in(usable, small, console=console) <= 0
+    found[mended.mask] = floats
+    return found
+
+
+def _unsupported(scene: Scene) -> Tensor:
+    """True for primitives of small groups that touch no other one, bool ``[N]``."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    n = scene.num_primitives
+    if n <= 1:
+        return torch.zeros(n, dtype=torch.bool, device=scene.device)
+    near = knn(scene.field["means"].detach(), min(16, n - 1))
+    reach = REACH * scene.field["scales"].detach().amax(dim=1).exp()
+    touching = near.distances < reach[:, None] + reach[near.indices]
+    rows = torch.arange(n, device=scene.device)[:, None].expand_as(touching)[touching].cpu().numpy()
+    columns = near.indices[touching].cpu().numpy()
+    graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(n, n))
+    groups = connected_components(graph, directed=False)[1]
+    small = np.bincount(groups) <= max(1, min(30, n // 1000))
+    return torch.from_numpy(small[groups]).to(scene.device)

@@ -1,0 +1,78 @@
+"""Initial parameters of a field: from a sparse point cloud, or random."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.gaussians import rgb_to_sh
+from sundae_ns.graph.neighbors import knn
+
+INITIAL_OPACITY = 0.1
+
+
+def random_quaternions(n: int, generator: torch.Generator | None = None) -> Tensor:
+    """Uniformly distributed unit quaternions ``[n, 4]`` (Shoemake, 1992)."""
+    u, v, w = torch.rand(3, n, generator=generator)
+    a, b = (1 - u).sqrt(), u.sqrt()
+    v, w = 2 * torch.pi * v, 2 * torch.pi * w
+    return torch.stack([a * v.sin(), a * v.cos(), b * w.sin(), b * w.cos()], dim=-1)
+
+
+def random_points(n: int, extent: float, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    """Random points ``[n, 3]`` in a cube of side ``extent`` around the origin, and colours ``[n, 3]`` in [0, 1]."""
+    points = (torch.rand(n, 3, generator=generator) - 0.5) * extent
+    return points, torch.rand(n, 3, generator=generator)
+
+
+def from_points(
+    points: Tensor, rgb: Tensor, *, sh_degree: int, num_features: int, generator: torch.Generator | None = None
+) -> dict[str, Tensor]:
+    """Parameters of a field with one primitive per point.
+
+    The standard deviation of a primitive is the mean distance to its three nearest neighbours (3DGS, Kerbl et al.
+    2023). Coincident points get the smallest positive one of the cloud, where 3DGS would take the logarithm of zero.
+
+    Args:
+        points: ``[N, 3]`` world units; points that are not finite, in place or colour, are dropped.
+        rgb: ``[N, 3]`` colours in [0, 1].
+        num_features: length F of the feature vectors; 0 for none.
+
+    Returns:
+        The field by parameter name (see ``gaussians.gaussians``), float32, on the device of ``points``.
+
+    Raises:
+        DataError: no point is finite.
+    """
+    finite = torch.isfinite(points).all(dim=1) & torch.isfinite(rgb).all(dim=1)
+    points, rgb = points[finite].float(), rgb[finite].float()
+    n = points.shape[0]
+    if n == 0:
+        raise DataError("the point cloud holds no finite point; check the capture, or start with --random-init True")
+    device = points.device
+    width = torch.ones(n, device=device)
+    if n > 1:
+        width = knn(points, min(3, n - 1)).distances.mean(dim=1).to(points)
+        positive = width[width > 0]
+        width = width.clamp_min(float(positive.min()) if len(positive) else 1e-3)
+    params = {
+        "means": points.clone(),
+        "scales": width.log()[:, None].repeat(1, 3),
+        "quats": random_quaternions(n, generator).to(device),
+        "features_dc": rgb_to_sh(rgb),
+        "features_rest": torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3, device=device),
+        "opacities": torch.logit(torch.full((n, 1), INITIAL_OPACITY, device=device)),
+    }
+    if num_features:
+        params["features"] = initial_features(params["features_dc"], num_features, generator)
+    return params
+
+
+def initial_features(features_dc: Tensor, num_features: int, generator: torch.Generator | None = None) -> Tensor:
+    """Initial feature vectors ``[N, F]``: small noise, plus ``features_dc`` ``[N, 3]`` in the first three channels."""
+    noise = 0.05 * torch.randn(features_dc.shape[0], num_features, generator=generator)
+    features = noise.to(features_dc)
+    color_channels = min(3, num_features)
+    features[:, :color_channels] += features_dc[:, :color_channels]
+    return features

@@ -1,0 +1,204 @@
+"""Scenes as files: packed scenes, primitives of any program, and runs of ns-train. Needs no nerfstudio."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, writing
+from sundae_ns.core.files import write_bytes
+from sundae_ns.core.gaussians import FEATURES
+from sundae_ns.data.capture import read_json
+from sundae_ns.head.head import SIZES, CompensationHead, HeadConfig
+from sundae_ns.io import checkpoint, formats
+from sundae_ns.io.config_file import find_config, model_options, parser_options
+from sundae_ns.io.formats import FORMATS, ViewerFile, kind_of, kind_of_primitives
+from sundae_ns.scene.cameras import is_frame
+from sundae_ns.scene.page import write_page
+from sundae_ns.scene.render import degree_in_use
+from sundae_ns.scene.scene import Scene
+
+SUFFIXES = (*FORMATS, ".sundae", ".html")
+"""Suffixes of the files that :func:`save` writes."""
+FRAME_FILE = "dataparser_transforms.json"
+"""Transform from the capture's coordinates to the model's, which nerfstudio writes into the folder of a run."""
+
+
+def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
+    """Open a finished scene. Nothing in its files is executed, and nerfstudio is not needed.
+
+    Opacities of exactly 0 or 1 and widths of 0, which files store as infinite, become finite. Primitives that are NaN,
+    or infinite without a meaning, are left out. A warning says how many.
+
+    Args:
+        path: a ``.ply``, also a compressed one, a ``.spz``, ``.sog``, ``.glb``, ``.splat`` or ``.ksplat`` of any
+            program, a checkpoint of gsplat (``.pt``), a packed ``.sundae``, or a run of ``ns-train`` with sundae or
+            splatfacto: its folder, its ``config.yml`` or one of its checkpoints.
+        device: of the scene.
+
+    Raises:
+        DataError: a file of primitives is missing, damaged, or has no finite primitive.
+        PackError: a packed scene is damaged, or states impossible values.
+        CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
+
+    >>> import pathlib, tempfile, torch, sundae_ns as sn
+    >>> path = pathlib.Path(tempfile.mkdtemp(), "cloud.ply")
+    >>> sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), path)
+    >>> sn.load(path)
+    Scene(50 primitives, SH degree 0, no head, cpu)
+    """
+    return load_with_mask(Path(path), device)[0]
+
+
+def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scene, Tensor | None]:
+    """As :func:`load`, with True for the primitives of a file that the scene has, bool ``[N]``; None for others."""
+    kind = kind_of(path)
+    if kind == "packed" or (kind is None and path.suffix.lower() == ".sundae"):
+        from sundae_ns.io.pack.packed_scene import read_scene
+        from sundae_ns.scene.packing import scene_of  # its decoder needs a compiler, which other files do not
+
+        return scene_of(read_scene(path)).to(device), None
+    if kind_of_primitives(path) is None:
+        return _of_run(path).to(device), None
+    found = formats.read_primitives(path)
+    scene = Scene(found.mended.field, antialiased=found.antialiased, in_model_frame=found.in_model_frame)
+    return scene.to(device), found.mended.mask
+
+
+def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
+    """Write a scene in the format of the file's suffix, atomically; an existing file is replaced.
+
+    ``.sundae`` holds everything that a render needs, quantised. ``.html`` is a web page that renders it. ``.ply``
+    and ``.glb`` (exact), ``.spz`` and ``.sog`` (quantised) hold base colours only, for other viewers.
+
+    Args:
+        scene: any device.
+        path: file to write; a missing folder of it is made.
+        upright: turn from nerfstudio's z-up axes to the -y-up axes of viewers; ``.ply``, ``.spz`` and ``.sog`` only. A
+            ``.glb`` is upright in any case.
+
+    Raises:
+        ConfigError: the suffix is not supported, or the format is not turned.
+        DataError, PackError: the format cannot store the scene.
+        StorageError: the disk is full or not writable.
+
+    >>> import pathlib, tempfile, torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3))
+    >>> path = pathlib.Path(tempfile.mkdtemp(), "cloud.sundae")
+    >>> sn.save(scene, path)
+    >>> sn.load(path).num_primitives
+    50
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+    if upright and suffix not in FORMATS:
+        raise ConfigError(f"{suffix} files keep their coordinates; leave out upright")
+    with writing(f"cannot write {path}"):
+        if suffix in FORMATS:
+            save_for_viewers(scene, path, upright=upright)
+            return
+        from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other files do not
+
+        packed = packed_bytes(scene)
+        if suffix == ".html":
+            write_page(path, scene, packed, title=path.resolve().stem)
+        else:
+            write_bytes(path, packed)
+
+
+def packed_file(path: Path) -> tuple[Scene, bytes]:
+    """A scene and the bytes of its packed file; a file that is not packed is packed with default settings."""
+    from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other files do not
+
+    scene = load(path)
+    return scene, path.read_bytes() if kind_of(path) == "packed" else packed_bytes(scene)
+
+
+def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:
+    """Write base colours in a format of other viewers; returns what was left out or clamped. See :func:`save`."""
+    facts = {"antialiased": scene.antialiased, "in_model_frame": scene.in_model_frame}
+    return formats.write_for_viewers(path, scene.field, upright=upright, **facts)
+
+
+def _of_run(path: Path) -> Scene:
+    config = find_config(path)
+    if config is None:
+        reason = "is no run" if path.exists() else "does not exist"
+        wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .glb, .splat, .ksplat or .pt file"
+        raise CheckpointError(f"{path} {formats.unread(path) or f'{reason}; {wanted}'}")
+    if path.suffix == ".ckpt":
+        return scene_of_checkpoint(path, checkpoint.read(path), config)
+    return scene_of_checkpoint(*checkpoint.read_newest(config.parent), config)
+
+
+def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -> Scene:
+    """The scene of a checkpoint ``source`` with the contents ``loaded``, in a run with a ``config.yml``; on the CPU.
+
+    Raises:
+        CheckpointError: the run is of another method, or its parts do not fit together.
+    """
+    options = model_options(config)
+    field, state = checkpoint.field_of(loaded, source), checkpoint.model_state(loaded)
+    extra = state.get(checkpoint.EXTRA_STATE)
+    extra = extra if isinstance(extra, Mapping) else {}
+    focal = extra.get("trained_focal")
+    head = _head_of(state, options, source) if extra.get("head_enabled") else None
+    if head is not None:
+        field[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
+    degree, interval = field.sh_degree, options.get("sh_degree_interval")
+    if options.get("warm_start") is None and isinstance(interval, int):
+        # Coefficients of degrees that training has not reached are not in use.
+        degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))
+    field["features_rest"] = field["features_rest"][:, : (degree + 1) ** 2 - 1]
+    field = formats.usable(field, source).field
+    frame = _frame_of(config.parent)
+    # nerfstudio turns captures so that z is upwards, unless the options forbid it.
+    upright = parser_options(config).get("orientation_method") in ("up", "vertical")
+    return Scene(
+        field,
+        head,
+        background_color=options.get("background_color", "random"),
+        antialiased=options.get("rasterize_mode") == "antialiased",
+        trained_focal=(float(focal[0]), float(focal[1])) if head is not None and focal else None,
+        up=(0.0, 0.0, 1.0) if upright else None,
+        in_model_frame=True,
+        meta={"source": {"step": int(loaded["step"])}, **({} if frame is None else {"frame": frame})},
+    )
+
+
+def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path) -> CompensationHead | None:
+    """The head of a checkpoint. Its size is that of its weights, because training may choose another than configured.
+
+    Raises:
+        CheckpointError: its weights fit no known size.
+    """
+    prefix = "networks.head."
+    weights = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+    features = state.get(f"gauss_params.{FEATURES}")
+    if not weights or not isinstance(features, Tensor):
+        return None
+    known = options["head"] if isinstance(options.get("head"), dict) else {}
+    fields = {name: known[name] for name in ("pixel_unshuffle", "precision") if name in known}
+    mode = "features" if known.get("mode") == "features" else "residual"
+    for size in sorted(SIZES, key=lambda size: size != known.get("size")):
+        config = HeadConfig(mode=mode, size=size, num_features=features.shape[1], **fields)  # type: ignore[arg-type]
+        head = CompensationHead.of_weights(config, weights)
+        if head is not None:
+            return head
+    raise CheckpointError(f"{source} has a head that does not fit its own config.yml; give another run")
+
+
+def _frame_of(run: Path) -> dict[str, Any] | None:
+    """Transform and scale from the capture's coordinates to the model's; None without a usable file."""
+    try:
+        frame = read_json(run / FRAME_FILE)
+        frame = {"transform": frame["transform"], "scale": float(frame["scale"])}
+    except (DataError, KeyError, TypeError, ValueError):
+        return None
+    return frame if is_frame(frame) else None

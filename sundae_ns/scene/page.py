@@ -1,0 +1,151 @@
+"""A packed scene as a web page that decodes and renders it, head included, alone or in a notebook.
+
+``page.html`` is built from the TypeScript in ``web/`` by ``make web``. It asks no host for anything: a scene is either
+in the page itself or in a file beside it. In a notebook it stands in a frame, which needs no server. That was seen to
+render in JupyterLab 4.6, in trusted notebooks: it removes frames from others. VS Code and Colab were not tried; VS
+Code's setting ``notebook.experimental.enableCsp`` would refuse the worker in which the page decodes.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import logging
+import re
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+from PIL import Image
+
+from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, writing
+from sundae_ns.core.files import write_bytes, write_text
+from sundae_ns.scene.cameras import view_in_front
+from sundae_ns.scene.scene import Scene, image_of, render
+
+SCENE_FILE = "scene.sundae"
+"""Name of the scene in a folder."""
+LARGE = 10_000_000
+"""Bytes of a page from which :func:`show` warns: notebooks keep their outputs, and load all of them at once."""
+_log = logging.getLogger(__name__)
+
+
+def page_of(scene: Scene, packed: bytes, *, title: str) -> str:
+    """The HTML of a page that contains its scene; arguments as for :func:`write_page`."""
+    return _filled(scene, title, inline=base64.b64encode(packed).decode())
+
+
+def write_page(path: Path, scene: Scene, packed: bytes, *, title: str) -> int:
+    """Write the page of a scene as one file, or as a folder with ``index.html`` and ``scene.sundae`` for a web server.
+
+    Args:
+        path: file with a suffix, or folder without one.
+        scene: for the first image; rendered on its device.
+        packed: the scene as a packed file.
+        title: title of the page.
+
+    Returns:
+        Bytes of the file or of both files.
+
+    Raises:
+        StorageError: the disk is full or not writable.
+    """
+    if path.suffix:
+        write_text(path, page_of(scene, packed, title=title))
+        return path.stat().st_size
+    page = _filled(scene, title, source=SCENE_FILE)
+    with writing(f"cannot write to {path}"):
+        path.mkdir(parents=True, exist_ok=True)
+    # The scene first: a page without its scene shows an error.
+    write_bytes(path / SCENE_FILE, packed)
+    write_text(path / "index.html", page)
+    return sum((path / name).stat().st_size for name in (SCENE_FILE, "index.html"))
+
+
+def _filled(scene: Scene, title: str, *, inline: str = "", source: str = "") -> str:
+    """The page with a scene in base64, or with the address of one."""
+    values = {
+        "TITLE": html.escape(title),
+        "POSTER": _poster(scene),
+        "SOURCE": source,
+        "SCENE": inline,
+    }
+    page = resources.files("sundae_ns.scene").joinpath("page.html").read_text(encoding="utf-8")
+    # In one pass: a title may contain the name of another place.
+    return re.sub("@@([A-Z]+)@@", lambda place: values[place[1]], page)
+
+
+def _poster(scene: Scene) -> str:
+    """Address of the first image; of an empty one if it cannot be rendered."""
+    try:
+        image = render_first(scene)
+    except MemoryExhaustedError as error:
+        _log.warning("the page has no first image: %s", error)
+        return "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7"  # a transparent pixel
+    content = io.BytesIO()
+    image.save(content, "jpeg", quality=80)
+    return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode()}"
+
+
+def render_first(scene: Scene) -> Image.Image:
+    """The image of the scene's start view, else of its first one, head included, at most 640 pixels wide and high.
+
+    Raises:
+        MemoryExhaustedError: the view has more primitives than any real scene, or needs more memory than there is.
+    """
+    view = scene.start or (scene.views[0] if scene.views else view_in_front(scene))
+    return image_of(render(scene, view.zoomed(min(640 / max(view.width, view.height), 1.0))).rgb)
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """The web page of a scene, which a notebook shows if it is the value of a cell."""
+
+    page: str = field(repr=False)
+    """HTML of the page, the scene included."""
+    title: str
+    """Title of the page and of the frame."""
+    height: int
+    """Height of the frame in pixels; it is as wide as the notebook."""
+
+    def _repr_html_(self) -> str:
+        """The frame, by the name under which notebooks ask for HTML."""
+        # srcdoc, not an address: notebooks serve no files beside them, and browsers limit the length of data addresses.
+        return (
+            f'<iframe srcdoc="{html.escape(self.page)}" title="{html.escape(self.title)}" width="100%" '
+            f'height="{self.height}" style="border: 0" allow="fullscreen; clipboard-write"></iframe>'
+        )
+
+
+def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
+    """The web page of a scene as the output of a notebook's cell, head included.
+
+    The page contains the scene, packed with default settings. The notebook stores it; a page of more than 10 MB is
+    logged as a warning.
+
+    Args:
+        scene: any device.
+        height: of the frame, pixels.
+        title: of the page, for screen readers too.
+
+    Raises:
+        ConfigError: the height is not a positive number of pixels.
+        PackError: the format cannot store the scene.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3))
+    >>> sn.show(scene, height=300)
+    Embedded(title='Scene', height=300)
+    """
+    if isinstance(height, bool) or not isinstance(height, int) or height < 1:
+        raise ConfigError(f"the height of a frame is {height!r}; give a positive number of pixels")
+    from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other pages do not
+
+    page = page_of(scene, packed_bytes(scene), title=title)
+    if len(page) > LARGE:
+        _log.warning(
+            "the notebook will hold a page of %.1f MB; prune the scene first, or save it as scene.html",
+            len(page) / 1e6,
+        )
+    return Embedded(page, title, height)

@@ -1,0 +1,330 @@
+"""From a field to the images of a view: colours, one splatting pass, the head's correction, and what views see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from sundae_ns.core.camera import View
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.gaussians import FEATURES, Field
+from sundae_ns.head.head import CompensationHead, ScalePlan, plan, resize
+from sundae_ns.pruning.scores import pixel_detail
+from sundae_ns.rasterize.interface import blending_weights, harmonic_colors, rasterize
+from sundae_ns.rasterize.types import Backend, Rasterization, check_memory
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+SHOWN_BACKGROUNDS = {"random": (0.1490, 0.1647, 0.2157), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+"""Backgrounds of images that are not trained on, by the option ``background_color``; for random the viewer's."""
+NEAR_PLANE = 0.01
+"""Distance of the near plane, world units."""
+
+
+class StepResolution(NamedTuple):
+    """Form of the training images at one step: a function of the step and the options."""
+
+    step: int
+    """Training step."""
+    downscale: int
+    """Divisor of the sides of the images."""
+    window_pixels: int
+    """Most pixels of an image; larger images are trained on by a random window. 0 for no limit."""
+    mirror: bool = False
+    """Whether half of the steps see their image in a mirror."""
+
+
+class TrainingView(NamedTuple):
+    """A training view for passes that do not train."""
+
+    view: View
+    """The camera."""
+    mask: Tensor | None
+    """Pixels that count, bool ``[H, W, 1]``; None for all."""
+
+
+@dataclass(frozen=True)
+class ColorSettings:
+    """How stored colours become colours seen from a camera."""
+
+    backend: Backend
+    active_sh_degree: int | None = None
+    """Highest SH degree in use; None for the degree of the field."""
+
+
+def colors_from(params: Mapping[str, Tensor], field: Field, center: Tensor, settings: ColorSettings) -> Tensor:
+    """Colours of primitives as seen from a place.
+
+    Args:
+        params: ``means`` ``[M, 3]``, ``features_dc`` and ``features_rest`` of the primitives.
+        field: the field that they belong to, for its encoding.
+        center: camera centre ``[3]``, or one for each primitive ``[M, 3]``; world units.
+        settings: backend and SH degree.
+
+    Returns:
+        ``[M, 3]``, at least 0.
+    """
+    if field.encoding == "logits":
+        return params["features_dc"].sigmoid()
+    degree = degree_in_use(field.sh_degree, settings.active_sh_degree)
+    coefficients = params["features_dc"], params["features_rest"]
+    return harmonic_colors(degree, params["means"], center, *coefficients, backend=settings.backend)
+
+
+def degree_in_use(sh_degree: int, active: int | None) -> int:
+    """The SH degree that colours are evaluated at: ``active``, at most the field's own; None for the field's own."""
+    return sh_degree if active is None else min(active, sh_degree)
+
+
+class LocalField:
+    """The primitives of one process.
+
+    Args:
+        field: the primitives.
+        whole: False for a part, whose tensors are new each time.
+    """
+
+    def __init__(self, field: Field, *, whole: bool = True) -> None:
+        self.field = field
+        self.replayable = whole
+        """Whether frames may be recorded: the tensors stay where they are."""
+
+    @property
+    def total(self) -> int:
+        """Number of primitives of the whole field."""
+        return self.field.num_primitives
+
+    def primitives(
+        self, view: View, settings: ColorSettings, *, features: bool, colors: bool = True
+    ) -> dict[str, Tensor]:
+        """Parameters of the primitives that the view may see ``[M, ...]``, with ``colors`` from its camera ``[M, 3]``.
+
+        Args:
+            view: the camera.
+            settings: how colours are evaluated.
+            features: whether feature vectors are needed.
+            colors: whether colours are needed.
+        """
+        primitives = dict(self.field)
+        if colors:
+            primitives["colors"] = colors_from(self.field, self.field, view.center, settings)
+        return primitives
+
+
+@dataclass(frozen=True)
+class RenderSettings(ColorSettings):
+    """What images depend on beside field and view."""
+
+    antialiased: bool = False
+    """Whether opacities compensate for the smallest footprint (``rasterize_mode`` of splatfacto)."""
+    training: bool = False
+    """Whether gradients are needed. The image is then not clamped, and the head runs at the scale of the image."""
+    absgrad: bool = False
+    """Whether to sum absolute gradients of the projected centres."""
+    head: CompensationHead | None = None
+    """The head; None while it is disabled."""
+    trained_focal: tuple[float, float] | None = None
+    """Shortest and longest focal length of the images that the head was trained on, pixels."""
+
+    def without_head(self) -> RenderSettings:
+        """The same settings with the head disabled."""
+        return replace(self, head=None)
+
+
+def pass_options(params: Mapping[str, Tensor], view: View, settings: RenderSettings) -> dict[str, Any]:
+    """Arguments that every pass over a view hands to the rasteriser: activated parameters, camera and settings."""
+    return {
+        "means": params["means"],
+        "quats": params["quats"],
+        "scales": params["scales"].exp(),
+        "opacities": params["opacities"].sigmoid().squeeze(-1),
+        "viewmat": view.viewmat,
+        "K": view.K,
+        "width": view.width,
+        "height": view.height,
+        "near_plane": NEAR_PLANE,
+        "antialiased": settings.antialiased,
+        "backend": settings.backend,
+    }
+
+
+def splat(
+    params: Mapping[str, Tensor], view: View, channels: Tensor, settings: RenderSettings, **options: Any
+) -> Rasterization:
+    """Splat values of the primitives ``[N, C]``; options are those of ``rasterize``."""
+    return rasterize(colors=channels, **pass_options(params, view, settings), **options)
+
+
+def scale_plan(view: View, trained_focal: tuple[float, float] | None) -> ScalePlan:
+    """Scale and strength of the correction for a view, given the focal lengths that the head was trained at."""
+    return plan(view.focal, trained_focal, view.width * view.height)
+
+
+def draw(
+    primitives: Mapping[str, Tensor], view: View, background: Tensor, settings: RenderSettings, *, depth: bool
+) -> tuple[dict[str, Any], Rasterization]:
+    """Splat colours, features and depth in one pass.
+
+    Args:
+        primitives: from a :class:`LocalField`; with ``features`` if the head is enabled.
+        view: the camera.
+        background: colour ``[3]``.
+        settings: everything else.
+        depth: whether to render depth.
+
+    Returns:
+        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result. Without
+        a head ``rgb`` is ``base_rgb``.
+    """
+    channels = primitives["colors"]
+    if settings.head is not None:
+        channels = torch.cat([channels, primitives[FEATURES]], dim=1)
+    splatted = splat(primitives, view, channels, settings, render_depth=depth, absgrad=settings.absgrad)
+    blended, features = splatted.colors[..., :3], splatted.colors[..., 3:]
+    base = (blended + (1 - splatted.alpha) * background).clamp(0.0, 1.0)
+    images = {
+        "rgb": base,
+        "base_rgb": base,
+        "depth": splatted.depth,
+        "accumulation": splatted.alpha,
+        "feature_image": features,
+    }
+    return images, splatted
+
+
+def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, background: Tensor) -> Tensor:
+    """The compensated image of one splatting pass ``[H, W, 3]``, not clamped. This is the one place that runs the head.
+
+    Args:
+        head: the head.
+        base: image without the head, ``[H, W, 3]``.
+        splatted: colours and features without background.
+        background: colour ``[3]``.
+
+    Raises:
+        MemoryExhaustedError: on a CPU, the layers of the head need more memory than there is.
+    """
+    height, width = base.shape[:2]
+    if base.device.type == "cpu":
+        # The last level: its input from below and beside, both joined, and its output, in float32.
+        channels = 4 * head.net.out.in_channels // head.config.pixel_unshuffle**2
+        check_memory(4 * channels * width * height, f"layers of the head for {width:,} x {height:,} pixels")
+    image = head(base, splatted.colors, splatted.alpha)
+    if head.config.mode == "features":
+        # This head sees neither background nor accumulation; without blending it would paint empty space.
+        image = splatted.alpha * image + (1 - splatted.alpha) * background
+    return image
+
+
+def render_view(
+    source: LocalField,
+    view: View,
+    background: Tensor,
+    settings: RenderSettings,
+    *,
+    depth: bool = True,
+) -> tuple[dict[str, Any], Rasterization]:
+    """The images of one view: primitives, one splatting pass, and the head.
+
+    An image of another scale than the head was trained at is rendered at the trained scale too, and gets the resized
+    correction (:mod:`sundae_ns.head.head`).
+
+    Args:
+        source: of the primitives.
+        view: the camera.
+        background: colour ``[3]``.
+        settings: everything else; ``head=None`` leaves the head out.
+        depth: whether to render depth.
+
+    Returns:
+        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result.
+    """
+    head = settings.head
+    primitives = source.primitives(view, settings, features=head is not None)
+    images, splatted = draw(primitives, view, background, settings, depth=depth)
+    if head is None:
+        return images, splatted
+    zoom, weight = ScalePlan(1.0, 1.0) if settings.training else scale_plan(view, settings.trained_focal)
+    base = images["base_rgb"]
+    if zoom == 1.0:
+        images["rgb"] = compensate(head, base, splatted, background)
+    elif weight > 0:
+        at_scale, _ = render_view(source, view.zoomed(zoom), background, settings, depth=False)
+        correction = at_scale["rgb"] - at_scale["base_rgb"]
+        images["rgb"] = base + weight * resize(correction, view.height, view.width)
+    if not settings.training:
+        images["rgb"] = images["rgb"].clamp(0.0, 1.0)
+    return images, splatted
+
+
+@torch.no_grad()
+def contribution(
+    source: LocalField,
+    views: Sequence[TrainingView],
+    background: Tensor,
+    settings: RenderSettings,
+    count: int | None = None,
+    *,
+    console: Console | None = None,
+) -> Tensor:
+    """Blending weight of each primitive, summed over the pixels of all views ``[N]``.
+
+    Args:
+        source: of the primitives.
+        views: the training views.
+        background: colour ``[3]``; fixed, so that the result does not depend on a random one.
+        settings: how images are made.
+        count: number of primitives that a prune will keep. If given, pixels are weighted by the detail that these
+            cannot show (:func:`sundae_ns.pruning.scores.pixel_detail`).
+        console: shows a progress bar; None for none.
+
+    Raises:
+        DataError: a mask has another size than its view.
+    """
+    total = torch.zeros(source.field.num_primitives, device=source.field["means"].device)
+    shown: Iterable[TrainingView] = views
+    if console is not None:
+        from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
+
+        shown = track(views, "Contribution of primitives", transient=True, console=console)
+    for view, mask in shown:
+        if mask is not None and tuple(mask.shape) != (view.height, view.width, 1):
+            raise DataError(
+                f"a mask is {list(mask.shape)} but its view is {view.width} x {view.height} px; "
+                "give masks the size of their images"
+            )
+        primitives = source.primitives(view, settings, features=False, colors=count is not None)
+        pixels = None if mask is None else mask[..., 0].to(total)
+        if count is None:
+            total += blending_weights(pixels=pixels, **pass_options(primitives, view, settings))
+        else:
+            share = count / source.total
+            total += _detail_weights(primitives, view, background.to(total.device), settings, share, pixels)
+    return total
+
+
+def _detail_weights(
+    primitives: Mapping[str, Tensor],
+    view: View,
+    background: Tensor,
+    settings: RenderSettings,
+    share: float,
+    pixels: Tensor | None,
+) -> Tensor:
+    """Blending weights ``[M]`` over pixels weighted by their detail, and by ``pixels`` ``[H, W]``."""
+    # As in blending_weights, but one pass gives the image and the weights: the gradient of the first channel.
+    fixed = {name: value.detach() for name, value in primitives.items()}
+    fixed["colors"].requires_grad_()
+    with torch.enable_grad():
+        images, splatted = draw(fixed, view, background, settings.without_head(), depth=False)
+    # A prune keeps the same share of the visible primitives as of all.
+    detail = pixel_detail(images["base_rgb"], share * float((splatted.radii > 0).sum()))
+    pixels = detail if pixels is None else detail * pixels
+    with torch.enable_grad():
+        blended = (splatted.colors[..., 0] * pixels).sum()
+    return torch.autograd.grad(blended, fixed["colors"])[0][:, 0]

@@ -1,1 +1,0 @@
-"""Finished scenes: opening, packing, fine-tuning and measuring them."""

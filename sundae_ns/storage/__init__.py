@@ -1,1 +1,0 @@
-"""Files: one module for each format, packed scenes, checkpoints and runs; atomic writes."""

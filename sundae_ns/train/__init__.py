@@ -1,0 +1,1 @@
+"""Training: state, step, densification, pruning, trials."""

@@ -1,0 +1,150 @@
+"""Means of the weights over steps of a training (stochastic weight averaging, Izmailov et al., UAI 2018).
+
+A step sees one image, so the weights wander around what suits all of them; their mean lies nearer.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sundae_ns.train.state import Extension, FieldState, TrainingRun
+
+log = logging.getLogger(__name__)
+
+AVERAGED_EVERY = 10  # Steps between two weights that count: neighbours differ by little
+
+NamedTensors = Mapping[str, Tensor]
+
+
+@torch.no_grad()
+def _put(values: NamedTensors, weights: NamedTensors) -> None:
+    for name, value in values.items():
+        weights[name].copy_(value)
+
+
+class RunningMean:
+    """The mean of weights that are counted in one after another.
+
+    Args:
+        values: the mean so far, by name; empty without one.
+        count: number of weights in it.
+    """
+
+    def __init__(self, values: NamedTensors | None = None, count: int = 0) -> None:
+        self.values, self.count = dict(values or {}), count
+
+    @classmethod
+    def of(cls, saved: Mapping[str, Any], device: torch.device) -> RunningMean:
+        """The mean of a :meth:`state_dict`; a new one if there is none in it."""
+        values = {name: value.to(device) for name, value in saved.get("mean", {}).items()}
+        return cls(values, int(saved.get("count", 0)))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Entries for a checkpoint."""
+        return {"mean": self.values, "count": self.count}
+
+    @torch.no_grad()
+    def count_in(self, weights: NamedTensors) -> None:
+        """Count weights in; those of other shapes begin a new mean."""
+        if not self.fits(weights):
+            self.values, self.count = {name: value.clone() for name, value in weights.items()}, 0
+        if not weights:  # a rank without primitives
+            return
+        self.count += 1
+        torch._foreach_lerp_([self.values[name] for name in weights], list(weights.values()), 1 / self.count)
+
+    def replace(self, weights: NamedTensors) -> dict[str, Tensor]:
+        """Put the mean, if one fits, in the place of weights; returns their copies, which are empty without a mean."""
+        if not self.fits(weights):
+            return {}
+        copies = {name: value.clone() for name, value in weights.items()}
+        _put(self.values, weights)
+        return copies
+
+    @contextmanager
+    def shown(self, weights: NamedTensors) -> Iterator[None]:
+        """Put the mean, if one fits, in the place of weights for the length of a block."""
+        own = self.replace(weights)
+        try:
+            yield
+        finally:
+            _put(own, weights)
+
+    def fits(self, weights: NamedTensors) -> bool:
+        """Whether there is a mean, and of weights of these names and shapes."""
+        same_names = self.count > 0 and self.values.keys() == weights.keys()
+        return same_names and all(value.shape == self.values[name].shape for name, value in weights.items())
+
+
+def weights_of(state: FieldState) -> dict[str, Tensor]:
+    """Weights of the field and of the enabled head, by name; changes in place change the field."""
+    weights = {name: value.data for name, value in state.field.items() if value.numel() > 0}
+    if state.head_enabled and state.head is not None:
+        weights |= {f"head.{name}": value.data for name, value in state.head.named_parameters()}
+    return weights
+
+
+class Averaging(Extension):
+    """Ends a training with the mean of field and head, a first part of one too if it ends within the share.
+
+    Args:
+        share: of the schedule, at its end, over which weights are averaged.
+        settled_at: step of the schedule before which the number of primitives may change, so that nothing is averaged.
+    """
+
+    name = "averaging"
+
+    def __init__(self, share: float, settled_at: float) -> None:
+        self.share = share
+        self.settled_at = settled_at
+        self._mean = RunningMean()
+        self._restored = 0  # Returns to a snapshot that the field had made when the mean began
+        self._replaced: dict[str, Tensor] = {}
+        """Weights of the last step, which the mean has replaced: a longer training goes on from them."""
+        self._alone = True
+
+    def state_dict(self) -> dict[str, Any]:
+        """The mean so far, or the weights that it has replaced.
+
+        Several ranks save neither, because each has those of its own shard: resumed, they go on from the mean.
+        """
+        return {**self._mean.state_dict(), "replaced": self._replaced} if self._alone else {}
+
+    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Counterpart of :meth:`state_dict`."""
+        self._mean, self._restored = RunningMean.of(saved, state.device), state.restored
+        self._replaced = {name: value.to(state.device) for name, value in saved.get("replaced", {}).items()}
+
+    def before_training(self, run: TrainingRun) -> None:
+        """Put back the weights that a mean has replaced, so that two trainings end as one of their length."""
+        self._alone = run.images_per_step == 1
+        if self._alone:
+            RunningMean(self._replaced, 1).replace(weights_of(run.state))
+        self._replaced = {}
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Count the weights if their turn has come; after the last step, put the mean in their place."""
+        state, length, last = run.state, run.schedule_length, run.last_step
+        if length is None or last is None:
+            return
+        end = max(last, length - 1)  # a part that ends earlier ends with its own weights
+        if state.schedule_step < self.settled_at or state.step < end - self.share * length:
+            self._mean = RunningMean()  # a run that was stopped in its last part may be resumed for a longer one
+            return
+        if state.restored != self._restored:
+            self._mean, self._restored = RunningMean(), state.restored
+        weights = weights_of(state)
+        if state.step % AVERAGED_EVERY == 0:
+            self._mean.count_in(weights)
+        if state.step == last and self._mean.fits(weights):
+            log.info(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
+            replaced = self._mean.replace(weights)
+            self._replaced = replaced if self._alone else {}
+            if last == end:  # after a part, the mean goes on with the rest of the run
+                self._mean = RunningMean()

@@ -1,0 +1,101 @@
+"""The parts of a model, built from its options: parameters, networks, state and extensions."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import torch
+
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.core.gaussians import Field
+from sundae_ns.head.head import CompensationHead
+from sundae_ns.train.averaging import Averaging
+from sundae_ns.train.densification import Densification, make_strategy
+from sundae_ns.train.exposure import PhotoGains
+from sundae_ns.train.initialize import DenseStart, Frame, Points, Start, initial_field
+from sundae_ns.train.pruning import FloaterRemoval, PruningSchedule, ScheduledPruning
+from sundae_ns.train.state import Extension, FieldState
+from sundae_ns.train.trials import AfterPrune, Trials
+
+
+def check(options: Any) -> None:
+    """Check options that cannot work, alone or together.
+
+    Raises:
+        ConfigError: the first such option, and its mend.
+    """
+    options.pruning.validate()
+    if options.head.mode != "off":
+        options.head.validate()
+    for name in ("base_loss_weight", "prior_after_prune"):
+        if getattr(options, name) < 0:
+            raise ConfigError(f"{name.replace('_', '-')} is {getattr(options, name)}; give 0 or more")
+    if options.dense_start_views < 0:
+        raise ConfigError(f"dense-start-views is {options.dense_start_views}; give a number of images, 0 for no sweep")
+    if not 0 <= options.average_share <= 1:
+        raise ConfigError(
+            f"average-share is {options.average_share}; give a share of the schedule, 0.1 for the last tenth"
+        )
+    if options.warm_start is not None and options.pruning.mode == "continuous":
+        raise ConfigError("a warm start is pruned at once, not while it grows: set pruning.mode to one-shot")
+    if options.use_bilateral_grid:
+        raise ConfigError("sundae has no bilateral grid: the head would learn against it; use splatfacto for it")
+
+
+def build(
+    options: Any, num_images: int, points: Points | None, frame: Frame | None
+) -> tuple[FieldState, list[Extension], Start]:
+    """Build the parts on the CPU.
+
+    Args:
+        options: ``SundaeModelConfig``.
+        num_images: number of training images.
+        points: sparse points of the capture, if it has any.
+        frame: transform from the capture's coordinates to the model's, if known.
+
+    Returns:
+        State of field and head; extensions in their order (dense start, densification, removal of floaters, trials,
+        scheduled pruning, trials after the prune, gains of the photos, averaging; trials and averaging optional);
+        what to announce when training starts.
+
+    Raises:
+        ConfigError: an option cannot work.
+    """
+    check(options)
+    pruning, head, warm = options.pruning, options.head.resolved, options.warm_start is not None
+    strategy, num_features = make_strategy(options, num_images), 0 if head.mode == "off" else head.num_features
+    params, start = initial_field(options, points, frame, num_features=num_features, cap=strategy.cap)
+    gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
+    networks = torch.nn.ModuleDict({} if head.mode == "off" else {"head": CompensationHead(head)})
+    state = FieldState(
+        field=Field(cast(Any, gauss_params), "logits" if options.sh_degree == 0 else "harmonics"),
+        networks=networks,
+        offset=pruning.prune_at if warm else 0,
+        densify_until=strategy.refine_stop_iter,
+        head_starts_at=pruning.settled_at if head.start_at is None else head.start_at,
+        sh_degree_interval=None if warm else options.sh_degree_interval,
+    )
+    densification, schedule = Densification(strategy), PruningSchedule(pruning)
+    densification.initialize(state)
+    state.pruning = schedule.initialize_state()
+    begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
+    removal = FloaterRemoval(None if points is None else points[0])
+    dense = DenseStart(options, points, num_images, num_features=num_features, cap=strategy.cap)
+    extensions: list[Extension] = [dense, densification, removal]
+    scheduled, decides_head = ScheduledPruning(schedule, evaluate=options.evaluate_prune), options.head.mode == "auto"
+    if pruning.decides or decides_head:
+        trials = Trials(
+            pruning,
+            state,
+            densification,
+            begins_at=begins_at,
+            decides_head=decides_head,
+            ssim_weight=options.ssim_lambda,
+        )
+        extensions += [trials, scheduled, AfterPrune(trials)]
+    else:
+        extensions.append(scheduled)
+    extensions.append(PhotoGains(num_images, options.photo_gains))
+    if options.average_share > 0:
+        extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
+    return state, extensions, start

@@ -1,0 +1,121 @@
+"""The curve of expected quality over the number of primitives, as a run records it in ``trials.json``."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from sundae_ns.core.errors import CheckpointError
+from sundae_ns.core.tables import MEGABYTE, table
+
+RECORD = "trials.json"  # in the folder of a run
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """What to expect of a field of one count, on the held-out training views."""
+
+    count: int
+    """Number of primitives."""
+    bytes: int | None
+    """Bytes of the packed scene, with a head if trials have found that it pays, estimated; None if unknown."""
+    psnr: float
+    """Expected PSNR after a fit of colours to each photo, dB. Differences to other points are more certain."""
+    ssim: float
+    """Expected SSIM."""
+    psnr_loss: float
+    """PSNR (dB) that is lost against the best count for it; so for SSIM."""
+    ssim_loss: float
+    psnr_error: float
+    """Standard error of the loss over the views, dB."""
+    ssim_error: float
+    """Standard error of the loss of SSIM over the views."""
+
+
+@dataclass(frozen=True)
+class CountCurve:
+    """The record of a decision."""
+
+    chosen: int
+    """The number of primitives that the run has kept."""
+    full: int
+    """Their number before the prune."""
+    reason: str
+    """Why this number was chosen."""
+    points: tuple[CurvePoint, ...]
+    """What was tried, largest count first."""
+
+
+def read_count_curve(folder: Path) -> CountCurve | None:
+    """The record of a run; None if trials have not decided about its number of primitives.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        CheckpointError: the record is damaged.
+    """
+    path, names = folder / RECORD, {field.name for field in fields(CurvePoint)}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8")).get("count")
+        if found is None:
+            return None
+        points = [CurvePoint(**{name: _number(point[name]) for name in names}) for point in found["curve"]]  # type: ignore[arg-type]
+        return CountCurve(int(found["chosen"]), int(found["full"]), str(found["reason"]), tuple(points))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise CheckpointError(f"{path} cannot be read ({error}); remove it, or train the run again") from error
+
+
+def _number(value: object) -> float | None:
+    """A number of the record; infinite losses are stored as null, and unknown bytes too."""
+    if value is None or isinstance(value, (int, float)) and not isinstance(value, bool):
+        return value
+    raise TypeError(f"{value!r} is no number")
+
+
+def expected_change(points: Sequence[CurvePoint], count: int, other: int) -> tuple[float, float] | None:
+    """Change of PSNR (dB) and SSIM from one count to another, after training; None beyond the tried counts.
+
+    Between two tried counts the losses are interpolated over the logarithm of the count.
+
+    Args:
+        points: of a curve, in any order.
+        count, other: numbers of primitives.
+    """
+    known = sorted((point for point in points if math.isfinite(point.psnr_loss)), key=lambda point: point.count)
+    if not known or not all(known[0].count <= one <= known[-1].count for one in (count, other)):
+        return None
+    places = [math.log(point.count) for point in known]
+    changes = []
+    for losses in ([point.psnr_loss for point in known], [point.ssim_loss for point in known]):
+        before, after = np.interp([math.log(count), math.log(other)], places, losses)
+        changes.append(float(before - after))
+    return changes[0], changes[1]
+
+
+def curve_table(points: Sequence[CurvePoint]) -> list[str]:
+    """Lines of a table of the points: count, packed size, and the expected figures with their losses."""
+    rows = [
+        [
+            f"{point.count:,}",
+            "" if point.bytes is None else f"{point.bytes / MEGABYTE:.2f}",
+            *_figures(point.psnr, point.psnr_loss, point.psnr_error, 2),
+            *_figures(point.ssim, point.ssim_loss, point.ssim_error, 4),
+        ]
+        for point in points
+    ]
+    heads = ["primitives", "packed, MB", "PSNR, dB", "below the best", "SSIM", "below the best"]
+    return table(heads, rows, words=0)
+
+
+def _figures(value: float | None, loss: float | None, error: float | None, digits: int) -> list[str]:
+    if value is None or loss is None or error is None or not math.isfinite(loss):
+        return ["", "not finite"]
+    return [f"{value:.{digits}f}", f"{loss:.{digits}f} ± {error:.{digits}f}"]

@@ -1,0 +1,182 @@
+"""Growth of a field: gsplat's densification under a cap.
+
+Its running state holds ``peak``, the number of primitives right after growing and before culling.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, MutableMapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gsplat.strategy import DefaultStrategy
+from torch import Tensor
+
+from sundae_ns.train.state import Extension, FieldState, TrainingRun
+
+STATISTICS = ("grad2d", "count", "radii")  # Tensors [N] in the running state of gsplat's strategy
+
+COUNTED = "counted"
+"""Entry of ``info`` of a step that has added its statistics to the running state: recorded, or of several ranks."""
+
+
+def limit_growth(
+    state: MutableMapping[str, Any], small: Tensor, capacity: int, threshold: float, radius: float | None
+) -> None:
+    """Let at most ``capacity`` primitives be added, by the highest gradients; others lose their statistics.
+
+    Args:
+        state: of gsplat's strategy, with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used.
+        small: primitives that a high gradient duplicates; it splits the others, bool ``[N]``.
+        capacity: number of primitives that may be added: one for each duplicated or split, two for one that is both.
+        threshold: mean gradient above which a primitive grows.
+        radius: radius above which it is split, as a share of the image; None ignores the radius.
+    """
+    gradients = state["grad2d"] / state["count"].clamp_min(1)
+    high = gradients > threshold
+    radii = None if radius is None else state.get("radii")
+    wide = torch.zeros_like(high) if radii is None else radii > radius
+    added = (high & small).long() + ((high & ~small) | wide).long()
+    candidates = added.nonzero().squeeze(1)
+    candidates = candidates[gradients[candidates].argsort(descending=True, stable=True)]
+    left_out = candidates[added[candidates].cumsum(0) > capacity]
+    state["grad2d"][left_out] = 0
+    if radii is not None:
+        radii[left_out] = radii[left_out].clamp_max(radius)
+
+
+def start_counting(state: MutableMapping[str, Any], means: Tensor) -> None:
+    """Make the tensors that are missing in the running state of gsplat's strategy.
+
+    Args:
+        state: the running state.
+        means: centres ``[N, 3]``.
+    """
+    for name in STATISTICS:
+        if name in state and state[name] is None:
+            state[name] = torch.zeros(len(means), device=means.device)
+
+
+@torch.no_grad()
+def count_view(state: Mapping[str, Any], grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+    """Add the statistics of one view to the running state of gsplat's strategy, without waiting for the GPU.
+
+    Args:
+        state: with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used; changed in place.
+        grads: gradients of the projected centres, per pixel ``[N, 2]``.
+        radii: on the screen, pixels ``[N]``, or one per axis ``[N, 2]``; 0 where a primitive is not drawn.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+    drawn = radii > 0 if radii.ndim == 1 else (radii > 0).all(dim=-1)
+    norms = torch.hypot(grads[:, 0] * (width / 2), grads[:, 1] * (height / 2))
+    state["grad2d"].add_(torch.where(drawn, norms, 0.0))
+    state["count"].add_(drawn)
+    if state.get("radii") is not None:
+        shares = (radii if radii.ndim == 1 else radii.amax(dim=-1)) / float(max(width, height))
+        torch.maximum(state["radii"], torch.where(drawn, shares, 0.0), out=state["radii"])
+
+
+@dataclass
+class CappedStrategy(DefaultStrategy):
+    """gsplat's densification with an exact cap: under it, the primitives with the highest gradients grow first."""
+
+    cap: int | None = None  # Highest number of primitives; None for no cap
+
+    def see_each_image_after_resets(self, steps: int) -> None:
+        """Let the field grow again only once opacities have recovered from a reset.
+
+        Args:
+            steps: steps in which each image is seen once. Growth waits for half of the time if resets are closer.
+        """
+        pause = steps + self.refine_every
+        if self.reset_every >= self.refine_stop_iter:
+            pause = 0  # gsplat also waits at the start of a run that never resets
+        elif pause >= self.reset_every:
+            pause = self.reset_every // 2
+        self.pause_refine_after_reset = pause
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """State of gsplat's strategy, and the peak."""
+        return {**super().initialize_state(scene_scale), "peak": 0}
+
+    @torch.no_grad()
+    def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
+        """Add the statistics of a step, unless they have been added."""
+        if not info.get(COUNTED):
+            super()._update_state(params, state, info, packed=packed)
+
+    @torch.no_grad()
+    def _grow_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> tuple[int, int]:
+        if self.cap is not None:
+            radius = self.grow_scale2d if step < self.refine_scale2d_stop_iter else None
+            small = params["scales"].exp().amax(dim=-1) <= self.grow_scale3d * state["scene_scale"]
+            limit_growth(state, small, self.cap - len(params["means"]), self.grow_grad2d, radius)
+        grown = super()._grow_gs(params, optimizers, state, step)
+        state["peak"] = max(state.get("peak", 0), len(params["means"]))
+        return grown
+
+
+class Densification(Extension):
+    """Grows the field until the schedule's prune would undo it.
+
+    Args:
+        strategy: gsplat's verbs, on the parameters of the field.
+    """
+
+    name = "densification"
+
+    def __init__(self, strategy: CappedStrategy) -> None:
+        self.strategy = strategy
+
+    def initialize(self, state: FieldState) -> None:
+        """Start the running state anew, as for a field that has not been trained."""
+        state.densification.clear()
+        state.densification.update(self.strategy.initialize_state(scene_scale=1.0))
+
+    def before_backward(self, state: FieldState) -> None:
+        """Keep the gradients that densification reads."""
+        if state.densifying:
+            self.strategy.step_pre_backward(
+                state.field.data, state.optimizers, state.densification, state.schedule_step, state.info
+            )
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Let the strategy add, move and remove primitives."""
+        state, params = run.state, run.state.field.data
+        if state.densifying:
+            running = state.densification
+            self.strategy.step_post_backward(params, state.optimizers, running, state.schedule_step, state.info)
+
+
+def make_strategy(options: Any, num_images: int) -> CappedStrategy:
+    """Strategy of the warm-up. It ends before the prune that would undo it.
+
+    Args:
+        options: of the model; those of pruning give the end of growth and, for continuous pruning, the cap.
+        num_images: training images. Each is seen once after opacities are reset, before anything grows.
+    """
+    stop, cap, pruning = options.stop_split_at, None, options.pruning
+    if pruning.mode == "continuous":
+        stop, cap = min(stop, pruning.stop), pruning.max_primitives
+    elif pruning.ends_growth_at is not None:
+        stop = min(stop, pruning.ends_growth_at)
+    strategy = CappedStrategy(
+        cap=cap,
+        prune_opa=options.cull_alpha_thresh,
+        grow_grad2d=options.densify_grad_thresh,
+        grow_scale3d=options.densify_size_thresh,
+        grow_scale2d=options.split_screen_size,
+        prune_scale3d=options.cull_scale_thresh,
+        prune_scale2d=options.cull_screen_size,
+        refine_scale2d_stop_iter=options.stop_screen_size_at,
+        refine_start_iter=options.warmup_length,
+        refine_stop_iter=stop,
+        reset_every=options.reset_alpha_every * options.refine_every,
+        refine_every=options.refine_every,
+        absgrad=options.use_absgrad,
+        verbose=False,
+    )
+    strategy.see_each_image_after_resets(num_images)
+    return strategy

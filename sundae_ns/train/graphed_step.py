@@ -1,0 +1,429 @@
+"""Whole training steps as CUDA graphs: the step, gradients, statistics of densification, and Adam.
+
+A step is some two hundred small kernels. Launched one by one from Python they take several times as long as the GPU
+works. A graph launches them together. It reads and writes fixed addresses and a fixed number of primitives, so the
+field lies in buffers with memory for more.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from sundae_ns.core.gaussians import FEATURES, Field
+from sundae_ns.cuda.adam import Update, adam_step
+from sundae_ns.cuda.cuda_graphs import record, warm_up
+from sundae_ns.head.head import CompensationHead
+from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
+from sundae_ns.rasterize.gsplat_kernels import Capacity
+from sundae_ns.scene.render import LocalField, RenderSettings, degree_in_use
+from sundae_ns.train.densification import COUNTED, STATISTICS, count_view, start_counting
+from sundae_ns.train.state import FieldState
+from sundae_ns.train.step import StepInputs, StepLosses, StepResult, TrainingStep
+
+SPARE = 1.1  # Capacity for a field that grows, as a multiple of its number of primitives
+
+MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's moments in the state of its optimizer
+
+_UNSEEN = {"means": 1e15, "scales": -30.0, "opacities": -30.0}
+"""Values of the rows beyond: behind the far plane, without width, transparent. Others are zero."""
+
+
+class _Rows(NamedTuple):
+    """A tensor of the state with a row for each primitive."""
+
+    name: str
+    value: Tensor
+    replace: Callable[[Tensor], object]  # Puts another tensor in its place
+
+
+class Buffers:
+    """Tensors of one field at a capacity."""
+
+    def __init__(self) -> None:
+        self.tensors: dict[str, Tensor] = {}
+        """By parameter name, ``NAME.exp_avg`` or the like for moments, and name for statistics ``[capacity, ...]``."""
+        self.capacity = 0
+        self._rows = 0
+
+    def hold(self, state: FieldState, trained: tuple[str, ...], *, growing: bool) -> bool:
+        """Let the tensors of a field be the first rows of the buffers; what was replaced since the last call is copied.
+
+        Args:
+            state: the field; its optimizers have states for the trained parameters.
+            trained: names of the parameters that are trained.
+            growing: whether the number of primitives will change.
+
+        Returns:
+            Whether the buffers are new, so that work on the older ones is void.
+        """
+        n, rows = state.field.num_primitives, list(_rows_of(state, trained))
+        shapes = {row.name: row.value.shape[1:] for row in rows}
+        fits = n <= self.capacity <= 2 * n if growing else n == self.capacity
+        # Trials widen and narrow features.
+        renewed = not fits or shapes != {name: held.shape[1:] for name, held in self.tensors.items()}
+        if renewed:
+            self.capacity = int(SPARE * n) if growing else n
+            for name in self.tensors.keys() - shapes.keys():
+                del self.tensors[name]
+        for row in rows:
+            held = self.tensors.get(row.name)
+            if renewed or held is None:
+                # One at a time: each replaces the older memory before the next is made.
+                held = self.tensors[row.name] = _filled(row, self.capacity)
+            elif row.value.data_ptr() == held.data_ptr() and n == self._rows:
+                continue
+            else:
+                _fill(held, row)
+            row.replace(held.detach()[:n])
+        self._rows = n
+        return renewed
+
+
+def start_moments(state: FieldState, trained: tuple[str, ...]) -> None:
+    """Make the state of Adam for parameters that have none, as its first step would."""
+    for name in trained:
+        for group in state.optimizers[name].param_groups:
+            for value in group["params"]:
+                held = state.optimizers[name].state[value]
+                if not held:
+                    held["step"] = torch.zeros((), dtype=torch.float32, device=value.device)
+                    held.update({moment: torch.zeros_like(value) for moment in MOMENTS})
+
+
+def trained_parameters(state: FieldState) -> tuple[str, ...]:
+    """Names of the parameters of the field that a step trains: features are trained with the head only."""
+    used = (name for name in state.field if name != FEATURES or state.head_enabled)
+    return tuple(name for name in used if state.field[name].numel() > 0)
+
+
+def _rows_of(state: FieldState, trained: tuple[str, ...]) -> Iterator[_Rows]:
+    for name in trained:
+        value = state.field[name]
+        yield _Rows(name, value, partial(setattr, value, "data"))
+        moments: dict[str, Any] = state.optimizers[name].state[value]
+        for moment in MOMENTS:
+            yield _Rows(f"{name}.{moment}", moments[moment], partial(moments.__setitem__, moment))
+    if state.densifying:
+        for name in STATISTICS:
+            value = state.densification.get(name)
+            if value is not None:
+                yield _Rows(name, value, partial(state.densification.__setitem__, name))
+
+
+def _filled(row: _Rows, capacity: int) -> Tensor:
+    held = row.value.detach().new_empty(capacity, *row.value.shape[1:])
+    _fill(held, row)
+    return held.requires_grad_(row.value.requires_grad)
+
+
+@torch.no_grad()
+def _fill(held: Tensor, row: _Rows) -> None:
+    n = len(row.value)
+    held[:n].copy_(row.value)
+    held[n:].fill_(_UNSEEN.get(row.name, 0.0))
+
+
+SPARE_PAIRS = 2.0  # Capacity for tile/primitive pairs, as a multiple of the most that a view has needed
+
+MAX_RECORDINGS = 8  # Recordings kept at a time: one for each image size and SH degree in use
+
+UNUSED = 1000
+"""Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by
+kernel, because recording takes longer than a step."""
+
+StepWork = Callable[[StepInputs, RenderSettings, Capacity | None], StepResult]
+"""The GPU work of a step, with the capacity of the rasteriser that is set; None for another rasteriser."""
+
+
+@dataclass(frozen=True)
+class _Recording:
+    graph: torch.cuda.CUDAGraph
+    inputs: StepInputs  # The graph reads them here
+    result: StepResult  # The graph writes it here
+    pairs: int  # Tile/primitive pairs that fit
+
+
+class StepRecordings:
+    """Runs training steps. The first of a kind runs kernel by kernel, because libraries choose and load kernels then.
+
+    Later ones replay. A step whose view has more tile/primitive pairs than fit changes nothing, and the next recording
+    has room for them.
+
+    Args:
+        record: False runs every step kernel by kernel, as a test does on a CPU.
+    """
+
+    def __init__(self, *, record: bool = True) -> None:
+        self._record = record
+        self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()
+        self._used: dict[Hashable, int] = {}  # Step at which a recording was last replayed
+        self._steps = 0
+        self._warm: set[Hashable] = set()  # Kinds of steps that have run kernel by kernel
+        self._most: Tensor | None = None  # Most tile/primitive pairs that a view has needed, on the device, int64 []
+        self._most_on_host: Tensor | None = None  # Its pinned copy, some steps late
+
+    def forget(self, *, pairs: bool = False) -> None:
+        """Drop all recordings; with ``pairs`` also measure again how many pairs a view needs."""
+        self._recordings.clear()
+        self._used.clear()
+        if pairs:
+            self._warm.clear()
+
+    def run(
+        self, work: StepWork, inputs: StepInputs, settings: RenderSettings, kind: Hashable, addresses: Hashable = None
+    ) -> StepResult:
+        """Run a step, by a recording where there is one.
+
+        Args:
+            work: of the step.
+            inputs: of this step.
+            settings: of training images, with the backend gsplat for recording.
+            kind: decides on the kernels of the step.
+            addresses: of what a recording reads beside its inputs, where they may change.
+
+        Raises:
+            BackendError: the step cannot be recorded. Nothing has changed.
+            torch.cuda.OutOfMemoryError: the same.
+        """
+        recording = self._recording(work, inputs, settings, kind, addresses) if kind in self._warm else None
+        if recording is None:
+            result = self._kernel_by_kernel(work, inputs, settings)
+            self._warm.add(kind)
+        else:
+            inputs.copy_to(recording.inputs)
+            recording.graph.replay()
+            result = recording.result
+        self._steps += 1
+        return result
+
+    @torch.no_grad()
+    def overflow(self, capacity: Capacity | None) -> Tensor | None:
+        """1 if the lists of tiles were too short, so the step must change nothing; else 0, float ``[]``."""
+        if capacity is None or capacity.pairs is None:  # lists of any length
+            return None
+        assert self._most is not None
+        assert self._most_on_host is not None
+        needed = torch.stack(capacity.needed).amax()
+        torch.maximum(self._most, needed, out=self._most)
+        self._most_on_host.copy_(self._most, non_blocking=True)
+        return (needed > capacity.pairs).float()
+
+    def _count(self, capacity: Capacity, device: torch.device) -> None:
+        """Count the pairs of a step that ran kernel by kernel, which waits for the GPU."""
+        most = max(int(number) for number in capacity.needed)
+        if self._most is None or self._most_on_host is None:
+            self._most = torch.zeros((), dtype=torch.int64, device=device)
+            self._most_on_host = torch.zeros((), dtype=torch.int64, pin_memory=True)
+        if self._warm:  # else forget the steps before
+            most = max(most, int(self._most))
+        self._most.fill_(most)
+        self._most_on_host.fill_(most)
+
+    def _kernel_by_kernel(self, work: StepWork, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+        """Run a step on the stream of the recordings."""
+        device = inputs.target.device
+        if device.type != "cuda":
+            return work(inputs, settings, None)
+        capacity = Capacity()
+        with warm_up(device):
+            result = work(inputs, replace(settings, backend=RecordableGsplat(capacity)), capacity)
+        self._count(capacity, device)
+        return result
+
+    def _recording(
+        self, work: StepWork, inputs: StepInputs, settings: RenderSettings, kind: Hashable, addresses: Hashable
+    ) -> _Recording | None:
+        """The recording of a kind of steps; None if it has to run kernel by kernel."""
+        if not self._record:
+            return None
+        assert self._most_on_host is not None
+        key, most = (kind, addresses), int(self._most_on_host)
+        recording = self._recordings.get(key)
+        if recording is None and len(self._recordings) >= MAX_RECORDINGS:
+            oldest = next(iter(self._recordings))
+            if self._steps - self._used[oldest] < UNUSED:
+                return None
+            del self._recordings[oldest], self._used[oldest]
+        if recording is None or most > recording.pairs:
+            recording = self._recorded(work, inputs, settings, int(SPARE_PAIRS * most) + 1)
+            self._recordings[key] = recording
+        self._recordings.move_to_end(key)
+        self._used[key] = self._steps
+        return recording
+
+    def _recorded(self, work: StepWork, inputs: StepInputs, settings: RenderSettings, pairs: int) -> _Recording:
+        own = inputs.clone()
+
+        def step() -> StepResult:
+            capacity = Capacity(pairs)
+            return work(own, replace(settings, backend=RecordableGsplat(capacity)), capacity)
+
+        last = next(reversed(self._recordings.values()), None)
+        # Results are read before the next replay, so all recordings can work in the same memory.
+        graph, result = record(step, own.target.device, share_memory_with=None if last is None else last.graph)
+        return _Recording(graph, own, result, pairs)
+
+
+HEAD = "compensation"  # Name of the head's optimizer
+
+
+@dataclass(frozen=True)
+class _Held:
+    """The tensors of a state whose field lies in the buffers, to notice cheaply when one is replaced."""
+
+    trained: tuple[str, ...]  # Names of the parameters of the field that are trained
+    growing: bool  # Whether the buffers have spare rows
+    groups: list[tuple[str, torch.optim.Optimizer, dict[str, Any]]]
+    """Groups of parameters that a step trains: name of the optimizer, optimizer, group."""
+    tensors: list[tuple[Mapping[Any, Any], Any, Any]]
+    """Mapping, key and value of everything that surgery and restored snapshots replace."""
+    addresses: Hashable  # What a recording reads beside the buffers: the head's weights, and the counts of steps
+
+    @classmethod
+    def of(cls, state: FieldState, trained: tuple[str, ...], head: CompensationHead | None) -> _Held:
+        names = trained if head is None else (*trained, HEAD)
+        groups = [
+            (name, state.optimizers[name], group) for name in names for group in state.optimizers[name].param_groups
+        ]
+        members = [(optimizer.state, value) for _, optimizer, group in groups for value in group["params"]]
+        states = [(held, value, held[value]) for held, value in members]
+        tensors: list[tuple[Mapping[Any, Any], Any, Any]] = [
+            *states,
+            *((state.field, name, state.field[name]) for name in trained),
+            *((state.densification, *item) for item in state.densification.items() if isinstance(item[1], Tensor)),
+        ]
+        addresses = tuple(own[name].data_ptr() for _, _, own in states for name in (*MOMENTS, "step"))
+        return cls(trained, state.densifying, groups, tensors, (addresses, None if head is None else head.addresses()))
+
+    def unchanged(self, state: FieldState, settings: RenderSettings) -> bool:
+        """Whether the state still consists of these tensors."""
+        with_head = self.groups[-1][0] == HEAD
+        return (
+            self.growing == state.densifying
+            and with_head == (settings.head is not None)
+            and all(mapping.get(key) is value for mapping, key, value in self.tensors)
+            and self.trained == trained_parameters(state)
+        )
+
+
+class RecordedStep:
+    """Training steps of one field.
+
+    Args:
+        losses: terms of the loss.
+        record: False runs every step kernel by kernel, as a test does on a CPU.
+    """
+
+    def __init__(self, losses: StepLosses, *, record: bool = True) -> None:
+        self._losses = losses
+        self._buffers = Buffers()
+        self._held: _Held | None = None
+        self._recordings = StepRecordings(record=record)
+
+    def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+        """Train one step.
+
+        Args:
+            state: the field. Afterwards its tensors are rows of this object's buffers, and ``info`` says that the
+                statistics of densification are counted.
+            inputs: of this step; learning rates are those of the optimizers.
+            settings: of training images, with the backend gsplat for recording.
+
+        Raises:
+            BackendError: the step cannot be recorded. Nothing has changed.
+            torch.cuda.OutOfMemoryError: the same.
+        """
+        held = self._held
+        if held is None or not held.unchanged(state, settings):
+            held = self._held = self._hold(state, settings)
+        # Pinned: copying from other memory would wait until the GPU has finished the last step.
+        numbers = torch.tensor(
+            [*(float(group["lr"]) for _, _, group in held.groups), float(state.field.num_primitives)],
+            pin_memory=state.device.type == "cuda",
+        ).to(state.device, non_blocking=True)
+        # The prior of a field that grows is a mean over fewer rows than the buffers have.
+        count = numbers[-1] if state.densifying and self._losses.prior_weight(state) > 0 else None
+        result = self._recordings.run(
+            partial(self._step, state, held),
+            replace(inputs, rates=numbers[:-1], count=count),
+            settings,
+            kind=_kind(state, inputs, settings),
+            addresses=held.addresses,
+        )
+        state.info = {COUNTED: True}
+        return result
+
+    def _hold(self, state: FieldState, settings: RenderSettings) -> _Held:
+        """Let the field be rows of the buffers, with all states that its optimizers need."""
+        trained = trained_parameters(state)
+        start_moments(state, trained if settings.head is None else (*trained, HEAD))
+        if state.densifying:
+            start_counting(state.densification, state.field["means"])
+        if self._buffers.hold(state, trained, growing=state.densifying):
+            self._recordings.forget(pairs=not state.densifying)  # a pruned field needs far fewer pairs
+        return _Held.of(state, trained, settings.head)
+
+    def _step(
+        self, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None
+    ) -> StepResult:
+        """One step on the buffers; all of its work is recorded."""
+        tensors, head, view = self._buffers.tensors, settings.head, inputs.view
+        trained = {name: tensors[name] for name in held.trained}
+        # With parameters that have no values, such as the features of a field without a head.
+        empty = {name: value for name, value in state.field.items() if name not in trained and value.numel() == 0}
+        field = Field(trained, state.field.encoding)
+        source = LocalField(Field({**empty, **trained}, state.field.encoding))
+        step = TrainingStep(source, state, self._losses, field)
+        loss, splatted, result = step(inputs, settings)
+        network = [] if head is None else list(head.parameters())
+        counting, centers = state.densifying and "grad2d" in tensors, splatted.info["means2d"]
+        wanted = [*field.values(), *network, *([centers] if counting else [])]
+        grads = torch.autograd.grad(loss, wanted, allow_unused=True)
+        with torch.no_grad():
+            overflow = self._recordings.overflow(capacity)
+            if counting:
+                of_centers, radii = centers.absgrad if settings.absgrad else grads[-1], splatted.info["radii"]
+                radii = radii if overflow is None else radii * (overflow == 0)
+                count_view(tensors, of_centers[0], radii[0], view.width, view.height)
+            assert inputs.rates is not None
+            updates = self._updates(held, dict(zip([*field.values(), *network], grads, strict=False)))
+            adam_step(updates, inputs.rates, overflow)
+        return result
+
+    def _updates(
+        self, held: _Held, grads: Mapping[Tensor, Tensor | None]
+    ) -> list[tuple[Mapping[str, Any], list[Update]]]:
+        """Groups of parameters with their updates, on whole buffers."""
+        tensors = self._buffers.tensors
+        groups: list[tuple[Mapping[str, Any], list[Update]]] = []
+        for name, optimizer, group in held.groups:
+            updates = []
+            for value in group["params"]:
+                whole, own = tensors.get(name, value), optimizer.state[value]
+                grad = grads.get(whole)
+                if grad is None:
+                    continue
+                if grad.stride() != whole.stride():  # kernels walk through all tensors in the order of memory
+                    grad = torch.empty_like(whole).copy_(grad)
+                mean, square = (tensors.get(f"{name}.{moment}", own[moment]) for moment in MOMENTS)
+                updates.append(Update(whole, grad, mean, square, own["step"]))
+            groups.append((group, updates))
+        return groups
+
+
+def _kind(state: FieldState, inputs: StepInputs, settings: RenderSettings) -> Hashable:
+    """What decides on the kernels of a step, beside numbers of primitives."""
+    view, head = inputs.view, settings.head
+    degree = degree_in_use(state.field.sh_degree, settings.active_sh_degree)
+    return (
+        (view.width, view.height, inputs.mask is not None, degree, settings.antialiased, settings.absgrad),
+        (state.densifying, state.pruned, state.head_enabled),
+        None if head is None else (head.net, *vars(head.config).values()),
+    )

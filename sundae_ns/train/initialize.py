@@ -1,0 +1,209 @@
+"""The field that a training starts from: sparse points of the capture, random points, or a finished field.
+
+Structure from motion finds points where it can tell one from another: a few hundred in a dozen photos, few on lawns and
+walls. There, :class:`DenseStart` adds points by a plane sweep through the images. Where a field begins without any, it
+explains each image by primitives near its camera, and other views do not agree.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.progress import track
+from torch import Tensor
+
+from sundae_ns.core.errors import CheckpointError
+from sundae_ns.core.gaussians import FEATURES, rgb_to_logit, sh_to_rgb
+from sundae_ns.core.surgery import replace_parameter
+from sundae_ns.io.coordinates import similarity
+from sundae_ns.io.formats import kind_of, read_field
+from sundae_ns.pruning.selection import neighbor_order, select_systematic
+from sundae_ns.scene.initialization import from_points, initial_features, random_points
+from sundae_ns.scene.virtual_cameras import by_device
+from sundae_ns.train.plane_sweep import Sweep
+from sundae_ns.train.state import Extension, FieldState, TrainingRun
+
+log = logging.getLogger(__name__)
+
+
+FEWEST_POINTS = 50  # With fewer sparse points a user hears that photos overlap too little
+
+Points = tuple[Tensor, Tensor]  # Positions [N, 3] and colours in 0 to 255 [N, 3]
+
+Frame = tuple[Tensor, float]  # Transform [3, 4] and scale from the capture's coordinates to those of the model
+
+
+@dataclass(frozen=True)
+class Start:
+    """Warnings or an error to report when training starts. A checkpoint that is loaded first makes them irrelevant."""
+
+    warnings: tuple[str, ...] = ()
+    failure: CheckpointError | None = None  # Why the model could not start from its warm start
+
+    def announce(self) -> None:
+        """Print the warnings.
+
+        Raises:
+            CheckpointError: the failure.
+        """
+        if self.failure is not None:
+            raise self.failure
+        for warning in self.warnings:
+            log.warning(warning)
+
+
+def initial_field(
+    options: Any, points: Points | None, frame: Frame | None, *, num_features: int, cap: int | None
+) -> tuple[dict[str, Tensor], Start]:
+    """Parameters of a new model, float32 on the CPU, and what to report if it is trained.
+
+    A finished run must open without the file that it started from. The field then comes from the sparse points, and the
+    error is reported only when training starts.
+
+    Args:
+        options: ``SundaeModelConfig``.
+        points: sparse points of the capture, if it has any.
+        frame: of the capture, if known.
+        num_features: length of the feature vectors; 0 for none.
+        cap: highest number of primitives to start with; None for no cap.
+    """
+    start = Start()
+    try:
+        if options.warm_start is None:
+            params, start = _sparse_field(options, points, num_features, cap)
+        else:
+            params = _warm_field(options, options.warm_start, frame, num_features)
+    except CheckpointError as error:
+        params, start = _sparse_field(options, points, num_features, cap)[0], Start(failure=error)
+    if options.sh_degree == 0:
+        # splatfacto and nerfstudio's exporter store logits of colours at SH degree 0.
+        params["features_dc"] = rgb_to_logit(sh_to_rgb(params["features_dc"]))
+    return params, start
+
+
+def _sparse_field(
+    options: Any, points: Points | None, num_features: int, cap: int | None
+) -> tuple[dict[str, Tensor], Start]:
+    warnings: list[str] = []
+    if points is not None and len(points[0]) > 0 and not options.random_init:
+        xyz, rgb = points[0], points[1].float() / 255 if len(points[1]) else torch.full_like(points[0], 0.5)
+        if len(xyz) < FEWEST_POINTS:
+            warnings.append(
+                f"the capture has only {len(xyz)} sparse points: its photos hardly overlap and the scene will be poor; "
+                "add photos between them"
+            )
+    else:
+        if not options.random_init:
+            warnings.append(
+                f"the capture has no sparse point cloud; starting from {options.num_random} random points. Results are "
+                "better with one (COLMAP, or ply_file_path in transforms.json)."
+            )
+        xyz, rgb = random_points(options.num_random, options.random_scale)
+    if cap is not None and len(xyz) > cap:
+        warnings.append(f"{len(xyz):,} points are more than the cap; starting from {cap:,} of them")
+        chosen = torch.randperm(len(xyz), generator=torch.Generator().manual_seed(options.pruning.seed))[:cap]
+        xyz, rgb = xyz[chosen], rgb[chosen]
+    params = from_points(xyz, rgb, sh_degree=options.sh_degree, num_features=num_features)
+    return params, Start(tuple(warnings))
+
+
+def _warm_field(options: Any, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
+    params, in_model_frame, _ = read_field(source)
+    if options.warm_start_frame != "auto":
+        in_model_frame = options.warm_start_frame == "model"
+    elif kind_of(source) == "gsplat":
+        raise CheckpointError(
+            f"{source} does not state its coordinates, and gsplat turns and scales a capture unless it trains with "
+            "--no-normalize-world-space; if it did, give --pipeline.model.warm-start-frame capture"
+        )
+    if not in_model_frame:
+        if frame is None:
+            raise CheckpointError(
+                "the warm start is in the capture's coordinates, and only sundae's datamanager knows their transform; "
+                "train with it, or give --pipeline.model.warm-start-frame model"
+            )
+        params = similarity(params, *frame)
+    wanted, found = (options.sh_degree + 1) ** 2 - 1, params["features_rest"].shape[1]
+    rest = params["features_rest"].new_zeros(len(params["means"]), wanted, 3)
+    rest[:, : min(wanted, found)] = params["features_rest"][:, : min(wanted, found)]
+    params["features_rest"] = rest
+    if num_features:
+        params[FEATURES] = initial_features(params["features_dc"], num_features)
+    log.info(f"warm start: {len(params['means'])} primitives from {source}")
+    return params
+
+
+SIDES = {"cuda": 640, "cpu": 160}
+"""Longest side of the swept images, pixels, by device: a CPU takes a second a view, a GPU a fraction."""
+MOST_ON_CPU = 24  # Most views that a CPU sweeps
+FILLED = {"cuda": 100_000, "cpu": 20_000}
+"""Number of points up to which a sparse cloud is filled; a larger one stays as it is."""
+
+
+class DenseStart(Extension):
+    """Begins the training anew from sparse and dense points, before the first step.
+
+    Args:
+        options: ``SundaeModelConfig``.
+        points: sparse points of the capture; None or none at all leave the field as it is.
+        num_images: number of training images.
+        num_features: length of the feature vectors; 0 for none.
+        cap: highest number of primitives to start with; None for no cap.
+    """
+
+    name = "dense-start"
+
+    def __init__(
+        self, options: Any, points: Points | None, num_images: int, *, num_features: int, cap: int | None
+    ) -> None:
+        self._options, self._points, self._num_features, self._cap = options, points, num_features, cap
+        wanted = 2 <= num_images <= options.dense_start_views and options.warm_start is None and not options.random_init
+        self._done = not wanted or points is None or len(points[0]) == 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: a checkpoint holds the field that has begun."""
+        return {}
+
+    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """A field of a checkpoint is in training."""
+        self._done = True
+
+    def before_training(self, run: TrainingRun) -> None:
+        """Sweep, and put the larger field in the place of the one from sparse points."""
+        if self._done:
+            return
+        self._done = True
+        assert self._points is not None
+        state, (sparse, colours) = run.state, self._points
+        too_many = state.device.type == "cpu" and len(run.view_indices()) > MOST_ON_CPU
+        if too_many or len(sparse) >= by_device(FILLED, state.device):
+            return
+        xyz, rgb = self._swept(run, sparse.to(state.device))
+        colours = colours.float()
+        colours = colours if len(colours) else torch.full_like(sparse, 127.5)
+        points = torch.cat([sparse, xyz.to(sparse)]), torch.cat([colours, 255 * rgb.to(colours)])
+        params, _ = initial_field(self._options, points, None, num_features=self._num_features, cap=self._cap)
+        for name, value in params.items():  # without moments
+            replace_parameter(state.field.data, state.optimizers, name, value.to(state.device), {})
+        log.info(
+            f"{len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones "
+            "(--pipeline.model.dense-start-views 0 leaves them out)"
+        )
+
+    @torch.no_grad()
+    def _swept(self, run: TrainingRun, sparse: Tensor) -> Points:
+        """Positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``; evenly spread ones if too many are found."""
+        most = by_device(FILLED, run.state.device) - len(sparse)
+        sweep = Sweep(run.photos(), sparse[sparse.isfinite().all(dim=1)], by_device(SIDES, run.state.device))
+        for i in track(range(len(sweep.photos)), "Plane sweep", transient=True):
+            sweep.add(i)
+        xyz, rgb = sweep.points(most)
+        if len(xyz) > most:
+            even = select_systematic(torch.ones(len(xyz)), most, neighbor_order(xyz), self._options.pruning.seed)
+            xyz, rgb = xyz[even.to(xyz.device)], rgb[even.to(rgb.device)]
+        return xyz.cpu(), rgb.cpu()

@@ -1,0 +1,316 @@
+"""Points from images with known cameras: planes are swept through each view and compared with its neighbours.
+
+The sweep is that of Collins ("A Space-Sweep Approach to True Multi-Image Matching", 1996), with planes of several
+directions (Gallup et al., 2007). Patches are compared by their normalised cross-correlation. A depth stays if it comes
+back to its pixel through the depth that another view has found there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, interpolate, normalize, pad
+
+from sundae_ns.core.camera import View
+from sundae_ns.cuda.kernels import Launch, kernels_where_possible
+from sundae_ns.cuda.sweep import WINDOW, FusedCorrelations, Patches, sweep_kernels
+from sundae_ns.train.state import Photo
+
+CONTRAST = 0.02  # Least standard deviation of the grey values of a patch: a flat one fits anywhere
+LEAST_VARIANCE = 1e-5  # Lower limit for the variance of a patch of another view, so that a flat one does not correlate
+CORRELATION = 0.6  # Least correlation with one of the views
+NEIGHBORS = 3
+"""Number of views that a view is compared with. The best one counts at a pixel, as often only one sees the place."""
+CONFIRMING = 24  # Number of best neighbours whose depths may confirm those of a view
+JUDGES = 5000  # Most sparse points, evenly drawn, that decide which views are neighbours
+STEP, FEWEST, MOST = 1.5, 16, 256
+"""Distance of two planes in another view, pixels of the reduced image, and the limits of the number of planes."""
+NEARER, FARTHER = 0.7, 4.0
+"""Range of the depths, as shares of those of the nearest and farthest sparse points (without 2% on either side)."""
+SEEN = 8  # Fewest sparse points that state a range
+LARGEST_ERROR, LARGEST_SHIFT = 0.1, 1.5
+"""Largest relative difference of two depths that agree, and largest distance from the pixel that is come back to."""
+STEEPEST = 0.15  # Least cosine between the ray of a pixel and the normal of a plane
+_TILT = 0.766, 0.643  # Cosine and sine of 40 degrees, by which planes are turned
+_BATCH = 16  # Planes at a time
+_LOOKED_AT = 16
+"""Pixels examined for each wanted point: views do not agree on all of them, and even ones are chosen afterwards."""
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """A photo of reduced size, 12 bytes a pixel with its depth: captures have hundreds."""
+
+    view: View
+    image: Tensor  # uint8 [H, W, 3]
+    grey: Tensor  # [1, 1, H, W]
+    usable: Tensor  # Pixels that count and have contrast, bool [H, W]
+    pose: Tensor  # Camera-to-world, OpenCV axes [4, 4]
+
+    unproject: Tensor  # Inverse intrinsics [3, 3]
+
+    def rays(self, row: Tensor, column: Tensor) -> Tensor:
+        """Points at depth 1 behind pixel centres, camera coordinates ``[..., 3]``; rows and columns broadcast."""
+        row, column = torch.broadcast_tensors(row, column)
+        pixels = torch.stack([column + 0.5, row + 0.5, torch.ones_like(row)], dim=-1)
+        return pixels.to(self.unproject) @ self.unproject.T
+
+
+class _Neighbors(NamedTuple):
+    """Indices of the views that are compared with a view, and of those that confirm its depths; the best come first."""
+
+    compared: list[int]
+    confirming: list[int]
+
+
+class Sweep:
+    """The sweep through all views, one at a time.
+
+    Args:
+        photos: images and cameras; one in full size is held at a time.
+        sparse: finite points of the scene that state the range of depths ``[P, 3]``.
+        longest: longest side of the compared images, pixels.
+    """
+
+    def __init__(self, photos: Iterable[Photo], sparse: Tensor, longest: int) -> None:
+        self.photos = [_reduced(photo, longest) for photo in photos]
+        self._sparse = sparse
+        self._neighbors = _neighbors(self.photos, sparse[:: -(-len(sparse) // JUDGES)] if len(sparse) else sparse)
+        upward = [-photo.view.viewmat[1, :3] for photo in self.photos]
+        self._up = torch.stack(upward).mean(dim=0) if upward else sparse.new_zeros(3)
+        self._depths = [torch.zeros_like(photo.usable, dtype=torch.float32) for photo in self.photos]
+
+    def add(self, index: int) -> Tensor:
+        """Find the depths of a view ``[H, W]``, along its axis; 0 where there are none."""
+        photo, others = self.photos[index], [self.photos[i] for i in self._neighbors[index].compared]
+        limits = self._limits(photo.view)
+        if limits is None or not others:
+            return self._depths[index]
+        low, high = limits
+        best = torch.full_like(self._depths[index], -1.0)
+        depth = torch.zeros_like(best)
+        rows, columns = (torch.arange(side, device=best.device) for side in best.shape)
+        rays = photo.rays(rows[:, None], columns)
+        lengths, correlations = rays.norm(dim=-1), _correlations(photo, others, rays, (1 / high, 1 / low))
+        for normal in _directions(photo.view, self._up):
+            # A plane is normal . X = 1 / s, so a pixel has the inverse depth facing * s.
+            facing = rays @ normal
+            steep = facing > STEEPEST * lengths
+            if not steep.any():
+                continue
+            ends = 1 / (high * float(facing[steep].max())), 1 / (low * float(facing[steep].min()))
+            s = torch.linspace(*ends, _number_of_planes(photo, others, normal, ends), device=facing.device)
+            score, place = _peaks(correlations(facing, s))
+            score = torch.where(steep, score, -1.0)
+            found = 1 / (facing * (s[0] + place * (s[1] - s[0]))).clamp_min(1e-12)
+            depth, best = torch.where(score > best, found, depth), torch.maximum(score, best)
+        self._depths[index] = torch.where((best > CORRELATION) & photo.usable, depth, 0.0)
+        return self._depths[index]
+
+    def points(self, wanted: int) -> tuple[Tensor, Tensor]:
+        """Points on which two or more views agree: positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``.
+
+        Args:
+            wanted: number of points that the caller needs. If there are many more, pixels are skipped evenly.
+        """
+        empty = self._sparse.new_zeros(0, 3)
+        every = max(1, sum(int((depth > 0).sum()) for depth in self._depths) // max(1, _LOOKED_AT * wanted))
+        places, colours = zip((empty, empty), *(self._agreeing(index, every) for index in range(len(self.photos))))
+        return torch.cat(places), torch.cat(colours)
+
+    def _limits(self, view: View) -> tuple[float, float] | None:
+        """Nearest and farthest depth to look at; None where too few sparse points are seen."""
+        x, y, z = _project(view, self._sparse)
+        seen = z[_in_view(view, x, y, z)].sort().values
+        if len(seen) < SEEN:
+            return None
+        ends = seen[[int(0.02 * (len(seen) - 1)), int(0.98 * (len(seen) - 1))]].tolist()
+        return NEARER * ends[0], FARTHER * ends[1]
+
+    def _agreeing(self, index: int, every: int) -> tuple[Tensor, Tensor]:
+        """Points of a view that others confirm: means with those of the others, and colours.
+
+        Args:
+            index: of the view.
+            every: examine one of this many pixels.
+        """
+        photo, depth = self.photos[index], self._depths[index]
+        rows, columns = (depth > 0).nonzero()[::every].T
+        points = _to_world(photo, photo.rays(rows, columns) * depth[rows, columns][:, None])
+        x, y, _ = _project(photo.view, points)
+        total, count = points.clone(), torch.ones_like(x)
+        for i in self._neighbors[index].confirming:
+            other, depths = self.photos[i], self._depths[i]
+            there_x, there_y, z = _project(other.view, points)
+            column = there_x.nan_to_num().clamp(0, other.view.width - 1).long()
+            row = there_y.nan_to_num().clamp(0, other.view.height - 1).long()
+            found = depths[row, column]
+            theirs = _to_world(other, other.rays(row, column) * found[:, None])
+            back_x, back_y, _ = _project(photo.view, theirs)
+            agrees = _in_view(other.view, there_x, there_y, z) & (found > 0) & ((found - z).abs() < LARGEST_ERROR * z)
+            agrees &= torch.hypot(back_x - x, back_y - y) < LARGEST_SHIFT
+            total += torch.where(agrees[:, None], theirs, 0.0)
+            count += agrees
+        good = count >= 2
+        return total[good] / count[good][:, None], photo.image[rows, columns][good] / 255
+
+
+def _reduced(photo: Photo, longest: int) -> _Reduced:
+    view, image = photo.view, photo.target.permute(2, 0, 1)[None]
+    mask = torch.ones_like(image[:, :1]) if photo.mask is None else photo.mask[None, None].to(image)
+    if longest < max(view.width, view.height):
+        view = view.zoomed(longest / max(view.width, view.height))
+        image, mask = (
+            interpolate(value, (view.height, view.width), mode="bilinear", antialias=True) for value in (image, mask)
+        )
+    grey = image.mean(dim=1, keepdim=True)
+    patches = _patches(grey)
+    usable = (patches.deviation > CONTRAST) & (_box(mask)[0, 0] / patches.size > 0.99)
+    colours = (255 * image[0].permute(1, 2, 0)).round().clamp(0, 255).to(torch.uint8)
+    return _Reduced(view, colours, grey, usable, torch.linalg.inv(view.viewmat), torch.linalg.inv(view.K))
+
+
+def _patches(grey: Tensor) -> Patches:
+    """The patches of an image ``[1, 1, H, W]``; flat ones have a small deviation, not none."""
+    size = _box(torch.ones_like(grey))
+    mean = _box(grey) / size
+    deviation = (_box(grey * grey) / size - mean * mean).clamp_min(1e-8).sqrt()
+    return Patches(*(value[0, 0] for value in (grey, size, mean, deviation)))
+
+
+def _project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels x, y and depths of points ``[..., 3]``; pixels mean something where depths are positive."""
+    x, y, z = ((points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]) @ view.K.T).unbind(dim=-1)
+    return x / z, y / z, z
+
+
+def _in_view(view: View, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Whether projected points lie in the image, in front of the camera, bool."""
+    return (z > 0) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
+
+
+def _to_world(photo: _Reduced, points: Tensor) -> Tensor:
+    return points @ photo.pose[:3, :3].T + photo.pose[:3, 3]
+
+
+def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[_Neighbors]:
+    """For each view the others that see most of its sparse points, from directions that differ by some degrees."""
+    if len(photos) < 2 or not len(sparse):
+        return [_Neighbors([], []) for _ in photos]
+    seen = torch.stack([_in_view(photo.view, *_project(photo.view, sparse)) for photo in photos])
+    directions = torch.stack([normalize(sparse - photo.pose[:3, 3], dim=-1) for photo in photos])
+    found = []
+    for i in range(len(photos)):
+        angles = torch.rad2deg((directions * directions[i]).sum(dim=-1).clamp(-1, 1).acos())
+        # Near directions tell little about depths; from far ones places look different.
+        weights = angles / (angles + 4) * torch.exp(-((angles / 36) ** 2))
+        shared = (weights * (seen & seen[i])).sum(dim=1)
+        shared[i] = -1
+        order = torch.argsort(shared, descending=True, stable=True)[: len(photos) - 1].tolist()
+        found.append(_Neighbors([j for j in order[:NEIGHBORS] if shared[j] > 0], order[:CONFIRMING]))
+    return found
+
+
+def _directions(view: View, up: Tensor) -> list[Tensor]:
+    """Normals of the planes in camera coordinates, away from the camera: facing it, four turned ones, the ground."""
+    c, s = _TILT
+    fixed = [(0.0, 0.0, 1.0), (s, 0.0, c), (-s, 0.0, c), (0.0, s, c), (0.0, -s, c)]
+    return [*(view.K.new_tensor(normal) for normal in fixed), view.viewmat[:3, :3] @ -normalize(up, dim=0)]
+
+
+def _number_of_planes(photo: _Reduced, others: Sequence[_Reduced], normal: Tensor, ends: tuple[float, float]) -> int:
+    """Number of planes between two, by the way that the middle of the image takes in the other views."""
+    row, column = (torch.tensor([side // 2], device=normal.device) for side in (photo.view.height, photo.view.width))
+    (middle,) = photo.rays(row, column)
+    points = _to_world(photo, torch.stack([middle / (torch.dot(middle, normal).clamp_min(STEEPEST) * s) for s in ends]))
+    longest = 0.0
+    for other in others:
+        x, y, z = _project(other.view, points)
+        if (z > 0).all():
+            longest = max(longest, float(torch.hypot(x[1] - x[0], y[1] - y[0])))
+    return int(min(max(longest / STEP, FEWEST), MOST))
+
+
+def _correlations(
+    photo: _Reduced, others: Sequence[_Reduced], rays: Tensor, inverses: tuple[float, float]
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """The function of :meth:`FusedCorrelations.__call__` for a view, its neighbours and the limits of inverse depths.
+
+    Args:
+        rays: of all pixels of the view ``[H, W, 3]``.
+    """
+    patches = _patches(photo.grey)
+    # X' = R X + t with s normal . X = 1: the ray r projects to K (R r + s (normal . r) t).
+    ways = [other.view.K @ (other.view.viewmat @ photo.pose)[:3] for other in others]
+    if kernels := _kernels(photo.grey):
+        maps = torch.stack([torch.cat([way[:, :3] @ photo.unproject, way[:, 3:]], dim=1) for way in ways])
+        images = [other.grey[0, 0] for other in others]
+        return FusedCorrelations(kernels, patches, images, maps, inverses, LEAST_VARIANCE)
+    starts = [rays @ way[:, :3].T for way in ways]
+    return lambda facing, s: torch.cat(
+        [_scores(patches, others, starts, ways, facing * part[:, None, None], inverses) for part in s.split(_BATCH)]
+    )
+
+
+def _scores(
+    patches: Patches,
+    others: Sequence[_Reduced],
+    starts: Sequence[Tensor],
+    ways: Sequence[Tensor],
+    inverse: Tensor,
+    inverses: tuple[float, float],
+) -> Tensor:
+    """What the kernel computes, by PyTorch's operations: scores ``[S, H, W]`` for inverse depths ``[S, H, W]``."""
+    inside = (inverse >= inverses[0]) & (inverse <= inverses[1])
+    scores = []
+    for other, start, way in zip(others, starts, ways):
+        x, y, z = (start[..., i] + inverse * way[i, 3] for i in range(3))
+        sides = z.new_tensor([other.view.width, other.view.height])
+        grid = 2 * torch.stack([x, y], dim=-1) / (z.clamp_min(1e-6)[..., None] * sides) - 1
+        valid = inside & (z > 1e-6) & (grid.abs() < 1).all(dim=-1)
+        grey = other.grey.expand(len(inverse), -1, -1, -1)
+        seen = grid_sample(grey, grid, padding_mode="border", align_corners=False)
+        moments = _box(torch.cat([seen, seen * seen, seen * patches.grey], dim=1)) / patches.size
+        average, square, product = moments.unbind(dim=1)
+        variance = (square - average * average).clamp_min(LEAST_VARIANCE)
+        score = (product - average * patches.mean) / (patches.deviation * variance.sqrt())
+        scores.append(torch.where(valid, score, -1.0))
+    return torch.stack(scores).amax(dim=0)
+
+
+def _kernels(image: Tensor) -> dict[str, Launch] | None:
+    """The kernel, on a GPU that can compile it."""
+    if not image.is_cuda:
+        return None
+    return kernels_where_possible(sweep_kernels, image.device, "a plane sweep runs as hundreds of kernels a direction")
+
+
+def _peaks(scores: Tensor) -> tuple[Tensor, Tensor]:
+    """Highest score of each pixel and its place among the planes, by a parabola through three of them: ``[H, W]``."""
+    score, k = scores.max(dim=0)
+    inner = k.clamp(1, len(scores) - 2)
+    before, at, after = (scores.gather(0, inner[None] + i)[0] for i in (-1, 0, 1))
+    curve = before - 2 * at + after
+    shift = torch.where(curve < -1e-6, 0.5 * (before - after) / curve.clamp_max(-1e-6), 0.0).clamp(-0.5, 0.5)
+    return score, k + torch.where((inner == k) & (before > -1) & (after > -1), shift, 0.0)
+
+
+def _box(image: Tensor) -> Tensor:
+    """Sum over the patch of each pixel ``[N, C, H, W]``; in few additions, as pooling is slow on a CPU."""
+    image = pad(image, (WINDOW // 2,) * 4)
+    for axis in (2, 3):
+        length, power, size, offset = image.shape[axis] - WINDOW + 1, image, 1, 0
+        total = image.new_zeros(())
+        while size <= WINDOW:  # sums of 1, 2, 4 ... neighbours, joined by the binary digits of the window
+            if WINDOW & size:
+                total, offset = total + power.narrow(axis, offset, length), offset + size
+            if 2 * size <= WINDOW:
+                shorter = power.shape[axis] - size
+                power = power.narrow(axis, 0, shorter) + power.narrow(axis, size, shorter)
+            size *= 2
+        image = total
+    return image

@@ -1,0 +1,465 @@
+"""Pruning in training: its options, its schedule, the extensions that prune and remove floaters, and their records.
+
+A schedule decides, a :class:`sundae_ns.pruning.decision.FieldPruner` prunes. The running state is a dict of integers,
+which checkpoints carry: a resumed run neither prunes twice nor forgets its peak.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from sundae_ns.core.errors import ConfigError, SundaeError
+from sundae_ns.core.files import write_text
+from sundae_ns.core.tables import without_nan
+from sundae_ns.core.timing import now, peak_memory
+from sundae_ns.io.run_folder import prunes_before
+from sundae_ns.pruning.decision import FieldPruner
+from sundae_ns.pruning.floaters import MOST, near_cameras
+from sundae_ns.pruning.rule import PruneRule, ScoreName, check_share, kept_count
+from sundae_ns.scene.render import contribution
+from sundae_ns.train.schedules import notify_pruned
+from sundae_ns.train.state import Extension, FieldState, TrainingRun
+
+log = logging.getLogger(__name__)
+
+
+USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise; also where trials cannot decide
+
+
+@dataclass
+class PruningConfig(PruneRule):
+    """When to prune and how many primitives to keep, beside the rule that says which.
+
+    One class, because ``config.yml`` and the command line have these options side by side. Code that prunes takes the
+    :class:`sundae_ns.pruning.rule.PruneRule` alone.
+    """
+
+    score: ScoreName = "detail-contribution"
+    """Importance of a primitive: its blending weight over the training views, with pixels weighted by the detail that
+    the kept primitives cannot show (detail-contribution), or its high-pass response (response)."""
+    mode: Literal["one-shot", "continuous", "off"] = "one-shot"
+    """Prune once (one-shot, the paper's main strategy), periodically during densification for less peak memory
+    (continuous), or never (off)."""
+    keep_ratio: float | None = USUAL_SHARE
+    """Share of the N primitives that one prune keeps, in (0, 1]: exactly round(keep_ratio * N). One-shot: None lets
+    trials on held-out training views decide the number."""
+    prune_at: int = 12000
+    """Step after which the one-shot prune happens."""
+    start: int = 2000
+    """First step of continuous pruning."""
+    stop: int = 15000
+    """Last step of continuous pruning."""
+    every: int = 2000
+    """Steps from one continuous prune to the next."""
+    max_primitives: int | None = None
+    """Continuous: most primitives at any step, densification included; a prune keeps at most this many. One-shot: most
+    primitives that the prune keeps."""
+    target_primitives: int | None = None
+    """Each prune keeps exactly this many, instead of a share or of what trials choose. Continuous: the final field has
+    exactly this many; if densification ends with fewer, primitives are added."""
+    max_drop: float | None = None
+    """One-shot, where trials decide: PSNR in dB that a smaller field may lose against the best one, and SSIM in
+    proportion. None for 0.1 dB and 0.003."""
+    max_bytes: int | None = None
+    """One-shot, where trials decide: most bytes of the packed scene, by an estimate."""
+
+    @property
+    def decides(self) -> bool:
+        """Whether trials decide how many primitives the one-shot prune keeps."""
+        return self.mode == "one-shot" and self.keep_ratio is None and self.target_primitives is None
+
+    @property
+    def ends_growth_at(self) -> int | None:
+        """Step of the prune after densification; None if the mode has none."""
+        return self.prune_at if self.mode == "one-shot" else None
+
+    @property
+    def first_prune(self) -> int | None:
+        """Step of the first prune; None if the mode is off."""
+        return self.start if self.mode == "continuous" else self.ends_growth_at
+
+    @property
+    def last_due(self) -> int:
+        """Step of the last scheduled prune; later ones happen only if the field exceeds a target or a cap."""
+        if self.mode != "continuous":
+            return self.prune_at
+        if self.target_primitives is not None or self.max_primitives is not None:
+            return self.stop
+        return self.start + (self.stop - self.start) // self.every * self.every
+
+    @property
+    def settled_at(self) -> int:
+        """Step after which the number of primitives does not change."""
+        return self.stop if self.mode == "continuous" else self.prune_at
+
+    def validate(self) -> None:
+        """Check every option of the schedule and of its rule.
+
+        Raises:
+            ConfigError: names the first invalid option and its valid values.
+        """
+        super().validate()
+        if self.keep_ratio is not None:
+            check_share(self.keep_ratio)
+        self.check_at_least(every=1, prune_at=0, start=0, max_primitives=1, target_primitives=1, max_bytes=1)
+        if self.mode == "continuous" and self.stop < self.start:
+            raise ConfigError(f"start ({self.start}) lies after stop ({self.stop}): swap them")
+        if self.mode == "continuous" and self.keep_ratio is None and self.target_primitives is None:
+            raise ConfigError(
+                "keep_ratio is None and mode is continuous, without trials: give 0.5, or target_primitives"
+            )
+        if self.mode == "off" and (self.max_primitives is not None or self.target_primitives is not None):
+            raise ConfigError("mode is off, which prunes nothing: set mode to one-shot, or drop the number")
+        for name in ("max_drop", "max_bytes"):
+            if getattr(self, name) is not None and not self.decides:
+                raise ConfigError(
+                    f"{name} is set, and trials do not decide the number of primitives: set keep_ratio to None and "
+                    "mode to one-shot, as sundae does"
+                )
+        if self.max_drop is not None and not 0 < self.max_drop < float("inf"):
+            raise ConfigError(f"max_drop is {self.max_drop}: use a positive number of dB, 0.1 for one")
+        cap, target = self.max_primitives, self.target_primitives
+        if cap is not None and target is not None and target > cap:
+            raise ConfigError(f"target_primitives ({target}) is more than max_primitives ({cap}): swap them")
+
+
+@dataclass(frozen=True)
+class PruneReport:
+    """Numbers of one prune."""
+
+    step: int  # Training step after which it happened
+    before: int  # Number of primitives before it, including those that are not finite
+    after: int  # Number of primitives after it
+    dropped_nonfinite: int  # Primitives removed because a parameter was NaN or infinite
+    peak: int  # Highest number of primitives at any step so far
+    seconds: float  # Wall-clock time of decision and surgery, synchronised
+    tau: float | None = None  # Threshold of the graph on squared distances, squared scene units; None without a graph
+    sigma: float | None = None  # Width of the edge weights, scene units; None without a graph
+    isolated: int | None = None  # Primitives without a neighbour within the threshold; None without a graph
+
+    def summary(self) -> str:
+        """One line for the log."""
+        parts = [f"step {self.step}: kept {self.after:,} of {self.before:,} primitives in {self.seconds:.1f} s"]
+        parts.append(f"peak {self.peak:,}")
+        if self.dropped_nonfinite:
+            parts.append(f"{self.dropped_nonfinite:,} were NaN or infinite")
+        if self.sigma is not None and self.tau is not None:
+            parts.append(f"sigma {self.sigma:.3g}, tau {self.tau:.3g}, {self.isolated:,} isolated")
+        return "; ".join(parts)
+
+
+def write_record(run: TrainingRun, name: str, record: Mapping[str, Any]) -> None:
+    """Write a record as JSON to the run's folder, if there is one; numbers that are not finite become null."""
+    if run.folder is not None:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        write_text(run.folder / name, json.dumps(without_nan(record), indent=2, allow_nan=False) + "\n")
+
+
+def write_report(
+    run: TrainingRun, report: PruneReport, *, before: Mapping[str, float], after: Mapping[str, float]
+) -> None:
+    """Write a report to the event file and to ``prune.json``.
+
+    Args:
+        run: the run.
+        report: numbers of the prune.
+        before, after: metrics of the test views on both sides of the prune; empty if they were not evaluated.
+
+    Raises:
+        StorageError: no space or no right to write.
+    """
+    scalars = {"before": report.before, "after": report.after, "seconds": report.seconds, "peak": report.peak}
+    run.log_scalars("Prune", scalars)
+    if run.folder is not None:
+        path = run.folder / "prune.json"
+        # A run that was killed between a prune and the next save repeats that prune.
+        reports = prunes_before(path, report.step)
+        reports.append({**asdict(report), "warm_up": dict(before), "pruned": dict(after)})
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, json.dumps(reports, indent=2))
+
+
+NEVER = -1  # Value of state["pruned_at"] before the first prune
+COUNT = "count"  # Key of the running state with the number that trials have chosen; 0 for the usual share
+LEAST_OPACITY = 0.005
+"""Lowest opacity of primitives that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
+
+Contribute = Callable[[int | None], Tensor]
+"""Renders the training views and returns the contribution of the pruner's primitives ``[N]``; the argument is ``count``
+of :func:`sundae_ns.scene.render.contribution`."""
+
+
+@dataclass(frozen=True)
+class PruningSchedule:
+    """The schedule of a pruning mode.
+
+    ``one-shot`` is the paper's main strategy: training, one prune that keeps ``keep_ratio`` or, once trials have chosen
+    it, their number, then fine-tuning.
+    ``continuous`` is the paper's alternative: periodic pruning during densification, for a lower peak of memory. Each
+    prune keeps ``keep_ratio``, so the final number is only roughly known; with ``target_primitives`` it is exact,
+    because the last prune comes after densification. ``max_primitives`` caps every prune, and every step in between
+    through :class:`sundae_ns.train.densification.CappedStrategy`. ``off`` only
+    records the peak.
+    """
+
+    config: PruningConfig  # Valid options; not changed
+
+    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
+        """Whether a field of ``n`` primitives is to be pruned after this step.
+
+        One-shot: after ``prune_at``, or at once if training was resumed from a later step without a prune. Continuous:
+        at ``start`` and every ``every`` steps until ``stop``; with a target only if there are more primitives. From
+        ``stop`` on at every step with more primitives than the target or, without a target, the cap.
+        """
+        config = self.config
+        if config.mode == "one-shot":
+            decided = not config.decides or COUNT in state
+            return decided and state["pruned_at"] == NEVER and step >= config.prune_at
+        if config.mode != "continuous":
+            return False
+        target = config.target_primitives
+        scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
+        most = config.max_primitives if target is None else target
+        by_count = most is not None and n > most and (scheduled or step >= config.stop)
+        return ((scheduled and target is None) or by_count) and step > state["pruned_at"]
+
+    def target(self, n: int, state: Mapping[str, Any]) -> int:
+        """Number of primitives that a prune keeps of ``n`` finite ones. The one place that decides this number.
+
+        ``target_primitives``, the number that trials have chosen, or ``round(keep_ratio * n)``, at least 1, under the
+        cap.
+        """
+        config = self.config
+        if config.target_primitives is not None:
+            return min(config.target_primitives, n)
+        chosen = state.get(COUNT, 0) if config.decides else 0
+        share = USUAL_SHARE if config.keep_ratio is None else config.keep_ratio
+        count = min(chosen, n) if chosen else kept_count(share, n)
+        return count if config.max_primitives is None else min(count, config.max_primitives)
+
+    def initialize_state(self) -> dict[str, Any]:
+        """Running state: step of the last prune (-1 for none), number of prunes, peak number of primitives."""
+        return {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}
+
+    def after_step(
+        self, pruner: FieldPruner, state: MutableMapping[str, Any], step: int, contribute: Contribute | None = None
+    ) -> PruneReport | None:
+        """Prune if it is due; add the primitives that lack to the target. Call it after optimizers and densification.
+
+        Args:
+            pruner: of the field.
+            state: from :meth:`initialize_state`, or from a checkpoint.
+            step: training step that has just ended.
+            contribute: called only if the rule needs it, after primitives that are not finite have been removed.
+
+        Returns:
+            A report, or None if no prune was due.
+
+        Raises:
+            ConfigError: the rule needs a contribution and there is none.
+            DataError: the field cannot be pruned, see :func:`sundae_ns.pruning.decision.decide`.
+        """
+        config, report = self.config, None
+        state["peak"] = max(state["peak"], pruner.total)
+        if self.due(state, step, pruner.total):
+            # Continuous pruning draws anew each time, and the same after a resume.
+            rule = replace(config, seed=config.seed + step) if config.mode == "continuous" else config
+            report = prune_to(lambda n: self.target(n, state), rule, pruner, state, step, contribute)
+        lacking = (config.target_primitives or 0) - pruner.total
+        if config.mode == "continuous" and step >= config.stop and lacking > 0:
+            pruner.add(lacking, LEAST_OPACITY)
+            state["peak"] = max(state["peak"], pruner.total)
+        return report
+
+
+def prune_to(
+    target: Callable[[int], int],
+    rule: PruneRule,
+    pruner: FieldPruner,
+    state: MutableMapping[str, Any],
+    step: int,
+    contribute: Contribute | None,
+) -> PruneReport:
+    """Prune a field in training now: drop what is not finite, decide the count, render, cut, and record the step.
+
+    Args:
+        target: maps the number of finite primitives to the number to keep.
+        rule: which primitives stay.
+        pruner, state, step, contribute: see :meth:`PruningSchedule.after_step`, also for errors.
+    """
+    device = pruner.params["means"].device
+    before, started = pruner.total, now(device)
+    dropped = pruner.drop_nonfinite()
+    count, weights = target(pruner.total), None
+    if contribute is not None and rule.uses_contribution and count < pruner.total:
+        weights = contribute(count if rule.uses_detail else None)
+    decision = pruner.cut(rule, count, weights)
+    state.update(pruned_at=step, num_prunes=state["num_prunes"] + 1)
+    return PruneReport(
+        step=step,
+        before=before,
+        after=decision.kept,
+        dropped_nonfinite=dropped,
+        peak=state["peak"],
+        seconds=now(device) - started,
+        tau=decision.tau,
+        sigma=decision.sigma,
+        isolated=decision.isolated,
+    )
+
+
+class ScheduledPruning(Extension):
+    """Prunes when the schedule says so.
+
+    Args:
+        schedule: when, and to how many primitives.
+        evaluate: whether to evaluate all test views right before and right after the one-shot prune.
+    """
+
+    name = "pruning"
+
+    def __init__(self, schedule: PruningSchedule, *, evaluate: bool) -> None:
+        self.schedule = schedule
+        self.evaluate = evaluate
+
+    def before_training(self, run: TrainingRun) -> None:
+        """Warn if training ends before the prune or the head."""
+        if run.last_step is not None:
+            _warn_if_too_short(run, self.schedule.config, run.last_step)
+
+    def needs_all(self, run: TrainingRun) -> bool:
+        """Whether a prune is due."""
+        return self.schedule.due(run.state.pruning, run.state.schedule_step, run.source.total)
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Prune if it is due, evaluate, report, and restart the learning rates.
+
+        Raises:
+            SundaeError: the field cannot be pruned. A checkpoint is saved first.
+        """
+        state, config = run.state, self.schedule.config
+        # Growing peaks before culling.
+        state.pruning["peak"] = max(state.pruning["peak"], state.densification.get("peak", 0))
+        total = run.source.total
+        due = self.schedule.due(state.pruning, state.schedule_step, total)
+        if due:
+            log.info(f"step {state.step}: pruning {total:,} primitives, with passes over the training views")
+        evaluate = due and self.evaluate and config.ends_growth_at is not None
+        before = _evaluated(run, "warm-up") if evaluate else {}
+
+        def contribute(count: int | None) -> Tensor:
+            return contribution(run.source, run.training_views(), run.background, run.settings, count)
+
+        try:
+            pruner = FieldPruner(state.field, state.optimizers, [state.densification])
+            report = self.schedule.after_step(pruner, state.pruning, state.schedule_step, contribute)
+        except SundaeError:
+            # Do not lose the warm-up to an option that can be corrected: a resumed run prunes at its first step.
+            run.save()
+            raise
+        settled = state.schedule_step >= config.settled_at
+        pruned = settled or (config.ends_growth_at is not None and state.pruning["num_prunes"] > 0)
+        if pruned:
+            with_head = settled and state.schedule_step >= state.head_starts_at
+            notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
+        if report is None:
+            return
+        log.info(report.summary())
+        if report.dropped_nonfinite:
+            log.warning(f"removed {report.dropped_nonfinite} primitives that were not finite")
+        after = _evaluated(run, "pruned") if evaluate else {}
+        write_report(run, report, before=before, after=after)
+
+    def finish(self, run: TrainingRun) -> None:
+        """Report the peak, and warn if nothing was pruned."""
+        state = run.state
+        primitives, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
+        log.info(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {state.device.type} memory")
+        run.log_scalars("Peak", {"primitives": primitives, "memory_mb": memory})
+        _warn_if_too_short(run, self.schedule.config, run.state.step)
+
+
+def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int) -> None:
+    """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""
+    state, target, pruned = run.state, pruning.target_primitives, run.state.pruning["num_prunes"]
+    # A warm start is pruned at once.
+    first = pruning.first_prune if state.offset == 0 else None
+    begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "prune-at")
+    # A head whose start is not known yet is decided upon elsewhere.
+    scheduled = state.head is not None and math.isfinite(state.head_starts_at)
+    idle = scheduled and last_step + state.offset <= state.head_starts_at
+    and_head = ", and the head stays disabled" if idle else ""
+    reached = pruned and target is not None and run.source.total <= target
+    if first is not None and last_step < first and not pruned:
+        event, step, option, found = "first prune", first, f"pruning.{begins}", "nothing is pruned" + and_head
+    elif first is not None and last_step < pruning.last_due and not reached:
+        event, step, option = "last prune", pruning.last_due, f"pruning.{ends}"
+        found = "more primitives are left than asked for" + and_head
+    elif idle:
+        # The head is enabled in the steps after that one.
+        event, step, found = "head", int(state.head_starts_at) + 1 - state.offset, "it stays disabled"
+        option = "head.start-at" if state.head_starts_at != pruning.settled_at else f"pruning.{ends}"
+    else:
+        return
+    log.warning(
+        f"training ends after {last_step + 1:,} steps, and the {event} needs more than {step:,} "
+        f"({option}): {found}; train longer, or {'enable it' if option.startswith('head') else 'prune'} earlier"
+    )
+
+
+def _evaluated(run: TrainingRun, label: str) -> dict[str, float]:
+    results = run.evaluate()
+    if results:
+        log.info(f"{label}: PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f} on all test views")
+    return results
+
+
+class FloaterRemoval(Extension):
+    """Removes what floats in front of a camera before anything is pruned, and before counts are compared.
+
+    Afterwards no primitive is added, so what they showed is learnt by those that stay.
+
+    Args:
+        points: sparse points of the capture ``[P, 3]``; None if it has none, and then nothing is removed.
+    """
+
+    name = "floaters"
+
+    def __init__(self, points: Tensor | None) -> None:
+        self._points, self._done = points, points is None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Whether it is done."""
+        return {"done": self._done}
+
+    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Counterpart of :meth:`state_dict`; a run that was pruned before this extension existed is done."""
+        self._done = self._points is None or bool(saved.get("done", state.pruning["num_prunes"] > 0))
+
+    def needs_all(self, run: TrainingRun) -> bool:
+        """Whether this is the last step at which the field grows, so that a saved warm-up has no floaters."""
+        return not self._done and run.state.schedule_step + 1 >= run.state.densify_until
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Remove floaters once."""
+        state = run.state
+        if not self.needs_all(run):
+            return
+        self._done = True
+        assert self._points is not None
+        views = [own.view for own in run.training_views()]
+        if not views:
+            return
+        eyes = torch.stack([view.center for view in views])
+        pruner = FieldPruner(state.field, state.optimizers, [state.densification])
+        removed = pruner.drop(near_cameras(state.field["means"], eyes, self._points), at_most=MOST)
+        if removed:
+            log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")

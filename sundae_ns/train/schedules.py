@@ -1,0 +1,434 @@
+"""What changes with the step: learning rates, and all options that count steps, fitted to the length of the run.
+
+A method's options are written for the method's own length, 30,000 steps for ``sundae``. :func:`fit_to_length` scales
+those that nobody set by hand to another length; nothing else in the package knows a factor.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.optim.lr_scheduler import LRScheduler
+
+from sundae_ns.core.errors import CheckpointError, ConfigError
+from sundae_ns.io import checkpoint
+from sundae_ns.io.config_file import find_config, load_config
+from sundae_ns.io.pack.config import FINETUNE_STEPS, tuned_steps
+
+log = logging.getLogger(__name__)
+
+
+DecayShape = Literal["exponential", "cosine"]
+
+SPARSE = 15_000
+"""In a pruned field of fewer primitives centres move faster: on surfaces, they are the root of the quotient farther
+apart."""
+MOST_FACTOR = 5.0  # Largest factor on the rate of the centres, that of 600 primitives; nothing smaller was measured
+
+
+@dataclass
+class Decay:
+    """Multiplier of the learning rate as a function of the step. Its state is plain numbers.
+
+    Before the prune the rate decays from 1 to ``final`` over ``max_steps``; with ``hold_until_prune`` it stays at 1.
+    The prune may restart it: a rise over ``warmup_steps``, then a decay from ``restart`` to ``final`` at ``max_steps``.
+    ``shape`` is exponential, or half a cosine (Loshchilov & Hutter 2017, "SGDR").
+    """
+
+    final: float
+    max_steps: int
+    restart: float | None
+    hold_until_prune: bool
+    warmup_steps: int
+    shape: DecayShape = "exponential"
+    pruned_at: int | None = None
+    after_prune: float = 1.0  # Factor on the rate after the prune
+    ends_at: int | None = None  # Step at which the decay after the prune ends, in place of max_steps
+
+    def __call__(self, step: int) -> float:
+        """The multiplier at ``step``."""
+        start, begin, end, rise, factor = 1.0, 0, self.max_steps, 1.0, 1.0
+        if self.pruned_at is None:
+            if self.hold_until_prune:
+                return 1.0
+        elif self.restart is not None and step >= self.pruned_at:
+            start, begin, factor = self.restart, self.pruned_at, self.after_prune
+            end = self.max_steps if self.ends_at is None else self.ends_at
+            rise = min((step - begin + 1) / (self.warmup_steps + 1), 1.0)
+        t = (step - begin) / max(end - begin, 1)
+        t = min(max(t, 0.0), 1.0)
+        if self.shape == "cosine":
+            return float(rise * factor * (self.final + (start - self.final) * (1.0 + math.cos(math.pi * t)) / 2.0))
+        return float(rise * factor * start ** (1.0 - t) * self.final**t)
+
+
+def fused_adam(groups: list[dict[str, Any]], **options: Any) -> torch.optim.Adam:
+    """Adam that updates each parameter by one fused kernel on CUDA instead of a dozen.
+
+    A field has seven parameters with an optimizer each, and launching their kernels takes much of a step.
+    """
+    fused = all(value.is_cuda for group in groups for value in group["params"])
+    return torch.optim.Adam(groups, fused=fused, **options)
+
+
+NETWORK_BETAS = (0.9, 0.95)
+FULL_RATE_INPUTS = 1152  # 3 x 3 of 128 channels, the most in the default head
+
+
+def network_groups(
+    params: Iterable[Tensor], lr: float, weight_decay: float, full_rate_inputs: int = FULL_RATE_INPUTS
+) -> list[dict[str, Any]]:
+    """Groups of parameters of a network without normalisation layers, whose loss bursts at usual settings of Adam.
+
+    The output is a product of layers, so aligned steps of all weights multiply it. Two measures keep such steps short.
+    With :data:`NETWORK_BETAS` the mean of squares forgets fast and follows gradients that suddenly grow: a weight moves
+    by up to 1.2 times the rate while they grow, and by 7.3 with the usual betas
+    (``(1 - b1) / sqrt((1 - b2) (1 - b1^2 / b2))``). Weights of layers with many inputs get a smaller rate, because
+    their sum grows with the inputs (Yang et al. 2022, "Tensor Programs V"). Weight decay shrinks weights, not biases.
+
+    Args:
+        params: weights and biases; a head that is resized in training keeps the rates of its first shapes.
+        lr: learning rate.
+        weight_decay: of the weights.
+        full_rate_inputs: weights with more inputs than this get a proportionally smaller rate.
+    """
+    groups: dict[tuple[float, float], list[Tensor]] = {}
+    for value in params:
+        inputs = value[0].numel() if value.ndim > 1 else 1
+        rate = lr * min(full_rate_inputs / inputs, 1.0)
+        groups.setdefault((rate, weight_decay if value.ndim > 1 else 0), []).append(value)
+    return [{"params": values, "lr": rate, "weight_decay": decay} for (rate, decay), values in groups.items()]
+
+
+def sparse_factor(primitives: int) -> float:
+    """Factor on the rate of the centres of a pruned field."""
+    return min(max(1.0, math.sqrt(SPARSE / max(primitives, 1))), MOST_FACTOR)
+
+
+def notify_pruned(
+    schedulers: Mapping[str, LRScheduler],
+    step: int,
+    primitives: int,
+    *,
+    last: bool = True,
+    ends_at: int | None = None,
+) -> None:
+    """Restart every :class:`Decay` among ``schedulers`` at ``step``; later calls change nothing.
+
+    Args:
+        schedulers: by name.
+        step: training step of the prune.
+        primitives: number of primitives that were kept. With fewer than :data:`SPARSE` the rate of the centres rises.
+        last: False while pruning goes on or the head is still disabled; rates that hold until then are left alone.
+        ends_at: training step at which they reach their final value, as for a trial; None for that of the run.
+    """
+    for name, scheduler, decay in _decays(schedulers):
+        if decay.pruned_at is None and (last or not decay.hold_until_prune):
+            decay.pruned_at, decay.ends_at = step, ends_at
+            if name == "means":
+                decay.after_prune = sparse_factor(primitives)
+            _apply(scheduler)
+
+
+Restarts = dict[str, tuple[int | None, float, int | None]]
+"""By name: the step at which a decay has restarted, its factor since, and the step at which it ends."""
+
+
+def restarts(schedulers: Mapping[str, LRScheduler]) -> Restarts:
+    """The restarts of every :class:`Decay`; plain values, for checkpoints."""
+    return {name: (decay.pruned_at, decay.after_prune, decay.ends_at) for name, _, decay in _decays(schedulers)}
+
+
+def put_restarts(schedulers: Mapping[str, LRScheduler], saved: Restarts, later: int) -> None:
+    """Put back the :func:`restarts`, this many steps later, as for a trial that starts again."""
+    for name, scheduler, decay in _decays(schedulers):
+        at, decay.after_prune, decay.ends_at = saved[name]
+        decay.pruned_at = None if at is None else at + later
+        _apply(scheduler)
+
+
+def limit_rise(schedulers: Mapping[str, LRScheduler], steps: int) -> None:
+    """Let every :class:`Decay` that has not restarted rise over at most this many steps when it does."""
+    for _, _, decay in _decays(schedulers):
+        if decay.pruned_at is None:
+            decay.warmup_steps = min(decay.warmup_steps, steps)
+
+
+def _decays(schedulers: Mapping[str, LRScheduler]) -> Iterator[tuple[str, LRScheduler, Decay]]:
+    """Name, scheduler and multiplier, each once: torch lists one for each group of parameters, which share theirs."""
+    for name, scheduler in schedulers.items():
+        found = {id(one): one for one in getattr(scheduler, "lr_lambdas", []) if isinstance(one, Decay)}
+        yield from ((name, scheduler, decay) for decay in found.values())
+
+
+def _apply(scheduler: LRScheduler) -> None:
+    """Give the optimizer the rate of the next step anew; it has one from before its multiplier changed."""
+    multipliers = scheduler.lr_lambdas  # type: ignore[attr-defined]
+    rates = [base * at(scheduler.last_epoch) for base, at in zip(scheduler.base_lrs, multipliers, strict=True)]
+    for group, rate in zip(scheduler.optimizer.param_groups, rates, strict=True):
+        group["lr"] = rate
+    scheduler._last_lr = rates
+
+
+SCHEDULE = {
+    "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval "
+    "refine_every",
+    "pipeline.model.pruning": "prune_at start stop every",
+    "pipeline.model.head": "start_at",
+}
+"""Options of the model that count steps, by the configuration that has them. Learning rates have more."""
+
+LEAST_IMAGES = 50
+"""Images that densification sees between two rounds, at least: fewer say too little of a primitive's gradient."""
+LEAST_RECOVERY = 1000
+"""Least steps between two resets of the opacities: shorter runs have no time to recover, and do without."""
+LONGEST_RISE = 12  # A learning rate rises over at most this fraction of the run
+
+_SHAPES = ("sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle")
+"""Options of the model that the shapes in a checkpoint depend on."""
+RESETS = "pipeline.model.reset_alpha_every"  # Counts rounds of densification, not steps
+
+
+def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
+    """Fit all options that count steps to the length of the run, or take those of the run that is resumed.
+
+    Args:
+        config: ``SundaeTrainerConfig``; its schedule changes.
+        usual: the method's own configuration, not changed; None if it is not known.
+        words: the command line; options in it keep their value.
+
+    Raises:
+        ConfigError: the length is no number of steps.
+    """
+    usual = deepcopy(usual)
+    given, place = given_options(words), config.load_dir or config.load_checkpoint
+    if place is not None:
+        run = _resumed_run(config, place)
+        if run is not None and usual is not None:
+            for line in take_options(config, run, usual, given):
+                log.warning(line + ("; a prune that is done is not repeated" if ".pruning." in line else ""))
+            config.schedule_length = config.schedule_length or run.schedule_length or run.max_num_iterations
+            if "max_num_iterations" not in given and config.max_num_iterations == usual.max_num_iterations:
+                config.max_num_iterations = _steps_left(config, place)
+        # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
+        config.schedule_length = config.schedule_length or config.max_num_iterations
+        if run is not None and "max_num_iterations" not in given:
+            _leave_finetune(config, config.schedule_length - config.max_num_iterations)
+        return
+    if config.schedule_length is None:
+        config.schedule_length = config.max_num_iterations
+    if config.schedule_length < 1:
+        raise ConfigError(
+            f"the length of the run is {config.schedule_length}; give --max-num-iterations 30000, or fewer"
+        )
+    _leave_finetune(config, done=0)
+    if usual is not None:
+        fit_to_length(config, usual, given)
+
+
+def _leave_finetune(config: Any, done: int) -> None:
+    """End the training before the steps that a fine-tune takes the place of, unless all others are done."""
+    steps = config.finetune_steps
+    if steps is None:
+        return
+    if steps < 1:
+        raise ConfigError(f"finetune-steps is {steps}; give {FINETUNE_STEPS}, or leave it out")
+    left = config.schedule_length - tuned_steps(config.schedule_length, steps) - done
+    if left > 0:
+        config.max_num_iterations = min(config.max_num_iterations, left)
+
+
+def _steps_left(config: Any, place: Path) -> int:
+    """Steps from the checkpoint that is resumed to the end of the schedule."""
+    step = checkpoint.newest_step(place) if config.load_step is None else config.load_step
+    left: int = config.schedule_length if step is None else config.schedule_length - step - 1
+    if left < 1:
+        raise ConfigError(
+            f"the run has trained all of its {config.schedule_length:,} steps; give the number of further ones with "
+            "--max-num-iterations"
+        )
+    return left
+
+
+def _resumed_run(config: Any, place: Path) -> Any:
+    """The configuration of the run that is resumed; None if it is not beside its checkpoints."""
+    path = find_config(place)
+    try:
+        run = None if path is None else load_config(path)
+    except CheckpointError as error:
+        log.warning(f"{error}; the run is resumed with the options of this command")
+        return None
+    return run if isinstance(run, type(config)) else None
+
+
+def given_options(words: Iterable[str]) -> frozenset[str]:
+    """Dotted names of the options in a command line: ``pipeline.model.sh_degree`` of ``--pipeline.model.sh-degree``."""
+    return frozenset(re.split("[= ]", word[2:])[0].replace("-", "_") for word in words if word.startswith("--"))
+
+
+def step_options(config: Any) -> list[str]:
+    """Dotted names of all options of a trainer's configuration that the schedule consists of."""
+    names = [f"{owner}.{name}" for owner, text in SCHEDULE.items() for name in text.split()]
+    for group, parts in config.optimizers.items():
+        if parts["scheduler"] is not None:
+            names += [f"optimizers.{group}.scheduler.{name}" for name in ("max_steps", "warmup_steps")]
+    return [*names, RESETS]
+
+
+def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
+    """Scale the schedule to ``config.schedule_length``, but for options that were set by hand.
+
+    A warm start skips the steps before the prune. Its schedule is compressed only if the steps after it do not fit.
+
+    Args:
+        config: ``SundaeTrainerConfig``; its schedule changes.
+        usual: the method's own configuration.
+        given: dotted names of options that keep their value, beside those that differ from ``usual``.
+    """
+    share = config.schedule_length / usual.max_num_iterations
+    if share == 1:
+        return
+    model, usual_model = config.pipeline.model, usual.pipeline.model
+    steps_share = share
+    if model.warm_start is not None:
+        left = usual.max_num_iterations - usual_model.pruning.prune_at
+        steps_share = min(config.schedule_length / max(left, 1), 1.0)
+    config.optimizers = deepcopy(config.optimizers)  # methods share them with every configuration that tyro makes
+    free = _free(config, usual, given, step_options(usual))
+    for name in free:
+        value = option(usual, name)
+        if name == RESETS or not value:
+            continue
+        if name.endswith(".warmup_steps"):
+            scaled = min(value, config.schedule_length // LONGEST_RISE)
+        else:
+            scaled = max(round(value * (share if name.startswith("optimizers.") else steps_share)), 1)
+        if name == "pipeline.model.refine_every":
+            scaled = max(scaled, min(value, LEAST_IMAGES))
+        set_option(config, name, scaled)
+    if RESETS in free:
+        period = round(usual_model.reset_alpha_every * usual_model.refine_every * steps_share)
+        never = model.stop_split_at // model.refine_every + 1
+        model.reset_alpha_every = max(round(period / model.refine_every), 1) if period >= LEAST_RECOVERY else never
+
+
+def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> list[str]:
+    """Give a configuration schedule and model of the run that it resumes, but for options that were set by hand.
+
+    Args:
+        config: ``SundaeTrainerConfig``; its schedule and its model change.
+        run: the configuration of that run.
+        usual: the method's own configuration.
+        given: see :func:`fit_to_length`.
+
+    Returns:
+        A line for each option that the run has otherwise.
+
+    Raises:
+        ConfigError: an option would change shapes or schedulers of the checkpoint.
+    """
+    config.optimizers = deepcopy(config.optimizers)
+    names = [*step_options(usual), *_leaves(usual.pipeline.model, "pipeline.model")]
+    free = set(_free(config, usual, given, names))
+    differing = []
+    for name in dict.fromkeys(names):
+        theirs = option(run, name)
+        if name in free:
+            set_option(config, name, deepcopy(theirs))
+        elif option(config, name) != theirs:
+            line = f"--{name.replace('_', '-')} is {option(config, name)}; the run to resume has {theirs}"
+            # The state of a scheduler holds its options. Refused before config.yml is replaced.
+            if name.removeprefix("pipeline.model.") in _SHAPES or name.startswith("optimizers."):
+                raise ConfigError(f"{line}, which cannot change; leave the option out")
+            differing.append(line)
+    return differing
+
+
+def schedule_table(config: Any) -> list[tuple[str, str]]:
+    """What happens when, for the log: pairs of a part of training and its steps."""
+    model = config.pipeline.model
+    warm, head = model.warm_start is not None, model.head
+    schedulers = (parts["scheduler"] for parts in config.optimizers.values())
+    ends = sorted({scheduler.max_steps for scheduler in schedulers if scheduler is not None})
+    rows = [
+        ("images", "full size" if warm else _resolution(model)),
+        ("densification", "none: warm start" if warm else _growth(model)),
+        ("SH degree", f"{model.sh_degree}" if warm else f"+1 every {model.sh_degree_interval:,} steps"),
+        ("prune", _prune(model.pruning, warm)),
+        ("head", "none" if head.mode == "off" else _head(model, warm)),
+    ]
+    if ends:
+        rows.append(("learning rates", f"decay until {', '.join(f'{end:,}' for end in ends)}"))
+    return rows
+
+
+def _resolution(model: Any) -> str:
+    parts = [
+        f"1/{2 ** (model.num_downscales - number)} until {(number + 1) * model.resolution_schedule:,}"
+        for number in range(model.num_downscales)
+    ]
+    return ", ".join([*parts, "then full size"]) if parts else "full size"
+
+
+def _growth(model: Any) -> str:
+    ends = model.pruning.stop if model.pruning.mode == "continuous" else model.pruning.ends_growth_at
+    last = model.stop_split_at if ends is None else min(model.stop_split_at, ends)
+    text = f"{model.warmup_length:,} to {last:,}, every {model.refine_every:,}"
+    resets = model.reset_alpha_every * model.refine_every
+    return text + (f"; opacities reset every {resets:,}" if resets < last else "; opacities never reset")
+
+
+def _prune(pruning: Any, warm: bool) -> str:
+    if pruning.mode == "continuous":
+        return f"{pruning.start:,} to {pruning.stop:,}, every {pruning.every:,}"
+    if pruning.mode == "off":
+        return "none"
+    after = "at once" if warm else f"after {pruning.prune_at:,}"
+    return f"{after}, to as many as trials choose" if pruning.decides and not warm else after
+
+
+def _head(model: Any, warm: bool) -> str:
+    at = model.pruning.settled_at if model.head.start_at is None else model.head.start_at
+    at = max(at - (model.pruning.prune_at if warm else 0), 0)
+    when = f"after {at:,}" if at else "from the start"
+    return f"{when}, if trials favour it" if model.head.mode == "auto" else when
+
+
+def _free(config: Any, usual: Any, given: Collection[str], names: Iterable[str]) -> list[str]:
+    """The options among ``names`` that nobody set by hand."""
+    return [name for name in names if name not in given and option(config, name) == option(usual, name)]
+
+
+def _leaves(config: Any, prefix: str) -> list[str]:
+    """Dotted names of all options in a configuration and in those that it holds."""
+    names = []
+    for entry in dataclasses.fields(config):
+        name, value = f"{prefix}.{entry.name}", getattr(config, entry.name)
+        if dataclasses.is_dataclass(value):
+            names += _leaves(value, name)
+        elif entry.name != "_target":
+            names.append(name)
+    return names
+
+
+def option(config: Any, name: str) -> Any:
+    """Value of the option of a dotted name; None if there is none."""
+    for part in name.split("."):
+        config = config.get(part) if isinstance(config, dict) else getattr(config, part, None)
+    return config
+
+
+def set_option(config: Any, name: str, value: Any) -> None:
+    """Set the option of a dotted name."""
+    owner, _, last = name.rpartition(".")
+    setattr(option(config, owner) if owner else config, last, value)

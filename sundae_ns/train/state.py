@@ -1,0 +1,263 @@
+"""The state of a field in training, and what extensions of a training (densification, pruning, trials) may do.
+
+Nothing here knows nerfstudio.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from sundae_ns.core.camera import View
+from sundae_ns.core.gaussians import FEATURES, Field
+from sundae_ns.core.surgery import Snapshot, module_snapshot, restore, restore_module, snapshot
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.rasterize.types import Backend
+from sundae_ns.scene.render import LocalField, RenderSettings, TrainingView
+
+_HEAD = "head"
+
+
+@dataclass
+class FieldState:
+    """Everything that training changes, and when it changes.
+
+    Surgery (densification, prunes) replaces parameters in ``field`` and ``optimizers``, and slices the running states.
+    """
+
+    field: Field  # The primitives of this process
+    networks: torch.nn.ModuleDict
+    """Holds the head under ``head``. The model registers this module, so checkpoints lack a head that was removed."""
+    optimizers: Mapping[str, Optimizer] = dataclasses.field(default_factory=dict)
+    """By parameter name; ``compensation`` is the head's."""
+    schedulers: Mapping[str, LRScheduler] = dataclasses.field(default_factory=dict)
+    """By the same names, where rates change."""
+    densification: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Running state of densification; tensors ``[N, ...]`` and plain numbers."""
+    pruning: dict[str, Any] = dataclasses.field(default_factory=dict)  # Running state of pruning: plain integers
+    info: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """What the rasteriser says of the last training image, with gradients after the backward pass."""
+    trained_focal: tuple[float, float] | None = None
+    """Shortest and longest focal length of the images that the head was trained on, pixels."""
+
+    step: int = 0  # Training step
+    offset: int = 0  # Steps of the schedule that a warm start skips
+    densify_until: int = 0  # Step of the schedule at which densification ends
+    head_starts_at: float = math.inf  # Step of the schedule after which the head is enabled
+    provisional: bool = False  # Whether a trial is trained whose field may be dropped
+    restored: int = 0  # Number of times in this process that other weights took the place of the trained ones
+    sh_degree_interval: int | None = None
+    """Steps after which the next SH degree is enabled; None enables all at once, as after a warm start."""
+
+    @property
+    def schedule_step(self) -> int:
+        """Step of the schedule: a warm start begins where its warm-up would have ended."""
+        return self.step + self.offset
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the field."""
+        device: torch.device = self.field["means"].device
+        return device
+
+    @property
+    def densifying(self) -> bool:
+        """Whether the field still grows."""
+        return self.schedule_step < self.densify_until
+
+    @property
+    def pruned(self) -> bool:
+        """Whether primitives were pruned and the field has stopped growing."""
+        return self.pruning.get("num_prunes", 0) > 0 and not self.densifying
+
+    @property
+    def active_sh_degree(self) -> int | None:
+        """Highest SH degree in use; None for the degree of the field."""
+        return None if self.sh_degree_interval is None else self.step // max(self.sh_degree_interval, 1)
+
+    @property
+    def head(self) -> CompensationHead | None:
+        """The head; None if the field has none."""
+        return self.networks[_HEAD] if _HEAD in self.networks else None  # type: ignore[return-value]
+
+    @property
+    def head_enabled(self) -> bool:
+        """Whether images get the head's correction at this step."""
+        return self.head is not None and self.schedule_step > self.head_starts_at
+
+    def remove_head(self) -> None:
+        """Do without head and features from now on. Parameters stay the same objects, as optimizers need them."""
+        if _HEAD in self.networks:
+            del self.networks[_HEAD]
+        if FEATURES in self.field:
+            features = self.field[FEATURES]
+            features.data, features.grad = features.data[:, :0], None
+        for name in ("compensation", FEATURES):
+            if name in self.optimizers:
+                self.optimizers[name].state.clear()
+
+    def reshape_head(self, config: HeadConfig) -> None:
+        """Give head and features the shapes of a configuration, in the same parameters; values are loaded later."""
+        assert self.head is not None
+        self.head.resize(config)
+        features = self.field[FEATURES]
+        features.data = features.data.new_zeros(len(features), config.num_features)
+
+    def render_settings(
+        self, backend: Backend, *, antialiased: bool, training: bool = False, absgrad: bool = False
+    ) -> RenderSettings:
+        """Settings that render the field at this step.
+
+        Args:
+            backend: the rasteriser.
+            antialiased: see :class:`RenderSettings`.
+            training: whether gradients are needed.
+            absgrad: whether densification reads absolute gradients.
+        """
+        return RenderSettings(
+            backend=backend,
+            active_sh_degree=self.active_sh_degree,
+            antialiased=antialiased,
+            training=training,
+            absgrad=absgrad and training and self.densifying,
+            head=self.head if self.head_enabled else None,
+            trained_focal=self.trained_focal,
+        )
+
+    def snapshot(self, *, head: bool) -> dict[str, Snapshot]:
+        """Copy the field, and the head if asked for, with the states of their optimizers."""
+        saved = {"field": snapshot(self.field, self.optimizers)}
+        if head:
+            assert self.head is not None
+            saved[_HEAD] = module_snapshot(self.head.parameters(), self.optimizers["compensation"])
+        return saved
+
+    def restore(self, saved: Mapping[str, Snapshot]) -> None:
+        """Restore a :meth:`snapshot`, with any number of primitives, and the width of its head."""
+        self.restored += 1
+        restore(self.field, self.optimizers, saved["field"])
+        if _HEAD in saved:
+            assert self.head is not None
+            width = self.field[FEATURES].shape[1]
+            if self.head.config.num_features != width:
+                self.head.resize(dataclasses.replace(self.head.config, num_features=width))
+            restore_module(self.head.parameters(), self.optimizers["compensation"], saved[_HEAD])
+
+    def running_states(self) -> dict[str, dict[str, Any]]:
+        """Running states for a checkpoint."""
+        return {"densification": dict(self.densification), "pruning": dict(self.pruning)}
+
+    def load_running_states(self, saved: Mapping[str, Mapping[str, Any]]) -> None:
+        """Counterpart of :meth:`running_states`; tensors move to the device of the field."""
+        for own, theirs in ((self.densification, saved["densification"]), (self.pruning, saved["pruning"])):
+            own.clear()
+            own.update({k: v.to(self.device) if isinstance(v, Tensor) else v for k, v in theirs.items()})
+
+
+class Photo(NamedTuple):
+    """A training view with its image."""
+
+    view: View
+    target: Tensor  # The image over the background of TrainingRun.background, in [0, 1] [H, W, 3]
+    mask: Tensor | None  # Pixels that count, bool [H, W]; None for all
+
+
+class TrainingRun(Protocol):
+    """What an extension may ask of the program that trains. nerfstudio's trainer stands behind it in ``ns-train``."""
+
+    state: FieldState  # The field in training
+    source: LocalField  # Where views get their primitives from
+    background: Tensor  # Background of images that are not trained on [3]
+
+    @property
+    def settings(self) -> RenderSettings:
+        """Settings of images that are not trained on, at this step."""
+
+    @property
+    def last_step(self) -> int | None:
+        """Step at which training ends; None if no trainer says so."""
+
+    @property
+    def schedule_length(self) -> int | None:
+        """Number of steps for which the schedule is made: at least those of the run; None if no trainer says so."""
+
+    @property
+    def images_per_step(self) -> int:
+        """Number of images in a batch: the number of ranks. Each counts as a step."""
+
+    @property
+    def folder(self) -> Path | None:
+        """Folder for records; None without one, and on every rank but the first."""
+
+    @property
+    def num_heldout(self) -> int:
+        """Number of held-out training views."""
+
+    def training_views(self) -> list[TrainingView]:
+        """All training views."""
+
+    def view_indices(self) -> list[int]:
+        """Indices of these views."""
+
+    def hold_out(self, indices: Iterable[int]) -> None:
+        """Hold out these training views too, from the next step on, until the next call."""
+
+    def heldout_views(self) -> Iterator[Photo]:
+        """The held-out training views, loaded one at a time."""
+
+    def photos(self) -> Iterator[Photo]:
+        """All training views in full size; transparent pixels are masked."""
+
+    def evaluate(self) -> dict[str, float]:
+        """Mean ``psnr`` (dB) and ``ssim`` over all test views; empty without any."""
+
+    def save(self) -> None:
+        """Save a checkpoint, if there is a trainer."""
+
+    def log_scalars(self, name: str, values: Mapping[str, float | int]) -> None:
+        """Write numbers to the run's event file."""
+
+
+class Extension:
+    """Base of the extensions: every verb does nothing. The model calls each verb on all extensions in their order."""
+
+    name: str  # Key of its state in checkpoints
+
+    def before_training(self, run: TrainingRun) -> None:
+        """Check options and warn, before the first step and after a checkpoint has been loaded."""
+
+    def trains(self, state: FieldState) -> bool:
+        """Whether this step trains; training is paused if one extension answers no."""
+        return True
+
+    def before_backward(self, state: FieldState) -> None:
+        """Prepare ``state.info`` of a training image for the backward pass."""
+
+    def needs_all(self, run: TrainingRun) -> bool:
+        """Whether :meth:`after_step` must see the primitives of all ranks at this step; the same on all of them."""
+        return False
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Act after the optimizers' step. May replace parameters of the field."""
+
+    def finish(self, run: TrainingRun) -> None:
+        """Report after the last step."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Own state for a checkpoint, beside the running states of :class:`FieldState`; plain values and tensors."""
+        return {}
+
+    def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Give field and head the shapes that they have in a checkpoint with this state of the extension."""
+
+    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Take over the state of a checkpoint, after field and head were loaded."""

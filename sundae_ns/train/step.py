@@ -1,0 +1,283 @@
+"""The training step: from a view to its loss. Every training runs this one.
+
+nerfstudio asks for images and losses in two calls, and runs the backward pass and the optimizers itself. Captured steps
+and fine-tunes run both halves in one call. Several ranks give another source of primitives.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, cast
+
+import cv2
+import numpy as np
+import torch
+from pytorch_msssim import SSIM
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sundae_ns.core.camera import View, Window
+from sundae_ns.core.metrics import SSIM_WINDOW
+from sundae_ns.cuda.kernels import kernels_where_possible
+from sundae_ns.cuda.loss import SIGMA, fused_loss, loss_kernels
+from sundae_ns.head.head import training_window
+from sundae_ns.rasterize.types import Rasterization
+from sundae_ns.scene.render import LocalField, RenderSettings, StepResolution, render_view
+from sundae_ns.train.state import FieldState
+
+LEAST_SQUARE = 1e-8  # Added to the mean square, so that its root has a gradient for equal images
+
+
+@dataclass(frozen=True)
+class StepLosses:
+    """Terms of the loss of a training step."""
+
+    options: Any  # SundaeModelConfig
+    ssim: SSIM  # SSIM of images [1, 3, H, W]
+    num_images: int  # Number of training images; 0 if it is not known
+
+    def __call__(
+        self,
+        state: FieldState,
+        params: Mapping[str, Tensor],
+        rgb: Tensor,
+        base: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
+        count: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """The terms by name, each ``[]``.
+
+        Args:
+            state: says what is enabled at this step.
+            params: trained parameters, with logits ``opacities`` ``[N, 1]`` and logarithms ``scales`` ``[N, 3]``.
+            rgb: the image ``[H, W, 3]``.
+            base: its base colours ``[H, W, 3]``.
+            target: the truth ``[H, W, 3]``.
+            mask: pixels that count ``[H, W, 1]``; None for all.
+            count: number of primitives ``[]``, where further rows are transparent and without width; None for N.
+        """
+        if mask is not None:
+            target, rgb, base = target * mask, rgb * mask, base * mask
+        options = self.options
+        compared = base if state.head_enabled and options.base_loss_weight > 0 else None
+        squares = options.loss_after_prune == "rms" and state.pruned
+        main_loss, base_loss = image_losses(rgb, compared, target, self.ssim, options.ssim_lambda, squares=squares)
+        losses = {"main_loss": main_loss}
+        if base_loss is not None:
+            losses["base_loss"] = options.base_loss_weight * base_loss
+        weight = self.prior_weight(state)
+        if weight > 0:
+            # Unused primitives become transparent and small (equation 10 of 3DGS-MCMC). In a pruned field they would
+            # fit what differs between the training images.
+            for name, values in (("opacity", params["opacities"].sigmoid()), ("scale", params["scales"].exp())):
+                mean = values.mean() if count is None else values.sum() / (values.shape[1] * count)
+                losses[f"{name}_loss"] = weight * mean
+        return losses
+
+    def prior_weight(self, state: FieldState) -> float:
+        """Weight of opacities and scales at this step."""
+        # A prior counts once, and the loss is of one image: its weight falls with their number.
+        return self.options.prior_after_prune / max(self.num_images, 1) if state.pruned else 0.0
+
+
+def image_losses(
+    image: Tensor, base: Tensor | None, target: Tensor, ssim: SSIM, weight: float, *, squares: bool = False
+) -> tuple[Tensor, Tensor | None]:
+    """``lambda_1 L1 + lambda_2 (1 - SSIM)`` of the paper for an image, and the L1 loss of its base colours.
+
+    In float32 one kernel computes both (:mod:`sundae_ns.cuda.loss`), and on a CPU SSIM is OpenCV's
+    (:func:`ssim_loss`). Images smaller than the window of SSIM are compared by L1 alone.
+
+    Args:
+        image: rendered image ``[H, W, 3]``, differentiable.
+        base: base colours ``[H, W, 3]``, differentiable; None for none.
+        target: the truth ``[H, W, 3]``.
+        ssim: SSIM of images ``[1, 3, H, W]``, with the window and constants of kernel and loop.
+        weight: lambda_2; lambda_1 is ``1 - weight``.
+        squares: whether the image is compared by the root of the mean square in place of L1.
+
+    Returns:
+        Both losses; the second is None without base colours.
+    """
+    if not squares:
+        return _losses(image, base, target, ssim, weight, 1 - weight)
+    root = ((image - target).square().mean() + LEAST_SQUARE).sqrt()
+    if weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
+        return root, None if base is None else (base - target).abs().mean()
+    rest, of_base = _losses(image, base, target, ssim, weight, 0.0)
+    return (1 - weight) * root + rest, of_base
+
+
+def _losses(
+    image: Tensor, base: Tensor | None, target: Tensor, ssim: SSIM, weight: float, l1_weight: float
+) -> tuple[Tensor, Tensor | None]:
+    """``l1_weight L1 + weight (1 - SSIM)`` of an image, and the L1 loss of its base colours."""
+    single = all(one.dtype == torch.float32 for one in (image, target, base) if one is not None)
+    large = min(target.shape[:2]) >= SSIM_WINDOW
+    if weight > 0 and large and single:
+        if image.is_cuda and kernels_where_possible(loss_kernels, image.device, "SSIM runs as slower convolutions"):
+            return fused_loss(image, target, weight, base, l1_weight=l1_weight)
+    of_base = None if base is None else (base - target).abs().mean()
+    if weight == 0 or not large:
+        return (image - target).abs().mean(), of_base
+    if single and image.device.type == "cpu":
+        return l1_weight * (image - target).abs().mean() + weight * ssim_loss(image, target), of_base
+    return convolved_loss(image, target, ssim, weight, l1_weight), of_base
+
+
+_GAUSSIAN = cv2.getGaussianKernel(SSIM_WINDOW, SIGMA, cv2.CV_32F)
+_C1, _C2 = 0.01**2, 0.03**2
+_HALF = SSIM_WINDOW // 2
+_WINDOWS = (slice(_HALF, -_HALF), slice(_HALF, -_HALF))  # centres of the windows that lie inside the image
+
+
+def ssim_loss(image: Tensor, target: Tensor) -> Tensor:
+    """Mean of 1 - SSIM over the windows inside the image (Wang et al. 2004), as pytorch_msssim; once differentiable.
+
+    ``image`` and ``target`` are float32 ``[H, W, 3]``, both sides at least the window; the target gets no gradient.
+    """
+    return cast("Tensor", _Dissimilarity.apply(image, target.detach()))
+
+
+def _filtered(values: Any) -> Any:
+    return cv2.sepFilter2D(values, -1, _GAUSSIAN, _GAUSSIAN, borderType=cv2.BORDER_CONSTANT)
+
+
+class _Dissimilarity(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
+        x, y = (np.ascontiguousarray(value.detach().numpy()) for value in (image, target))
+        mean_x, mean_y, squares, products = (_filtered(value)[_WINDOWS] for value in (x, y, x * x + y * y, x * y))
+        both, power = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+        luminance, luminance_max = 2 * both + _C1, power + _C1
+        structure, structure_max = 2 * (products - both) + _C2, squares - power + _C2
+        inverse = 1 / (luminance_max * structure_max)
+        value = luminance * structure * inverse
+        if ctx.needs_input_grad[0]:
+            # Derivatives by the means of x, x x and x y; covariances are means of products minus products of means.
+            by_mean = mean_y * (structure - luminance) * inverse
+            by_mean += mean_x * value * (1 / structure_max - 1 / luminance_max)
+            padded = np.zeros_like(x)
+
+            def spread(values: Any) -> Any:
+                padded[_WINDOWS] = values
+                return _filtered(padded)  # the window is symmetric
+
+            gradient = spread(by_mean)
+            gradient -= x * spread(value / structure_max)
+            gradient += y * spread(luminance * inverse)
+            gradient *= np.float32(-2 / value.size)
+            ctx.save_for_backward(torch.from_numpy(gradient))
+        return image.new_tensor(1 - value.mean(dtype=np.float64))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
+        return grad_loss * ctx.saved_tensors[0], None
+
+
+def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_weight: float | None = None) -> Tensor:
+    """``l1_weight L1 + weight (1 - SSIM)`` by convolutions, on any device; ``l1_weight`` is ``1 - weight`` if None."""
+    l1_weight = 1 - weight if l1_weight is None else l1_weight
+    ssim.win = ssim.win.to(target.device)  # once; each call would copy it and wait
+    # Contiguous planes: convolutions of a large image with interleaved colours take much longer.
+    planes, truth = (one.permute(2, 0, 1)[None].contiguous() for one in (image, target))
+    similarity: Tensor = ssim(planes, truth)
+    return l1_weight * (image - target).abs().mean() + weight * (1 - similarity)
+
+
+@dataclass(frozen=True)
+class StepInputs:
+    """What a step trains on."""
+
+    view: View
+    target: Tensor  # The true image over the background [H, W, 3]
+    mask: Tensor | None  # Pixels that count, float [H, W, 1]; None for all
+    background: Tensor  # Colour [3]
+    window: Window | None = None  # The part of the training image that is shown; None for the whole image
+    rates: Tensor | None = None  # Learning rates of the groups of parameters [G]; None where the optimizer holds them
+    count: Tensor | None = None
+    """Number of primitives ``[]``, where parameters have rows for more and a loss is a mean over them."""
+
+    def _tensors(self) -> list[Tensor]:
+        always = (self.view.viewmat, self.view.K, self.target, self.background)
+        tensors = (*always, self.mask, self.rates, self.count)
+        return [value.detach() for value in tensors if value is not None]
+
+    def clone(self) -> StepInputs:
+        """A copy, so that a recording reads it where it stays."""
+        copies = [value.clone(memory_format=torch.contiguous_format) for value in self._tensors()]
+        viewmat, K, target, background, *rest = copies
+        mask, rates, count = (None if one is None else rest.pop(0) for one in (self.mask, self.rates, self.count))
+        view = self.view._replace(viewmat=viewmat, K=K)
+        return StepInputs(view, target, mask, background, self.window, rates, count)
+
+    def copy_to(self, other: StepInputs) -> None:
+        """Write these into the inputs of a recording."""
+        torch._foreach_copy_(other._tensors(), self._tensors())
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """Images and losses of a step; the next step overwrites them."""
+
+    images: dict[str, Tensor]  # rgb, base_rgb and accumulation, each [H, W, C]
+    losses: dict[str, Tensor]  # Terms of the loss []
+    loss: Tensor  # Their sum []
+
+
+def training_part(state: FieldState, view: View, at: StepResolution) -> tuple[View, Window | None]:
+    """The part of a training view that a step shows, and its window; None for the whole image.
+
+    Args:
+        state: the field in training; it remembers the focal lengths that the head is trained on.
+        view: the whole view.
+        at: resolution at this step.
+    """
+    if state.head_enabled and at.downscale == 1:
+        low, high = state.trained_focal or (view.focal, view.focal)
+        state.trained_focal = (min(low, view.focal), max(high, view.focal))
+    window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
+    return view if window is None else view.cut(window), window
+
+
+class TrainingStep(NamedTuple):
+    """The step of a field, from a view to its loss."""
+
+    source: LocalField  # Where the view gets its primitives from
+    state: FieldState  # Says what is enabled at this step
+    losses: StepLosses  # Terms of the loss
+    params: Mapping[str, Tensor]  # Trained parameters, for the terms that see them
+
+    def images(
+        self,
+        view: View,
+        background: Tensor,
+        settings: RenderSettings,
+        *,
+        depth: bool = False,
+    ) -> tuple[dict[str, Any], Rasterization]:
+        """The first half: primitives, one splatting pass, and the head; see :func:`render_view`."""
+        return render_view(self.source, view, background, settings, depth=depth)
+
+    def terms(
+        self, images: Mapping[str, Tensor], target: Tensor, mask: Tensor | None, count: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """The second half: the terms of the loss by name, each ``[]``; see :class:`StepInputs` for the arguments."""
+        return self.losses(self.state, self.params, images["rgb"], images["base_rgb"], target, mask, count)
+
+    def __call__(self, inputs: StepInputs, settings: RenderSettings) -> tuple[Tensor, Rasterization, StepResult]:
+        """Both halves.
+
+        Returns:
+            The loss ``[]`` with its graph, the rasteriser's result, and the detached result of the step.
+        """
+        with torch.enable_grad():
+            images, splatted = self.images(inputs.view, inputs.background, settings)
+            terms = self.terms(images, inputs.target, inputs.mask, inputs.count)
+            loss = functools.reduce(torch.add, terms.values())
+        shown = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
+        return loss, splatted, StepResult(shown, {name: value.detach() for name, value in terms.items()}, loss.detach())

@@ -1,0 +1,807 @@
+"""Trials: train candidates (count x head x length) for some steps, measure held-out training views, keep the best.
+
+The stages of a run follow each other. Each tries its candidates in turn, from the same field, until one does not pay:
+
+``count``
+    How many Gaussians the prune keeps (``pruning.keep_ratio`` left out). Views are held out from the first step: a
+    large field remembers for long what it has seen once. From the unpruned field each trial prunes to a smaller count.
+``tenth``
+    Where quality levels off, a head is the only thing that gains more, and it shows what it gains the sooner, the fewer
+    Gaussians there are. So if more than the usual share is chosen, that share is trained without and with a head.
+``head``
+    How the pruned field is finished (``head.mode auto``), unless the stage before has told: plain, with a head, or with
+    one of more features. Where views are few or differ, a head fits their differences. The chosen trial goes on.
+``length``
+    How long a field on few views trains: other views get worse while training goes on. The views of the last trial stay
+    held out and are measured again and again. Once their loss grows, the field goes back (stage ``repeat``), trains on
+    all views for as many steps as were best, and training is paused.
+
+The mean of the weights over the last steps of a trial renders the held-out views: the weights of a single step fit the
+last images best. Test views are never used. :mod:`sundae_ns.train.choice` has the rules.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sundae_ns.core.errors import CheckpointError, PackError
+from sundae_ns.core.files import write_text
+from sundae_ns.core.gaussians import FEATURES
+from sundae_ns.core.metrics import MOST_PSNR, SSIM_WINDOW, fitted_psnr, psnr, ssim
+from sundae_ns.core.surgery import replace_parameter
+from sundae_ns.core.tables import without_nan
+from sundae_ns.head.head import HeadConfig
+from sundae_ns.io.accounting import megabytes, stored_bytes
+from sundae_ns.io.coordinates import scene_order
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
+from sundae_ns.pruning.decision import FieldPruner
+from sundae_ns.pruning.rule import kept_count
+from sundae_ns.scene.initialization import initial_features
+from sundae_ns.scene.render import contribution, render_view
+from sundae_ns.train import choice
+from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
+from sundae_ns.train.choice import HEADS, HeadGain, HeldOutQuality, Tolerance, Tried, mean_quality
+from sundae_ns.train.curve import RECORD, CurvePoint, curve_table
+from sundae_ns.train.densification import Densification
+from sundae_ns.train.pruning import COUNT, USUAL_SHARE, PruningConfig, prune_to
+from sundae_ns.train.schedules import limit_rise, notify_pruned, put_restarts, restarts
+from sundae_ns.train.state import Extension, FieldState, TrainingRun
+
+log = logging.getLogger(__name__)
+
+SHARES = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)
+"""Shares of the Gaussians that are tried, about a factor of 2 apart, largest first."""
+COUNT_SHARE = 0.02
+"""Length of a trial of a count, and of a window between two measurements of a length, as a share of the schedule."""
+MANY_VIEWS = 32
+"""With fewer training views, those that could be held out are too few to compare counts. With as many, the length is
+not tried: captures of 43 views and more gain to the end."""
+FEWEST_VIEWS = 6  # fewer cannot judge a head; the field is then finished plain
+MOST_CONTRIBUTING = 32  # training views that the prune of a trial looks at
+MOST_TRIALS = 0.45  # largest share of the steps after the prune that trials of counts, and of a head in them, may take
+MEAN_SHARE = 0.25  # share of a trial, at its end, over which weights are averaged
+RISE_SHARE = 5 / 12  # share of a trial, at its beginning, over which the rate of the head may rise
+HOLD_SHARE = 0.1  # share of the schedule for which views are held out before trials of a head, so that it forgets them
+WATCHED_SHARE = 0.5  # longest watch of the length, as a share of the steps after the decision about the head
+MORE_FEATURES = 29  # of the last candidate: as many as are splatted without padding after the default 13
+NAMES = {"plain": "no head", "head": "head", "features": f"head with {MORE_FEATURES} features"}
+SAMPLE = 1 << 13  # neighbouring Gaussians that are packed to estimate the bytes of a field
+_DISABLED = "so it stays disabled; train longer, or force it with --pipeline.model.head.mode residual"
+
+
+# ------------------------------------------------------------------------------------------------------- measurement
+
+
+@torch.no_grad()
+def measure_heldout(run: TrainingRun, *, with_fitted: bool = False) -> list[HeldOutQuality]:
+    """Quality of the held-out views as the field is now, with the head if it is enabled; without fully masked views.
+
+    Args:
+        run: the training.
+        with_fitted: whether to fit colours, too.
+    """
+    qualities = []
+    for view, target, mask in run.heldout_views():
+        images, _ = render_view(run.source, view, run.background, run.settings, depth=False)
+        quality = view_quality(images["rgb"], target, mask)
+        if quality.pixels:
+            fitted = float(fitted_psnr(images["rgb"], target, mask)) if with_fitted else math.nan
+            qualities.append(quality._replace(fitted=fitted))
+    return qualities
+
+
+def view_quality(image: Tensor, target: Tensor, mask: Tensor | None) -> HeldOutQuality:
+    """Quality of an image ``[H, W, 3]`` under a mask, bool ``[H, W]``; None for all pixels."""
+    total = target[..., 0].numel()
+    pixels = total if mask is None else int(mask.sum())
+    if not pixels:
+        return HeldOutQuality(0, 0.0, 0.0)
+    # Outside of the mask the compared image is exact, so all of its error belongs to the pixels that count.
+    compared = image if mask is None else torch.where(mask[..., None], image, target)
+    share = pixels / total
+    decibels = float(psnr(compared, target)) + 10 * math.log10(share)
+    similarity = 0.0
+    if min(target.shape[:2]) >= SSIM_WINDOW:
+        similarity = 1 - (1 - float(ssim(compared, target))) / share
+    return HeldOutQuality(pixels, min(decibels, MOST_PSNR), similarity)
+
+
+def packed_size(field: Mapping[str, Tensor], head: torch.nn.Module | None = None) -> list[int] | None:
+    """Estimated bytes of the Gaussians and of the head in a packed scene; None if it cannot be packed.
+
+    Args:
+        field: parameters by name ``[N, ...]``; neighbouring ones are packed as a sample.
+        head: the head that reads the features; None leaves them out.
+    """
+    n = len(field["means"])
+    packed = {name: value.detach() for name, value in field.items() if head is not None or name != FEATURES}
+    if n > SAMPLE:
+        order = scene_order(packed["means"].float().cpu().numpy())
+        middle = torch.from_numpy(order[(n - SAMPLE) // 2 :][:SAMPLE])
+        packed = {name: value[middle.to(value.device)] for name, value in packed.items()}
+    weights = {} if head is None else {name: value.float().cpu() for name, value in head.state_dict().items()}
+    try:
+        sample = PackedScene({name: value.float().cpu() for name, value in packed.items()}, weights)
+        data, sections = pack_bytes(*fit_scene(sample))
+    except PackError:
+        return None
+    fixed = sum(size for name, size in sections.items() if name.startswith("head/"))
+    return [round((len(data) - fixed) * n / min(n, SAMPLE)), fixed]
+
+
+# ------------------------------------------------------------------------------------------------------------ engine
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Options of a trial; plain values, for checkpoints."""
+
+    length: int  # Training steps
+    held_out: list[int] = field(default_factory=list)  # Indices of the training views that are held out
+    averaged: float = 0
+    """Steps at its end over which weights are averaged; the mean is measured. 0 measures the last weights."""
+    num_features: int | None = None
+    """Width of the features: 0 disables the head, another width begins with a fresh one. None changes nothing."""
+    counts: bool = True  # Whether its field goes on in any case; that of others is FieldState.provisional
+    began: int = 0  # Step of the schedule at which it began; the engine sets it
+
+
+class TrialEngine:
+    """Trains trials on the field of a run, one after another, and keeps copies of the field to go back to.
+
+    Args:
+        head_starts_at: step of the schedule after which an enabled head corrects images.
+    """
+
+    def __init__(self, head_starts_at: float = -math.inf) -> None:
+        self.trial: Trial | None = None  # The current trial
+        self.kept: dict[str, dict[str, Any]] = {}
+        """Copies of the field by name: a :meth:`FieldState.snapshot`, and the number of ``counted`` steps before it."""
+        self.taken_back = 0  # Steps after which the field went back to before them
+        self.coming: dict[str, list[int]] = {}
+        """Views that are held out for the trials to come of a stage. In a trial its own views are, and no others."""
+        self._head_starts_at = head_starts_at
+        self._mean = RunningMean()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values and tensors for a checkpoint."""
+        numbers = {"taken_back": self.taken_back, "coming": self.coming}
+        trial = None if self.trial is None else asdict(self.trial)
+        return {"trial": trial, "kept": self.kept, **numbers, **self._mean.state_dict()}
+
+    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Counterpart of :meth:`state_dict`; the head is enabled as the trial has it."""
+        self.trial = None if saved["trial"] is None else Trial(**saved["trial"])
+        self.kept, self.taken_back, self.coming = dict(saved["kept"]), saved["taken_back"], dict(saved["coming"])
+        self._mean = RunningMean.of(saved, state.device)
+        if self.trial is not None and self.trial.num_features is not None:
+            self.enable_head(state, self.trial.num_features > 0)
+        self._mark(state)
+
+    def start(self, run: TrainingRun, trial: Trial) -> None:
+        """Start a trial from the present field."""
+        state = run.state
+        self.trial, self._mean = replace(trial, began=state.schedule_step), RunningMean()
+        self.hold_out(run)
+        if trial.num_features is not None:
+            self.enable_head(state, trial.num_features > 0)
+        if trial.num_features:
+            _widen(state, trial.num_features)
+            # Now: the extension that prunes acts before, so it would be a step later.
+            notify_pruned(state.schedulers, state.step, run.source.total)
+        self._mark(state)
+
+    def hold_out(self, run: TrainingRun) -> None:
+        """Hold out the views of the current trial, or else those of the trials to come."""
+        coming = {view for views in self.coming.values() for view in views}
+        run.hold_out(sorted(coming) if self.trial is None else self.trial.held_out)
+
+    def after_step(self, run: TrainingRun) -> bool:
+        """Average the weights if it is due; returns whether the current trial has been trained."""
+        trial, state = self.trial, run.state
+        assert trial is not None
+        left = trial.began + trial.length - state.schedule_step
+        if left < trial.averaged and state.step % AVERAGED_EVERY == 0:
+            self._mean.count_in(weights_of(state))
+        return left <= 0
+
+    def measure(self, run: TrainingRun, *, with_fitted: bool = False) -> list[HeldOutQuality]:
+        """Quality of the held-out views with the mean of the weights, if there is one; the next mean begins anew."""
+        with self._mean.shown(weights_of(run.state)):
+            views = measure_heldout(run, with_fitted=with_fitted)
+        self._mean = RunningMean()
+        return views
+
+    def take_mean(self, state: FieldState) -> None:
+        """Continue with the mean of the weights, if there is one."""
+        self._mean.replace(weights_of(state))
+        self._mean = RunningMean()
+        state.restored += 1  # another mean must not contain the weights before it
+
+    def keep(self, name: str, state: FieldState, *, head: bool) -> None:
+        """Keep a copy of the field, and of the head if asked for, until the stage ends."""
+        self.kept[name] = {
+            "counted": state.schedule_step - self.taken_back,
+            "taken_back": self.taken_back,
+            "pruning": dict(state.pruning),
+            "restarts": restarts(state.schedulers),
+            **state.snapshot(head=head),
+        }
+
+    def go_back(self, name: str, state: FieldState) -> None:
+        """Continue with a kept copy of the field, its learning rates and its counted steps."""
+        kept = self.kept[name]
+        state.restore(kept)
+        peak = {name: value for name, value in state.pruning.items() if name == "peak"}  # goes on through all trials
+        state.pruning.update({**kept["pruning"], **peak})
+        self.taken_back = state.schedule_step - kept["counted"]
+        put_restarts(state.schedulers, kept["restarts"], self.taken_back - kept["taken_back"])
+
+    def end(self, run: TrainingRun, stage: str) -> None:
+        """End the trials of a stage: forget the kept copies, and serve its views from the next step on."""
+        self.trial, self.kept, self._mean = None, {}, RunningMean()
+        self.coming.pop(stage, None)
+        self.hold_out(run)
+        self._mark(run.state)
+
+    def enable_head(self, state: FieldState, enabled: bool) -> None:
+        """Enable or disable the head."""
+        # Not from this step on: a run that is resumed on several GPUs counts other steps.
+        state.head_starts_at = self._head_starts_at if enabled else math.inf
+
+    def _mark(self, state: FieldState) -> None:
+        state.provisional = self.trial is not None and not self.trial.counts
+
+
+def _widen(state: FieldState, num_features: int) -> None:
+    """Give the field fresh features and a fresh head of a width that they do not have."""
+    assert state.head is not None
+    if state.head.config.num_features == num_features:
+        return
+    state.head.resize(replace(state.head.config, num_features=num_features))
+    state.optimizers["compensation"].state.clear()
+    colors, generator = state.field["features_dc"].detach(), torch.Generator().manual_seed(0)
+    features = initial_features(colors, num_features, generator)
+    replace_parameter(state.field, state.optimizers, FEATURES, features, {})
+
+
+# ------------------------------------------------------------------------------------------------------------ trials
+
+
+@dataclass
+class Progress:
+    """Where the trials of a run are; plain values, for checkpoints."""
+
+    stage: str = ""  # The stage whose candidates are tried; empty between stages, and paused at the end of the last
+    steps: int = 0
+    """Length of the schedule when training started: a resumed run may be longer or shorter, its trials may not."""
+    full: int = 0  # Number of Gaussians before the prune
+    tried: list[Tried] = field(default_factory=list)  # All candidates after their trials
+    chosen: dict[str, Any] = field(default_factory=dict)
+    """By decided stage: ``count`` (0 for the usual share), ``tenth`` (whether the head pays), ``head``, and ``length``
+    (steps on all views; None for all that are left)."""
+    reason: str = ""  # Why the head was chosen without trials
+    watched_until: int = 0  # Step of the schedule at which the trial of the length ends at the latest
+    records: dict[str, Any] = field(default_factory=dict)
+    """What ``trials.json`` holds, by decided stage; a resumed run writes it again."""
+
+    def of(self, stage: str) -> list[Tried]:
+        """The candidates of a stage."""
+        return [row for row in self.tried if row.stage == stage]
+
+    def curve(self, *, plain: bool = False) -> list[CurvePoint]:
+        """Expected quality over the counts that were tried, largest first, with a head if it pays or if not plain."""
+        curve = choice.curve_of(self.of("count"))
+        return (
+            choice.with_head(curve, HeadGain.of(*self.of("tenth"))) if self.chosen.get("tenth") and not plain else curve
+        )
+
+
+class Trials(Extension):
+    """Tries candidates for the number of Gaussians, the head, and the length of the training.
+
+    It acts before the schedule prunes. :class:`AfterPrune` calls it again afterwards, for the stages that follow.
+
+    Args:
+        config: options of pruning; trials decide about the count if its options leave it to them.
+        state: the field. A head that is to be decided about stays disabled until its trial.
+        densification: its running state starts anew when the trials of counts begin.
+        begins_at: step of the schedule after which a head is tried: the number of Gaussians is settled.
+        decides_head: whether trials decide about the head.
+        ssim_weight: weight of SSIM in the loss.
+    """
+
+    name = "trials"
+
+    def __init__(
+        self,
+        config: PruningConfig,
+        state: FieldState,
+        densification: Densification,
+        *,
+        begins_at: int,
+        decides_head: bool,
+        ssim_weight: float,
+    ) -> None:
+        self.config, self.begins_at, self.ssim_weight = config, begins_at, ssim_weight
+        self.progress, self.engine = Progress(), TrialEngine(begins_at)
+        self.decides_head = decides_head
+        self._densification = densification
+        self._head = HeadConfig(mode="off") if state.head is None else state.head.config
+        self._heads = HEADS if self._head.num_features < MORE_FEATURES else HEADS[:2]
+        if decides_head:
+            self.engine.enable_head(state, False)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What was tried and chosen, and the state of the engine."""
+        return {"progress": asdict(self.progress), "engine": self.engine.state_dict(), "head": self.decides_head}
+
+    def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Give head and features the width that they have in the checkpoint, or remove them.
+
+        Raises:
+            CheckpointError: the checkpoint carries no decision about the head.
+        """
+        if not self.decides_head:
+            return
+        if not saved.get("head"):
+            raise CheckpointError(
+                "the checkpoint is of a run with head.mode residual, features or off; give this mode with "
+                "--pipeline.model.head.mode"
+            )
+        head, trial = saved["progress"]["chosen"].get("head"), saved["engine"]["trial"]
+        if head == "features" or (trial and trial["num_features"] == MORE_FEATURES):
+            state.reshape_head(replace(self._head, num_features=MORE_FEATURES))
+        elif head == "plain":
+            state.remove_head()
+
+    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Counterpart of :meth:`state_dict`.
+
+        Raises:
+            CheckpointError: the checkpoint lacks a field to which its trials may return.
+        """
+        if not saved:
+            return
+        tried = [Tried(**row) for row in saved["progress"]["tried"]]
+        self.progress = progress = Progress(**{**saved["progress"], "tried": tried})
+        if self.decides_head:
+            self.engine.enable_head(state, progress.chosen.get("head", "plain") != "plain")
+        self.engine.load_state_dict(state, saved["engine"])
+        names = {"head": ["start", *(row.head for row in progress.of("head"))], "count": ["start"], "tenth": ["start"]}
+        names["length"] = ["start"]
+        kept, in_trial = self.engine.kept, progress.stage in (*names, "repeat")
+        if in_trial and not all(isinstance(kept.get(name), Mapping) for name in names.get(progress.stage, [])):
+            raise CheckpointError("the checkpoint lacks a field that its trials would return to; give another")
+
+    def trains(self, state: FieldState) -> bool:
+        """False while training is paused. After the end of the schedule it goes on: the user has asked for more."""
+        return self.progress.stage != "paused" or state.schedule_step >= self.progress.steps
+
+    def before_training(self, run: TrainingRun) -> None:
+        """Hold views out; decide at once where trials cannot."""
+        progress, state, views = self.progress, run.state, len(run.view_indices())
+        several = run.images_per_step > 1
+        # A warm start skips the steps before the prune.
+        progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
+        if self.config.decides and "count" not in progress.chosen:
+            reasons = {
+                "trials of counts need a single GPU": several,
+                "a warm start has seen all training views before": state.offset > 0,
+                f"{views} training views are too few to compare counts": views < MANY_VIEWS,
+                "the steps after the prune are too few to compare counts": not self._counts_fit(run),
+            }
+            reason = next((reason for reason, holds in reasons.items() if holds), None)
+            if state.pruning["num_prunes"] and not progress.stage:  # by a share that was given
+                progress.chosen["count"] = 0
+            elif reason is not None:
+                self._keep_usual(run, reason)
+            else:
+                self.engine.coming["count"] = self._count_views(run)
+        if self.decides_head and "head" not in progress.chosen:
+            if several:  # also if one GPU has begun them: its copies are of all Gaussians
+                wide = state.head is not None and state.head.config.num_features == MORE_FEATURES
+                self._finish_with(run, "features" if wide else "head", "trials need a single GPU")
+            elif views < FEWEST_VIEWS:
+                self._finish_with(run, "plain", f"{views} training views are too few to tell whether a head helps")
+            elif progress.stage != "head" and "head" not in self.engine.coming and not self._heads_fit(run):
+                if run.last_step is not None:
+                    log.warning("training ends before the head can be tried, %s", _DISABLED)
+        elif several and progress.stage in ("length", "repeat", "paused"):  # a length counts steps of one image
+            self._train_on(run)
+        self.engine.hold_out(run)
+        self._write(run)
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Try counts, before the schedule prunes."""
+        progress = self.progress
+        if progress.stage in ("count", "tenth"):
+            if self.engine.after_step(run):
+                self._end_trial(run)
+        elif self.config.decides and "count" not in progress.chosen and run.state.schedule_step >= self.config.prune_at:
+            self._begin_counts(run)
+
+    def after_prune(self, run: TrainingRun) -> None:
+        """Try heads and lengths, once the schedule has pruned."""
+        progress, state, coming = self.progress, run.state, self.engine.coming
+        if not self.decides_head or progress.stage in ("count", "tenth", "paused"):
+            return
+        if progress.stage:
+            if self.engine.after_step(run):
+                self._end_trial(run)
+        elif "head" not in progress.chosen:
+            holds = state.schedule_step >= self.begins_at - HOLD_SHARE * progress.steps
+            if "head" not in coming and holds and self._heads_fit(run):
+                coming["head"] = self._head_views(run)
+                self.engine.hold_out(run)
+            pruned = not self.config.decides or state.pruning["num_prunes"] > 0
+            if "head" in coming and pruned and state.schedule_step >= self.begins_at:
+                self._begin_heads(run)
+        if not progress.stage and "head" in progress.chosen and "length" not in progress.chosen:
+            self._begin_length(run)
+
+    def finish(self, run: TrainingRun) -> None:
+        """Warn if training ended before a decision."""
+        last = run.last_step
+        undecided = self.decides_head and "head" not in self.progress.chosen
+        if undecided and last is not None and last + 1 >= (run.schedule_length or 0):
+            log.warning("training ended before the head could be tried, %s", _DISABLED)
+
+    # ---------------------------------------------------------------------------------------------------- the one loop
+
+    def _end_trial(self, run: TrainingRun) -> None:
+        """Measure the current trial; try the next candidate of the stage, or choose."""
+        progress, state, stage = self.progress, run.state, self.progress.stage
+        if stage == "repeat":
+            self._pause(run)
+            return
+        trial, name = self.engine.trial, self._present_head(state)
+        assert trial is not None
+        views = [list(view) for view in self.engine.measure(run, with_fitted=stage == "count")]
+        row = Tried(stage, run.source.total, name, trial.length, views)
+        progress.tried.append(row)
+        if stage in ("count", "tenth"):
+            row.bytes = packed_size(state.field, state.head if state.head_enabled else None)
+            self.engine.go_back("start", state)
+            self.engine.enable_head(state, False)
+            self._try_count(run)
+        elif stage == "head":
+            row.bytes = self._stored_bytes(state, name)
+            self._try_head(run, name)
+        else:
+            self._try_length(run)
+
+    def _present_head(self, state: FieldState) -> str:
+        if state.head is None or not state.head_enabled:
+            return "plain"
+        return "features" if state.head.config.num_features == MORE_FEATURES and len(self._heads) == 3 else "head"
+
+    # ---------------------------------------------------------------------------------------------------------- counts
+
+    @property
+    def _tolerance(self) -> Tolerance:
+        return Tolerance.of_drop(self.config.max_drop)
+
+    @property
+    def _short(self) -> int:
+        """Steps of a trial of a count, and of a window of a length."""
+        return max(round(COUNT_SHARE * self.progress.steps), 1)
+
+    def _count_views(self, run: TrainingRun) -> list[int]:
+        indices = run.view_indices()
+        return choice.spread_views(indices, min(choice.MOST_HELD_OUT, len(indices) // choice.HELD_OUT_EVERY), 0)
+
+    def _plan(self, run: TrainingRun) -> tuple[list[list[int]], int]:
+        return choice.plan_heads(run.view_indices(), self.progress.steps)
+
+    def _head_views(self, run: TrainingRun) -> list[int]:
+        return [index for fold in self._plan(run)[0] for index in fold]
+
+    def _counts_fit(self, run: TrainingRun) -> bool:
+        """Whether the trials leave enough of the steps after the prune."""
+        heads = 2 * self._plan(run)[1] if self.decides_head else 0
+        return len(SHARES) * self._short + heads <= MOST_TRIALS * (_steps_of(run) - self.config.prune_at)
+
+    def _begin_counts(self, run: TrainingRun) -> None:
+        progress, state = self.progress, run.state
+        FieldPruner(state.field, state.optimizers, [state.densification]).drop_nonfinite()
+        self._densification.initialize(state)  # its statistics would not match the field that comes back
+        progress.full = run.source.total
+        log.info(
+            f"step {state.step}: how many primitives does the scene need? Up to {len(SHARES)} trials of "
+            f"{self._short:,} steps; {len(self._count_views(run))} of {len(run.view_indices())} training views "
+            "are held out"
+        )
+        self.engine.enable_head(state, False)
+        self.engine.keep("start", state, head=self.decides_head)
+        self._try_count(run)
+
+    def _try_count(self, run: TrainingRun) -> None:
+        """Try the next count or, on the usual share, no head and then a head; or choose."""
+        progress, state, number, tenth = (
+            self.progress,
+            run.state,
+            len(self.progress.of("count")),
+            self.progress.of("tenth"),
+        )
+        if len(tenth) == 2:
+            pays = choice.head_pays(progress.curve(plain=True), HeadGain.of(*tenth), self._tolerance)
+            progress.chosen["tenth"] = pays
+        curve, usual = progress.curve(), kept_count(USUAL_SHARE, progress.full)
+        more = number < len(SHARES) and (number == 0 or (curve and not choice.is_lost(curve[-1], self._tolerance)))
+        if more and progress.stage != "tenth":
+            progress.stage, length = "count", self._short
+            count = kept_count(SHARES[number], progress.full)
+            self._prune(run, count)
+            notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + length)
+            trial = Trial(length, self._count_views(run), num_features=0)
+        elif self.decides_head and curve and len(tenth) < 2 and self._count_of(curve)[0] > usual:
+            progress.stage, length = "tenth", self._plan(run)[1]
+            self._prune(run, usual)
+            limit_rise(state.schedulers, round(RISE_SHARE * length))
+            notify_pruned(state.schedulers, state.step, usual, last=False)
+            # On the views that it would hold out for trials of its own.
+            trial = Trial(length, self._head_views(run), num_features=self._head.num_features if tenth else 0)
+        else:
+            self._choose_count(run, curve)
+            return
+        self.engine.start(run, replace(trial, averaged=MEAN_SHARE * length, counts=False))
+
+    def _prune(self, run: TrainingRun, count: int) -> None:
+        """Prune the field as the schedule would, by fewer views."""
+        state = run.state
+
+        def contribute(kept: int | None) -> Tensor:
+            views = run.training_views()
+            views = views[:: -(-len(views) // MOST_CONTRIBUTING)]
+            return contribution(run.source, views, run.background, run.settings, kept)
+
+        pruner = FieldPruner(state.field, state.optimizers, [state.densification])
+        prune_to(lambda n: min(count, n), self.config, pruner, state.pruning, state.schedule_step, contribute)
+
+    def _count_of(self, curve: list[CurvePoint]) -> tuple[int, str]:
+        limits = {"most": self.config.max_primitives, "most_bytes": self.config.max_bytes}
+        return choice.choose_within(curve, self._tolerance, **limits)
+
+    def _choose_count(self, run: TrainingRun, curve: list[CurvePoint]) -> None:
+        """Choose a count, and let the schedule prune to it."""
+        progress = self.progress
+        if not curve:
+            self._keep_usual(run, "masks leave no pixel of the held-out training views")
+            return
+        count, reason = self._count_of(curve)
+        self._set_count(run, count)
+        log.info("\n".join(["expected at the end, on held-out training views:", *curve_table(curve)]))
+        log.info(f"keeping {count:,} of {progress.full:,} primitives: {reason}")
+        if choice.still_climbs(curve, self._tolerance):
+            log.info(
+                "quality still grows at the full count: the scene may need more primitives than densification made; "
+                "a lower --pipeline.model.densify-grad-thresh makes more"
+            )
+        points = [
+            {**asdict(point), "measured": [view._asdict() for view in row.qualities]}
+            for point, row in zip(curve, progress.of("count"), strict=True)
+        ]
+        run.log_scalars("Curve", {"chosen": count, "full": progress.full})
+        record: dict[str, Any] = {"chosen": count, "full": progress.full, "reason": reason, "step": run.state.step}
+        record |= {"tolerance": self._tolerance._asdict(), "held_out_views": self._count_views(run)}
+        record |= {"steps_per_trial": self._short, "curve": points}
+        if "tenth" in progress.chosen:
+            length, figures = self._plan(run)[1], _figures(progress.of("tenth"))
+            log.info(f"a tenth of the primitives after {length:,} steps: {_in_words(figures)}")
+            record["head"] = {"pays": progress.chosen["tenth"], "steps_per_trial": length, **figures}
+        self._record(run, "count", record)
+
+    def _keep_usual(self, run: TrainingRun, reason: str) -> None:
+        log.warning(
+            f"pruning keeps {USUAL_SHARE:.0%} of the primitives: {reason}; --pipeline.model.pruning.keep-ratio sets it"
+        )
+        self._set_count(run, 0)
+
+    def _set_count(self, run: TrainingRun, count: int) -> None:
+        """End the trials of counts; with 0 the schedule keeps the usual share."""
+        self.progress.stage, self.progress.chosen["count"] = "", count
+        run.state.pruning[COUNT] = count
+        self.engine.end(run, "count")
+        if not self.decides_head:
+            self.engine.enable_head(run.state, True)
+
+    # ----------------------------------------------------------------------------------------------------------- heads
+
+    def _heads_fit(self, run: TrainingRun) -> bool:
+        """Whether the chosen candidate can train on for the length of a trial."""
+        folds, length = self._plan(run)
+        trials = len(self._heads) * len(folds) + 1
+        return _steps_of(run) + run.state.offset > self.begins_at + trials * length
+
+    def _begin_heads(self, run: TrainingRun) -> None:
+        progress, state, (folds, length) = self.progress, run.state, self._plan(run)
+        if "tenth" in progress.chosen:
+            head = "head" if progress.chosen["tenth"] else "plain"
+            self._finish_with(run, head, "the trials of counts have shown what it gains")
+            return
+        log.info(
+            f"step {state.step}: is the head worth it? Up to {len(self._heads) * len(folds)} trials of "
+            f"{length:,} steps; {len(self._head_views(run))} of {len(run.view_indices())} training views are held out"
+        )
+        progress.stage = "head"
+        limit_rise(state.schedulers, round(RISE_SHARE * length))
+        self.engine.keep("start", state, head=True)
+        self._start_head(run)
+
+    def _start_head(self, run: TrainingRun) -> None:
+        (folds, length), number = self._plan(run), len(self.progress.of("head"))
+        head = self._heads[number // len(folds)]
+        width = {"plain": 0, "head": self._head.num_features, "features": MORE_FEATURES}[head]
+        # A trial is too short for what helps in the long run, so its steps do not count yet.
+        trial = Trial(length, folds[number % len(folds)], MEAN_SHARE * length, num_features=width, counts=False)
+        self.engine.start(run, trial)
+
+    def _try_head(self, run: TrainingRun, head: str) -> None:
+        """Try the next head from the same field, unless the last one does not pay; or choose."""
+        tried, folds = self.progress.of("head"), len(self._plan(run)[0])
+        complete = len(tried) % folds == 0 and head != "plain"
+        if complete and (head == self._heads[-1] or choice.best_head(tried, folds) != head):
+            self._choose_head(run, head)
+            return
+        self.engine.keep(head, run.state, head=head != "plain")
+        self.engine.go_back("start", run.state)
+        self._start_head(run)
+
+    def _choose_head(self, run: TrainingRun, trained: str) -> None:
+        """Continue with the best candidate; ``trained`` is the one that the field is."""
+        tried, (folds, length) = self.progress.of("head"), self._plan(run)
+        head, figures = choice.best_head(tried, len(folds)), _figures(tried)
+        reason = "" if all(row.views for row in tried) else "masks leave no pixel of the held-out training views"
+        record: dict[str, Any] = {}
+        if not reason:
+            log.info(f"step {run.state.step}: held-out training views: {_in_words(figures)}. Continuing: {NAMES[head]}")
+            run.log_scalars("Trials", {f"psnr_{name}": found["psnr"] for name, found in figures.items()})
+            record = {"held_out_views": self._head_views(run), "steps_per_trial": length, "arms": figures}
+        if head != trained:
+            self.engine.go_back(head, run.state)
+        self._finish_with(run, head, reason, record)
+
+    def _finish_with(self, run: TrainingRun, head: str, reason: str, record: Mapping[str, Any] | None = None) -> None:
+        """Take a decision about the head, serve all training views from now on, and record it."""
+        progress, state = self.progress, run.state
+        if reason:
+            log.info(f"the head is {'removed' if head == 'plain' else 'enabled'}: {reason}")
+        progress.stage, progress.chosen["head"], progress.reason = "", head, reason
+        self.engine.end(run, "head")
+        self.engine.enable_head(state, head != "plain")
+        if head == "plain":
+            state.remove_head()
+        self._record(run, "head", {"decision": head, "reason": reason, "step": state.step, **(record or {})})
+
+    def _stored_bytes(self, state: FieldState, head: str) -> list[int]:
+        params = {name: value for name, value in state.field.items() if head != "plain" or name != FEATURES}
+        size = stored_bytes(params, None)
+        config = None if head == "plain" or state.head is None else state.head.config
+        return [size, stored_bytes(params, config) - size]
+
+    # ---------------------------------------------------------------------------------------------------------- length
+
+    def _length_views(self, run: TrainingRun) -> list[int]:
+        """Views that the chosen field has not seen since before its trial; none without trials."""
+        return [] if self.progress.reason else self._plan(run)[0][-1]
+
+    def _begin_length(self, run: TrainingRun) -> None:
+        progress, state, views = self.progress, run.state, self._length_views(run)
+        step = state.schedule_step
+        watched, num_views = int(WATCHED_SHARE * (progress.steps - step)), len(run.view_indices())
+        # A field that comes from elsewhere has learnt all views: what it forgets of them is no overfitting.
+        if state.offset > 0 or not views or num_views >= MANY_VIEWS or watched < self._short:
+            progress.chosen["length"] = None
+            return
+        progress.stage, progress.watched_until = "length", step + watched
+        self.engine.keep("start", state, head=state.head_enabled)
+        self.engine.start(run, Trial(self._short, views, averaged=self._short))
+        log.info(
+            f"step {state.step}: {num_views} training views are few; {len(views)} stay held out, to see when training "
+            "stops helping"
+        )
+
+    def _try_length(self, run: TrainingRun) -> None:
+        """Train another window; or go back, to train on all views for as many steps as were best."""
+        progress, state, tried = self.progress, run.state, self.progress.of("length")
+        run.log_scalars("Stopping", dict(zip(("psnr", "ssim"), mean_quality(tried[-1].qualities), strict=True)))
+        best, lost = choice.best_length([choice.loss_of(row.qualities, self.ssim_weight) for row in tried])
+        if lost:
+            figures, length = [mean_quality(row.qualities) for row in (tried[best - 1], tried[-1])], best * self._short
+            then, now = (f"{decibels:.2f} dB, SSIM {similarity:.4f}" for decibels, similarity in figures)
+            log.info(
+                f"step {state.step}: the held-out views were best after {length:,} steps, {then}; now {now}. "
+                "Going back, to train as long on all views"
+            )
+            self.engine.go_back("start", state)
+            self.engine.end(run, "length")
+            progress.stage, progress.chosen["length"] = "repeat", length
+            self.engine.start(run, Trial(length, averaged=self._short))
+            self._record_length(run, length)
+        elif state.schedule_step + self._short > progress.watched_until:
+            log.info(f"step {state.step}: the held-out views lose nothing; training goes on, on all views")
+            self._train_on(run)
+            self._record_length(run, None)
+        else:
+            self.engine.start(run, Trial(self._short, self._length_views(run), averaged=self._short))
+
+    def _train_on(self, run: TrainingRun) -> None:
+        self.progress.stage, self.progress.chosen["length"] = "", None
+        self.engine.end(run, "length")
+
+    def _pause(self, run: TrainingRun) -> None:
+        """Take the mean of the last window, and keep it to the end of the schedule."""
+        self.engine.take_mean(run.state)
+        self.engine.end(run, "length")
+        self.progress.stage = "paused"
+        log.info(f"step {run.state.step}: more training would harm other views; the remaining steps change nothing")
+
+    # --------------------------------------------------------------------------------------------------------- records
+
+    def _record_length(self, run: TrainingRun, length: int | None) -> None:
+        """Record the watch, and the number of steps on all views that follow it; None for all that are left."""
+        rows = [row.qualities for row in self.progress.of("length")]
+        measured = [
+            {"loss": choice.loss_of(views, self.ssim_weight), **dict(zip(("psnr", "ssim"), mean_quality(views)))}
+            for views in rows
+        ]
+        record = {"held_out_views": self._length_views(run), "steps_per_measurement": self._short, "measured": measured}
+        self._record(run, "length", {**record, "steps_on_all_views": length, "step": run.state.step})
+
+    def _record(self, run: TrainingRun, stage: str, record: Mapping[str, Any]) -> None:
+        """Add the record of a decision to ``trials.json``."""
+        self.progress.records[stage] = dict(record)
+        self._write(run)
+
+    def _write(self, run: TrainingRun) -> None:
+        if run.folder is not None and self.progress.records:
+            run.folder.mkdir(parents=True, exist_ok=True)
+            text = json.dumps(without_nan(self.progress.records), indent=2, allow_nan=False)
+            write_text(run.folder / RECORD, text + "\n")
+
+
+class AfterPrune(Extension):
+    """Calls trials again after the schedule's prune, because extensions act in their order."""
+
+    name = "after-prune"
+
+    def __init__(self, trials: Trials) -> None:
+        self._trials = trials
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Try heads and lengths."""
+        self._trials.after_prune(run)
+
+
+def _steps_of(run: TrainingRun) -> int:
+    """Steps of the run, of which this training may be the first part; 0 if they are not known."""
+    return 0 if run.last_step is None else max(run.last_step + 1, run.schedule_length or 0)
+
+
+def _figures(tried: list[Tried]) -> dict[str, dict[str, Any]]:
+    """Mean figures by head, over all folds, for a record."""
+    figures = {}
+    for head in dict.fromkeys(row.head for row in tried):
+        rows = [row for row in tried if row.head == head]
+        views = [view for row in rows for view in row.qualities]
+        mean = dict(zip(("psnr", "ssim"), mean_quality(views), strict=True))
+        size = sum(rows[0].bytes) if rows[0].bytes else None
+        figures[head] = {**mean, "bytes": size, "views": [view._asdict() for view in views]}
+    return figures
+
+
+def _in_words(figures: Mapping[str, Mapping[str, Any]]) -> str:
+    return "; ".join(
+        f"{NAMES[name]} {found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}"
+        + ("" if found["bytes"] is None else f", {megabytes(found['bytes'])}")
+        for name, found in figures.items()
+    )

@@ -1,0 +1,256 @@
+"""A field: its shapes, its initial values from points, and values beyond the finite numbers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from sundae_ns.core.covariance import rotation_matrices
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.gaussians import MAX_SH_DEGREE, SPLAT_NAMES, Field, mend, odd_shapes, sh_degree_of, sh_to_rgb
+from sundae_ns.pruning.decision import FieldPruner, prune_field
+from sundae_ns.pruning.rule import PruneRule
+from sundae_ns.scene.initialization import (
+    INITIAL_OPACITY,
+    from_points,
+    initial_features,
+    random_points,
+    random_quaternions,
+)
+
+N = 40
+
+
+def field() -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(N, 3, generator=generator)
+    return from_points(points, points, sh_degree=1, num_features=3, generator=generator)
+
+
+# --------------------------------------------------------------------------------------------------------------- shapes
+
+
+@pytest.mark.parametrize("degree", range(MAX_SH_DEGREE + 1))
+def test_fields_have_no_odd_shapes(degree: int) -> None:
+    points = torch.rand(7, 3)
+    assert odd_shapes(from_points(points, points, sh_degree=degree, num_features=3)) == []
+    assert sh_degree_of((degree + 1) ** 2 - 1) == degree
+
+
+@pytest.mark.parametrize("name", [name for name in SPLAT_NAMES if name != "means"])
+@pytest.mark.parametrize("shape", [(), (N,), (6, 3), (N, 9), (N, 3, 3, 1), (N, 7, 3), (N, 3, 4), (N, 35, 3)])
+def test_an_odd_shape_is_named(name: str, shape: tuple[int, ...]) -> None:
+    (found,) = odd_shapes(field() | {name: torch.zeros(shape)})
+    assert found.startswith(f"{name} has shape {list(shape)}; it must be [{N}, ")
+
+
+def test_means_set_the_number_of_primitives() -> None:
+    found = odd_shapes(field() | {"means": torch.zeros(N, 4)})
+    assert found == [f"means has shape [{N}, 4]; it must be [{N}, 3]"]
+    assert len(odd_shapes(field() | {"means": torch.zeros(6, 3)})) == len(SPLAT_NAMES) - 1
+    assert len(odd_shapes(field() | {"means": torch.zeros(())})) == len(SPLAT_NAMES)
+
+
+# ------------------------------------------------------------------------------------------------------- initial values
+
+
+def cloud(n: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(n, 3, generator=generator), torch.rand(n, 3, generator=generator)
+
+
+def test_one_primitive_per_point() -> None:
+    points, rgb = cloud()
+    params = from_points(points, rgb, sh_degree=3, num_features=5)
+    assert {name: tuple(value.shape[1:]) for name, value in params.items()} == {
+        "means": (3,),
+        "scales": (3,),
+        "quats": (4,),
+        "features_dc": (3,),
+        "features_rest": (15, 3),
+        "opacities": (1,),
+        "features": (5,),
+    }
+    assert all(len(value) == 50 and value.dtype == torch.float32 for value in params.values())
+    assert torch.equal(params["means"], points)
+    torch.testing.assert_close(sh_to_rgb(params["features_dc"]), rgb)
+    assert not params["features_rest"].any()
+    torch.testing.assert_close(params["opacities"].sigmoid(), torch.full((50, 1), INITIAL_OPACITY))
+    torch.testing.assert_close(params["quats"].norm(dim=1), torch.ones(50))
+    # The width is the mean distance to three neighbours.
+    expected = torch.cdist(points, points).sort(dim=1).values[:, 1:4].mean(dim=1)
+    torch.testing.assert_close(params["scales"].exp(), expected[:, None].expand(50, 3))
+    assert "features" not in from_points(points, rgb, sh_degree=0, num_features=0)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_few_points(n: int) -> None:
+    points, rgb = cloud(n)
+    params = from_points(points, rgb, sh_degree=1, num_features=2)
+    assert all(len(value) == n and torch.isfinite(value).all() for value in params.values())
+
+
+def test_coincident_points_get_a_finite_width() -> None:
+    points, rgb = cloud()
+    points[:10] = points[0]
+    scales = from_points(points, rgb, sh_degree=0, num_features=0)["scales"]
+    assert torch.isfinite(scales).all()
+    torch.testing.assert_close(scales[:10], scales.min().expand(10, 3))
+    same = from_points(points[:10], rgb[:10], sh_degree=0, num_features=0)["scales"]
+    assert torch.isfinite(same).all()
+
+
+def test_points_that_are_not_finite_are_dropped() -> None:
+    points, rgb = cloud()
+    points[3, 1], points[7, 0], rgb[9, 2] = torch.nan, torch.inf, torch.nan
+    params = from_points(points, rgb, sh_degree=1, num_features=1)
+    good = [i for i in range(50) if i not in (3, 7, 9)]
+    assert torch.equal(params["means"], points[good])
+    assert all(torch.isfinite(value).all() for value in params.values())
+
+
+@pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.full((4, 3), torch.nan)])
+def test_no_finite_point(points: torch.Tensor) -> None:
+    with pytest.raises(DataError, match="no finite point") as caught:
+        from_points(points, torch.zeros_like(points), sh_degree=0, num_features=0)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("width", [1, 3, 13])
+def test_features_begin_with_the_colour_and_differ(width: int) -> None:
+    dc = torch.randn(200, 3)
+    features = initial_features(dc, width)
+    assert features.shape == (200, width)
+    noise = features.clone()
+    noise[:, : min(3, width)] -= dc[:, : min(3, width)]
+    assert noise.abs().max() < 0.5
+    assert (noise.std(dim=0) > 0.02).all()
+
+
+def test_equal_generators_give_equal_fields() -> None:
+    first, second, other = (
+        from_points(*cloud(), sh_degree=0, num_features=4, generator=torch.Generator().manual_seed(seed))
+        for seed in (1, 1, 2)
+    )
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not torch.equal(first["quats"], other["quats"])
+    assert not torch.equal(first["features"], other["features"])
+
+
+def test_random_points_fill_the_cube_and_rotations_are_uniform() -> None:
+    points, rgb = random_points(5000, 10.0, torch.Generator().manual_seed(0))
+    assert 4.9 < points.abs().max() <= 5
+    assert points.mean(dim=0).abs().max() < 0.2
+    assert rgb.shape == (5000, 3)
+    assert 0 <= rgb.min() < rgb.max() <= 1
+    quats = random_quaternions(20000, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(quats.T @ quats / 20000, torch.eye(4) / 4, atol=0.01, rtol=0)
+
+
+# -------------------------------------------------------------------------------------------------------------- mending
+
+
+def test_a_finite_field_is_returned_as_it_is() -> None:
+    for given in (field(), {name: value[:0] for name, value in field().items()}):
+        mended = mend(given)
+        assert all(mended.field[name] is value for name, value in given.items())
+        assert (mended.clamped, mended.dropped, mended.summary()) == (False, 0, "")
+
+
+def test_values_with_a_meaning_are_clamped() -> None:
+    given = field()
+    given["opacities"][:10], given["opacities"][10:12] = math.inf, -math.inf
+    given["scales"][5:20, 2] = -math.inf
+    given["quats"][30:33] = 0
+    before = {name: value.clone() for name, value in given.items()}
+    mended = mend(given)
+    assert (mended.limits, mended.flat, mended.unrotated, mended.dropped) == (12, 15, 3, 0)
+    assert mended.summary() == (
+        "40 primitives: clamped 12 with opacity 0 or 1 and 15 with width 0 and 3 with rotation 0 to finite values"
+    )
+    found = mended.field
+    assert all(value.isfinite().all() for value in found.values())
+    opacities = found["opacities"].sigmoid()
+    assert (opacities[:10] > 1 - 1e-6).all()
+    assert (opacities[:10] < 1).all()  # with a finite optical depth
+    assert (opacities[10:12] < 1e-6).all()
+    assert (found["scales"][5:20, 2].exp() < 1e-18).all()
+    assert torch.equal(rotation_matrices(found["quats"][30:33]), torch.eye(3).expand(3, 3, 3))
+    # All else stays, and so does what was given.
+    assert torch.equal(found["opacities"][12:], given["opacities"][12:])
+    assert torch.equal(found["scales"][:, :2], given["scales"][:, :2])
+    assert torch.equal(found["means"], given["means"])
+    assert all(torch.equal(given[name], before[name]) for name in given)
+
+
+def test_flat_primitives_of_a_tiny_scene_are_as_narrow_as_its_narrowest() -> None:
+    given = field()
+    given["scales"] -= 60
+    given["scales"][3, 0] = -math.inf
+    narrowest = given["scales"][torch.arange(N) != 3].min()
+    assert mend(given).field["scales"][3, 0] == narrowest
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-15, 1e25])
+def test_quaternions_of_any_length_keep_their_rotation(size: float) -> None:
+    given = field()
+    turned = normalize(torch.tensor([0.5, -0.3, 0.2, 0.7]), dim=0)
+    given["quats"][7] = size * turned
+    mended = mend(given)
+    torch.testing.assert_close(normalize(mended.field["quats"][7], dim=0), turned)
+    assert not mended.clamped
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, math.nan) for name in field()),
+        *(
+            (name, sign * math.inf)
+            for name in ("means", "features_dc", "features_rest", "features")
+            for sign in (1, -1)
+        ),
+        ("scales", math.inf),
+        ("quats", math.inf),
+        ("quats", -math.inf),
+    ],
+)
+def test_primitives_without_a_meaning_are_left_out(name: str, value: float) -> None:
+    given = field()
+    given[name][4].view(-1)[0] = value
+    given["opacities"][8] = math.inf
+    mended = mend(Field(given, "logits"))
+    assert mended.field.encoding == "logits"
+    assert (mended.dropped, mended.limits) == (1, 1)
+    assert (~mended.mask).nonzero().flatten().tolist() == [4]
+    assert mended.field.num_primitives == N - 1
+    assert mended.summary().endswith("finite values, dropped 1 that were not finite (NaN or infinite)")
+
+
+@pytest.mark.parametrize("redistribution", ["none", "merge"])
+@pytest.mark.parametrize("count", [10, N])
+def test_a_prune_of_opaque_and_flat_primitives_is_exact_and_finite(redistribution: str, count: int) -> None:
+    given = field()
+    given["opacities"][:], given["scales"][:, 1] = math.inf, -math.inf
+    rule = PruneRule(redistribution=redistribution)  # type: ignore[arg-type]
+    contribution = torch.linspace(0, 1, N)
+    found = prune_field(given, rule, count, contribution)
+    assert found.decision.dropped_nonfinite == 0
+    assert found.field.num_primitives == count
+    assert all(value.isfinite().all() for value in found.field.values())
+
+
+def test_training_keeps_them_too() -> None:
+    params = {name: torch.nn.Parameter(value) for name, value in field().items()}
+    with torch.no_grad():
+        params["opacities"][:6], params["means"][9] = math.inf, math.nan
+    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
+    assert FieldPruner(params, optimizers).drop_nonfinite() == 1
+    assert len(params["means"]) == N - 1
+    assert (params["opacities"][:6].sigmoid() > 1 - 1e-6).all()
+    assert all(value.isfinite().all() for value in params.values())
+    assert optimizers["opacities"].param_groups[0]["params"][0] is params["opacities"]

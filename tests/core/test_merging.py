@@ -1,0 +1,272 @@
+"""Covariances, overlap, merging, and overwriting a field during training."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from sundae_ns.core.covariance import (
+    covariances,
+    mean_projected_area,
+    overlap,
+    quaternions,
+    rotation_matrices,
+    scales_and_quaternions,
+)
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.merging import merge
+from sundae_ns.core.surgery import rewrite
+
+
+def field(n: int = 12, seed: int = 0) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "features_rest": (3, 3)}
+    shapes |= {"opacities": (1,), "features": (5,)}
+    return {name: torch.randn(n, *s, generator=generator, dtype=torch.float64) for name, s in shapes.items()}
+
+
+def covariance_of(params: dict[str, Tensor]) -> Tensor:
+    return covariances(params["scales"].exp(), params["quats"])
+
+
+def test_a_group_becomes_one_with_the_moments_of_the_mixture() -> None:
+    params, w = field(), torch.rand(12, dtype=torch.float64)
+    label = torch.tensor([0, 0, 0, 0, 4, 4, 6, 7, 7, 7, 0, -1])
+    found = merge(params, label, w)
+    assert {name: value.shape for name, value in found.items()} == {k: (4, *v.shape[1:]) for k, v in params.items()}
+    for place, owner in enumerate([0, 4, 6, 7]):
+        group = label == owner
+        weight = w[group] / w[group].sum()
+        mean = weight @ params["means"][group]
+        offset = params["means"][group] - mean
+        spread = offset[:, :, None] * offset[:, None, :]
+        S = (weight[:, None, None] * (covariance_of(params)[group] + spread)).sum(dim=0)
+        torch.testing.assert_close(found["means"][place], mean)
+        torch.testing.assert_close(covariance_of(found)[place], S)
+        for name in ("features_dc", "features_rest", "features"):
+            expected = torch.einsum("n,n...->...", weight, params[name][group])
+            torch.testing.assert_close(found[name][place], expected)
+    # 6 is alone.
+    assert all(torch.equal(found[name][2], params[name][6]) for name in params)
+
+
+def test_transmittances_of_clones_multiply() -> None:
+    params = {name: value.expand(3, *value.shape[1:]).clone() for name, value in field(1).items()}
+    params["opacities"][:] = math.log(0.3 / 0.7)
+    found = merge(params, torch.zeros(3, dtype=torch.long), torch.ones(3))
+    assert float(found["opacities"].sigmoid()) == pytest.approx(1 - 0.7**3)
+    torch.testing.assert_close(covariance_of(found), covariance_of(params)[:1])
+
+
+def test_a_wall_of_small_primitives_absorbs_as_much_light_after_merging() -> None:
+    # From afar, a primitive absorbs its optical depth times its projected area.
+    params = field(100)
+    params["means"] = torch.cartesian_prod(*[torch.arange(10.0).double()] * 2, torch.zeros(1).double())
+    params["scales"][:] = torch.tensor([0.4, 0.4, 1e-3]).double().log()
+    params["quats"][:] = torch.tensor([1.0, 0, 0, 0]).double()
+    params["opacities"][:] = -2.0
+    found = merge(params, torch.zeros(100, dtype=torch.long), torch.ones(100))
+
+    def absorption(p: dict[str, Tensor]) -> float:
+        return float(
+            (-torch.log1p(-p["opacities"].sigmoid().squeeze(1)) * mean_projected_area(p["scales"].exp())).sum()
+        )
+
+    assert absorption(found) == pytest.approx(absorption(params))
+    assert float(found["scales"].exp().min()) == pytest.approx(1e-3)
+
+
+def test_merging_commutes_with_rotation_scale_and_shift() -> None:
+    params, label, w = field(), torch.tensor([0, 0, 0, 3, 3, 3, 6, 6, 6, 9, 9, -1]), torch.rand(12)
+    turn = torch.randn(1, 4, dtype=torch.float64)
+    R = rotation_matrices(turn)[0]
+    moved = {**params, "means": 8 * params["means"] @ R.T + 100, "scales": params["scales"] + math.log(8)}
+    moved["quats"] = quaternions(R @ rotation_matrices(params["quats"]))
+    before, after = merge(params, label, w), merge(moved, label, w)
+    torch.testing.assert_close(after["means"], 8 * before["means"] @ R.T + 100)
+    torch.testing.assert_close(covariance_of(after), 64 * R @ covariance_of(before) @ R.T)
+    torch.testing.assert_close(after["opacities"], before["opacities"])
+
+
+def test_groups_without_weight_are_unchanged_and_the_scale_of_weights_is_irrelevant() -> None:
+    params, label = field(), torch.tensor([0] * 6 + [6] * 6)
+    for w in (torch.zeros(12), torch.full((12,), torch.nan)):
+        found = merge(params, label, w)
+        assert all(torch.equal(found[name], params[name][[0, 6]]) for name in params)
+    w = torch.rand(12, dtype=torch.float64)
+    small, plain = merge(params, label, w * 1e-200), merge(params, label, w)
+    assert all(torch.allclose(small[name], plain[name]) for name in params)
+
+
+def test_weights_that_are_nan_infinite_or_negative_count_as_zero() -> None:
+    params, label, w = field(), torch.tensor([0] * 6 + [6] * 6), torch.rand(12, dtype=torch.float64)
+    w[[1, 7]] = 0
+    expected = merge(params, label, w)
+    for odd in (torch.nan, torch.inf, -1.0):
+        w[[1, 7]] = odd
+        found = merge(params, label, w)
+        assert all(torch.equal(found[name], expected[name]) for name in params), odd
+
+
+def test_a_group_with_an_axis_that_overflows_is_unchanged_and_others_are_merged() -> None:
+    params = field()
+    params["scales"][2, 1] = 400.0
+    params["quats"][2] = torch.tensor([1.0, 0, 0, 0]).double()
+    found = merge(params, torch.tensor([0] * 6 + [6] * 6), torch.ones(12))
+    assert all(torch.equal(found[name][0], params[name][0]) for name in params)
+    assert not torch.equal(found["means"][1], params["means"][6])
+    assert all(value.isfinite().all() for value in found.values())
+
+
+def test_extremes_stay_finite() -> None:
+    params = {name: value.float() for name, value in field().items()}
+    params["scales"][0] = torch.tensor([1e-8, 1e3, 1.0]).log()
+    params["quats"][1] = 0
+    params["opacities"][:4] = torch.tensor([30.0, -30.0, 200.0, -200.0])[:, None]
+    params["means"][5] = 1e18
+    found = merge(params, torch.zeros(12, dtype=torch.long), torch.ones(12))
+    assert all(value.isfinite().all() for value in found.values())
+    assert found["opacities"].dtype == torch.float32
+    assert float(found["opacities"].sigmoid().max()) <= 0.99 + 1e-6
+
+
+def test_groups_that_overflow_or_vanish_are_unchanged() -> None:
+    params = field()
+    params["scales"][0], params["scales"][6] = 500.0, -500.0
+    params["scales"][7:] = -500.0
+    params["means"][6:] = 0
+    found = merge(params, torch.tensor([0] * 3 + [3] * 3 + [6] * 6), torch.ones(12))
+    assert all(torch.equal(found[name][[0, 2]], params[name][[0, 6]]) for name in params)
+    assert all(value.isfinite().all() for value in found.values())
+    assert not torch.equal(found["means"][1], params["means"][3])
+
+
+def test_overlap_with_itself_is_one_falls_with_distance_and_is_scale_invariant() -> None:
+    params = field(200)
+    S, means = covariance_of(params), params["means"]
+    indices = torch.stack([torch.arange(200), torch.arange(200).roll(1)], dim=1)
+    found = overlap(means, S, indices, least_width=0.0)
+    torch.testing.assert_close(found[:, 0], torch.ones(200, dtype=torch.float64))
+    assert float(found[:, 1].max()) < 1
+    torch.testing.assert_close(overlap(16 * means, 256 * S, indices, least_width=0.0), found)
+    # Two spheres of width 1 at a distance of 2: exp(-4 / 8).
+    unit = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
+    apart = overlap(torch.tensor([[0.0, 0, 0], [2.0, 0, 0]]).double(), unit, torch.tensor([[1], [0]]), least_width=0.0)
+    assert apart.squeeze(1).tolist() == pytest.approx([math.exp(-0.5)] * 2)
+    flat = torch.diag(torch.tensor([1.0, 1.0, 0.0])).double().expand(2, 3, 3)
+    # Compare with the formula, with determinants and inverses of LAPACK.
+    S = S + 0.3**2 * torch.eye(3)
+    middle = (S + S.roll(1, dims=0)) / 2
+    offset = means - means.roll(1, dims=0)
+    exponent = -torch.einsum("ni,nij,nj->n", offset, torch.linalg.inv(middle), offset) / 8
+    ratio = (S.det() * S.roll(1, dims=0).det()) ** 0.25 / middle.det() ** 0.5
+    found = overlap(means, covariance_of(params), indices, least_width=0.3)
+    torch.testing.assert_close(found[:, 1], exponent.exp() * ratio)
+    assert overlap(torch.zeros(2, 3).double(), flat, torch.tensor([[1], [0]]), least_width=0.0).isfinite().all()
+
+
+def test_overlap_of_needles_survives_pivots_lost_to_rounding() -> None:
+    # Two crossed needles of 1e6 by 1e-6 with one centre, rotated away from the coordinate axes.
+    turn = rotation_matrices(torch.tensor([[0.3, -0.5, 0.7, 0.2]]).double())
+    crossed = torch.diag_embed(torch.tensor([[1e6, 1e-6, 1e-6], [1e-6, 1e6, 1e-6]]).double().square())
+    found = overlap(
+        torch.zeros(2, 3).double(), turn @ crossed @ turn.mT, torch.tensor([[0, 1], [1, 0]]), least_width=1e-6
+    )
+    assert found[:, 0].tolist() == [1, 1]
+    assert found.isfinite().all()
+    assert float(found[:, 1].max()) < 1e-3
+
+
+def test_chunks_of_rows_give_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    params = field(50)
+    indices = torch.randint(50, (50, 4))
+    whole = overlap(params["means"], covariance_of(params), indices, least_width=0.1)
+    label = torch.arange(50) // 5 * 5
+    merged = merge(params, label, torch.rand(50, generator=torch.Generator().manual_seed(0)))
+    monkeypatch.setattr("sundae_ns.core.covariance.PAIRS", 30)
+    monkeypatch.setattr("sundae_ns.core.covariance.ROWS", 7)
+    assert torch.equal(overlap(params["means"], covariance_of(params), indices, least_width=0.1), whole)
+    again = merge(params, label, torch.rand(50, generator=torch.Generator().manual_seed(0)))
+    assert all(torch.equal(again[name], merged[name]) for name in merged)
+
+
+def test_quaternions_inverts_rotations_also_at_half_turns() -> None:
+    turns = torch.cat([torch.eye(4), torch.randn(200, 4), torch.randn(200, 4) * torch.tensor([1e-4, 1, 1, 1])]).double()
+    torch.testing.assert_close(rotation_matrices(quaternions(rotation_matrices(turns))), rotation_matrices(turns))
+    assert torch.equal(rotation_matrices(torch.zeros(1, 4)), torch.eye(3)[None])
+
+
+def test_scales_and_quaternions_invert_covariances_also_of_equal_axes_needles_and_single_points() -> None:
+    generator = torch.Generator().manual_seed(0)
+    scales = torch.rand(300, 3, generator=generator, dtype=torch.float64).pow(4)
+    scales[:20] = 0.3
+    scales[20:40, 1] = scales[20:40, 0]
+    scales[40:60] *= torch.tensor([1e-9, 1.0, 1e-5])
+    scales[60:80] = 0
+    scales[80:100] *= 1e-100
+    scales[100:120] *= 1e100
+    turns = torch.randn(300, 4, generator=generator, dtype=torch.float64)
+    turns[::7] = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    found, quats = scales_and_quaternions(covariances(scales, turns))
+    largest = scales.amax(dim=1, keepdim=True).clamp_min(1e-300)
+    torch.testing.assert_close(found / largest, scales.sort(dim=1).values / largest, rtol=0, atol=1e-7)
+    back, first = (covariances(s / largest, q) for s, q in ((found, quats), (scales, turns)))
+    torch.testing.assert_close(back, first, rtol=0, atol=1e-14)
+
+
+def test_mean_projected_area_of_spheres_and_discs() -> None:
+    found = mean_projected_area(torch.tensor([[2.0, 2, 2], [1, 1, 0], [3, 2, 1]]).double())
+    assert float(found[0]) == pytest.approx(4)
+    # For a disc it is half the area; the surface of a = 3, b = 2, c = 1 is 48.882.
+    assert float(found[1]) == pytest.approx(0.5, rel=0.012)
+    assert float(found[2]) == pytest.approx(48.882 / (4 * math.pi), rel=0.012)
+
+
+def trained(n: int = 6) -> tuple[dict[str, Parameter], dict[str, torch.optim.Optimizer]]:
+    params = {name: Parameter(value) for name, value in field(n).items()}
+    optimizers: dict[str, torch.optim.Optimizer] = {name: torch.optim.Adam([value]) for name, value in params.items()}
+    torch.stack([value.square().sum() for value in params.values()]).sum().backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+    return params, optimizers
+
+
+def test_rewriting_resets_first_moments_of_changed_values_only() -> None:
+    params, optimizers = trained()
+    before = {name: value.detach().clone() for name, value in params.items()}
+    values = {name: value.clone() for name, value in before.items()}
+    values["means"][2] += 1
+    values["opacities"][4] += 1
+    objects, moments = dict(params), {name: dict(optimizers[name].state[params[name]]) for name in params}
+    moments = {name: {k: v.clone() for k, v in entries.items()} for name, entries in moments.items()}
+    rewrite(params, optimizers, values)
+    for name, value in params.items():
+        assert value is objects[name]
+        assert torch.equal(value.detach(), values[name])
+        state, changed = optimizers[name].state[value], values[name] != before[name]
+        assert (state["exp_avg"][changed] == 0).all()
+        assert torch.equal(state["exp_avg"][~changed], moments[name]["exp_avg"][~changed])
+        assert torch.equal(state["exp_avg_sq"], moments[name]["exp_avg_sq"])
+    assert int((params["means"].detach() != before["means"]).sum()) == 3
+
+
+def test_rewriting_before_the_first_step_and_without_an_optimizer() -> None:
+    params = {name: Parameter(value) for name, value in field(6).items()}
+    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items() if name != "features"}
+    values = {name: value.detach() + 1 for name, value in params.items()}
+    rewrite(params, optimizers, values)
+    assert all(torch.equal(params[name].detach(), values[name]) for name in params)
+    assert not any(optimizer.state for optimizer in optimizers.values())
+
+
+def test_rewriting_refuses_wrong_names_and_shapes_and_changes_nothing() -> None:
+    params, optimizers = trained()
+    before = params["means"].detach().clone()
+    for values in ({"means": before + 1, "colour": before}, {"means": before + 1, "scales": before[:2]}):
+        with pytest.raises(DataError, match="one row per primitive"):
+            rewrite(params, optimizers, values)
+    assert torch.equal(params["means"].detach(), before)

@@ -1,0 +1,211 @@
+"""The cache of CUDA graphs, and the recording of one; users of recorded graphs have tests of their own."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+
+import pytest
+import torch
+
+from sundae_ns.core.errors import BackendError
+from sundae_ns.cuda import cuda_graphs
+from sundae_ns.cuda.cuda_graphs import MAX_GRAPHS, RECORD_AT, GraphCache, is_recording, record, warm_up
+
+
+@pytest.fixture
+def eager_collector() -> Iterator[None]:
+    """Run the garbage collector at almost every allocation."""
+    before = gc.get_threshold()
+    gc.set_threshold(1, 1, 1)
+    yield
+    gc.set_threshold(*before)
+
+
+def test_a_key_repeated_in_a_row_is_recorded_once() -> None:
+    cache: GraphCache[str] = GraphCache()
+    made: list[str] = []
+
+    def get(key: str) -> str | None:
+        def make() -> str:
+            made.append(key)
+            return f"graph of {key}"
+
+        return cache.get(key, make)
+
+    for key in "abababab":
+        assert get(key) is None
+    found = [get("a") for _ in range(RECORD_AT + 2)]
+    assert found == [None] * (RECORD_AT - 1) + ["graph of a"] * 3
+    assert get("b") is None
+    assert get("a") == "graph of a"
+    assert made == ["a"]
+
+
+def test_the_least_recently_used_graph_is_dropped() -> None:
+    cache: GraphCache[int] = GraphCache()
+    for key in range(MAX_GRAPHS):
+        for _ in range(RECORD_AT):
+            cache.get(key, lambda key=key: key)
+    cache.get(0, lambda: -1)
+    for _ in range(RECORD_AT):
+        cache.get(MAX_GRAPHS, lambda: MAX_GRAPHS)
+    assert len(cache) == MAX_GRAPHS
+    assert cache.get(0, lambda: -1) == 0
+    assert cache.get(1, lambda: -1) is None
+    cache.put(0, 7)
+    assert cache.get(0, lambda: -1) == 7
+    cache.clear()
+    assert len(cache) == 0
+    assert cache.get(0, lambda: -1) is None  # the count of repeats starts anew
+
+
+def test_code_called_in_a_recording_knows_it() -> None:
+    assert not is_recording()
+    with cuda_graphs._mark_recording():
+        with cuda_graphs._mark_recording():
+            assert is_recording()
+        assert is_recording()
+        with ThreadPoolExecutor(1) as pool:
+            assert not pool.submit(is_recording).result()
+    assert not is_recording()
+
+
+@pytest.mark.parametrize("fails", [False, True])
+@pytest.mark.parametrize("enabled", [True, False])
+def test_no_garbage_collection_during_a_recording(enabled: bool, fails: bool) -> None:
+    try:
+        if not enabled:
+            gc.disable()
+        try:
+            with cuda_graphs._no_garbage_collection():
+                assert not gc.isenabled()
+                if fails:
+                    raise ValueError
+        except ValueError:
+            assert fails
+        assert gc.isenabled() == enabled
+    finally:
+        gc.enable()
+
+
+def test_a_failed_recording_restores_stream_and_generator(monkeypatch: pytest.MonkeyPatch) -> None:
+    current = "main"
+
+    @contextmanager
+    def stream(side: str) -> Iterator[None]:
+        nonlocal current
+        before, current = current, side
+        try:
+            yield
+        finally:
+            current = before
+
+    class Capture:
+        """Like torch's: a failure at its end leaves its stream current."""
+
+        def __init__(self, graph: object, *, stream: str, **_: object) -> None:
+            self.stream = stream
+
+        def __enter__(self) -> None:
+            nonlocal current
+            current = self.stream
+
+        def __exit__(self, *_: object) -> None:
+            assert not gc.isenabled()
+            raise RuntimeError("operation failed due to a previous error during capture\nand more lines")
+
+    class Generator:
+        """Like torch's: a failed recording leaves it refusing to draw, but copies from before still draw."""
+
+        def __init__(self) -> None:
+            self.drawn_from = "now"
+
+        def clone_state(self) -> str:
+            return "before"
+
+        def graphsafe_set_state(self, state: str) -> None:
+            self.drawn_from = state
+
+    generator = Generator()
+    stand_ins = {"stream": stream, "graph": Capture, "CUDAGraph": object, "device": nullcontext}
+    stand_ins |= {"default_generators": (generator,), "current_device": lambda: 0, "graph_pool_handle": lambda: "pool"}
+    for name, stand_in in stand_ins.items():
+        monkeypatch.setattr(torch.cuda, name, stand_in)
+    monkeypatch.setattr(cuda_graphs, "_side_stream", lambda device: "side")
+    monkeypatch.setattr(cuda_graphs, "_abandoned", failed := [])
+    ended: list[object] = []
+    monkeypatch.setattr(torch._C, "_cuda_endAllocateToPool", lambda *of: ended.append(of), raising=False)
+    with pytest.raises(
+        BackendError, match=r"as a CUDA graph: operation failed due to a previous error during capture$"
+    ):
+        record(lambda: current, torch.device("cuda"))
+    assert current == "main"
+    assert generator.drawn_from == "before"
+    assert ended == [(0, "pool")]
+    assert len(failed) == 1
+    assert gc.isenabled()
+    assert not is_recording()
+
+    def too_much() -> None:
+        raise torch.cuda.OutOfMemoryError("no room")
+
+    with pytest.raises(torch.cuda.OutOfMemoryError, match="no room"):  # not the error that follows from it
+        record(too_much, torch.device("cuda"))
+    assert len(ended) == len(failed) == 2
+
+
+@pytest.mark.gpu
+def test_a_graph_in_the_garbage_does_not_break_a_recording(eager_collector: None) -> None:
+    device, values = torch.device("cuda"), torch.arange(8.0, device="cuda")
+
+    def plus(summand: float) -> torch.Tensor:
+        return values + summand
+
+    with warm_up(device):
+        plus(1.0)
+    others = [record(lambda: plus(1.0), device)]
+
+    def run() -> torch.Tensor:
+        ring: list[object] = [others.pop()]
+        ring.append(ring)
+        del ring
+        assert len([[] for _ in range(1000)]) == 1000  # allocations that trigger the collector
+        return plus(2.0)
+
+    graph, made = record(run, device)
+    graph.replay()
+    assert torch.equal(made, values + 2)
+
+
+@pytest.mark.gpu
+def test_later_work_is_not_affected_by_a_failed_recording() -> None:
+    device, values = torch.device("cuda"), torch.arange(8.0, device="cuda")
+    before = torch.cuda.current_stream()
+
+    def total() -> torch.Tensor:
+        return (values + 1).sum()
+
+    with warm_up(device):
+        total()
+    for _ in range(3):
+        with pytest.raises(BackendError, match="cannot record this as a CUDA graph"):
+            record(lambda: float(total()), device)  # waits for the device
+        assert torch.cuda.current_stream() == before
+        assert not is_recording()
+        torch.manual_seed(1)
+        drawn = torch.rand(3, device="cuda")
+        large = torch.empty(2**28, device="cuda")
+        held = torch.cuda.memory_reserved()
+        del large
+        torch.cuda.empty_cache()
+        assert torch.cuda.memory_reserved() <= held - 2**30, "the allocator releases free memory"
+        torch.manual_seed(1)
+        assert torch.equal(drawn, torch.rand(3, device="cuda"))
+    graph, made = record(total, device)
+    values += 1
+    graph.replay()
+    assert float(made) == float(total())
+    assert torch.cuda.current_stream() == before

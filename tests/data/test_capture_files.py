@@ -1,0 +1,247 @@
+"""The files of a capture: upright images at several sizes, and cameras that see what COLMAP sees."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from sundae_ns.core.errors import DataError
+from sundae_ns.data.capture import check_transforms
+from sundae_ns.data.capture_files import (
+    APPLIED,
+    Placed,
+    names_of,
+    placed_in,
+    transforms_of,
+    write_images,
+    write_smaller,
+)
+from sundae_ns.data.photos import find_photos, reads_heif
+from sundae_ns.scene.cameras import views_of
+
+PARAMETERS = [50.0, 60.0, 20.0, 15.0, 0.01, -0.02, 0.003, 0.004]
+ORIENTATION, MODEL, FOCAL, EXIF = 0x0112, 0x0110, 0x920A, 0x8769
+
+
+def model(cameras: int = 1) -> Any:
+    """A reconstruction of four images, and one without a pose."""
+    images = []
+    for i, number in enumerate((5, 4, 3, 2, 9)):
+        pose = np.column_stack([Rotation.random(random_state=i).as_matrix(), np.random.default_rng(i).normal(size=3)])
+        images.append(
+            SimpleNamespace(
+                name=f"c{1 + i % cameras}/frame_{number:05d}.jpg",
+                camera_id=1 + i % cameras,
+                has_pose=number != 9,
+                cam_from_world=lambda pose=pose: SimpleNamespace(matrix=lambda: pose),
+            )
+        )
+    stated = [SimpleNamespace(width=40 + i, height=30, params=np.array(PARAMETERS)) for i in range(cameras)]
+    return SimpleNamespace(images=dict(enumerate(images)), cameras=dict(enumerate(stated, start=1)))
+
+
+def transforms(made: Any) -> dict[str, Any]:
+    return transforms_of(made, {image.name: f"IMG {image.name[-9:-4]}.HEIC" for image in made.images.values()})
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_our_cameras_see_what_colmap_sees(tmp_path: Path, cameras: int) -> None:
+    made = model(cameras)
+    meta = transforms(made)
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    check_transforms(tmp_path / "transforms.json")
+    assert ("fl_x" in meta, "fl_x" in meta["frames"][0]) == (cameras == 1, cameras == 2)
+    points = np.random.default_rng(0).normal(size=(10, 3))
+    moved = torch.from_numpy(points @ APPLIED[:, :3].T)
+    posed = sorted((image for image in made.images.values() if image.has_pose), key=lambda image: image.name[3:])
+    for view, image in zip(views_of(tmp_path), posed, strict=True):
+        pose, viewmat = image.cam_from_world().matrix(), view.viewmat.double()
+        seen = moved @ viewmat[:3, :3].T + viewmat[:3, 3]
+        np.testing.assert_allclose(seen.numpy(), points @ pose[:, :3].T + pose[:, 3], atol=1e-5)
+        assert (view.width, view.height) == (39 + image.camera_id, 30)
+        assert (float(view.K[0, 0]), float(view.K[1, 2])) == (PARAMETERS[0], PARAMETERS[3])
+
+
+def test_frames_name_their_photos_in_order() -> None:
+    meta = transforms(model())
+    assert [frame["file_path"] for frame in meta["frames"]] == [f"images/frame_{i:05d}.jpg" for i in (2, 3, 4, 5)]
+    assert meta["frames"][0]["original"] == "IMG 00002.HEIC"
+    assert meta["left_out"] == ["IMG 00009.HEIC"]
+    made = model()
+    made.cameras[1].params = np.array([50.0, 20.0, 15.0, 0.01])  # a simple camera is a special case
+    meta = transforms(made)
+    assert [meta[name] for name in ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1")] == [50, 50, 20, 15, 0.01, 0, 0]
+
+
+def test_photos_of_a_capture(tmp_path: Path) -> None:
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"frames": [{"original": "b"}, {"file_path": "images/c"}], "left_out": ["a"]}))
+    assert placed_in(tmp_path) == Placed(("b", "images/c"), ("a",))
+    for text in ('{"frames": 3}', '{"frames": [], "left_out": 2}', '{"frames": [{}, {}', "[]"):
+        path.write_text(text)
+        with pytest.raises(DataError):
+            placed_in(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("placed", "left_out", "enough", "again"),
+    [
+        ("abcdef", "", True, "add sharp photos"),
+        ("abcf", "de", True, "the way from c to d again"),
+        ("efgh", "abcd", True, "the way from e to d again"),
+        ("ab", "cde", False, "the way from b to c again"),
+        ("ab", "", False, "add sharp photos"),
+        ("abc", "defgh", False, "the way from c to d again"),
+    ],
+)
+def test_what_to_photograph_again(placed: str, left_out: str, enough: bool, again: str) -> None:
+    photos = Placed(tuple(placed), tuple(left_out))
+    assert (photos.total, photos.enough) == (len(placed + left_out), enough)
+    assert again in photos.again
+
+
+def gradient(width: int = 40, height: int = 24) -> Image.Image:
+    """Red grows to the right and green downwards."""
+    x, y = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
+    return Image.fromarray(np.stack([x, y, np.zeros_like(x)], axis=2).astype(np.uint8))
+
+
+def save(path: Path, image: Image.Image | None = None, **entries: object) -> None:
+    exif = Image.Exif()
+    for name, value in entries.items():
+        if name == "focal":
+            exif.get_ifd(EXIF)[FOCAL] = value
+        else:
+            exif[{"orientation": ORIENTATION, "model": MODEL}[name]] = value
+    (image or gradient()).save(path, exif=exif)
+
+
+def written(folder: Path, out: Path) -> list[Path]:
+    photos = find_photos(folder)
+    done: list[int] = []
+    write_images(photos, out, done.append)
+    assert sum(done) == len(photos)
+    return [out / name for name in names_of(photos)]
+
+
+def test_photos_of_one_camera_share_a_folder(tmp_path: Path) -> None:
+    save(tmp_path / "a.jpg", model="Phone", focal=4.2)
+    save(tmp_path / "b.jpg", model="Phone", focal=9.0)
+    save(tmp_path / "c.jpg", gradient(24, 40), model="Phone", focal=4.2)
+    save(tmp_path / "d.jpg", gradient(24, 40), model="Phone", focal=4.2, orientation=6)  # turned, it is as the first
+    save(tmp_path / "e.png", model="Other")
+    names = names_of(find_photos(tmp_path))
+    assert [name[:2] for name in names] == ["c1", "c2", "c3", "c1", "c4"]
+    assert names[3:] == ["c1/frame_00004.jpg", "c4/frame_00005.png"]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photos_become_upright(tmp_path: Path, orientation: int) -> None:
+    turns = [None, "FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM"]
+    turns += ["TRANSPOSE", "ROTATE_90", "TRANSVERSE", "ROTATE_270"]
+    turn = turns[orientation - 1]
+    stored = gradient() if turn is None else gradient().transpose(Image.Transpose[turn])
+    for name in ("a", "b", "c"):
+        save(tmp_path / f"{name}.jpg", stored, orientation=orientation)
+    assert find_photos(tmp_path)[0].as_it_is == (orientation == 1)
+    with Image.open(written(tmp_path, tmp_path / "out")[0]) as image:
+        assert image.getexif().get(ORIENTATION, 1) == 1
+        assert image.size == (40, 24)
+        assert np.abs(np.asarray(image, float) - np.asarray(gradient(), float)).mean() < 6
+
+
+def test_files_that_can_stay_are_copied_and_others_saved(tmp_path: Path) -> None:
+    clear = gradient().convert("RGBA")
+    clear.putalpha(100)
+    save(tmp_path / "a.jpg")
+    save(tmp_path / "b.png")
+    gradient().save(tmp_path / "c.tif")
+    clear.save(tmp_path / "d.webp", lossless=True)
+    gradient().convert("L").save(tmp_path / "e.bmp")
+    paths = written(tmp_path, tmp_path / "out")
+    assert [path.suffix for path in paths] == [".jpg", ".png", ".jpg", ".png", ".jpg"]
+    for name, path in zip(("a.jpg", "b.png"), paths):
+        assert path.read_bytes() == (tmp_path / name).read_bytes()
+    modes = []
+    for path in paths:
+        with Image.open(path) as image:
+            modes.append(image.mode)
+            assert image.format == {".jpg": "JPEG", ".png": "PNG"}[path.suffix]
+    assert modes == ["RGB", "RGB", "RGB", "RGBA", "L"]
+    before = paths[0].stat().st_mtime_ns
+    paths[1].unlink()
+    write_images(find_photos(tmp_path), tmp_path / "out", lambda _: None)
+    assert paths[0].stat().st_mtime_ns == before, "what is there stays"
+    assert paths[1].exists()
+
+
+def test_heic(tmp_path: Path) -> None:
+    if not reads_heif():
+        pytest.skip("pillow-heif is not installed")
+    for name in ("a", "b", "c"):
+        exif = Image.Exif()
+        exif[ORIENTATION] = 6
+        gradient().save(tmp_path / f"{name}.HEIC", exif=exif.tobytes())
+    with Image.open(written(tmp_path, tmp_path / "out")[0]) as image:
+        assert (image.size, image.getexif().get(ORIENTATION, 1)) == ((24, 40), 1)
+        left, right = image.getpixel((2, 20)), image.getpixel((21, 20))
+    assert left[1] > right[1] + 100, "the bottom of the stored image is at the left"
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png", "webp"])
+def test_pixels_that_cannot_be_decoded(tmp_path: Path, kind: str) -> None:
+    for name in ("a", "b", "c"):
+        Image.effect_noise((90, 60), 80).convert("RGB").save(tmp_path / f"{name}.{kind}")
+    path = tmp_path / f"b.{kind}"
+    photos = find_photos(tmp_path)
+    path.write_bytes(path.read_bytes()[:1500])
+    with pytest.raises(DataError, match=rf"b\.{kind} cannot be decoded"):
+        write_images(photos, tmp_path / "out", lambda _: None)
+
+
+@pytest.mark.parametrize(("width", "factors"), [(43, [2, 4, 8]), (12800, [2, 4, 8]), (12803, [2, 4, 8, 16])])
+def test_smaller_images(tmp_path: Path, width: int, factors: list[int]) -> None:
+    (tmp_path / "images").mkdir()
+    gradient(width, 19).save(tmp_path / "images" / "a.jpg")
+    write_smaller(tmp_path / "images", lambda _: None)
+    assert {path.name for path in tmp_path.iterdir()} == {"images", *(f"images_{factor}" for factor in factors)}
+    for factor in factors:
+        with Image.open(tmp_path / f"images_{factor}" / "a.jpg") as image:
+            assert image.size == (width // factor, 19 // factor)
+            assert image.getpixel((0, 0))[0] < 60 < 200 < image.getpixel((width // factor - 1, 0))[0]
+
+
+class Raw:
+    """A raw photo, as rawpy opens one."""
+
+    def __init__(self, path: str) -> None:
+        self.size = (16, 12) if Path(path).stem != "odd" else (12, 16)
+
+    def __enter__(self) -> Raw:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def postprocess(self) -> np.ndarray:
+        return np.asarray(gradient(*self.size))
+
+
+def test_raw_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rawpy", SimpleNamespace(imread=Raw))  # type: ignore[arg-type]
+    for name in ("a", "b", "c"):
+        (tmp_path / f"{name}.CR2").write_bytes(b"II*\0\x10\0\0\0CR\2\0" + bytes(100))
+    with Image.open(written(tmp_path, tmp_path / "out")[2]) as image:
+        assert (image.format, image.size) == ("JPEG", (16, 12))
+    (tmp_path / "c.CR2").rename(tmp_path / "odd.CR2")
+    with pytest.raises(DataError, match=r"raw photos of several sizes \(.*odd\.CR2 differs\); save them as JPEG"):
+        written(tmp_path, tmp_path / "others")

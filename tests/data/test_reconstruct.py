@@ -1,0 +1,285 @@
+"""From photos to a capture: each stage continues where a killed process has left it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_colmap import FakeColmap
+from PIL import Image
+from run_commands import write_video
+
+from harness.still_life import write_still_life
+from sundae_ns.core.errors import ConfigError, DataError, StorageError
+from sundae_ns.data import reconstruct
+from sundae_ns.data.capture import check_transforms
+from sundae_ns.data.reconstruct import Request, check_installed, find_poses, pycolmap, threads
+from sundae_ns.io import run_folder
+from sundae_ns.io.ply import read_point_cloud
+
+PHOTOS = 8
+
+
+@pytest.fixture
+def colmap(monkeypatch: pytest.MonkeyPatch) -> FakeColmap:
+    """A pycolmap with two threads."""
+    made = FakeColmap()
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setattr(reconstruct, "pycolmap", lambda: made)
+    monkeypatch.setattr(run_folder, "_held", {})
+    return made
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "-my $(photos)"
+    folder.mkdir()
+    for index in range(PHOTOS):
+        Image.new("RGB", (16, 12), (20 * index, 90, 90)).save(folder / f"{index}.JPG")
+    return folder
+
+
+class Log:
+    """Stages with their progress."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, list[int]] = {}
+
+    @contextmanager
+    def __call__(self, stage: str, total: int) -> Iterator[Callable[[int], None]]:
+        self.stages[stage] = [total, 0]
+
+        def advance(count: int) -> None:
+            self.stages[stage][1] += count
+
+        yield advance
+
+
+def request(photos: Path, **changes: object) -> Request:
+    out = photos.parent / "capture"
+    return Request(**{"photos": photos, "capture": out, "matching": "auto", "frames": 20, "masks": None, **changes})  # type: ignore[arg-type]
+
+
+def test_photos_become_a_capture(colmap: FakeColmap, photos: Path) -> None:
+    log = Log()
+    found = find_poses(request(photos), log)
+    assert len(found.photos.placed) == PHOTOS
+    assert (found.cameras, found.error, found.models, found.masks) == (1, 0.5, (PHOTOS,), None)
+    capture = photos.parent / "capture"
+    meta = check_transforms(capture / "transforms.json")
+    assert [frame["original"] for frame in meta["frames"]] == [f"{i}.JPG" for i in range(PHOTOS)]
+    assert len(list((capture / "images").iterdir())) == PHOTOS
+    assert read_point_cloud(capture / "sparse_pc.ply")[0].tolist() == [[1.0, 3.0, -2.0]]
+    assert (capture / "colmap" / "sparse" / "0" / "images.json").is_file()
+    assert sorted(path.name for path in photos.parent.iterdir()) == ["-my $(photos)", "capture"]
+    for stage, parts in (("images", 8), ("features", 8), ("matches of pairs", 28), ("capture", 8)):
+        assert log.stages[stage] == [parts, parts]
+    assert colmap.calls["models"] == ["OPENCV"]
+
+
+@pytest.mark.parametrize("stage", ["import", "features", "pairs", "models"])
+def test_a_stage_continues(colmap: FakeColmap, photos: Path, stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reconstruct, "_PAIRS_AT_ONCE", 5)
+    colmap.fails = stage
+    with pytest.raises(RuntimeError, match="ended early"):
+        find_poses(request(photos), Log())
+    assert not (photos.parent / "capture").exists()
+    run_folder._held.clear()  # the process has ended
+    log = Log()
+    assert len(find_poses(request(photos), log).photos.placed) == PHOTOS
+    assert log.stages["features"] == [PHOTOS, PHOTOS]
+    for name, times in (("import", PHOTOS * (1 + (stage == "import"))), ("features", PHOTOS), ("pairs", 28)):
+        assert len(colmap.calls[name]) == times, "nothing is done twice"
+    assert len(colmap.calls["models"]) == 1 + (stage == "models")
+
+
+@pytest.mark.parametrize("change", ["a photo more", "another photo", "another way"])
+def test_other_photos_or_options_start_anew(colmap: FakeColmap, photos: Path, change: str) -> None:
+    colmap.fails = "models"
+    with pytest.raises(RuntimeError):
+        find_poses(request(photos), Log())
+    run_folder._held.clear()
+    if change == "a photo more":
+        shutil.copy(photos / "0.JPG", photos / "9.JPG")
+    elif change == "another photo":
+        Image.new("RGB", (16, 12), "red").save(photos / "0.JPG")
+    find_poses(request(photos, matching="similar" if change == "another way" else "auto"), Log())
+    assert colmap.calls["features"].count("c1/frame_00001.jpg") == 2
+
+
+def test_the_largest_model_is_taken(colmap: FakeColmap, photos: Path) -> None:
+    colmap.models = [3, 6, 4, 2]
+    found = find_poses(request(photos), Log())
+    assert found.models == (6, 4, 3)
+    assert found.photos.left_out == ("6.JPG", "7.JPG")
+    assert len(list((photos.parent / "capture" / "images").iterdir())) == 6
+
+
+@pytest.mark.parametrize(("simple", "count"), [([PHOTOS], PHOTOS), ([6, 2], 6), ([5], 5), ([], 5)])
+def test_simple_cameras_are_tried_while_photos_are_left_out(
+    colmap: FakeColmap, photos: Path, simple: list[int], count: int
+) -> None:
+    colmap.models, colmap.simple = [5], simple
+    assert len(find_poses(request(photos), Log()).photos.placed) == count
+    assert colmap.calls["models"] == ["OPENCV", "SIMPLE_RADIAL"]
+
+
+def test_images_that_see_hardly_a_point_have_no_pose(colmap: FakeColmap, photos: Path) -> None:
+    colmap.blind = ("c1/frame_00002.jpg",)
+    assert find_poses(request(photos), Log()).photos.left_out == ("1.JPG",)
+    capture = photos.parent / "capture"
+    assert not (capture / "images" / "frame_00002.jpg").exists()
+    assert "frame_00002" not in (capture / "colmap" / "sparse" / "0" / "images.json").read_text()
+
+
+def test_no_model(colmap: FakeColmap, photos: Path) -> None:
+    colmap.models = []
+    with pytest.raises(DataError, match="no photos could be placed"):
+        find_poses(request(photos), Log())
+
+
+def test_frames_of_a_video(colmap: FakeColmap, tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", 90)
+    log = Log()
+    assert find_poses(request(tmp_path / "a.mp4", frames=40), log).photos.total == 40
+    assert log.stages["frames"] == [40, 40]
+
+
+def test_masks_reach_the_capture(colmap: FakeColmap, photos: Path, tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    for index in range(PHOTOS):
+        mask = Image.new("L", (16, 12), 255)
+        mask.putpixel((index, 0), 0)
+        mask.save(tmp_path / "masks" / f"{index}.png")
+    colmap.models = [6]
+    assert find_poses(request(photos, masks=tmp_path / "masks"), Log()).masks == "6 of 6"
+    frames = check_transforms(tmp_path / "capture" / "transforms.json")["frames"]
+    assert frames[2]["mask_path"] == "masks/frame_00003.png"
+    with Image.open(tmp_path / "capture" / "masks" / "frame_00003.png") as stored:
+        assert (stored.getpixel((2, 0)), stored.getpixel((3, 0))) == (0, 255)
+
+
+def test_one_process_works_on_a_capture(colmap: FakeColmap, photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_folder.reserve(photos.parent / "capture.partial")
+    held = dict(run_folder._held)
+    monkeypatch.setattr(run_folder, "_held", {})
+    with pytest.raises(StorageError, match="works in .*partial; wait for it, or choose another folder"):
+        find_poses(request(photos), Log())
+    del held
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> list[str]:
+    """A database of 60 images of a walk in a circle: each shares features with its neighbours."""
+    module = pytest.importorskip("pycolmap")
+    rng = np.random.default_rng(0)
+    ring = rng.integers(0, 256, (60, 40, 128), dtype=np.uint8)
+    names = [f"frame_{number:05d}.jpg" for number in range(60)]
+    with module.Database.open(tmp_path / "database.db") as database:
+        camera = module.Camera.create_from_model_name(1, "OPENCV", 50.0, 64, 48)
+        database.write_camera(camera)
+        for number, name in enumerate(names):
+            image = database.write_image(module.Image(name=name, camera_id=1))
+            seen = np.concatenate([ring[(number + step) % 60] for step in range(-4, 5)])
+            database.write_keypoints(image, rng.uniform(0, 48, (len(seen), 2)).astype(np.float32))
+            kind = module.FeatureExtractorType.SIFT
+            database.write_descriptors(image, module.FeatureDescriptors(type=kind, data=seen))
+    return names
+
+
+def pairs_of(work: Path, names: list[str], matching: str, video: bool = False) -> set[tuple[int, int]]:
+    pairs = reconstruct._pairs(work, names, matching, video)  # type: ignore[arg-type]
+    assert len(pairs) == len(set(pairs))
+    return {(names.index(a), names.index(b)) for a, b in pairs}
+
+
+def test_pairs_of_a_walk(tmp_path: Path, walk: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    every = pairs_of(tmp_path, walk, "auto")
+    assert every == {(a, b) for b in range(60) for a in range(b)}
+    along = pairs_of(tmp_path, walk, "auto", video=True)
+    assert {(10, 10 + step) for step in (1, 2, 5, 10, 16, 32)} <= along
+    assert {(0, 59), (1, 58)} <= along, "the walk ends where it began"
+    assert len(along) < 60 * 20
+    monkeypatch.setattr(reconstruct, "_ALIKE", 12)
+    monkeypatch.setattr(reconstruct, "_MOST_EXHAUSTIVE", 59)
+    similar = pairs_of(tmp_path, walk, "auto")
+    near = {(a, b) for a, b in every if min(b - a, 60 - b + a) <= 3}
+    assert near <= similar
+    assert len(similar) < 60 * 13
+
+
+def test_its_log_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakeColmap()
+    monkeypatch.setitem(sys.modules, "pycolmap", fake)  # type: ignore[arg-type]
+    assert pycolmap() is fake
+    assert fake.logging.minloglevel == 3
+
+
+def test_a_missing_package_and_a_broken_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    for load in (check_installed, pycolmap):
+        with pytest.raises(ConfigError, match=r"need pycolmap; install it with pip install \"sundae_ns\[photos\]\""):
+            load()
+    (tmp_path / "pycolmap.py").write_text("raise ImportError('libgomp.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pycolmap")
+    check_installed()
+    with pytest.raises(ConfigError, match=r"pycolmap cannot be loaded \(libgomp.*; install it again with"):
+        pycolmap()
+
+
+def test_a_process_that_is_told_to_end_prints_nothing(tmp_path: Path) -> None:
+    (tmp_path / "pycolmap.py").write_text(
+        "import signal, sys\nfrom types import SimpleNamespace as Names\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit('a stack of thirty lines'))\n"
+        "logging = Names(minloglevel=0, Level=Names(FATAL=Names(value=3)))\n"
+    )
+    code = "import os, signal\nfrom sundae_ns.data.reconstruct import pycolmap\npycolmap()\n"
+    code += "os.kill(os.getpid(), signal.SIGTERM)"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
+
+
+@pytest.mark.parametrize(("stated", "count"), [("3", 3), ("0", None), ("", None), ("many", None)])
+def test_threads(monkeypatch: pytest.MonkeyPatch, stated: str, count: int | None) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", stated)
+    assert threads() == (count or os.cpu_count())
+
+
+def test_poses_of_a_still_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The real COLMAP: where the cameras stand and what they see agree with the scene's own, after a similarity."""
+    pytest.importorskip("pycolmap")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setattr(run_folder, "_held", {})
+    scene = write_still_life(
+        tmp_path / "scene", train_views=29, test_views=1, width=240, height=180, points=10, samples=1
+    )
+    found = find_poses(request(scene / "images"), Log())
+    assert len(found.photos.placed) >= 20
+    assert found.error < 1
+    truth = {frame["file_path"]: frame for frame in json.loads((scene / "transforms.json").read_text())["frames"]}
+    meta = check_transforms(tmp_path / "scene" / "capture" / "transforms.json")
+    ours = np.array([frame["transform_matrix"] for frame in meta["frames"]])
+    theirs = np.array([truth[f"images/{frame['original']}"]["transform_matrix"] for frame in meta["frames"]])
+    a, b = ours[:, :3, 3], theirs[:, :3, 3]
+    centred, target = a - a.mean(axis=0), b - b.mean(axis=0)
+    u, values, v = np.linalg.svd(target.T @ centred)
+    signs = np.diag([1, 1, np.sign(np.linalg.det(u @ v))])
+    rotation = u @ signs @ v
+    scale = (values * np.diag(signs)).sum() / (centred**2).sum()
+    away = np.linalg.norm(target - scale * centred @ rotation.T, axis=1)
+    assert away.max() < 0.05 * np.linalg.norm(target, axis=1).max()  # measured: 0.022
+    turned = np.einsum("ij,njk,nlk->nil", rotation, ours[:, :3, :3], theirs[:, :3, :3])
+    angles = np.degrees(np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    assert angles.max() < 3

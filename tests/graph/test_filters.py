@@ -1,0 +1,164 @@
+"""Filters against exact spectra and dense algebra, and their invariances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from sundae_ns.core.errors import DataError
+from sundae_ns.graph import filters
+from sundae_ns.graph.filters import Smoother, high_pass, low_pass, response_magnitude
+from sundae_ns.graph.graph import NeighborGraph, build_graph
+
+
+def cloud(n: int = 60, seed: int = 0) -> torch.Tensor:
+    return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def random_walk(graph: NeighborGraph) -> torch.Tensor:
+    """Dense A = D^-1 W; an isolated node is its own neighbour."""
+    W = torch.zeros(graph.N, graph.N, dtype=graph.weights.dtype).scatter_add(1, graph.indices, graph.weights)
+    W += torch.diag(graph.isolated.to(W.dtype))
+    return W / W.sum(1, keepdim=True)
+
+
+@pytest.mark.parametrize("num_neighbors", [5, 59])
+def test_filters_match_the_exact_spectrum(num_neighbors: int) -> None:
+    points = cloud()
+    graph = build_graph(points, num_neighbors=num_neighbors, tau=100.0, sigma=0.5)
+    eigenvalues, V = torch.linalg.eig(random_walk(graph))
+    assert eigenvalues.abs().max().item() == pytest.approx(1.0)
+    x = points.to(V.dtype)
+    high = V @ ((1 - eigenvalues)[:, None] * torch.linalg.solve(V, x))
+    low = V @ ((1 + eigenvalues)[:, None] * torch.linalg.solve(V, x))
+    assert high.imag.abs().max() < 1e-8
+    torch.testing.assert_close(high_pass(graph, points), high.real, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(low_pass(graph, points), low.real, rtol=1e-8, atol=1e-8)
+
+
+def test_high_and_low_pass_add_up_and_constants_vanish() -> None:
+    graph = build_graph(cloud(), num_neighbors=6, sigma=10.0)
+    x = cloud(seed=1)
+    torch.testing.assert_close(high_pass(graph, x) + low_pass(graph, x), 2 * x)
+    assert high_pass(graph, torch.full((60,), 3.7, dtype=torch.float64)).abs().max() == 0
+
+
+def test_shapes_dtypes_and_chunks_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = build_graph(cloud().float(), num_neighbors=6, sigma=10.0)
+    x = cloud(seed=1)
+    whole = high_pass(graph, x)
+    assert whole.dtype == torch.float64
+    assert high_pass(graph, x.float()).dtype == torch.float32
+    torch.testing.assert_close(high_pass(graph, x[:, 0]), whole[:, 0])
+    monkeypatch.setattr(filters, "CHUNK_ELEMENTS", 7 * 18)
+    assert torch.equal(high_pass(graph, x), whole)
+
+
+def test_isolated_nodes_are_nan() -> None:
+    points = torch.cat([cloud(), torch.full((1, 3), 1e3, dtype=torch.float64)])
+    graph = build_graph(points, num_neighbors=6)
+    alone = graph.isolated
+    assert alone[-1]
+    assert torch.equal(high_pass(graph, points).isnan().all(dim=1), alone)
+    assert torch.equal(response_magnitude(high_pass(graph, points)).isnan(), alone)
+    A = random_walk(graph)
+    torch.testing.assert_close(high_pass(graph, points)[~alone], (points - A @ points)[~alone])
+    torch.testing.assert_close(low_pass(graph, points)[~alone], (points + A @ points)[~alone])
+
+
+def test_one_node_and_no_node() -> None:
+    for n in (0, 1):
+        graph = NeighborGraph(torch.zeros(n, 1, dtype=torch.int64), torch.zeros(n, 1), torch.zeros(n), 1.0, 1.0)
+        assert high_pass(graph, torch.ones(n, 2)).shape == (n, 2)
+        assert high_pass(graph, torch.ones(n)).isnan().all()
+    bare = NeighborGraph(torch.zeros(1, 0, dtype=torch.int64), torch.zeros(1, 0), torch.zeros(1), 1.0, 1.0)
+    assert high_pass(bare, torch.ones(1, 2)).isnan().all()
+
+
+def test_two_nodes_respond_with_their_difference() -> None:
+    points = torch.tensor([[0.0, 0, 0], [2.0, 0, 0]])
+    graph = build_graph(points, num_neighbors=1)
+    assert high_pass(graph, points).tolist() == [[-2.0, 0, 0], [2.0, 0, 0]]
+    assert response_magnitude(high_pass(graph, points)).tolist() == [4.0, 4.0]
+
+
+def test_float32_far_from_the_origin_keeps_its_digits() -> None:
+    # Coordinates are exact in float32 at this offset, so float64 has the same field.
+    points = (cloud(300) * 64).round() / 64 + 1e5
+    exact_graph = build_graph(points, num_neighbors=8, tau=4.0, sigma=0.5)
+    exact = high_pass(exact_graph, points)
+    known = ~exact_graph.isolated
+    single = points.float()
+    assert torch.equal(single.double(), points)
+    graph = build_graph(single, num_neighbors=8, tau=4.0, sigma=0.5)
+    assert torch.equal(graph.isolated, exact_graph.isolated)
+    worst = (high_pass(graph, single) - exact)[known].abs().max().item()
+    assert worst < 2e-6  # measured 1.5e-7
+    naive = single - random_walk(graph) @ single
+    assert (naive - exact)[known].abs().max().item() > 1e-3  # measured 2.2e-2, the reason for the difference form
+
+
+def test_wrong_signal_is_refused() -> None:
+    graph = build_graph(cloud(), num_neighbors=6)
+    for shape in ((59, 3), (60, 3, 1), ()):
+        with pytest.raises(DataError, match="60 nodes"):
+            high_pass(graph, torch.zeros(shape))
+
+
+def test_magnitudes_of_tiny_responses_do_not_vanish() -> None:
+    response = torch.tensor([[1e-30, 0.0], [3e-30, 4e-30], [torch.nan, 0.0]])
+    magnitude = response_magnitude(response)
+    assert magnitude.dtype == torch.float64
+    torch.testing.assert_close(magnitude[:2], torch.tensor([1e-60, 25e-60], dtype=torch.float64), rtol=1e-6, atol=0)
+    assert magnitude[2].isnan()
+    assert response_magnitude(torch.tensor([-3.0])).tolist() == [9.0]
+    assert response_magnitude(torch.zeros(0, 3)).shape == (0,)
+
+
+# ----------------------------------------------------------------------------------------------------- the smooth part
+
+
+def laplacian(graph: NeighborGraph, strength: float) -> NDArray[np.float64]:
+    W = torch.zeros(graph.N, graph.N, dtype=torch.float64).scatter_add(1, graph.indices, graph.weights.double())
+    W = 0.5 * (W + W.T)
+    return (strength / W.sum(1).mean() * (torch.diag(W.sum(1)) - W)).numpy()
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.3, 8.0, 100.0])
+def test_it_solves_its_equation_for_the_known_nodes(strength: float) -> None:
+    graph, signal = build_graph(cloud(), num_neighbors=6), cloud(seed=1).numpy()
+    smoother, known = Smoother(graph, strength), np.arange(60) % 3 > 0
+    for mask in (np.ones(60, bool), known):  # one after the other: factors of other nodes must not be kept
+        signal[~mask] = np.nan  # never read
+        smooth = smoother(signal, mask)
+        system = np.diag(np.maximum(mask, 1e-9)) + laplacian(graph, strength)
+        np.testing.assert_allclose(system @ smooth, np.where(mask[:, None], signal, 0.0), atol=1e-9)
+        # What is left is a high-pass response: it changes no mean.
+        np.testing.assert_allclose((signal - smooth)[mask].sum(axis=0), 0.0, atol=1e-4)
+
+
+def test_a_constant_is_smooth_and_what_changes_from_node_to_node_is_not() -> None:
+    angle = torch.linspace(0, 2 * torch.pi, 61)[:60]
+    ring = torch.stack([angle.cos(), angle.sin(), torch.zeros(60)], dim=1)
+    smoother, known = Smoother(build_graph(ring, num_neighbors=4), 8.0), np.ones(60, bool)
+    slow, fast = np.sin(angle.numpy())[:, None], np.where(np.arange(60) % 2, 1.0, -1.0)[:, None]
+    np.testing.assert_allclose(smoother(np.full((60, 2), 3.7), known), 3.7)
+    assert np.abs(smoother(slow, known) - slow).max() < 0.1
+    assert np.abs(smoother(fast, known)).max() < 0.1
+
+
+def test_a_node_without_an_edge_keeps_its_value() -> None:
+    graph = build_graph(torch.cat([cloud(), torch.tensor([[1e3, 0, 0], [0, 1e3, 0]])]), num_neighbors=6)
+    assert graph.isolated.tolist()[-2:] == [True, True]
+    known = np.arange(62) < 61
+    smooth = Smoother(graph, 8.0)(np.full((62, 1), 2.0), known)
+    assert smooth[60] == pytest.approx(2.0)
+    assert smooth[61] == 0
+
+
+def test_a_graph_without_edges_changes_nothing() -> None:
+    graph = build_graph(cloud(5) * 1e3, num_neighbors=2, tau=0.0)
+    signal = cloud(5, seed=1).numpy()
+    np.testing.assert_allclose(Smoother(graph, 8.0)(signal, np.ones(5, bool)), signal)

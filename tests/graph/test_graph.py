@@ -1,0 +1,174 @@
+"""Edge weights, their width and reach, and the invariances of graph and response on hard point sets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from sundae_ns.core.errors import DataError
+from sundae_ns.graph import graph
+from sundae_ns.graph.filters import high_pass, response_magnitude
+from sundae_ns.graph.graph import NeighborGraph, build_graph
+
+
+def normal(n: int = 120, seed: int = 0) -> Tensor:
+    return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def dense(graph: NeighborGraph) -> Tensor:
+    W = torch.zeros(graph.N, graph.N, dtype=graph.weights.dtype)
+    return W.scatter_add(1, graph.indices, graph.weights)
+
+
+def edges(graph: NeighborGraph) -> int:
+    return int((graph.weights > 0).sum())
+
+
+def magnitude(points: Tensor, k: int = 8, **options: float) -> Tensor:
+    return response_magnitude(high_pass(build_graph(points, num_neighbors=k, **options), points))
+
+
+def check(graph: NeighborGraph, signal: Tensor) -> None:
+    """Properties of every graph: weights in [0, 1], and a response that is finite exactly for nodes with an edge."""
+    assert ((graph.weights >= 0) & (graph.weights <= 1)).all()
+    assert (graph.indices != torch.arange(graph.N)[:, None])[graph.weights > 0].all()
+    response = high_pass(graph, signal)
+    assert torch.equal(response.isfinite().all(dim=1), ~graph.isolated)
+    # A mean of differences is at most as long as the longest difference.
+    reach = (signal[graph.indices] - signal[:, None]).norm(dim=2).amax(dim=1)
+    assert (response.norm(dim=1) <= reach * (1 + 1e-5))[~graph.isolated].all()
+
+
+def test_weights_follow_the_equation_of_the_paper() -> None:
+    points = normal(40)
+    graph = build_graph(points, num_neighbors=39, tau=1.5, sigma=0.6)
+    squared = (points[:, None] - points[None]).square().sum(-1)
+    expected = torch.where(squared < 1.5, torch.exp(-squared / (2 * 0.6**2)), 0.0).fill_diagonal_(0)
+    torch.testing.assert_close(dense(graph), expected)
+    torch.testing.assert_close(graph.dw, expected.sum(1))
+    assert edges(graph) == int((expected > 0).sum())
+    assert (graph.tau, graph.sigma) == (1.5, 0.6)
+
+
+def test_the_median_ignores_clones_and_floaters() -> None:
+    points = normal()
+    clean = build_graph(points)
+    spoiled = build_graph(torch.cat([points, points[:20], torch.full((5, 3), 1e9, dtype=torch.float64)]))
+    assert clean.tau == pytest.approx((3 * clean.sigma) ** 2)
+    assert spoiled.sigma == pytest.approx(clean.sigma, rel=0.25)
+    assert edges(spoiled) > edges(clean)
+    apart = build_graph(torch.cat([normal(200), torch.full((1, 3), 50.0, dtype=torch.float64)]))
+    assert apart.isolated[-1]
+    assert apart.isolated.sum() < 10
+
+
+@pytest.mark.parametrize("sampled", [2**22, 64])
+def test_the_width_is_the_lower_median_of_positive_distances(sampled: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graph, "SAMPLED", sampled)
+    odd = torch.tensor([1e-40, 1e30, torch.inf, torch.nan])
+    values = torch.cat([normal(300).abs().flatten(), torch.zeros(40), odd])
+    values = values[torch.randperm(len(values), generator=torch.Generator().manual_seed(0))].reshape(-1, 4)
+    rows = values[:: 1 if sampled > 1000 else values.numel() // sampled]
+    positive = sorted(value for value in rows.flatten().tolist() if 0 < value < math.inf)
+    assert graph._typical_distance(values) == positive[(len(positive) - 1) // 2]
+    assert graph._typical_distance(torch.zeros(3, 2)) == graph._typical_distance(torch.zeros(0, 2)) == 1.0
+
+
+def test_given_values_replace_the_median() -> None:
+    points = normal(20)
+    cases = (({"sigma": 2.0}, 36.0, 2.0), ({"sigma": 1e200}, math.inf, 1e200), ({"tau": 0.5}, 0.5, None))
+    for options, tau, sigma in cases:
+        found = build_graph(points, num_neighbors=4, **options)
+        assert found.tau == tau
+        assert sigma is None or found.sigma == sigma
+
+
+def test_symmetries_are_followed() -> None:
+    points, order = normal(), torch.randperm(120, generator=torch.Generator().manual_seed(3))
+    rotation = torch.linalg.qr(normal(3, seed=5)).Q
+    found, shuffled, scaled = build_graph(points), build_graph(points[order]), build_graph(points * 1e-6)
+    torch.testing.assert_close(dense(shuffled), dense(found)[order][:, order])
+    torch.testing.assert_close(dense(build_graph(points @ rotation.T + 7.0)), dense(found))
+    torch.testing.assert_close(dense(scaled), dense(found))
+    assert shuffled.sigma == pytest.approx(found.sigma, rel=1e-12)
+    assert scaled.sigma == pytest.approx(1e-6 * found.sigma)
+    assert scaled.tau == pytest.approx(1e-12 * found.tau)
+    expected = magnitude(points)
+    torch.testing.assert_close(magnitude(points @ rotation.T), expected, rtol=1e-9, atol=1e-15, equal_nan=True)
+    assert torch.equal(magnitude(points[order]).nan_to_num(-1), expected[order].nan_to_num(-1))
+
+
+def test_smallest_graphs() -> None:
+    two = build_graph(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]), num_neighbors=1)
+    assert two.sigma == 1.0
+    torch.testing.assert_close(two.weights, torch.full((2, 1), math.exp(-0.5)))
+    for distance in (0.0, 1e-30, 1.0, 1e18):
+        points = torch.tensor([[0.0, 0, 0], [distance, 0, 0]])
+        found = build_graph(points, num_neighbors=1)
+        check(found, points)
+        assert (found.weights > 0).all()
+    with pytest.raises(DataError, match="1 primitives cannot have 1 neighbours"):
+        build_graph(torch.zeros(1, 3), num_neighbors=1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_every_hard_cloud(cloud: Callable, dtype: torch.dtype) -> None:
+    points = cloud(1500).to(dtype)
+    check(build_graph(points), points)
+
+
+@given(
+    st.lists(st.tuples(st.integers(-2, 2), st.integers(-2, 2), st.integers(0, 1)), min_size=3, max_size=60),
+    st.integers(-30, 15),
+    st.sampled_from([0.0, 1.0, 1e5]),
+    st.sampled_from([None, 0.0, 1e-30, 1.0, float("inf")]),
+    st.booleans(),
+)
+def test_any_cells_at_any_scale(cells: list, exponent: int, shift: float, tau: float | None, double: bool) -> None:
+    points = torch.tensor(cells, dtype=torch.float64 if double else torch.float32) * 2.0**exponent + shift
+    graph = build_graph(points, num_neighbors=min(4, len(cells) - 1), tau=tau)
+    check(graph, points)
+    assert tau != 0 or not graph.weights.any()
+    assert tau != float("inf") or not graph.isolated.any()
+
+
+def test_collinear_and_coplanar_points_respond_within_their_line_and_plane(cloud: Callable) -> None:
+    points = cloud(400)
+    points[:, 1] = 0.25
+    response = high_pass(build_graph(points), points)
+    assert (response[:, 1].nan_to_num() == 0).all()
+
+
+def test_two_clusters_1e6_apart_are_independent() -> None:
+    cluster = (torch.randn(300, 3, dtype=torch.float64) * 2**20).round() / 2**20
+    both = torch.cat([cluster, cluster + 1e6])
+    assert torch.equal(both[300:] - 1e6, cluster)
+    found = magnitude(both)
+    torch.testing.assert_close(found[:300], found[300:], rtol=0, atol=0, equal_nan=True)
+    torch.testing.assert_close(found[:300], magnitude(cluster), rtol=0, atol=0, equal_nan=True)
+
+
+def test_a_shift_by_1e5_changes_no_bit_of_the_response_in_float32() -> None:
+    points = (torch.randn(2000, 3) * 64).round() / 64
+    shifted = points + 1e5
+    assert torch.equal(shifted - 1e5, points)
+    assert torch.equal(magnitude(shifted).nan_to_num(-1), magnitude(points).nan_to_num(-1))
+
+
+def test_thousands_of_points_at_one_spot_do_not_respond() -> None:
+    points = torch.cat([torch.full((5000, 3), 0.1), torch.randn(500, 3)])
+    found = magnitude(points, 16)
+    assert (found[:5000] == 0).all()
+    assert (found[5000:].nan_to_num(1) > 0).all()
+
+
+def test_an_overflowing_distance_and_an_infinite_width_give_no_nan() -> None:
+    points = torch.cat([torch.randn(20, 3), torch.tensor([[3e38, 3e38, 3e38]])])
+    graph = build_graph(points, num_neighbors=6, sigma=float("inf"))
+    assert set(graph.weights.unique().tolist()) == {0.0, 1.0}

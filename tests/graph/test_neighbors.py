@@ -1,0 +1,209 @@
+"""Neighbour search against all pairs, on the CPU and by the kernel compiled for the CPU: clones, floaters, ties."""
+
+from __future__ import annotations
+
+import ctypes
+import tracemalloc
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from sundae_ns.core.errors import BackendError, ConfigError, DataError
+from sundae_ns.cuda import kernels
+from sundae_ns.cuda.kernels import Argument, Launch
+from sundae_ns.graph import neighbors
+from sundae_ns.graph.neighbors import FILE, KERNEL, LEAF, MAX_NEIGHBORS, build_tree, kernel_options, knn, search_tree
+
+
+def check(points: Tensor, indices: Tensor, distances: Tensor) -> None:
+    """Other points, each once, at the distances of the nearest ones, ascending; of one place the lowest indices."""
+    n, k = indices.shape
+    x, y, z = (points.double()[:, None] - points.double()[None]).unbind(2)
+    squared = (x * x + y * y + z * z).fill_diagonal_(torch.inf)
+    ordered = squared.sort(dim=1, stable=True)
+    expected = ordered.values[:, :k].sqrt().to(points.dtype)
+    torch.testing.assert_close(distances, expected, rtol=1e-6, atol=0)
+    assert (distances.diff(dim=1) >= 0).all()
+    assert (indices != torch.arange(n)[:, None]).all()
+    assert (indices.sort(dim=1).values.diff(dim=1) > 0).all()
+    torch.testing.assert_close(squared.gather(1, indices).sqrt().to(points.dtype), expected, rtol=1e-6, atol=0)
+    clones = ordered.values[:, :k] == 0
+    assert torch.equal(indices[clones], ordered.indices[:, :k][clones])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("n", "k"), [(700, 16), (130, 3), (40, 39), (2, 1)])
+def test_every_hard_cloud(cloud: Callable, dtype: torch.dtype, n: int, k: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = cloud(n).to(dtype)
+    for chunk in (neighbors.CHUNK, 10):
+        monkeypatch.setattr(neighbors, "CHUNK", chunk)
+        found = knn(points, k)
+        assert found.indices.dtype == torch.int64
+        check(points, *found)
+
+
+@given(st.lists(st.integers(0, 2), min_size=2, max_size=40), st.integers(1, 10))
+def test_any_clones(cells: list[int], k: int) -> None:
+    points = torch.tensor(cells, dtype=torch.float32)[:, None].expand(-1, 3)
+    check(points, *knn(points, min(k, len(cells) - 1)))
+
+
+@pytest.mark.parametrize("reach", [1e18, 1e20, 1e30, 1e38])
+def test_one_far_floater_costs_the_others_no_precision(reach: float) -> None:
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    alone, found = knn(points, 3), knn(torch.cat([points, torch.full((1, 3), reach)]), 3)
+    assert torch.equal(found.indices[:50], alone.indices)
+    assert torch.equal(found.distances[:50], alone.distances)
+
+
+@pytest.mark.parametrize("place", [torch.zeros, torch.rand])
+def test_memory_and_time_grow_with_points_also_of_clones(place: Callable) -> None:
+    def peak(n: int) -> int:
+        points = place(n, 3)
+        tracemalloc.start()
+        try:
+            assert knn(points, 16).indices.shape == (n, 16)
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    assert peak(80_000) < 6 * peak(20_000)
+
+
+@pytest.mark.parametrize(
+    ("points", "k", "error", "words"),
+    [
+        *((torch.zeros(n, 3), k, DataError, f"{n} primitives cannot have {k} .*at most {max(n - 1, 0)}")
+          for n, k in ((0, 1), (1, 1), (5, 5), (5, 9))),
+        (torch.zeros(5, 3), 0, ConfigError, "at least 1"),
+        (torch.zeros(5, 2), 1, DataError, r"\[5, 2\]"),
+        (torch.tensor([[0.0] * 3, [torch.nan] * 3, [torch.inf] * 3]), 1, DataError, "2 of 3 positions are NaN"),
+        (torch.full((5, 3), 1e200, dtype=torch.float64), 2, DataError, "1e.150"),
+    ],
+)  # fmt: skip
+def test_wrong_input_is_refused(points: Tensor, k: int, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        knn(points, k)
+
+
+def test_without_a_kernel_the_cpu_searches_and_logs_one_line(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(*_: object) -> None:
+        raise BackendError("no compiler on board")
+
+    monkeypatch.setattr(neighbors, "Kernel", broken)
+    neighbors._kernel.cache_clear()
+    device = torch.device("cuda", 0)
+    with caplog.at_level("WARNING"):
+        assert [neighbors._kernel(device, torch.float32, 16) for _ in range(3)] == [None] * 3
+        assert neighbors._kernel(device, torch.float32, MAX_NEIGHBORS + 1) is None
+    first, second = (record.getMessage() for record in caplog.records)
+    assert "search runs on the CPU" in first
+    assert "no compiler on board" in first
+    assert f"at most {MAX_NEIGHBORS} neighbours, not {MAX_NEIGHBORS + 1}" in second
+    neighbors._kernel.cache_clear()
+
+
+# ----------------------------------------------------------------------------------------------------------- the kernel
+
+
+# The kernel's source with a counter of visited points, and a loop over the threads.
+SHIM = """
+extern "C" long long visited;
+long long visited = 0;
+%s
+extern "C" void run(int threads, const REAL* points, const int* order, const REAL* boxes, const int* lowest, int n,
+                    int depth, double infinity, long long* indices, REAL* distances) {
+    blockDim.x = 128;
+    for (blockIdx.x = 0; blockIdx.x * 128 < threads; ++blockIdx.x)
+        for (threadIdx.x = 0; threadIdx.x < 128; ++threadIdx.x)
+            nearest(points, order, boxes, lowest, n, depth, infinity, indices, distances);
+}
+"""
+
+
+class Compile(Protocol):
+    """Compiles the kernel for a dtype and a number of neighbours; returns a launch on the CPU."""
+
+    def __call__(self, dtype: torch.dtype, k: int, visited: list[int] | None = None) -> Launch:
+        """Each launch appends the number of visited points to ``visited``."""
+
+
+@pytest.fixture(scope="module")
+def compiled(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Compile:
+    visit = "const double dx = points"
+    source = kernels.read_source(FILE)
+    assert source.count(visit) == 1
+    source = SHIM % source.replace(visit, "++visited; " + visit)
+
+    def compile_for(dtype: torch.dtype, k: int, visited: list[int] | None = None) -> Launch:
+        kernel = compile_for_cpu(source, ["-ffp-contract=off", *kernel_options(dtype, k)[1:]])
+        counter = ctypes.c_longlong.in_dll(kernel, "visited")
+
+        def launch(threads: int, arguments: Sequence[Argument]) -> None:
+            assert all(a.is_contiguous() for a in arguments if isinstance(a, Tensor))
+            values = [kernels._as_c(argument, torch.device("cpu")) for argument in arguments]
+            counter.value = 0
+            kernel.run(ctypes.c_int(threads), *values)
+            if visited is not None:
+                visited.append(counter.value)
+
+        return launch
+
+    return compile_for
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("n", "k"), [(700, 16), (130, 3), (40, 32)])
+def test_kernel_matches_all_pairs(compiled: Compile, cloud: Callable, dtype: torch.dtype, n: int, k: int) -> None:
+    points = cloud(n).to(dtype)
+    check(points, *search_tree(build_tree(points), k, compiled(dtype, k)))
+
+
+@pytest.mark.parametrize("n", [2, 15, 16, 17, 33, 63, 64, 65])
+def test_kernel_on_every_shape_of_small_tree(compiled: Compile, n: int) -> None:
+    points, k = torch.randn(n, 3), min(3, n - 1)
+    check(points, *search_tree(build_tree(points), k, compiled(torch.float32, k)))
+
+
+def test_tree_holds_every_point_once_in_tight_boxes(cloud: Callable) -> None:
+    for n in (1, 15, 1000):
+        tree = build_tree(cloud(n).float())
+        assert torch.equal(tree.order.long().sort().values, torch.arange(n))
+        assert torch.equal(tree.points, cloud(n).float()[tree.order.long()])
+        for node in range(1, 2 ** (tree.depth + 1)):
+            level = node.bit_length() - 1
+            begin, end = ((node - 2**level + i) * n // 2**level for i in (0, 1))
+            inside = tree.points[begin:end]
+            assert torch.equal(tree.boxes[node], torch.cat([inside.amin(0), inside.amax(0)]))
+            assert tree.lowest[node] == tree.order[begin:end].min()
+            assert level < tree.depth or n < 2 * LEAF or LEAF <= end - begin <= 2 * LEAF
+
+
+def test_thousands_of_clones_visit_no_more_points_than_others(compiled: Compile) -> None:
+    # Counts visited points, not seconds. Without the lowest index of each node, every clone would visit all others.
+    visited: list[int] = []
+    for points in (torch.zeros(20_000, 3), torch.randn(20_000, 3)):
+        search_tree(build_tree(points), 16, compiled(torch.float32, 16, visited))
+    clones, others = (count / 20_000 for count in visited)
+    assert clones < 2 * others  # measured 116 and 114 points per query
+
+
+def test_kernel_compiles_for_gpus_from_turing_to_hopper() -> None:
+    try:
+        kernels._library("nvrtc")
+    except BackendError as error:
+        pytest.skip(f"no NVRTC here: {error}")
+    cases = [("sm_75", torch.float32, 16), ("sm_90", torch.float64, 1), ("sm_90", torch.float32, MAX_NEIGHBORS)]
+    for architecture, dtype, k in cases:
+        code = kernels.compile_cubin(FILE, architecture, kernel_options(dtype, k))
+        assert code.startswith(b"\x7fELF")
+        assert KERNEL.encode() in code
+    with pytest.raises(BackendError, match="does not compile for sm_90.*REAL"):
+        kernels.compile_cubin(FILE, "sm_90")

@@ -1,0 +1,242 @@
+"""The fused kernels: the CUDA source, compiled for the CPU, against the network layer by layer; and on a GPU."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from sundae_ns.core.errors import BackendError
+from sundae_ns.head import fused
+from sundae_ns.head.head import CompensationHead, HeadConfig
+
+
+@pytest.fixture(autouse=True, scope="module")
+def on_cpu(load_on_cpu: Callable[..., fused.Launches]) -> Iterator[None]:
+    """Float32 images, which only these tests use, are those of the CPU."""
+    on_gpu = fused.load_kernels
+
+    def load(file: str, names: tuple[str, ...], options: tuple[str, ...], device: torch.device) -> fused.Launches:
+        return (load_on_cpu if device.type == "cpu" else on_gpu)(file, names, options, device)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fused, "load_kernels", load)
+        patch.setitem(fused._TYPES, torch.float32, "-DFP32")
+        yield
+
+
+def compiled(head: CompensationHead) -> fused.Launches:
+    options = fused.head_options(head.net, head.config.mode == "residual")
+    return fused.head_kernels(torch.device("cpu"), torch.float32, options)
+
+
+def make(**options: object) -> CompensationHead:
+    torch.manual_seed(0)
+    head = CompensationHead(HeadConfig(**{"size": "tiny", "num_features": 5, **options}))  # type: ignore[arg-type]
+    for parameter in head.parameters():
+        nn.init.normal_(parameter, std=0.3 if parameter.ndim == 1 else (parameter[0].numel()) ** -0.5)
+    return head
+
+
+def splatted(height: int, width: int, num_features: int, *, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Base, colours with features, and accumulation; colours are a slice of a tensor, as from a rasteriser."""
+    generator = torch.Generator().manual_seed(seed)
+    everything = torch.rand(height, width, 4 + num_features, generator=generator)
+    alpha = torch.rand(height, width, 1, generator=generator)
+    base = torch.rand(height, width, 3, generator=generator)
+    return base, everything[..., :-1], alpha
+
+
+@torch.no_grad()
+def by_kernels(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    return fused.compensated(head.net, head.config.mode == "residual", *images, torch.float32)
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+@pytest.mark.parametrize("pixel_unshuffle", [1, 2, 3, 4])
+@torch.no_grad()
+def test_same_image(mode: str, pixel_unshuffle: int) -> None:
+    head = make(mode=mode, pixel_unshuffle=pixel_unshuffle)
+    images = splatted(37, 50, 5)
+    torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
+
+
+@given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
+@torch.no_grad()
+def test_same_image_at_any_size(height: int, width: int, num_features: int, seed: int) -> None:
+    head = make(num_features=num_features)
+    images = splatted(height, width, num_features, seed=seed)
+    torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_sizes_of_the_network() -> None:
+    for size in ("compact", "wide"):
+        head = make(size=size, num_features=13)
+        images = splatted(20, 33, 13)
+        torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_overflowing_pixels_are_not_corrected() -> None:
+    head = make()
+    base, seen, alpha = splatted(16, 16, 5)
+    seen[3, 4] = torch.inf
+    out = by_kernels(head, (base, seen, alpha))
+    assert torch.isfinite(out).all()
+    assert torch.equal(out[3, 4], base[3, 4])
+
+
+Gradients = list[Tensor]
+
+
+def layer_gradients(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor], grad_out: Tensor) -> Gradients:
+    """The image, and gradients of splatted values, accumulation and parameters, by autograd."""
+    base, *leaves = images[0], *(image.clone().requires_grad_() for image in images[1:])
+    head.zero_grad()
+    out = head(base, *leaves)
+    (out * grad_out).sum().backward()
+    grads = [leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for leaf in leaves]
+    return [out.detach(), *grads, *(p.grad.clone() for p in head.parameters() if p.grad is not None)]
+
+
+def kernel_gradients(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor], grad_out: Tensor) -> Gradients:
+    """The image and gradients by the fused."""
+    base, *leaves = images[0], *(image.clone().requires_grad_() for image in images[1:])
+    head.zero_grad()
+    residual = head.config.mode == "residual"
+    out = fused.correction(head.net, residual, *leaves, torch.float32)
+    out = base + out if residual else out
+    (out * grad_out).sum().backward()
+    return [out.detach(), *(leaf.grad for leaf in leaves), *(p.grad.clone() for p in head.parameters())]
+
+
+def assert_same(found: Gradients, expected: Gradients) -> None:
+    assert len(found) == len(expected)
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5 * max(1.0, float(b.abs().max())))
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+@pytest.mark.parametrize("pixel_unshuffle", [1, 2, 4])
+def test_same_gradients(mode: str, pixel_unshuffle: int) -> None:
+    head = make(mode=mode, pixel_unshuffle=pixel_unshuffle)
+    for size in ((37, 50), (16, 16)):
+        images, grad_out = splatted(*size, 5), torch.randn(*size, 3)
+        assert_same(
+            kernel_gradients(head, images, grad_out),
+            layer_gradients(head, images, grad_out),
+        )
+
+
+def test_sums_over_pixels_by_few_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fused, "MOST_WORKERS", 37)
+    head, images, grad_out = make(), splatted(37, 50, 5), torch.randn(37, 50, 3)
+    assert_same(kernel_gradients(head, images, grad_out), layer_gradients(head, images, grad_out))
+
+
+@given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
+def test_same_gradients_at_any_size(height: int, width: int, num_features: int, seed: int) -> None:
+    head = make(num_features=num_features)
+    images, grad_out = splatted(height, width, num_features, seed=seed), torch.randn(height, width, 3)
+    both = zip(
+        kernel_gradients(head, images, grad_out),
+        layer_gradients(head, images, grad_out),
+        strict=True,
+    )
+    for found, expected in both:
+        # Compare norms: some image has an activation so near zero that rounding decides its slope.
+        assert float((found - expected).norm()) <= 2e-3 * max(float(expected.norm()), 1e-3)
+
+
+def test_kernels_compile_for_gpus_that_have_the_types(compile_for_gpu: Callable[..., bytes]) -> None:
+    for architecture, head in (("sm_80", make(pixel_unshuffle=4)), ("sm_90", make(size="regular", mode="features"))):
+        options = fused.head_options(head.net, head.config.mode == "residual")
+        code = compile_for_gpu("head.cu", architecture, (fused._TYPES[torch.bfloat16], *options))
+        assert all(name.encode() in code for name in fused.KERNELS)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("mode", ["residual", "features"])
+@torch.no_grad()
+def test_on_a_gpu_at_any_size_with_changing_weights(mode: str) -> None:
+    exact = make(mode=mode, size="compact", num_features=13, precision="fp32").cuda().eval()
+    quick = make(mode=mode, size="compact", num_features=13).cuda().eval()
+    sizes = [(33, 40)] * 5 + [(48, 64)] * 4 + [(33, 40), (16, 16)] + [(31, 30)] * 3 + [(20, 30)] * 3 + [(8, 8)] * 3
+    for seed, (height, width) in enumerate([*sizes, *sizes]):
+        for parameter in exact.parameters():
+            parameter += 0.01 * torch.randn_like(parameter)
+        quick.load_state_dict(exact.state_dict())
+        images = tuple(image.cuda() for image in splatted(height, width, 13, seed=seed))
+        found, expected = quick(*images), exact(*images)
+        scale = float((expected - images[0]).abs().max())
+        assert float((found - expected).abs().max()) < 0.02 * scale
+    assert quick._can_fuse
+
+
+@pytest.mark.gpu
+@torch.no_grad()
+def test_without_kernels_the_layers_run(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def refuse(*_: object) -> fused.Launches:
+        raise BackendError("no compiler: install one")
+
+    head = make().cuda().eval()
+    images = tuple(image.cuda() for image in splatted(16, 16, 5))
+    expected = head(*images)
+    monkeypatch.setattr(fused, "head_kernels", refuse)
+    with caplog.at_level(logging.WARNING):
+        found, again = head(*images), head(*images)
+    assert caplog.text.count("layer by layer") == 1
+    torch.testing.assert_close(found, expected, rtol=0.05, atol=0.05)
+    torch.testing.assert_close(again, found)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_training_on_a_gpu_matches_the_layers(mode: str) -> None:
+    """Values and gradients, at more sizes than are recorded, with weights that change between steps."""
+    exact = make(mode=mode, size="compact", num_features=13, precision="fp32").cuda()
+    layers = make(mode=mode, size="compact", num_features=13).cuda()
+    layers._can_fuse = False
+    quick = make(mode=mode, size="compact", num_features=13).cuda()
+    sizes = [(33, 40), (48, 64), (33, 40), (31, 30), (16, 16), (24, 56), (16, 16), (8, 8)]
+    norms = []
+    for seed, (height, width) in enumerate(sizes):
+        with torch.no_grad():
+            for parameter in exact.parameters():
+                parameter += 0.01 * torch.randn_like(parameter)
+        for head in (layers, quick):
+            head.load_state_dict(exact.state_dict())
+        images = tuple(image.cuda() for image in splatted(height, width, 13, seed=seed))
+        grad_out = torch.randn(height, width, 3, device="cuda")
+        results = (layer_gradients(head, images, grad_out) for head in (quick, layers, exact))
+        by_result = [[found - whole, rounded - whole, whole] for found, rounded, whole in zip(*results, strict=True)]
+        norms.append(torch.tensor([[float(value.norm()) for value in values] for values in by_result]))
+        assert quick._can_fuse
+    # Both sides round to bf16, at different places. Where this flips an activation's sign, one small image differs by
+    # several percent; all images together by no more than four times the error of the layers.
+    together = torch.stack(norms).square().sum(dim=0).sqrt()
+    for table, slack in [*((each, 0.1) for each in norms), (together, 0.01)]:
+        error, allowed, whole = table.unbind(1)
+        assert (error <= 4 * allowed + slack * whole).all(), (error, allowed, whole)
+
+
+@pytest.mark.gpu
+def test_gradients_of_several_images_add_up_on_a_gpu() -> None:
+    """Gradients of parameters lie in buffers that later passes overwrite."""
+    head = make(size="compact", num_features=13).cuda()
+    parts, sizes = [], [(33, 40), (48, 64), (33, 40), (33, 40)]
+    shown = [tuple(image.cuda() for image in splatted(*size, 13, seed=n)) for n, size in enumerate(sizes)]
+    for images in shown:
+        parts.append(layer_gradients(head, images, torch.ones(3, device="cuda"))[3:])
+    head.zero_grad()
+    for base, *leaves in shown:
+        head(base, *(leaf.clone().requires_grad_() for leaf in leaves)).sum().backward()
+    for parameter, *of_each in zip(head.parameters(), *parts, strict=True):
+        assert parameter.grad is not None
+        torch.testing.assert_close(parameter.grad, torch.stack(of_each).sum(dim=0), rtol=1e-4, atol=1e-4)

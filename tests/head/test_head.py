@@ -1,0 +1,272 @@
+"""The head: its two modes and their invariances, training crops, and images at other scales."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sundae_ns.core.camera import Window
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.head.head import (
+    FADE,
+    MARGIN,
+    MAX_PIXELS,
+    TOLERANCE,
+    CompensationHead,
+    HeadConfig,
+    plan,
+    resize,
+    training_window,
+)
+
+
+def inputs(height: int = 33, width: int = 40, features: int = 5) -> tuple[torch.Tensor, ...]:
+    colors = torch.rand(height, width, 3)
+    alpha = torch.rand(height, width, 1)
+    splatted = torch.cat([colors, torch.randn(height, width, features)], dim=2)
+    return (colors + (1 - alpha) * 0.5).clamp(0, 1), splatted, alpha
+
+
+def head(**options: object) -> CompensationHead:
+    return CompensationHead(HeadConfig(size="tiny", num_features=5, **options))  # type: ignore[arg-type]
+
+
+def perturb(module: torch.nn.Module) -> None:
+    """Move the zero start away from zero, as training does."""
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+
+
+def test_residual_starts_at_the_base_and_corrects_only_what_is_splatted() -> None:
+    base, splatted, alpha = inputs()
+    module = head()
+    assert torch.equal(module(base, splatted, alpha), base)
+    perturb(module)
+    alpha[:10] = 0
+    out = module(base, splatted, alpha)
+    assert torch.equal(out[:10], base[:10])
+    assert not torch.allclose(out[10:], base[10:])
+    on_another_background = module(base + 0.1, splatted, alpha)
+    torch.testing.assert_close(on_another_background - out, torch.full_like(out, 0.1), rtol=0, atol=1e-5)
+
+
+def test_features_mode_sees_features_alone() -> None:
+    base, splatted, alpha = inputs()
+    module = head(mode="features")
+    out = module(base, splatted, alpha)
+    no_colors = torch.cat([torch.zeros_like(splatted[..., :3]), splatted[..., 3:]], dim=2)
+    assert torch.equal(out, module(base * 0, no_colors, alpha * 0))
+    assert not torch.equal(out, module(base, splatted + 1, alpha))
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_a_few_steps_learn(mode: str) -> None:
+    base, splatted, _ = inputs()
+    alpha = torch.ones(33, 40, 1)  # the residual head corrects nothing where nothing was splatted
+    target = (base * 0.8).detach()
+    module = head(mode=mode)
+    splatted.requires_grad_()
+    optimizer = torch.optim.Adam([*module.parameters(), splatted], lr=1e-2)
+
+    def loss() -> torch.Tensor:
+        return (module(base, splatted, alpha) - target).abs().mean()
+
+    first = loss().item()
+    for _ in range(60):
+        optimizer.zero_grad()
+        value = loss()
+        value.backward()
+        optimizer.step()
+    assert value.item() < 0.6 * first
+    assert splatted.grad is not None
+    assert splatted.grad[..., 3:].abs().sum() > 0
+
+
+@pytest.mark.parametrize("options", [{"num_features": 0}, {"pixel_unshuffle": 0}, {"mode": "off"}])
+def test_bad_options(options: dict[str, object]) -> None:
+    with pytest.raises(ConfigError) as error:
+        CompensationHead(HeadConfig(**options))  # type: ignore[arg-type]
+    assert "\n" not in str(error.value)
+
+
+WILD = {
+    "large": lambda t: 1e4 * t,
+    "large and negative": lambda t: -1e4 * t,
+    "zero": torch.zeros_like,
+    "one spike": lambda t: t.index_fill(1, torch.tensor([7], device=t.device), 1e4),
+}
+
+
+@pytest.mark.parametrize("kind", WILD)
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_wild_inputs_give_finite_images(mode: str, kind: str) -> None:
+    base, splatted, alpha = inputs()
+    module = head(mode=mode)
+    perturb(module)
+    splatted = WILD[kind](splatted).requires_grad_()
+    out = module(base, splatted, alpha)
+    out.square().mean().backward()
+    assert torch.isfinite(out).all()
+    assert torch.isfinite(splatted.grad).all()
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_training_with_ten_times_the_rate_stays_finite(mode: str) -> None:
+    torch.manual_seed(0)
+    module = head(mode=mode, pixel_unshuffle=2)
+    optimizer = torch.optim.Adam(module.parameters(), lr=1e-2)  # the methods have 1e-3 at most
+    images = [inputs(16, 16) for _ in range(4)]
+    truths = [torch.rand(16, 16, 3) for _ in images]
+    for step in range(1000 if os.environ.get("SUNDAE_ALL_SEEDS") == "1" else 200):
+        optimizer.zero_grad()
+        (module(*images[step % 4]) - truths[step % 4]).abs().mean().backward()
+        optimizer.step()
+    assert all(torch.isfinite(module(*image)).all() for image in images)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", [None, *WILD])
+@torch.no_grad()
+def test_half_precision_is_close_and_finite(kind: str | None) -> None:
+    base, splatted, alpha = (t.cuda() for t in inputs())
+    module = head().cuda()
+    perturb(module)
+    out = module(base, splatted if kind is None else WILD[kind](splatted), alpha)
+    assert out.dtype == torch.float32
+    assert torch.isfinite(out).all()
+    if kind is None:
+        exact = head(precision="fp32").cuda()
+        exact.load_state_dict(module.state_dict())
+        expected = exact(base, splatted, alpha)
+        assert (out - expected).abs().mean() < 0.03 * (expected - base).abs().mean()
+
+
+def test_a_resized_head_keeps_its_parameter_objects() -> None:
+    head = CompensationHead(HeadConfig(size="compact"))
+    wanted = HeadConfig(size="tiny", num_features=5, pixel_unshuffle=1)
+    optimizer, before = torch.optim.Adam(head.parameters(), lr=0.01), list(head.parameters())
+    head.eval()
+    head.resize(wanted)
+    fresh = CompensationHead(wanted)
+    assert all(a is b for a, b in zip(before, head.parameters(), strict=True))
+    assert [p.shape for p in head.parameters()] == [p.shape for p in fresh.parameters()]
+    assert str(head.net) == str(fresh.eval().net), "layers describe themselves"
+    assert not any(module.training for module in head.modules())
+    fresh.load_state_dict(head.state_dict())
+    images = [torch.rand(9, 11, channels) for channels in (3, 3 + 5, 1)]
+    assert torch.equal(head(*images), fresh(*images))
+    head.train()(*images).square().mean().backward()
+    optimizer.step()
+    assert not torch.equal(head(*images), fresh(*images))
+
+
+SIDES = st.integers(1, 5000)
+
+
+@given(SIDES, SIDES, st.integers(1, 2**22), st.integers(0, 2**31))
+def test_inside_the_image(width: int, height: int, limit: int, seed: int) -> None:
+    window = training_window(width, height, limit, seed)
+    assert (window is None) == (width * height <= limit)
+    if window is None:
+        return
+    assert 0 <= window.left <= window.left + window.width <= width
+    assert 0 <= window.top <= window.top + window.height <= height
+    assert 1 <= window.width
+    assert 1 <= window.height
+    # A side of a window is at least the grid, however low the limit.
+    assert window.width * window.height <= limit or min(window.width, window.height) <= 16
+
+
+def test_determined_by_the_seed_and_without_a_limit() -> None:
+    assert training_window(10_000, 10_000, 0, seed=1) is None
+    windows = [training_window(1061, 1893, 2**20, seed) for seed in (3, 3, 4)]
+    assert windows[0] == windows[1] != windows[2]
+
+
+def test_windows_keep_the_aspect_and_use_the_limit() -> None:
+    window = training_window(1061, 1893, 2**20, seed=0)
+    assert window is not None
+    assert window.width / window.height == pytest.approx(1061 / 1893, rel=0.03)
+    assert 0.95 * 2**20 < window.width * window.height <= 2**20
+
+
+def test_both_edges_are_seen_often() -> None:
+    seen = np.zeros(1000)
+    for seed in range(2000):
+        window = training_window(1000, 1000, 490_000, seed)
+        assert window is not None
+        seen[window.left : window.left + window.width] += 1
+    assert seen.min() > 0.3 * seen.max()
+    assert abs(seen - seen[::-1]).max() < 0.1 * seen.max()
+
+
+def test_half_of_the_windows_are_mirrored_if_asked() -> None:
+    """Whole images and parts, with the same places as without."""
+    for limit in (0, 900):
+        plain = [training_window(40, 30, limit, seed) for seed in range(400)]
+        both = [training_window(40, 30, limit, seed, mirror=True) for seed in range(400)]
+        mirrored = [window for window in both if window is not None and window.mirrored]
+        assert 160 < len(mirrored) < 240
+        for before, after in zip(plain, both, strict=True):
+            whole = Window(0, 0, 40, 30) if before is None else before
+            assert (whole if after is None else after._replace(mirrored=False)) == whole
+
+
+FOCAL = st.floats(1.0, 1e5)
+
+
+@given(FOCAL, FOCAL, FOCAL)
+def test_the_head_runs_near_its_own_scale(focal: float, a: float, b: float) -> None:
+    low, high = min(a, b), max(a, b)
+    zoom, weight = plan(focal, (low, high), 100)
+    assert 0 <= weight <= 1
+    assert low / (TOLERANCE + 1e-6) <= focal * zoom <= high * (TOLERANCE + 1e-6)
+    if low <= focal <= high:
+        assert (zoom, weight) == (1.0, 1.0)
+    assert plan(focal * zoom, (low, high), 10**9) == (1.0, 1.0)  # an image at the head's scale is not rescaled
+
+
+def test_a_scale_near_the_trained_one_gets_its_correction() -> None:
+    assert plan(500.0, None, 10**9) == (1.0, 1.0)
+    assert plan(1000.0, (1000.0, 1000.0), 100) == (1.0, 1.0)
+    for focal in (900.0, 980.0, 1020.0, 1100.0):
+        assert plan(focal, (1000.0, 1000.0), 100) == (1000.0 / focal, 1.0)
+
+
+def test_the_head_fades_out_without_a_jump() -> None:
+    """For thumbnails, and for wide views with too many pixels at the trained scale."""
+    shrinks = torch.linspace(1.3, 5, 200).tolist()
+    sizes = torch.linspace(2**18, 1.1 * 2**23, 400).tolist()
+    for weights in (
+        [plan(1000 / shrink, (1000.0, 1000.0), 100).weight for shrink in shrinks],
+        [plan(1000.0, (1950.0, 1950.0), int(pixels)).weight for pixels in sizes],
+    ):
+        assert (weights[0], weights[-1]) == (1, 0)
+        assert all(0 <= a - b < 0.02 for a, b in zip(weights, weights[1:], strict=False))
+    assert plan(1000 / FADE[0], (1000.0, 1000.0), 100).weight == 0
+    assert plan(1000.0, (250.0, 250.0), 4000 * 3000).weight == 1  # a large image that is rescaled to a smaller one
+
+
+@given(st.integers(1, 10**9), st.floats(0.1, 5.0))
+def test_the_head_fades_in_at_any_size(pixels: int, zoom: float) -> None:
+    weight = plan(1000.0, (1000 * zoom, 1000 * zoom), pixels).weight
+    assert abs(weight - plan(1000.0, (1010 * zoom, 1010 * zoom), pixels).weight) < 0.08
+    if zoom <= MARGIN:
+        assert weight == 1
+    elif pixels * zoom**2 > 2 * max(MAX_PIXELS, MARGIN**2 * pixels):
+        assert weight == 0
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 64), (31, 90)])
+def test_resizing_keeps_the_mean(size: tuple[int, int]) -> None:
+    image = torch.rand(16, 24, 3, generator=torch.Generator().manual_seed(0))
+    out = resize(image, *size)
+    assert out.shape == (*size, 3)
+    assert out.mean() == pytest.approx(float(image.mean()), abs=0.03)
+    assert torch.equal(resize(image, 16, 24), image)

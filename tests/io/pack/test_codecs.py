@@ -1,0 +1,241 @@
+"""A codec rounds to the values that a reader decodes, bit for bit, also for values to which it was not fitted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fields import random_field
+from hard_values import hard_values
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from sundae_ns.core.errors import PackError
+from sundae_ns.io.pack import entropy, quantize
+from sundae_ns.io.pack.codecs import HeadCodec, Sensitivity
+from sundae_ns.io.pack.config import PackConfig
+from sundae_ns.io.pack.container import Floats
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, read_scene, write_fitted, write_scene
+
+hard = given(
+    st.sampled_from(["normal", "constant", "huge", "tiny", "outliers"]), st.integers(1, 500), st.integers(0, 2**16)
+)
+
+
+def drifted(x: Floats, seed: int) -> Floats:
+    """Values after training: moved, and some out of range."""
+    rng = np.random.default_rng(seed + 1)
+    moved = x + 0.05 * x.std() * rng.normal(size=x.shape)
+    moved[rng.random(len(x)) < 0.01] *= 3
+    return moved.astype(np.float32)
+
+
+@given(st.integers(1, 500), st.integers(0, 2**16), st.sampled_from([1e-4, 0.01, 0.3]))
+def test_rotations(n: int, seed: int, step: float) -> None:
+    q = hard_values("normal", n, 4, seed)
+    q[::7] = [0.5, -0.5, 0.5, 0.5]
+    q[::11] = 0
+    codec = quantize.Rotations(step)
+    found = quantize.rotations_at(torch.from_numpy(codec.encode(q)[1]), step)
+    assert torch.equal(codec.rounded(torch.from_numpy(q)), found)
+
+
+@hard
+def test_weights(kind: str, n: int, seed: int) -> None:
+    x, share = hard_values(kind, n, 18, seed).reshape(n, 2, 3, 3), 2.0 ** -(seed % 9)
+    codec = HeadCodec({"w": quantize.weight_steps(torch.from_numpy(x), share)}, {"w": torch.tensor([1.0, 2.0**0.25])})
+    for y in (x, drifted(x, seed)):
+        _, levels, arrays = codec.encode({"w": torch.from_numpy(y)})
+        codes = torch.from_numpy(levels.reshape(x.shape))
+        found = quantize.weights_at(
+            codes, torch.from_numpy(arrays["steps"])[:, None] * torch.from_numpy(arrays["columns"])
+        )
+        assert torch.equal(codec.rounded("w", torch.from_numpy(y)), found)
+
+
+@hard
+def test_transform(kind: str, n: int, seed: int) -> None:
+    x = hard_values(kind, n, 9, seed)
+    codec = quantize.fit_transform(x, 0.03)
+    for y in (x, drifted(x, seed)):
+        _, levels, arrays = codec.encode(y)
+        arrays["basis"] = arrays["basis"].reshape(9, 9)
+        found = quantize.rows_at(levels, step=codec.step, **arrays)
+        assert np.array_equal(codec.rounded(torch.from_numpy(y)).numpy(), found)
+        assert np.abs(levels).max() <= entropy.LARGEST
+
+
+def scene(n: int = 700) -> PackedScene:
+    g = torch.Generator().manual_seed(1)
+    head = {"a.weight": torch.randn(4, 3, 3, 3, generator=g), "a.bias": torch.randn(4, generator=g)}
+    return PackedScene(random_field(n), head)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        PackConfig(block=100),
+        PackConfig(
+            scale_step=0.5, rotation_step=0.1, feature_step=0.5, head_step=0.14, harmonics_step=0.1, position_bits=10
+        ),
+        PackConfig(head_step=0.01, feature_step=0.001),
+    ],
+)
+def test_a_file_holds_the_values_rounded_in_training(tmp_path: Path, config: PackConfig) -> None:
+    fitted, codecs = fit_scene(scene(), config)
+    g = torch.Generator().manual_seed(1)
+    moved = {name: value + 0.02 * torch.randn(value.shape, generator=g) for name, value in fitted.field.items()}
+    assert codecs.head is not None
+    head = {name: 1.1 * value for name, value in fitted.head.items()}
+    write_fitted(tmp_path / "a.sundae", PackedScene(moved, head), codecs)
+    found = read_scene(tmp_path / "a.sundae")
+    rounded, rounded_head = codecs.rounded(moved), codecs.rounded_head(head)
+    assert torch.equal(found.field["means"], fitted.field["means"])
+    for name in codecs.field:
+        assert torch.equal(found.field[name], rounded[name]), name
+        assert not torch.equal(rounded[name], moved[name]), name
+    assert found.head.keys() == head.keys()
+    for name, value in found.head.items():
+        assert torch.equal(value, rounded_head[name]), name
+
+
+def test_packing_is_fitting_and_writing(tmp_path: Path) -> None:
+    write_scene(tmp_path / "a.sundae", scene(), PackConfig(feature_step=0.3))
+    write_fitted(tmp_path / "b.sundae", *fit_scene(scene(), PackConfig(feature_step=0.3)))
+    assert (tmp_path / "a.sundae").read_bytes() == (tmp_path / "b.sundae").read_bytes()
+
+
+def without(name: str) -> PackedScene:
+    whole = scene()
+    return PackedScene({key: value for key, value in whole.field.items() if key != name}, whole.head)
+
+
+@pytest.mark.parametrize("other", [scene(650), without("features"), PackedScene(scene().field)])
+def test_codecs_of_another_scene_are_refused(tmp_path: Path, other: PackedScene) -> None:
+    _, codecs = fit_scene(scene())
+    with pytest.raises(PackError, match="another scene"):
+        write_fitted(tmp_path / "a.sundae", other, codecs)
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_steps_keep_grids_and_bases(tmp_path: Path) -> None:
+    """Of a scene that has moved since, whose own bases would be others."""
+    present = PackConfig(block=100, position_bits=11, head_step=0.1)
+    fitted, codecs = fit_scene(scene(), present)
+    moved = replace(fitted, field={name: drifted_tensor(value) for name, value in fitted.field.items()})
+    wanted = replace(present, scale_step=0.2, rotation_step=0.002, head_step=0.8, position_bits=16, block=1024)
+    other = codecs.with_steps(wanted, moved.field, moved.head)
+    assert other.blocks is codecs.blocks
+    assert other.config == replace(wanted, position_bits=11, block=100)
+    for name, codec in codecs.field.items():
+        factor = {"scales": 0.2 / 0.05, "quats": 0.002 / 0.008}.get(name, 1.0)
+        found = other.field[name]
+        assert found.step == pytest.approx(factor * codec.step), name
+        if isinstance(codec, quantize.Transform):
+            assert isinstance(found, quantize.Transform)
+            assert torch.equal(found.basis, codec.basis)
+            assert torch.equal(found.mean, codec.mean)
+    assert codecs.head is not None
+    assert other.head is not None
+    # Half of the largest weight, not eight tenths.
+    torch.testing.assert_close(other.head.rows["a.weight"], 5 * codecs.head.rows["a.weight"])
+    same = codecs.with_steps(present, moved.field, moved.head)
+    for number, these in enumerate((codecs, same, other)):
+        write_fitted(tmp_path / f"{number}.sundae", moved, these)
+    assert (tmp_path / "0.sundae").read_bytes() == (tmp_path / "1.sundae").read_bytes()
+    found, shown = read_scene(tmp_path / "2.sundae").field, other.rounded(moved.field)
+    assert all(torch.equal(found[name], shown[name]) for name in other.field)
+
+
+def test_steps_that_are_too_fine_for_a_row_become_larger() -> None:
+    rows = hard_values("normal", 50, 3, 0)
+    codec = quantize.fit_transform(rows, 0.01)
+    rows[7] = 1e5
+    finer = codec.with_step(0.0001, rows)
+    assert finer.step > 0.005
+    assert np.abs(finer.rounded(torch.from_numpy(rows)).numpy() - rows).max() < 0.1
+
+
+def drifted_tensor(values: Tensor) -> Tensor:
+    return torch.from_numpy(drifted(values.flatten(1).numpy(), 0)).reshape(values.shape)
+
+
+def test_larger_steps_of_the_head_are_fewer_bytes(tmp_path: Path) -> None:
+    big = {"a.weight": torch.randn(64, 64, 3, 3, generator=torch.Generator().manual_seed(0))}
+    whole = PackedScene(scene().field, big)
+    sizes = {}
+    for step in (0.008, 0.03, 0.14):
+        report = write_scene(tmp_path / "a.sundae", whole, PackConfig(head_step=step))
+        sizes[step] = report.sections["head/levels"]
+        weight, found = big["a.weight"], read_scene(tmp_path / "a.sundae").head["a.weight"]
+        most = weight.flatten(1).abs().amax(dim=1) * step / 2
+        assert ((found - weight).abs().flatten(1).amax(dim=1) <= most * (1 + 1e-5)).all()
+    assert sizes[0.03] < 0.8 * sizes[0.008]
+    assert sizes[0.14] < 0.7 * sizes[0.03]
+
+
+@pytest.mark.gpu
+def test_rounding_is_the_same_on_a_gpu() -> None:
+    """Levels are equal; values differ in the last bits, because a GPU rounds roots, quotients and sums differently."""
+    fitted, codecs = fit_scene(scene(), PackConfig(feature_step=0.3))
+    cuda = torch.device("cuda")
+    on_cpu, on_gpu = codecs.rounded(fitted.field), codecs.to(cuda).rounded(_moved(fitted.field, cuda))
+    for name in codecs.field:
+        torch.testing.assert_close(on_gpu[name].cpu(), on_cpu[name], rtol=1e-6, atol=1e-6, msg=name)
+    head = codecs.to(cuda).rounded_head(_moved(fitted.head, cuda))
+    for name, value in codecs.rounded_head(fitted.head).items():
+        torch.testing.assert_close(head[name].cpu(), value, rtol=1e-6, atol=0, msg=name)
+
+
+def _moved(tensors: dict[str, Tensor], device: torch.device) -> dict[str, Tensor]:
+    return {name: value.to(device) for name, value in tensors.items()}
+
+
+def test_weights_that_show_less_are_coarser_at_the_same_total_error() -> None:
+    g = torch.Generator().manual_seed(0)
+    head = {name: torch.randn(8, 8, 3, 3, generator=g) for name in ("a.weight", "b.weight")}
+    shown = {name: torch.rand(8, 8, generator=g, dtype=torch.float64) + 0.5 for name in head}
+    shown["b.weight"] /= 64
+    original = PackedScene(random_field(50), head)
+    errors, sizes = [], []
+    for sensitivity in (None, Sensitivity({}, shown)):
+        _, codecs = fit_scene(replace(original, sensitivity=sensitivity), PackConfig(head_step=0.02))
+        assert codecs.head is not None
+        moved = {name: codecs.head.rounded(name, value) - value for name, value in head.items()}
+        errors.append(sum(float((shown[name] * moved[name].square().sum((2, 3))).sum()) for name in head))
+        levels = codecs.head.encode(head)[1]
+        sizes.append(len(entropy.encode_levels(levels, entropy.predecessors(len(levels)))))
+    assert errors[1] == pytest.approx(errors[0], rel=0.25)
+    assert sizes[1] < 0.9 * sizes[0]
+    share = [float(codecs.head.steps(name).mean()) for name in head]
+    assert share[1] == pytest.approx(8 * share[0], rel=0.25)
+
+
+def test_no_step_is_larger_than_half_of_the_largest_weight() -> None:
+    """Weights behind an output layer of zeros seem useless, but training will need them."""
+    head = {"a.weight": torch.randn(4, 4, 3, 3), "out.weight": torch.full((4, 4, 1, 1), 1e-6)}
+    shown = {"a.weight": torch.full((4, 4), 1e-12).double(), "out.weight": torch.ones(4, 4).double()}
+    _, codecs = fit_scene(PackedScene(random_field(50), head, sensitivity=Sensitivity({}, shown)), PackConfig())
+    assert codecs.head is not None
+    largest = head["a.weight"].flatten(1).abs().amax(dim=1)
+    assert (codecs.head.rows["a.weight"] <= 0.6 * largest).all()
+
+
+@pytest.mark.parametrize("seen", [[], ["b.weight"]], ids=["nothing", "the last layer"])
+def test_a_head_that_does_nothing_yet_is_packed(tmp_path: Path, seen: list[str]) -> None:
+    """The last layer of a head starts at zero, so no feature and no other weight shows."""
+    g = torch.Generator().manual_seed(0)
+    head = {name: torch.randn(8, 8, 3, 3, generator=g) for name in ("a.weight", "b.weight")}
+    shown = {name: torch.full((8, 8), float(name in seen), dtype=torch.float64) for name in head}
+    field = random_field(50)
+    sensitivity = Sensitivity({"features": torch.zeros(2 * field["features"].shape[1:], dtype=torch.float64)}, shown)
+    write_scene(tmp_path / "a.sundae", PackedScene(field, head, sensitivity=sensitivity), PackConfig(head_step=0.02))
+    found = read_scene(tmp_path / "a.sundae")
+    assert (found.field["features"].std(dim=0) > 0).all()
+    for name, value in head.items():
+        most = value.flatten(1).abs().amax(dim=1)[:, None, None, None]
+        assert ((found.head[name] - value).abs() <= 0.6 * most / 2).all()

@@ -1,0 +1,192 @@
+"""The description of the format, and the checks by it."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+import pytest
+
+from sundae_ns.core.gaussians import MAX_SH_DEGREE
+from sundae_ns.head.head import HeadConfig
+from sundae_ns.io.pack.container import FORMAT, LIMITS, fault, fits, in_range, parsed
+from sundae_ns.scene.scene import Background
+
+SCHEMAS = ("container", "header", "model")
+HEAD = {"mode": "residual", "size": "tiny", "pixel_unshuffle": 1, "num_features": 3, "precision": "bf16"}
+MODEL = {
+    "sh_degree": 2,
+    "rasterize_mode": "classic",
+    "background_color": "black",
+    "head": HEAD,
+    "trained_focal": [5, 6],
+}
+ATTRIBUTES = {
+    "means": {"codec": "blocks", "bits": 13, "block": 1024},
+    "quats": {"codec": "xyz", "step": 0.008},
+    **{name: {"codec": "transform", "step": 0.05} for name in ("scales", "opacities", "features_dc")},
+    "features_rest": {"codec": "transform", "step": 0.02, "width": 24},
+    "head": {"codec": "channels", "weights": 4, "tensors": [["a", [2, 2]], ["b", [2]]]},
+}
+POSE = [[1.0, 0, 0, 3], [0, 0.6, -0.8, 1e9], [0, 0.8, 0.6, 0]]
+START = {"pose": POSE, "intrinsics": [9, 9.5, -3, 0], "size": [640, 480.0]}
+HEADER = {
+    "primitives": 40,
+    "attributes": ATTRIBUTES,
+    "source": {"method": "sundae"},
+    "up": [0, 0.6, -0.82],
+    "start": START,
+}
+SECTION = {"name": "means/low", "dtype": "<f4", "shape": [1, 3], "parts": [3, 3, 3, 3], "sha256": 64 * "0"}
+CONTAINER = {"sections": [SECTION, {**SECTION, "name": "means/high"}]}
+VALID = {"container": CONTAINER, "header": HEADER, "model": MODEL}
+
+
+@pytest.mark.parametrize("schema", SCHEMAS)
+def test_valid_values_pass(schema: str) -> None:
+    assert fault(VALID[schema], FORMAT[schema]) is None
+
+
+WRONG: list[tuple[str, str, Any]] = [
+    ("header", "primitives", 0),
+    ("header", "primitives", True),
+    ("header", "primitives", 2.5),
+    ("header", "source", []),
+    ("header", "attributes.means", None),
+    ("header", "attributes.means.bits", "13"),
+    ("header", "attributes.means.bits", 3),
+    ("header", "attributes.means.bits", 17),
+    ("header", "attributes.means.block", 15),
+    ("header", "attributes.means.block", 1048577),
+    ("header", "attributes.opacities.step", 1e39),
+    ("header", "attributes.scales.codec", None),
+    ("header", "attributes.head.tensors", {"a": [4]}),
+    ("header", "attributes.quats.step", 1.5),
+    ("header", "attributes.quats.step", -0.1),
+    ("header", "attributes.scales.codec", ["transform"]),
+    ("header", "attributes.features_rest.width", 10),
+    ("header", "attributes.head.tensors", []),
+    ("header", "attributes.head.tensors.0.0", "a\n"),
+    ("header", "attributes.head.tensors.1.1", [2, 0]),
+    ("header", "attributes.head.tensors.1", ["b", [2], 3]),
+    ("header", "up", None),
+    ("header", "up", [0, 0, 0]),
+    ("header", "up", [0, 1]),
+    ("header", "up", [0, 0, 1, 0]),
+    ("header", "up", [[0, 0, 1]]),
+    ("header", "up", [0, 0, True]),
+    ("header", "up", [0, 1e-200, 0]),
+    ("header", "up.1", 1e30),
+    ("header", "up.1", "0.6"),
+    ("header", "start", None),
+    ("header", "start", []),
+    ("header", "start.pose", POSE[:2]),
+    ("header", "start.pose", 3 * [4 * [0]]),
+    ("header", "start.pose", [POSE[1], POSE[0], POSE[2]]),
+    ("header", "start.pose", [POSE[0], POSE[0], POSE[2]]),
+    ("header", "start.pose.0", [1, 0, 0]),
+    ("header", "start.pose", [[1.06, 0, 0, 0], *POSE[1:]]),
+    ("header", "start.pose.0.3", 1e30),
+    ("header", "start.pose.0.3", None),
+    ("header", "start.intrinsics.1", 0),
+    ("header", "start.intrinsics.2", -1e10),
+    ("header", "start.size.0", 0),
+    ("header", "start.size.1", 480.5),
+    ("container", "sections.1.dtype", "|O"),
+    ("container", "sections.1.sha256", 64 * "g"),
+    ("container", "sections.1.shape", []),
+    ("model", "sh_degree", 5),
+    ("model", "head.precision", "fp64"),
+    ("model", "trained_focal.0", 1e30),
+    ("model", "trained_focal.1", 0),
+    ("model", "trained_focal", [5]),
+]
+
+
+@pytest.mark.parametrize(("schema", "place", "value"), WRONG)
+def test_the_first_wrong_place_is_named(schema: str, place: str, value: Any) -> None:
+    changed = json.loads(json.dumps(VALID[schema]))
+    *front, last = (int(key) if key.isdigit() else key for key in place.split("."))
+    inner = changed
+    for key in front:
+        inner = inner[key]
+    inner[last] = value
+    found = fault(changed, FORMAT[schema], "x")
+    assert found is not None
+    assert found.startswith(f"x.{place}")
+
+
+def test_names_are_unique_and_heads_have_no_other_option() -> None:
+    twice = [["a", [2, 2]], ["a", [2]]]
+    header = {**HEADER, "attributes": {**ATTRIBUTES, "head": {**ATTRIBUTES["head"], "tensors": twice}}}
+    assert fault(header, FORMAT["header"]) == "attributes.head.tensors"
+    assert fault({"sections": [SECTION, SECTION]}, FORMAT["container"]) == "sections"
+    assert fault({**MODEL, "head": {**HEAD, "other": 4}}, FORMAT["model"]) == "head"
+    assert fault({**MODEL, "other": 4}, FORMAT["model"]) is None
+    assert fault({key: value for key, value in MODEL.items() if key != "sh_degree"}, FORMAT["model"]) == "sh_degree"
+
+
+def test_whole_numbers_may_be_written_as_real_ones() -> None:
+    """JavaScript does not tell 3.0 from 3."""
+    assert fault({**MODEL, "sh_degree": 2.0, "head": {**HEAD, "num_features": 3.0}}, FORMAT["model"]) is None
+
+
+def test_the_format_lists_what_the_code_knows() -> None:
+    model = FORMAT["model"]["properties"]
+    kinds = get_type_hints(HeadConfig)
+    for name in ("size", "precision"):
+        assert set(model["head"]["properties"][name]["enum"]) == set(get_args(kinds[name]))
+    assert set(model["head"]["properties"]["mode"]["enum"]) == set(get_args(kinds["mode"])) - {"auto", "off"}
+    assert set(model["background_color"]["enum"]) == set(get_args(Background))
+    assert model["sh_degree"]["maximum"] == MAX_SH_DEGREE
+    widths = FORMAT["header"]["properties"]["attributes"]["properties"]["features_rest"]["properties"]["width"]["enum"]
+    assert widths == [3 * ((degree + 1) ** 2 - 1) for degree in range(1, MAX_SH_DEGREE + 1)]
+
+
+def test_headers_are_json_of_utf8_with_numbers_of_float64() -> None:
+    assert parsed(b' {"a": [1, 2.5, 1E2]}\n') == {"a": [1, 2.5, 100.0]}
+    deepest = LIMITS["depth"]
+    assert parsed(b"[" * deepest + b"]" * deepest)
+    assert parsed(b"1" + b"0" * 300)
+    for text in (
+        b"[" * (deepest + 1) + b"]" * (deepest + 1),
+        b"[" * 100_000,
+        b"\xef\xbb\xbf{}",
+        "{}".encode("utf-16"),
+        b'"\xff"',
+        b'"\xed\xa0\x80"',  # a surrogate
+        b"NaN",
+        b"1e999",
+        b"-1e999",
+        b"1" + b"0" * 400,
+        b"1" + b"0" * 5000,
+        b"01",
+        b"{} {}",
+    ):
+        with pytest.raises(ValueError, match=r"\w"):
+            parsed(text)
+
+
+def test_sections_have_shape_and_range() -> None:
+    section = {"dtype": "<f4", "shape": ["rows", 2], "minimum": [0, -1], "maximum": 10}
+    array = np.array([[0, -1], [10, 10]], np.float32)
+    assert fits(array, section, {"rows": 2})
+    assert not fits(array, section, {"rows": 3})
+    assert not fits(array[None], section, {"rows": 1})
+    assert not fits(array.astype(np.float64), section, {"rows": 2})
+    assert fits(array, {"dtype": "<f4", "shape": [None, 2]}, {})
+    assert in_range(array, section)
+    for row, column, value in ((0, 0, -0.5), (0, 1, -2), (1, 0, 11), (1, 1, np.nan), (0, 0, np.inf)):
+        changed = array.copy()
+        changed[row, column] = value
+        assert not in_range(changed, section)
+    assert not in_range(np.array([np.inf], np.float32), {})
+
+
+def test_a_million_counts_take_little_time() -> None:
+    started = time.perf_counter()
+    assert fault({"sections": [{**SECTION, "parts": [1] * 10**6}]}, FORMAT["container"]) is None
+    assert fault({"sections": [{**SECTION, "parts": [1] * 10**6 + [-1]}]}, FORMAT["container"]) == "sections.0.parts"
+    assert time.perf_counter() - started < 10

@@ -1,0 +1,198 @@
+"""Atomic writes: after any error a file is complete or unchanged."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from sundae_ns.core.errors import DataError, PackError, StorageError, reading, regular, writing
+from sundae_ns.core.files import put_aside, replacing, write_files, write_image, write_text
+from sundae_ns.io.ply import write_ply
+from sundae_ns.scene.initialization import from_points
+
+resource = pytest.importorskip("resource", reason="Windows has none")
+
+
+@contextmanager
+def small_disk(limit: int) -> Iterator[None]:
+    """Limit the size of any file to ``limit`` bytes, like a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+
+
+def test_a_new_text_replaces_the_old(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "old")
+    write_text(tmp_path / "a.txt", "new, ünïcode")
+    assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "new, ünïcode"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_an_error_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "old")
+
+    def fail() -> None:
+        with replacing(tmp_path / "a.txt") as partial:
+            partial.write_text("half")
+            assert (tmp_path / "a.txt").read_text() == "old"
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_a_file_is_flushed_before_it_is_renamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    sync, replace = os.fsync, Path.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (order.append("sync"), sync(handle))[1])
+    monkeypatch.setattr(Path, "replace", lambda path, to: (order.append("rename"), replace(path, to))[1])
+    write_text(tmp_path / "a.txt", "new")
+    assert order == ["sync", "rename", "sync"]
+
+
+def test_files_that_belong_together_are_written_all_or_none(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "old")
+    with small_disk(10_000), pytest.raises(StorageError, match="cannot write .*b.txt"):
+        write_files({tmp_path / "a.txt": b"new", tmp_path / "b.txt": b"x" * 10_001})
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+    write_files({tmp_path / "a.txt": b"new", tmp_path / "b.txt": b"x"})
+    assert [(tmp_path / name).read_text() for name in ("a.txt", "b.txt")] == ["new", "x"]
+
+
+def test_what_killed_processes_left_is_removed_and_what_others_write_stays(tmp_path: Path) -> None:
+    path = tmp_path / "[a].txt"
+    ready = "import sys, os\nfrom pathlib import Path\nfrom sundae_ns.core.files import replacing\n"
+    waits = "with replacing(Path(sys.argv[1])) as f:\n    f.write_text('half')\n    print(f, flush=True)\n    input()\n"
+    command = [sys.executable, "-c", ready + waits, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        partial = Path(other.stdout.readline().strip())
+        longer = tmp_path / "[a].txt.ply.2.partial"
+        longer.touch()
+        write_text(path, "new")
+        assert partial.read_text() == "half"
+        other.kill()
+    write_text(path, "newer")
+    assert sorted(os.listdir(tmp_path)) == ["[a].txt", longer.name]
+
+
+def test_full_disk(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.ply", "old")
+    points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
+    field = from_points(points, points, sh_degree=1, num_features=0)
+    with small_disk(10_000), pytest.raises(StorageError, match=r"cannot write .*a\.ply: .*ulimit") as caught:
+        write_ply(tmp_path / "a.ply", field)
+    assert "\n" not in str(caught.value)
+    assert (tmp_path / "a.ply").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.ply"]
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [(errno.ENOSPC, "disk is full; make room"), (errno.EROFS, "read-only"), (errno.EACCES, "permission denied")],
+)
+def test_system_errors_become_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reason: str
+) -> None:
+    def refuse(_: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(StorageError, match=reason):
+        write_text(tmp_path / "a.txt", "new")
+    assert os.listdir(tmp_path) == []
+
+
+def test_missing_folders_are_made(tmp_path: Path) -> None:
+    write_text(tmp_path / "new" / "folder" / "a.txt", "new")
+    assert (tmp_path / "new" / "folder" / "a.txt").read_text() == "new"
+
+
+def test_other_errors_are_not_converted(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), replacing(tmp_path / "a.txt"):
+        (tmp_path / "nowhere").read_text()
+
+
+def test_only_errors_that_a_user_can_correct_are_converted() -> None:
+    with pytest.raises(StorageError, match="^cannot make a: the disk is full; make room$"), writing("cannot make a"):
+        raise OSError(errno.ENOSPC, "no space")
+    for error in (StorageError("cannot write b: denied"), OSError(errno.EMFILE, "too many open files")):
+        with pytest.raises(OSError, match=str(error.args[-1])) as caught, writing("cannot make a"):
+            raise error
+        assert caught.value is error
+
+
+def test_a_full_disk_is_found_behind_the_error_that_replaces_it(tmp_path: Path) -> None:
+    """torch replaces the error of a failed write by its own when it closes the archive."""
+
+    class Full(io.RawIOBase):
+        def write(self, _: object) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(StorageError, match="disk is full"), replacing(tmp_path / "a.ckpt"):
+        torch.save({"values": torch.zeros(9)}, Full())
+
+
+def test_only_regular_files_are_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(OSError, match="it is a pipe or a device, not a file"):
+            regular(path)
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file", tmp_path, tmp_path / "missing"):
+        assert regular(path) == path
+
+
+@pytest.mark.parametrize(
+    ("raised", "kind", "message"),
+    [
+        (FileNotFoundError(2, "No such file"), PackError, r"a\.x cannot be read \(No such file\); check the path"),
+        (KeyError("means\n twice"), PackError, r"a\.x is not a whole x \('means\\n twice'\); get it again"),
+        (ValueError(), PackError, r"a\.x is not a whole x \(ValueError\); get it again"),
+        (DataError("one of ours; mend it"), DataError, "one of ours; mend it"),
+    ],
+)
+def test_errors_of_reading_name_the_file(raised: Exception, kind: type[Exception], message: str) -> None:
+    with pytest.raises(kind, match=f"^{message}$"), reading(Path("a.x"), "a whole x", PackError, mend="get it again"):
+        raise raised
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp"])
+def test_half_an_image_is_none(tmp_path: Path, name: str) -> None:
+    write_image(tmp_path / name, Image.new("RGB", (40, 30)))
+    before = (tmp_path / name).read_bytes()
+    with small_disk(10_000), pytest.raises(StorageError, match="ulimit"):
+        write_image(tmp_path / name, Image.effect_noise((400, 300), 100))
+    assert (tmp_path / name).read_bytes() == before
+    assert os.listdir(tmp_path) == [name]
+
+
+def test_what_is_damaged_is_put_aside(tmp_path: Path) -> None:
+    put_aside(tmp_path / "gone")
+    for text in ("first", "second"):
+        (tmp_path / "a").mkdir()
+        (tmp_path / "a" / "b").write_text(text)
+        (tmp_path / "c").write_text(text)
+        for name in ("a", "c"):
+            put_aside(tmp_path / name)
+    assert sorted(os.listdir(tmp_path)) == ["a.damaged", "c.damaged"]
+    assert (tmp_path / "a.damaged" / "b").read_text() == (tmp_path / "c.damaged").read_text() == "second"

@@ -1,0 +1,300 @@
+"""Checkpoints: those that load, those that are refused in one line, and fields from files of other programs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from torch import Tensor
+
+from sundae_ns.core import gaussians
+from sundae_ns.core.errors import CheckpointError
+from sundae_ns.core.gaussians import SPLAT_NAMES, finite_mask, sh_to_rgb
+from sundae_ns.io import checkpoint
+from sundae_ns.io.formats import read_field
+from sundae_ns.io.ply import MODEL_FRAME, write_ply
+
+
+def field(n: int = 6, degree: int = 3) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(n)
+    shapes = {
+        "means": (3,),
+        "scales": (3,),
+        "quats": (4,),
+        "features_dc": (3,),
+        "features_rest": ((degree + 1) ** 2 - 1, 3),
+        "opacities": (1,),
+    }
+    return {name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()}
+
+
+def model_state(n: int = 6, degree: int = 3, **extra: Any) -> dict[str, Any]:
+    state: dict[str, Any] = {f"gauss_params.{name}": value for name, value in field(n, degree).items()}
+    state["gauss_params.features"] = torch.zeros(n, 5)
+    state["networks.head.weight"] = torch.zeros(4, 4)
+    about = checkpoint.extra_state(
+        step=7,
+        num_features=5,
+        encoding="harmonics",
+        running={"densification": {"grad2d": None}, "pruning": {"pruned_at": -1}},
+        extensions={},
+        head_enabled=False,
+        trained_focal=None,
+    )
+    state["_extra_state"] = {**about, **extra}
+    return state
+
+
+def check(state: dict[str, Any], **options: Any) -> None:
+    """The checks of a checkpoint against a model of 6 primitives, in the order of loading."""
+    checkpoint.check_extra_state(state, 5, "harmonics")
+    checkpoint.check_model_state(state, model_state(6), **options)
+
+
+def stock_checkpoint(path: Path, prefix: str = "_model.", n: int = 6) -> dict[str, Tensor]:
+    """A checkpoint of splatfacto by nerfstudio's trainer, whose scheduler leaves a numpy number in it."""
+    params = field(n)
+    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
+    config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
+    scheduler = config.setup().get_scheduler(optimizer, lr_init=1.6e-4)
+    optimizer.step()
+    scheduler.step()
+    torch.save(
+        {
+            "step": 1,
+            "pipeline": {f"{prefix}gauss_params.{name}": value for name, value in params.items()},
+            "optimizers": {"means": optimizer.state_dict()},
+            "schedulers": {"means": scheduler.state_dict()},
+            "scalers": {},
+        },
+        path,
+    )
+    return params
+
+
+def one_line(error: BaseException) -> bool:
+    return isinstance(error, ValueError) and "\n" not in str(error)
+
+
+def test_another_number_of_primitives_fits() -> None:
+    check(model_state(9))
+
+
+def test_a_field_may_not_be_empty() -> None:
+    with pytest.raises(CheckpointError, match=r"parameters of \[0\] primitives"):
+        check(model_state(0))
+
+
+def _without(name: str) -> dict[str, Any]:
+    return {key: value for key, value in model_state().items() if key != name}
+
+
+@pytest.mark.parametrize(
+    ("state", "cause"),
+    [
+        (_without("_extra_state"), "splatfacto checkpoint.*warm-start"),
+        ({"field.weight": torch.zeros(1)}, "another method.*warm-start"),
+        (model_state(method="other"), "not one of sundae"),
+        (model_state(format=1), "format 1, this version reads 2; use the version that wrote it"),
+        (model_state(format=99), "format 99"),
+        (model_state(encoding="logits"), "colours as logits, the model as harmonics; .*sh-degree"),
+        (model_state(running=None), "where training stopped"),
+        (model_state(extensions=[]), "where training stopped"),
+        (
+            {
+                **model_state(),
+                "_extra_state": {"method": "sundae", "format": 2, "num_features": 5, "encoding": "harmonics"},
+            },
+            "where training stopped",
+        ),
+        (model_state(running={"densification": {}, "pruning": {"pruned_at": "x"}}), "where training stopped"),
+        (model_state(running={"densification": {"grad2d": torch.zeros(7)}, "pruning": {}}), "grad2d has 7 rows"),
+        (model_state(num_features=13), "length 13.*length 5.*num-features 13"),
+        (_without("networks.head.weight"), "no networks.head.weight"),
+        (
+            {**model_state(), "networks.head.weight": torch.zeros(8, 4)},
+            r"networks.head.weight is \[8, 4\].*\[4, 4\].*--pipeline.model.head.size",
+        ),
+        (model_state(degree=2), r"features_rest is \[6, 8, 3\].*\[6, 15, 3\]"),
+    ],
+)
+def test_a_checkpoint_that_does_not_fit_is_refused(state: dict[str, Any], cause: str) -> None:
+    with pytest.raises(CheckpointError, match=cause) as caught:
+        check(state)
+    assert one_line(caught.value)
+
+
+@pytest.mark.parametrize("prefix", ["_model.", "_model.module."])
+def test_stock_checkpoint_with_numpy_numbers(tmp_path: Path, prefix: str) -> None:
+    params = stock_checkpoint(tmp_path / "step-000000001.ckpt", prefix)
+    with pytest.raises(Exception, match="[Ww]eights.only"):
+        torch.load(tmp_path / "step-000000001.ckpt", weights_only=True)
+    read, in_model_frame, _ = read_field(tmp_path / "step-000000001.ckpt")
+    assert in_model_frame
+    assert tuple(read) == SPLAT_NAMES
+    assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
+
+
+SUNDAE = {"method": "sundae", "format": checkpoint.FORMAT}
+
+
+def save_without_harmonics(folder: Path, extra: Any) -> None:
+    """A checkpoint of SH degree 0, with the state of a model beside its tensors if any is given."""
+    state = {f"_model.gauss_params.{name}": value for name, value in field().items()}
+    state["_model.gauss_params.features_rest"] = state["_model.gauss_params.features_rest"][:, :0]
+    if extra is not None:
+        state["_model._extra_state"] = extra
+    torch.save({"step": 1, "pipeline": state}, folder / "step-000000001.ckpt")
+
+
+@pytest.mark.parametrize(
+    ("extra", "logits"),
+    [
+        (None, True),
+        ({}, True),
+        ({"method": "other"}, True),
+        ({**SUNDAE, "encoding": "logits"}, True),
+        ({**SUNDAE, "encoding": "harmonics"}, False),
+    ],
+)
+def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path: Path, extra: Any, logits: bool) -> None:
+    """Logits if the model was built at degree 0, harmonics if a search has lowered the degree."""
+    save_without_harmonics(tmp_path, extra)
+    read, _, _ = read_field(tmp_path)
+    stored = field()["features_dc"]
+    expected = sh_to_rgb(read["features_dc"]).logit() if logits else read["features_dc"]
+    torch.testing.assert_close(expected, stored)
+
+
+@pytest.mark.parametrize(
+    ("extra", "cause"),
+    [
+        (
+            {"method": "sundae", "format": 1, "logits": True},
+            "format 1, this version reads 2; use the version that wrote",
+        ),
+        (SUNDAE, "does not say how it stores colours"),
+        ({**SUNDAE, "encoding": "words"}, "does not say how it stores colours"),
+        ({**SUNDAE, "encoding": torch.zeros(2)}, "does not say how it stores colours"),
+    ],
+)
+def test_a_field_of_another_format_is_refused(tmp_path: Path, extra: Any, cause: str) -> None:
+    """Its colours could be misread silently."""
+    save_without_harmonics(tmp_path, extra)
+    with pytest.raises(CheckpointError, match=cause) as caught:
+        read_field(tmp_path)
+    assert one_line(caught.value)
+
+
+def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mended: list[int] = []
+
+    def count(params: Any) -> Any:
+        mended.append(len(params["means"]))
+        return finite_mask(params)
+
+    monkeypatch.setattr(gaussians, "finite_mask", count)
+    stored = stock_checkpoint(tmp_path / "step-000000001.ckpt", n=4)
+    assert torch.equal(read_field(tmp_path)[0]["means"], stored["means"])
+    assert mended == [4]
+    loaded = checkpoint.read(tmp_path / "step-000000001.ckpt")
+    loaded["pipeline"]["_model.gauss_params.means"].fill_(torch.nan)
+    torch.save(loaded, tmp_path / "step-000000002.ckpt")
+    with pytest.raises(CheckpointError, match=r"has 4 primitives, and none is finite"):
+        read_field(tmp_path)
+
+
+@pytest.mark.parametrize("inside", [".", "nerfstudio_models"])
+def test_newest_of_a_folder(tmp_path: Path, inside: str) -> None:
+    (tmp_path / inside).mkdir(exist_ok=True)
+    stock_checkpoint(tmp_path / inside / "step-000000999.ckpt", n=3)
+    newest = stock_checkpoint(tmp_path / inside / "step-000029999.ckpt", n=4)
+    assert torch.equal(read_field(tmp_path)[0]["means"], newest["means"])
+
+
+@pytest.mark.parametrize(("comments", "in_model_frame"), [((), False), ((MODEL_FRAME,), True)])
+def test_ply(tmp_path: Path, comments: tuple[str, ...], in_model_frame: bool) -> None:
+    params = field()
+    write_ply(tmp_path / "a.ply", params, comments=list(comments))
+    read, in_frame, _ = read_field(tmp_path / "a.ply")
+    assert in_frame is in_model_frame
+    assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
+    renamed = (tmp_path / "a.ply").rename(tmp_path / "cloud")
+    assert torch.equal(read_field(renamed)[0]["means"], params["means"])
+
+
+class Burglar:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str]]:
+        return os.mkdir, (str(self.path),)
+
+
+def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
+    stolen = tmp_path / "stolen"
+    torch.save({"pipeline": {}, "extra": Burglar(stolen)}, tmp_path / "a.ckpt")
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        read_field(tmp_path / "a.ckpt")
+    assert not stolen.exists()
+
+
+def test_numpy_is_allowed_for_one_file_only(tmp_path: Path) -> None:
+    stock_checkpoint(tmp_path / "a.ckpt")
+    read_field(tmp_path / "a.ckpt")
+    with pytest.raises(Exception, match="[Ww]eights.only"):
+        torch.load(tmp_path / "a.ckpt", weights_only=True)
+
+
+def _save(content: object) -> Callable[[Path], object]:
+    return lambda path: torch.save(content, path)
+
+
+WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing": (lambda path: None, "does not exist"),
+    "empty folder": (lambda path: path.mkdir(), "holds no checkpoint"),
+    "no checkpoint": (lambda path: path.write_text("hello"), "cannot be read"),
+    "empty file": (lambda path: path.write_bytes(b""), "cannot be read"),
+    "only tensors": (_save({"weight": torch.zeros(2)}), "it holds no model"),
+    "no step": (_save({"pipeline": {"_model.field.weight": torch.zeros(2)}}), "after which step it was saved"),
+    "a step of words": (_save({"step": "3", "pipeline": {}}), "after which step it was saved"),
+    "a number for a name": (_save({"step": 3, "pipeline": {3: torch.zeros(2)}}), "it holds no model"),
+    "a list": (_save([1, 2]), "cannot be read"),
+    "of another method": (_save({"step": 3, "pipeline": {"_model.field.weight": torch.zeros(2)}}), "no Gaussian field"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_file_without_a_field_is_refused(tmp_path: Path, wrong: str) -> None:
+    make, cause = WRONG[wrong]
+    path = tmp_path / "a.ckpt"
+    make(path)
+    with pytest.raises(CheckpointError, match=cause) as caught:
+        read_field(path)
+    assert one_line(caught.value)
+
+
+def test_extra_state_is_plain_data(tmp_path: Path) -> None:
+    state = checkpoint.extra_state(
+        step=12,
+        num_features=5,
+        encoding="harmonics",
+        running={"densification": {"grad2d": torch.ones(3), "scene_scale": 1.0}, "pruning": {"pruned_at": 7}},
+        extensions={"budget": {"numbers": {"phase": "before"}}},
+        head_enabled=False,
+        trained_focal=(900.0, 1100.0),
+    )
+    torch.save(state, tmp_path / "a.pt")
+    loaded = torch.load(tmp_path / "a.pt", weights_only=True)
+    assert loaded["running"]["pruning"] == {"pruned_at": 7}
+    assert loaded["extensions"] == {"budget": {"numbers": {"phase": "before"}}}
+    assert loaded["trained_focal"] == [900.0, 1100.0]

@@ -1,0 +1,260 @@
+"""Scenes of other programs: values against what was written, and refusals of damaged ones in one line."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from foreign_files import FOREIGN, colors_of, small_field, write_colored_ply, write_compressed_ply, write_gsplat
+from foreign_files import write_splat as write_small_splat
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+import sundae_ns as sn
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.gaussians import SPLAT_NAMES
+from sundae_ns.io.formats import kind_of, read_primitives, unread
+from sundae_ns.io.ply import ply_comments, read_ply, read_point_cloud, write_ply
+from sundae_ns.io.sog import write_sog
+
+FIELD = small_field()
+RGB = ("red", "green", "blue")
+
+
+def found(path: Path) -> dict[str, Tensor]:
+    return dict(read_primitives(path).mended.field)
+
+
+def check(values: dict[str, Tensor], tolerances: dict[str, float], truth: dict[str, Tensor] = FIELD) -> None:
+    """Rotations up to their sign, colours and opacities as they are shown."""
+    assert tuple(sorted(values)) == tuple(sorted(SPLAT_NAMES))
+    quats = torch.nn.functional.normalize(values["quats"], dim=1)
+    signs = (quats * truth["quats"]).sum(dim=1, keepdim=True).sign()
+    shown = {**values, "quats": quats * signs, "features_dc": colors_of(values)}
+    shown["opacities"] = values["opacities"].sigmoid()
+    expected = {**truth, "features_dc": colors_of(truth), "opacities": truth["opacities"].sigmoid()}
+    for name, tolerance in tolerances.items():
+        torch.testing.assert_close(shown[name], expected[name], rtol=0, atol=tolerance, msg=name)
+
+
+def test_splat(tmp_path: Path) -> None:
+    write_small_splat(tmp_path / "a.splat", FIELD)
+    values = found(tmp_path / "a.splat")
+    # Half a level of a byte: 1/510 of colours and opacities, 1/256 of quaternions before they are normalised.
+    check(values, {"means": 0, "scales": 1e-6, "quats": 0.011, "features_dc": 0.002, "opacities": 0.002})
+    assert values["features_rest"].shape == (300, 0, 3)
+
+
+def test_ends_of_a_splat_have_a_meaning(tmp_path: Path) -> None:
+    given = small_field(4)
+    given["opacities"][:2] = torch.tensor([[math.inf], [-math.inf]])
+    given["scales"][2, 1] = -math.inf
+    given["quats"][3] = 0
+    write_small_splat(tmp_path / "a.splat", given)
+    mended = read_primitives(tmp_path / "a.splat").mended
+    assert mended.dropped == 0
+    assert (mended.flat, mended.unrotated) == (1, 1)
+    assert mended.field["opacities"].sigmoid()[:2, 0].tolist() == pytest.approx([1, 0], abs=2e-6)
+    assert all(value.isfinite().all() for value in mended.field.values())
+
+
+@pytest.mark.parametrize("n", [1, 256, 257, 300])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("old", [False, True])
+def test_compressed_ply(tmp_path: Path, n: int, degree: int, old: bool) -> None:
+    given, path = small_field(n, degree), tmp_path / "a.ply"
+    write_compressed_ply(path, given, old=old)
+    values = found(path)
+    # Half a level: of 11 and 10 bits in 2 units, of 10 bits in sqrt(2), of 8 bits in 1, and in 8.
+    tolerances = {"means": 0.001, "scales": 0.001, "quats": 0.0015, "opacities": 0.002, "features_rest": 0.016}
+    check(values, {**tolerances, "features_dc": 0.0021}, given)
+
+
+def test_compressed_ply_as_another_reader_reads_it(tmp_path: Path) -> None:
+    gsply = pytest.importorskip("gsply")
+    write_compressed_ply(tmp_path / "a.ply", FIELD)
+    ours, theirs = found(tmp_path / "a.ply"), gsply.plyread(str(tmp_path / "a.ply"))
+    columns = {"means": "means", "scales": "scales", "quats": "quats", "features_dc": "sh0", "features_rest": "shN"}
+    for name, column in columns.items():
+        expected = torch.from_numpy(np.asarray(getattr(theirs, column))).reshape(ours[name].shape)
+        torch.testing.assert_close(ours[name], expected, rtol=0, atol=1e-5, msg=name)
+
+
+@pytest.mark.parametrize(("dtype", "most"), [("u1", 255), ("<u2", 65535), ("<f4", 1), ("<f4", 255)])
+def test_colours_in_place_of_harmonics(tmp_path: Path, dtype: str, most: float) -> None:
+    write_colored_ply(tmp_path / "a.ply", FIELD, dtype, most)
+    read = read_primitives(tmp_path / "a.ply")
+    check(dict(read.mended.field), {"means": 0, "scales": 0, "quats": 1e-6, "features_dc": 0.002, "opacities": 1e-6})
+    assert read.in_model_frame
+
+
+def test_harmonics_come_before_colours(tmp_path: Path) -> None:
+    """Some programs write both, the colours for viewers of points."""
+    write_ply(tmp_path / "a.ply", FIELD)
+    content = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "b.ply").write_bytes(content.replace(b"nx", b"red", 1).replace(b"ny", b"green").replace(b"nz", b"blue"))
+    assert torch.equal(read_ply(tmp_path / "b.ply")["features_dc"], FIELD["features_dc"])
+
+
+@pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
+def test_a_header_with_other_letters(tmp_path: Path, newline: bytes) -> None:
+    write_ply(tmp_path / "a.ply", FIELD)
+    header, end, rows = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    comment = "comment Aufnahme: Küche, 東京, end_header\n".encode()
+    changed = header.replace(b"element", comment + b"comment \xff\xe9\nelement", 1) + end
+    (tmp_path / "b.ply").write_bytes(changed.replace(b"\n", newline) + rows)
+    values = read_ply(tmp_path / "b.ply")
+    assert all(torch.equal(values[name], FIELD[name]) for name in SPLAT_NAMES)
+    assert ply_comments(tmp_path / "b.ply")[0] == "Aufnahme: Küche, 東京, end_header"
+
+
+def test_gsplat(tmp_path: Path) -> None:
+    write_gsplat(tmp_path / "ckpt_6999_rank0.pt", FIELD)
+    values = found(tmp_path / "ckpt_6999_rank0.pt")
+    assert all(torch.equal(values[name], FIELD[name]) for name in SPLAT_NAMES)
+
+
+def test_the_ranks_of_gsplat_are_one_scene(tmp_path: Path) -> None:
+    """Each GPU writes its own part."""
+    for rank in (0, 1, 2, 10):
+        part = {name: value[min(rank, 3) :: 4] for name, value in FIELD.items()}
+        write_gsplat(tmp_path / f"ckpt_6999_rank{rank}.pt", part)
+    write_gsplat(tmp_path / "ckpt_29999_rank0.pt", FIELD)  # another step
+    values = found(tmp_path / "ckpt_6999_rank1.pt")
+    assert len(values["means"]) == 300
+    assert torch.equal(values["means"].sort(dim=0).values, FIELD["means"].sort(dim=0).values)
+
+
+class Harmful:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (open, ("harm", "w"))
+
+
+def _saved(**splats: object) -> Callable[[Path], None]:
+    return lambda path: torch.save({"step": 1, "splats": splats}, path)
+
+
+def _cut(name: str, size: int) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        FOREIGN[name](path, FIELD)
+        path.write_bytes(path.read_bytes()[:size])
+
+    return write
+
+
+def _replaced(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        FOREIGN[name](path, FIELD)
+        content = path.read_bytes()
+        assert old in content
+        path.write_bytes(content.replace(old, new))
+
+    return write
+
+
+DAMAGED: dict[str, tuple[str, Callable[[Path], None], str]] = {
+    "an empty .splat": ("a.splat", lambda path: path.touch(), "0 bytes are no whole number"),
+    "half a primitive": ("a.splat", _cut("a.splat", 48), "48 bytes are no whole number of primitives of 32 bytes"),
+    "a short compressed .ply": ("a.ply", _cut("a.compressed.ply", 2000), "its header states at least"),
+    "no chunks": ("a.ply", _replaced("a.compressed.ply", b"element chunk", b"element chump"), "compressed .ply"),
+    "too few chunks": ("a.ply", _replaced("a.compressed.ply", b"vertex 300", b"vertex 999"), "its header states"),
+    "no bound": ("a.ply", _replaced("a.compressed.ply", b"min_scale_x", b"min_scale_u"), "compressed .ply"),
+    "odd harmonics": ("a.ply", _replaced("a.compressed.ply", b"f_rest_8", b"unknown8"), "fit no SH degree"),
+    "no archive": ("a.pt", lambda path: path.write_bytes(b"PK\x03\x04" + b"\x00" * 99), "not a checkpoint of gsplat"),
+    "an old archive": ("a.pt", lambda path: path.write_bytes(b"\x80\x02" * 50), "not a checkpoint of gsplat"),
+    "a cut archive": ("a.pt", _cut("ckpt_6999_rank0.pt", 3000), "not a checkpoint of gsplat"),
+    "code": ("a.pt", lambda path: torch.save({"splats": Harmful()}, path), "more than tensors and plain values"),
+    "no splats": ("a.pt", lambda path: torch.save({"step": 1}, path), "it holds no splats"),
+    "no harmonics": ("a.pt", _saved(means=torch.zeros(3, 3)), "its splats lack scales, quats, opacities, sh0, shN"),
+    "colours of a network": ("a.pt", _saved(colors=torch.zeros(3, 3)), "its colours need a network"),
+    "an odd shape": (
+        "a.pt",
+        lambda path: write_gsplat(path, {**FIELD, "scales": torch.zeros(300, 2)}),
+        "scales has shape",
+    ),
+    "sparse": ("a.pt", _saved(means=torch.zeros(3, 3).to_sparse()), "sparse"),
+    "a missing file": ("a.splat", lambda _: None, "cannot be read"),
+    "only NaN": (
+        "a.splat",
+        lambda path: write_small_splat(path, {**FIELD, "means": torch.full((300, 3), math.nan)}),
+        "300 primitives, and none is finite",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_damaged_files_are_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    name, write, message = DAMAGED[kind]
+    write(tmp_path / name)
+    with pytest.raises(DataError, match=re.escape(message)) as caught:
+        read_primitives(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "harm").exists()
+
+
+def unbundled(folder: Path) -> Path:
+    """A .sog as splat-transform and SuperSplat write it for a web page."""
+    write_sog(folder.with_suffix(".sog"), FIELD)
+    with zipfile.ZipFile(folder.with_suffix(".sog")) as bundle:
+        bundle.extractall(folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["", "meta.json"])
+def test_a_sog_that_is_a_folder(tmp_path: Path, name: str) -> None:
+    folder = unbundled(tmp_path / "scene")
+    whole, parts = found(tmp_path / "scene.sog"), found(folder / name)
+    assert all(torch.equal(parts[each], whole[each]) for each in SPLAT_NAMES)
+    assert sn.load(folder / name).num_primitives == 300
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": None}, "has version 1 of the format; convert it with splat-transform"),
+        ({"version": 3}, "has version 3 of the format"),
+        ({"means": {"mins": [0] * 3, "maxs": [1] * 3, "files": ["../x.webp"] * 2}}, "../x.webp lies elsewhere"),
+        ({"scales": {"codebook": [0.0], "files": ["gone.webp"]}}, "cannot be read"),
+    ],
+)
+def test_other_folders_are_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    meta = unbundled(tmp_path / "scene") / "meta.json"
+    content = {name: value for name, value in {**json.loads(meta.read_text()), **change}.items() if value is not None}
+    meta.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=re.escape(message)):
+        read_primitives(meta)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_cloud_with_a_comment_in_utf_8(tmp_path: Path, text: bool) -> None:
+    rows = np.array([(0.5, -1.25, 2.0, 10, 20, 30)], [(n, "f4") for n in "xyz"] + [(n, "u1") for n in RGB])
+    PlyData([PlyElement.describe(rows, "vertex")], text=text).write(str(tmp_path / "a.ply"))
+    content = (tmp_path / "a.ply").read_bytes().replace(b"element", "comment Küche 東京\nelement".encode(), 1)
+    (tmp_path / "b.ply").write_bytes(content)
+    points, colors = read_point_cloud(tmp_path / "b.ply")
+    assert (points.tolist(), colors.tolist()) == ([[0.5, -1.25, 2.0]], [[10, 20, 30]])
+
+
+def test_kinds(tmp_path: Path) -> None:
+    kinds = {}
+    for name, write in FOREIGN.items():
+        write(tmp_path / name, FIELD)
+        kinds[name] = kind_of(tmp_path / name)
+    assert list(kinds.values()) == ["splat", "ply", "ply", "gsplat", "ksplat", "ply"]
+
+
+def test_folders_of_3dgs_name_their_file(tmp_path: Path) -> None:
+    last = tmp_path / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    last.parent.mkdir(parents=True)
+    last.touch()
+    assert unread(tmp_path) == f"is a folder of 3DGS; give {last}"
+    assert unread(tmp_path / "point_cloud") is None

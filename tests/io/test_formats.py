@@ -1,0 +1,207 @@
+"""Files for other viewers: kinds, round trips of every format, refusals, and splat-transform if it is installed."""
+
+from __future__ import annotations
+
+import gzip
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import hypothesis.strategies as st
+import pytest
+import torch
+from foreign_files import small_field
+from hypothesis import HealthCheck, given, settings
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from sundae_ns.core.errors import CheckpointError, ConfigError, DataError
+from sundae_ns.core.gaussians import Field
+from sundae_ns.io.accounting import Sizes, bytes_of, bytes_of_module, megabytes
+from sundae_ns.io.formats import ANTIALIASED, FORMATS, kind_of, read_primitives, refuse, write_for_viewers
+from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
+from sundae_ns.io.ply import read_ply, write_ply
+from sundae_ns.io.spz import fractional_bits
+from sundae_ns.rasterize.reference import harmonic_basis
+
+PROGRAM = shutil.which("splat-transform")
+TOLERANCES: dict[str, dict[str, float]] = {
+    # Half a step of each format, plus rounding; colours and opacities after activation, codebooks by their worst case.
+    ".ply": {},
+    ".glb": dict.fromkeys(("means", "scales", "features_rest"), 1e-5) | {"quats": 1e-6, "opacities": 1e-6},
+    ".spz": {"means": 1e-6, "scales": 1 / 32, "quats": 0.002, "features_dc": 0.0134, "features_rest": 0.0079}
+    | {"opacities": 0.5 / 255},
+    ".sog": {"means": 1e-4, "scales": 0.02, "quats": 0.006, "features_dc": 0.02, "features_rest": 0.02}
+    | {"opacities": 0.5 / 255},
+}
+
+
+def matched(params: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Tensor]:
+    """A field in the order of another by the nearest centres, with its rotations' signs and activated opacities."""
+    rows = torch.from_numpy(cKDTree(params["means"].numpy()).query(truth["means"].numpy())[1])
+    assert len(rows.unique()) == len(truth["means"])
+    ordered = {name: value[rows] for name, value in params.items()}
+    signs = (ordered["quats"] * truth["quats"]).sum(dim=1, keepdim=True).sign()
+    return {**ordered, "quats": ordered["quats"] * signs, "opacities": ordered["opacities"].sigmoid()}
+
+
+def check(params: dict[str, Tensor], truth: dict[str, Tensor], kind: str) -> None:
+    expected = {**truth, "opacities": truth["opacities"].sigmoid()}
+    for name, value in matched(params, truth).items():
+        tolerance = TOLERANCES[kind].get(name, 0.0) + (1e-6 if TOLERANCES[kind] else 0.0)
+        torch.testing.assert_close(value, expected[name], rtol=0, atol=tolerance, msg=lambda m, n=name: f"{n}: {m}")
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(n=st.integers(1, 300), degree=st.integers(0, 3), marks=st.tuples(st.booleans(), st.booleans()))
+def test_what_is_written_is_read(tmp_path: Path, kind: str, n: int, degree: int, marks: tuple[bool, bool]) -> None:
+    truth, path = small_field(n, degree), tmp_path / f"a{kind}"
+    antialiased, in_model_frame = marks
+    written = write_for_viewers(path, truth, antialiased=antialiased, in_model_frame=in_model_frame)
+    assert written == (n, 0, degree, 0, False, path.stat().st_size)
+    read = read_primitives(path)
+    check(dict(read.mended.field), truth, kind)
+    assert read.antialiased == antialiased
+    assert read.in_model_frame == (in_model_frame and kind in (".ply", ".glb"))
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_equal_fields_give_equal_bytes(tmp_path: Path, kind: str) -> None:
+    for name in ("a", "b"):
+        write_for_viewers(tmp_path / f"{name}{kind}", small_field())
+    assert (tmp_path / f"a{kind}").read_bytes() == (tmp_path / f"b{kind}").read_bytes()
+
+
+@pytest.mark.skipif(
+    PROGRAM is None, reason="splat-transform is not in PATH: npm install -g @playcanvas/splat-transform"
+)
+@pytest.mark.parametrize("kind", [".ply", ".spz", ".sog"])
+@pytest.mark.parametrize(("degree", "antialiased"), [(3, True), (0, False)])
+def test_another_program_reads_the_same_scene(tmp_path: Path, kind: str, degree: int, antialiased: bool) -> None:
+    truth, file, back = small_field(300, degree), tmp_path / f"a{kind}", tmp_path / "back.ply"
+    write_for_viewers(file, truth, antialiased=antialiased)
+    subprocess.run([str(PROGRAM), "--quiet", str(file), str(back)], check=True, capture_output=True, timeout=120)
+    read = read_primitives(back)
+    check(dict(read.mended.field), truth, kind)
+    assert read.antialiased == antialiased
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_primitives_that_are_not_finite_are_dropped(tmp_path: Path, kind: str) -> None:
+    field = small_field()
+    field["means"][3, 0] = torch.nan
+    field["scales"][7, 1] = torch.inf
+    field["scales"][9, 1] = -torch.inf  # a flat primitive
+    written = write_for_viewers(tmp_path / f"a{kind}", field)
+    assert (written.primitives, written.dropped) == (298, 2)
+
+
+@pytest.mark.parametrize(("kind", "degree"), [(".ply", 4), (".spz", 3), (".sog", 3), (".glb", 3)])
+def test_sh_degree_4_is_cut_to_the_format(tmp_path: Path, kind: str, degree: int) -> None:
+    written = write_for_viewers(tmp_path / f"a{kind}", small_field(30, 4))
+    assert (written.degree, written.cut) == (degree, degree == 3)
+
+
+def test_colours_of_models_of_sh_degree_0(tmp_path: Path) -> None:
+    field = small_field(degree=0)
+    write_for_viewers(tmp_path / "a.ply", Field(field, "logits"))
+    colors = 0.5 + 0.28209479 * read_ply(tmp_path / "a.ply")["features_dc"]
+    torch.testing.assert_close(colors, field["features_dc"].sigmoid(), rtol=0, atol=1e-6)
+
+
+def test_upright_rotates_z_to_minus_y(tmp_path: Path) -> None:
+    field = small_field()
+    field["means"][0] = torch.tensor([1.0, 2.0, 3.0])
+    write_for_viewers(tmp_path / "b.ply", field, upright=True)
+    read = read_primitives(tmp_path / "b.ply")
+    assert not read.in_model_frame
+    turned = read.mended.field
+    torch.testing.assert_close(turned["means"][0], torch.tensor([1.0, -3.0, 2.0]))
+    # SH rotate, too: from above, along +z before and -y after, the colours are the same.
+    above, turned_above = (harmonic_basis(1, torch.tensor([d]))[0, 1:] for d in ([0.0, 0.0, 1.0], [0.0, -1.0, 0.0]))
+    before = torch.einsum("k,nkc->nc", above, field["features_rest"])
+    after = torch.einsum("k,nkc->nc", turned_above, turned["features_rest"])
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-5)
+
+
+BAD = {"opacities": torch.zeros(300)}, {"features_rest": torch.zeros(300, 4, 3)}
+REFUSED: list[tuple[str, dict[str, Tensor], type[Exception], str]] = [
+    ("a.splat", {}, ConfigError, "name it .ply or .spz or .sog or .glb"),
+    *((f"a{kind}", change, DataError, "has shape") for kind in FORMATS for change in BAD),
+    *((f"a{kind}", {"means": torch.full((300, 3), torch.nan)}, DataError, "no primitives") for kind in FORMATS[1:]),
+    ("a.spz", {"means": torch.full((300, 3), 1e5)}, DataError, "1e+05 from the origin"),
+]
+
+
+@pytest.mark.parametrize(("name", "change", "failure", "words"), REFUSED)
+def test_refusals_leave_the_older_file(
+    tmp_path: Path, name: str, change: dict[str, Tensor], failure: Any, words: str
+) -> None:
+    (tmp_path / name).write_bytes(b"older")
+    with pytest.raises(failure, match=re.escape(words)):
+        write_for_viewers(tmp_path / name, {**small_field(), **change})
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"older"]
+
+
+@pytest.mark.parametrize(
+    ("farthest", "bits"), [(0.0, 24), (0.25, 24), (1.0, 22), (2.0, 21), (-2000.0, 12), (2048.0, 11)]
+)
+def test_positions_of_a_spz_get_as_many_bits_as_fit(tmp_path: Path, farthest: float, bits: int) -> None:
+    assert fractional_bits(torch.tensor([[0.0, farthest, 0.0]])) == bits
+    field = small_field(50)
+    field["means"] *= farthest / field["means"].abs().max() or 1e-9
+    write_for_viewers(tmp_path / "a.spz", field)
+    raw = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    assert len(raw) == 16 + 50 * (9 + 1 + 3 + 3 + 4 + 9)
+    means = read_primitives(tmp_path / "a.spz").mended.field["means"]
+    assert (means - field["means"]).abs().max() <= 2.0 ** -(bits + 1) + 1e-7
+
+
+def test_values_beyond_the_range_of_a_spz_are_counted(tmp_path: Path) -> None:
+    field = small_field()
+    field["scales"][0, 0], field["features_dc"][1, 2], field["features_rest"][2, 0, 0] = 7.0, 4.0, -1.5
+    assert write_for_viewers(tmp_path / "a.spz", field).clamped == 3
+
+
+@pytest.mark.parametrize("kind", [".spz", ".sog", ".glb"])
+def test_zero_quaternions_become_the_identity(tmp_path: Path, kind: str) -> None:
+    field = small_field(3)
+    field["quats"][:] = torch.tensor([0.0, 1e-30, 0.0, 0.0])
+    field["quats"][0] = 0
+    write_for_viewers(tmp_path / f"a{kind}", field)
+    quats = matched(dict(read_primitives(tmp_path / f"a{kind}").mended.field), {**field, "quats": torch.ones(3, 4)})
+    torch.testing.assert_close(quats["quats"][0].abs(), torch.tensor([1.0, 0, 0, 0]), rtol=0, atol=0.006)
+
+
+def test_kinds_follow_from_first_bytes(tmp_path: Path) -> None:
+    write_scene(tmp_path / "packed.ply", PackedScene(small_field(4)))
+    write_ply(tmp_path / "points.sundae", small_field(4))
+    for name, content in {"dos.txt": b"ply\r\nformat", "word.ply": b"plywood", "empty.sundae": b""}.items():
+        (tmp_path / name).write_bytes(content)
+    kinds = {"packed.ply": "packed", "points.sundae": "ply", "dos.txt": "ply"}
+    kinds |= dict.fromkeys(("word.ply", "empty.sundae", "missing.sundae", "."))
+    assert {name: kind_of(tmp_path / name) for name in kinds} == kinds
+    with pytest.raises(CheckpointError, match=r"packed\.ply is a packed scene; unpack it$"):
+        refuse(tmp_path / "packed.ply", packed="unpack it")
+    with pytest.raises(CheckpointError, match=r"points\.sundae is a \.ply file; give a run$"):
+        refuse(tmp_path / "points.sundae", packed="unpack it", primitives="give a run")
+    refuse(tmp_path / "points.sundae", packed="unpack it")
+    refuse(tmp_path / "word.ply", packed="unpack it", primitives="give a run")
+
+
+def test_the_mark_of_antialiased_scenes(tmp_path: Path) -> None:
+    write_for_viewers(tmp_path / "a.PLY", small_field(), antialiased=True)
+    assert f"comment {ANTIALIASED}".encode() in (tmp_path / "a.PLY").read_bytes()
+
+
+def test_bytes_of_fields_and_modules() -> None:
+    params = {"means": torch.zeros(10, 3), "features": torch.zeros(10, 13)}
+    assert bytes_of(params) == bytes_of({name: value.half() for name, value in params.items()}) == 10 * 16 * 4
+    a, b = torch.nn.Linear(3, 3, bias=False), torch.nn.Linear(3, 3, bias=False)
+    b.weight = a.weight
+    assert bytes_of_module(torch.nn.ModuleList([a, b])) == 36
+    assert bytes_of_module(torch.nn.BatchNorm1d(8).half()) == 2 * 4 * 8 + 8  # counts its batches in one int64
+    assert megabytes(Sizes(23_600_000, 7_800_000).total) == "31.40 MB"

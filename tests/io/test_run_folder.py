@@ -1,0 +1,109 @@
+"""The folder of a run: one process trains in it, and damaged records of prunes do not end a training."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sundae_ns.core.errors import StorageError
+from sundae_ns.io.config_file import find_config
+from sundae_ns.io.run_folder import files_of, new_name, prunes_before, prunes_of, reserve, take_records
+
+HOLDER = "import sys, time; from pathlib import Path; from sundae_ns.io.run_folder import reserve; "
+HOLDER += "reserve(Path(sys.argv[1])); print(flush=True); time.sleep(600)"
+
+
+def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    folder = run / "nerfstudio_models"
+    folder.mkdir(parents=True)
+    (folder / "step-000000001.ckpt").touch()
+    places = (run, folder, folder / "step-000000001.ckpt", run / "config.yml")
+    assert [find_config(place) for place in places] == [None] * 4
+    (run / "config.yml").touch()
+    assert [find_config(place) for place in places] == [run / "config.yml"] * 4
+    assert find_config(tmp_path) is None
+    assert find_config(tmp_path / "gone") is None
+
+
+def test_earlier_records_are_kept_and_a_damaged_file_is_renamed(tmp_path: Path) -> None:
+    path = tmp_path / "prune.json"
+    assert prunes_before(path, 5) == []
+    path.write_text('[{"step": 3, "before": 9}, {"step": 7}]')
+    assert prunes_before(path, 7) == [{"step": 3, "before": 9}]
+    assert path.exists()
+    for text in ('[{"step": 3', "", '"step"', "3", '[{"before": 9}]', "[3]", '[{"step": "3"}]'):
+        path.write_text(text)
+        assert prunes_before(path, 7) == []
+        assert not path.exists()
+        assert (tmp_path / "prune.damaged.json").read_text() == text
+
+
+def test_records_of_a_finished_run_are_read_whole_or_not_at_all(tmp_path: Path) -> None:
+    assert prunes_of(tmp_path) == []
+    (tmp_path / "prune.json").write_text('[{"before": 9, "after": 3}]')
+    assert prunes_of(tmp_path) == [{"before": 9, "after": 3}]
+    for text in ("[", "3", '{"before": 9}', "[3]", '[{"before": 9}, 3]', "\x00"):
+        (tmp_path / "prune.json").write_text(text)
+        assert prunes_of(tmp_path) == []
+        assert (tmp_path / "prune.json").read_text() == text
+
+
+def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "a"
+    other = subprocess.Popen([sys.executable, "-c", HOLDER, run], stdout=subprocess.PIPE)
+    try:
+        assert other.stdout is not None
+        other.stdout.readline()
+        for path in (run, tmp_path / "runs" / ".." / "runs" / "a"):
+            with pytest.raises(StorageError, match=f"^process {other.pid} on .* trains in .*; .*--timestamp$"):
+                reserve(path)
+        (run / "models").mkdir()
+        for name in ("config.yml.17.partial", "models/partial--1.17.tmp", "config.yml", "models/step-000000001.ckpt"):
+            (run / name).touch()
+    finally:
+        other.kill()
+        other.wait()
+    reserve(run)
+    reserve(run)  # its own folder
+    assert (run / "training.lock").read_text().startswith(f"process {os.getpid()} on ")
+    assert sorted(path.name for path in run.rglob("*") if path.is_file()) == [
+        "config.yml",
+        "step-000000001.ckpt",
+        "training.lock",
+    ]
+
+
+def test_runs_of_the_same_second_have_different_names() -> None:
+    assert len({new_name() for _ in range(100)}) == 100
+
+
+def test_parts_of_a_run(tmp_path: Path) -> None:
+    (tmp_path / "config.yml").touch()
+    (tmp_path / "a.ply").touch()
+    assert files_of(tmp_path) == files_of(tmp_path / "config.yml")
+    assert tmp_path / "nerfstudio_models" in files_of(tmp_path)
+    assert files_of(tmp_path / "a.ply") == [tmp_path / "a.ply"]
+
+
+def test_records_follow_a_resumed_run(tmp_path: Path) -> None:
+    old = tmp_path / "old"
+    old.mkdir()
+    take_records(old, tmp_path / "none", 9)  # there are none
+    (old / "prune.json").write_text('[{"step": 3, "after": 9}, {"step": 5, "after": 4}, {"step": 8, "after": 2}]')
+    for step, prunes in ((2, []), (5, [3, 5]), (8, [3, 5, 8])):
+        new = tmp_path / f"resumed-after-{step}"
+        new.mkdir()
+        take_records(old, new, step)
+        assert [record["step"] for record in prunes_of(new)] == prunes
+    (new / "prune.json").write_text("[]")
+    take_records(old, new, 8)
+    assert prunes_of(new) == []  # its own record
+    for text in ("[", "[1]", "1", '{"step": "a"}', '[{"step": "a"}]', "[{}]"):
+        (old / "prune.json").write_text(text)
+        take_records(old, tmp_path / "none", 9)
+    assert not (tmp_path / "none").exists()

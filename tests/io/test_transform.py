@@ -1,0 +1,152 @@
+"""A transformed field, rendered from the transformed camera, gives the same image up to rounding."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from sundae_ns.core.covariance import rotation_matrices
+from sundae_ns.io.coordinates import rotate_spherical_harmonics, similarity
+from sundae_ns.rasterize.interface import rasterize, select_backend, spherical_harmonics
+from sundae_ns.rasterize.reference import evaluate_harmonics
+
+SCALE = 1.7
+SIZE = 24
+
+
+def rotation(seed: int = 1) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    q, r = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    q = q * r.diagonal().sign()
+    return q * q.det()
+
+
+def transform() -> Tensor:
+    return torch.cat([rotation(), torch.tensor([[0.4], [-1.1], [0.7]], dtype=torch.float64)], dim=1)
+
+
+def field(degree: int = 3, n: int = 60) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(2)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(n, *shape, generator=generator, dtype=torch.float64)
+
+    return {
+        "means": normal(3) * 0.6,
+        # Elongated, so that a wrong rotation changes the image.
+        "scales": (0.12 * torch.tensor([3.0, 1.0, 0.3], dtype=torch.float64)).log() + 0.1 * normal(3),
+        "quats": normal(4),
+        "features_dc": normal(3),
+        "features_rest": 0.3 * normal((degree + 1) ** 2 - 1, 3),
+        "opacities": normal(1),
+    }
+
+
+def camera() -> Tensor:
+    view = torch.eye(4, dtype=torch.float64)
+    view[:3, :3] = rotation(3)
+    view[:3, 3] = torch.tensor([0.1, -0.2, 3.0])
+    return view
+
+
+def moved_camera() -> Tensor:
+    """World-to-camera of the transformed camera; its coordinates are ``SCALE`` times as large."""
+    view, (turn, shift) = camera(), transform().split([3, 1], dim=1)
+    moved = view.clone()
+    moved[:3, :3] = view[:3, :3] @ turn.T
+    moved[:3, 3:] = SCALE * (view[:3, 3:] - moved[:3, :3] @ shift)
+    return moved
+
+
+def image(params: dict[str, Tensor], view: Tensor) -> tuple[Tensor, Tensor]:
+    backend = select_backend("reference", "cpu")
+    K = torch.tensor([[30.0, 0.0, SIZE / 2], [0.0, 30.0, SIZE / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    center = -view[:3, :3].T @ view[:3, 3]
+    coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
+    colors = spherical_harmonics(3, params["means"] - center, coeffs, backend=backend) + 0.5
+    rendered = rasterize(
+        params["means"],
+        params["quats"],
+        params["scales"].exp(),
+        params["opacities"].sigmoid().squeeze(1),
+        colors,
+        view,
+        K,
+        SIZE,
+        SIZE,
+        render_depth=True,
+        backend=backend,
+    )
+    assert rendered.depth is not None
+    return rendered.colors, rendered.depth
+
+
+def test_transformed_field_and_camera_give_the_same_image() -> None:
+    params = field()
+    colors, depth = image(params, camera())
+    moved_colors, moved_depth = image(similarity(params, transform(), SCALE), moved_camera())
+    assert colors.std() > 0.1
+    torch.testing.assert_close(moved_colors, colors, atol=1e-10, rtol=0)
+    torch.testing.assert_close(moved_depth, SCALE * depth, atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["means", "scales", "quats", "features_rest"])
+def test_each_transformed_parameter_changes_the_image(name: str) -> None:
+    params = field()
+    colors, _ = image(params, camera())
+    wrong = {**similarity(params, transform(), SCALE), name: params[name]}
+    assert (image(wrong, moved_camera())[0] - colors).abs().max() > 0.02
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_rotated_harmonics_are_the_rotated_function(degree: int) -> None:
+    rest = field(degree, n=4)["features_rest"]
+    degree_0 = torch.zeros(4, 1, 3, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=1)
+    before = evaluate_harmonics(degree, directions, torch.cat([degree_0, rest], dim=1))
+    rotated = rotate_spherical_harmonics(rest, rotation())
+    after = evaluate_harmonics(degree, directions @ rotation().T, torch.cat([degree_0, rotated], dim=1))
+    torch.testing.assert_close(after, before, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        torch.eye(3, dtype=torch.float64),
+        torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)),
+        torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)),
+        torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]], dtype=torch.float64),
+        rotation(5),
+    ],
+    ids=["identity", "half turn x", "half turn z", "COLMAP to nerfstudio", "any"],
+)
+def test_rotations_follow(matrix: Tensor) -> None:
+    params = field()
+    moved = similarity(params, torch.cat([matrix, torch.zeros(3, 1, dtype=torch.float64)], dim=1), 1.0)
+    expected = matrix @ rotation_matrices(params["quats"])
+    torch.testing.assert_close(rotation_matrices(moved["quats"]), expected, atol=1e-12, rtol=0)
+
+
+def test_other_parameters_are_shared_and_the_input_is_unchanged() -> None:
+    params = field()
+    before = {name: value.clone() for name, value in params.items()}
+    moved = similarity({**params, "features": torch.ones(60, 2)}, transform(), SCALE)
+    assert moved["opacities"] is params["opacities"]
+    assert moved["features_dc"] is params["features_dc"]
+    assert all(torch.equal(params[name], before[name]) for name in params)
+    torch.testing.assert_close(moved["scales"] - params["scales"], torch.full_like(params["scales"], math.log(SCALE)))
+
+
+def test_there_and_back_in_float32() -> None:
+    params = {name: value.float() for name, value in field().items()}
+    there = similarity(params, transform(), SCALE)
+    turn, shift = transform().split([3, 1], dim=1)
+    back = similarity(there, torch.cat([turn.T, -SCALE * turn.T @ shift], dim=1), 1 / SCALE)
+    assert all(value.dtype == torch.float32 for value in back.values())
+    # A quaternion and its negative are the same rotation.
+    back["quats"] = back["quats"] * (back["quats"] * params["quats"]).sum(dim=1, keepdim=True).sign()
+    for name, value in params.items():
+        torch.testing.assert_close(back[name], value, atol=1e-5, rtol=1e-5)

@@ -1,0 +1,295 @@
+"""Two processes over gloo render, gather and prune one field as one process does; nothing that is seen stays behind.
+
+``rank.py`` runs the checks of this file on each rank; the tests read their results.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from photographed import COUNT, batch_of, begin, image_of, update
+from splat_inputs import geometry
+from torch import Tensor
+from torch.nn import Parameter, ParameterDict
+
+from sundae_ns.core.camera import View
+from sundae_ns.core.gaussians import Field
+from sundae_ns.core.surgery import keep
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.plugin.distributed import BatchOptimizers, Ranks, ShardedField, _summed, may_be_seen
+from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
+from sundae_ns.rasterize.interface import rasterize, select_backend
+from sundae_ns.rasterize.reference import project
+from sundae_ns.scene.render import ColorSettings, LocalField
+from sundae_ns.train.state import Extension, FieldState
+
+REFERENCE = select_backend("reference", "cpu")
+COLORS = ColorSettings(REFERENCE)
+N, RANKS = 90, 2
+
+
+def gaussians(n: int = N) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(3)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(n, *shape, generator=generator, dtype=torch.float64)
+
+    return {
+        "means": normal(3) * 0.6,
+        "quats": normal(4),
+        "scales": normal(3) * 0.4 - 1.8,
+        "opacities": normal(1),
+        "features_dc": normal(3),
+        "features_rest": normal(8, 3) * 0.3,
+        "features": normal(5),
+    }
+
+
+def field_of(values: dict[str, Tensor], start: int = 0, end: int = N) -> Field:
+    rows: Any = ParameterDict({name: Parameter(value[start:end].clone()) for name, value in values.items()})
+    return Field(rows)
+
+
+def camera(rank: int, *, behind: bool = False) -> View:
+    """Cameras that differ in all: position, size and intrinsics."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([0.4 * rank, -0.1, 2.5])
+    if behind:
+        pose = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]).double()) @ pose
+    width, height, focal = (40, 32, 35.0) if rank == 0 else (24, 48, 28.0)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
+    return View(pose, K, width, height, focal)
+
+
+def draw(source: LocalField, view: View) -> Any:
+    params = source.primitives(view, COLORS, features=True)
+    shown = rasterize(
+        *(params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid().squeeze(-1)),
+        torch.cat([params["colors"], params["features"]], dim=1),
+        *(view.viewmat, view.K, view.width, view.height),
+        absgrad=True,
+        render_depth=True,
+        backend=REFERENCE,
+    )
+    if shown.info["means2d"].requires_grad:
+        shown.info["means2d"].retain_grad()
+    return shown
+
+
+def loss_of(shown: Any, rank: int) -> Tensor:
+    weights = torch.randn(shown.colors.shape, generator=torch.Generator().manual_seed(rank), dtype=torch.float64)
+    return (shown.colors * weights).mean() + shown.depth.mean() + shown.alpha.square().mean()
+
+
+def state_of(field: Field, **running: Any) -> FieldState:
+    """A field in training whose moments say to which row they belong."""
+    state = FieldState(field, torch.nn.ModuleDict(), densification=running, densify_until=10)
+    state.pruning = {"pruned_at": -1, "num_prunes": 0, "peak": 0}
+    state.optimizers = {}
+    for name, value in field.items():
+        rows = torch.arange(len(value)).double().reshape(-1, *[1] * (value.ndim - 1)).expand_as(value).clone()
+        state.optimizers[name] = torch.optim.Adam([value])
+        state.optimizers[name].state[value] = {"step": torch.tensor(7.0), "exp_avg": rows, "exp_avg_sq": rows + 0.5}
+    return state
+
+
+def check_drawing(rank: int) -> None:
+    """Images, gradients and statistics of two ranks are those of one process for both images."""
+    for behind in (False, True):  # then rank 1 sees nothing, and takes part
+        start, end = ((0, 60), (60, N))[rank]
+        source = ShardedField(field_of(gaussians(), start, end))
+        views = [camera(0), camera(1, behind=behind)]
+        shown = draw(source, views[rank])
+        assert (source.sizes, source.total) == ([60, 30], N)
+        loss_of(shown, rank).backward()
+        state = state_of(source.field, grad2d=None, count=None, radii=None)
+        state.info = {**shown.info, "radii": shown.radii[None]}
+        source.count_views(state, absgrad=True)
+
+        whole = LocalField(field_of(gaussians()))
+        both = [draw(whole, view) for view in views]
+        (sum(loss_of(image, index) for index, image in enumerate(both)) / RANKS).backward()  # type: ignore[union-attr]
+        for image in ("colors", "depth", "alpha"):
+            torch.testing.assert_close(getattr(shown, image), getattr(both[rank], image), rtol=0, atol=1e-14)
+        for name, value in whole.field.items():
+            assert value.grad is not None
+            torch.testing.assert_close(source.field[name].grad, value.grad[start:end], rtol=1e-10, atol=1e-14)
+        norms, counts, radii = torch.zeros(3, N, dtype=torch.float64)
+        for image, view in zip(both, views):
+            halves = torch.tensor([view.width / 2, view.height / 2]).double()
+            # The mean of two losses has half the gradient of each, and statistics are of each.
+            norms += (image.info["means2d"].absgrad[0] * halves * RANKS).norm(dim=-1) * (image.radii > 0)
+            counts += image.radii > 0
+            radii = radii.maximum(image.radii.double() / max(view.width, view.height))
+        for name, expected in (("grad2d", norms), ("count", counts), ("radii", radii)):
+            found = state.densification[name]
+            torch.testing.assert_close(found, expected[start:end].float(), rtol=1e-6, atol=1e-8)
+
+
+class Halving(Extension):
+    """Keeps every second Gaussian once."""
+
+    name = "halving"
+    done = False
+    calls = 0
+
+    def needs_all(self, run: Any) -> bool:
+        return not self.done
+
+    def after_step(self, run: Any) -> None:
+        self.calls += 1
+        if not self.done:
+            state, mask = run.state, torch.arange(N) % 2 == 0
+            keep(state.field.data, state.optimizers, [state.densification], mask)
+            state.pruning["num_prunes"] = 1
+        self.done = True
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"done": self.done}
+
+    def load_state_dict(self, state: Any, saved: Any) -> None:
+        self.done = saved["done"]
+
+
+def shared(rank: int, state: FieldState) -> tuple[Ranks, Any]:
+    ranks, model = Ranks(rank, RANKS), SimpleNamespace(state=state, extensions=[], source=LocalField(state.field))
+    model.device = torch.device("cpu")
+    optimizers: Any = SimpleNamespace(parameters={})
+    ranks.share(model, SimpleNamespace(rank=0), optimizers)
+    assert all(held[0] is state.field[name] for name, held in optimizers.parameters.items())
+    return ranks, model
+
+
+def check_gathering(rank: int) -> None:
+    """A prune by the first rank: rows move with their moments and statistics, in order; notes are shared."""
+    values = gaussians() if rank == 0 else {name: value + 1 for name, value in gaussians().items()}
+    state = state_of(field_of(values), grad2d=torch.arange(N), radii=None, peak=40 + rank)
+    ranks, model = shared(rank, state)
+    assert model.source.sizes == [45, 45]
+    state.trained_focal = (None, (30.0, 50.0))[rank]
+    halving = Halving()
+    ranks.after_step(halving, SimpleNamespace(state=state))
+    assert (halving.done, halving.calls) == (True, 1)
+    own = torch.arange(0, N, 2)[:22] if rank == 0 else torch.arange(0, N, 2)[22:]
+    assert torch.equal(state.densification["grad2d"], own)
+    for name, value in state.field.items():
+        assert torch.equal(value, gaussians()[name][own]), name
+        moments = state.optimizers[name].state[value]
+        assert torch.equal(moments["exp_avg"].flatten(1)[:, 0].long(), own)
+        assert torch.equal(moments["exp_avg_sq"].flatten(1)[:, 0], own + 0.5)
+        assert (float(moments["step"]), len(state.optimizers[name].state)) == (7, 1)
+    assert (state.pruning["peak"], state.pruning["num_prunes"], state.trained_focal) == (81, 1, (30.0, 50.0))
+    assert (model.source.total, model.source.sizes) == (45, [22, 23])
+    with ranks.whole() as first, ranks.whole() as again:  # a save during a prune
+        assert first == again == (rank == 0)
+        assert model.source.total == (45 if first else 23)
+        if first:
+            assert torch.equal(state.field["means"], gaussians()["means"][::2])
+
+
+def check_an_empty_shard(rank: int) -> None:
+    """Fewer Gaussians than ranks: a rank without any renders those of the other, and takes a step."""
+    alone = LocalField(field_of(gaussians()))
+    seen = int(draw(alone, camera(0)).radii.argmax())
+    state = state_of(field_of(gaussians(), seen, seen + 1))
+    _, model = shared(rank, state)
+    assert model.source.sizes == [0, 1]
+    shown, expected = draw(model.source, camera(0)), LocalField(field_of(gaussians(), seen, seen + 1))
+    loss_of(shown, 0).backward()
+    loss_of(draw(expected, camera(0)), 0).backward()
+    for name, value in state.field.items():
+        if rank == 1:  # both ranks have the same image, so the mean is that of one
+            torch.testing.assert_close(value.grad, expected.field[name].grad, rtol=1e-10, atol=1e-14)
+        state.optimizers[name].step()
+
+
+def check_optimizers(rank: int) -> None:
+    """The head's gradients are averaged, Gaussians step by the scaled rate, and the groups keep their numbers."""
+    torch.manual_seed(0)
+    head = CompensationHead(HeadConfig(mode="residual", size="tiny")).to(memory_format=torch.channels_last)
+    means = Parameter(torch.zeros(4, 3))
+    config = {name: {"optimizer": FusedAdamConfig(lr=0.01), "scheduler": None} for name in ("compensation", "means")}
+    optimizers = BatchOptimizers(config, {"compensation": list(head.parameters()), "means": [means]})
+    gradients = []
+    for value in head.parameters():
+        gradients.append(torch.randn_like(value))
+        value.grad = gradients[-1] * (0.5 if rank == 0 else 1.5)
+    means.grad = torch.ones_like(means)
+    optimizers.optimizer_scaler_step_some(torch.amp.GradScaler(enabled=False), list(config))  # type: ignore[attr-defined]
+    for value, gradient in zip(head.parameters(), gradients):
+        torch.testing.assert_close(value.grad, gradient)
+    torch.testing.assert_close(means.detach(), torch.full_like(means, -0.01 * math.sqrt(RANKS)))
+    (group,) = optimizers.optimizers["means"].param_groups
+    assert (group["lr"], group["betas"]) == (0.01, (0.9, 0.999))
+
+
+def check_gains_of_photos(rank: int) -> None:
+    """All ranks divide photos by the same gains, from what both have measured."""
+    gains, run = begin()
+    gains.total = _summed
+    for index in range(rank, COUNT, 2):
+        gains.observe(image_of(index), image_of(index) * (1.3 if index % 3 else 1.0), None, batch_of(index))
+    update(gains, run)
+    state = gains.state_dict()
+    assert state["counts"].tolist() == [1] * COUNT
+    expected = torch.tensor([1.3 if index % 3 else 1.0 for index in range(COUNT)]).log()
+    torch.testing.assert_close(state["measured"].mean(dim=1).float(), expected, rtol=1e-4, atol=1e-4)
+    assert state["gains"].std() > 0.05
+
+
+def checks(_: Path) -> dict[str, Callable[[int], None]]:
+    """The checks of each rank, in this order."""
+    every = (check_drawing, check_gathering, check_an_empty_shard, check_optimizers, check_gains_of_photos)
+    return {check.__name__: check for check in every}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: Callable[[str, Path], None]) -> Path:
+    """Results of two ranks that ran all checks, once for all tests."""
+    folder = tmp_path_factory.mktemp("ranks")
+    run_ranks(__file__, folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", checks(Path()))
+def test_two_ranks(folder: Path, name: str, passed: Callable[[Path, str], None]) -> None:
+    passed(folder, name)
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    shape=st.sampled_from([(64, 48, 50.0, 32.0, 2.0), (300, 20, 20.0, -40.0, 6.0)]),
+)
+def test_all_rendered_gaussians_may_be_seen(seed: int, shape: tuple[int, int, float, float, float]) -> None:
+    """Centres all around a camera, some of them very near; sizes over four decades."""
+    width, height, focal, cx, most = shape
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.randn(4000, 3, generator=generator) * torch.rand(4000, 1, generator=generator).exp2().pow(3)
+    means[:500, 2] *= 0.01
+    quats, scales = torch.randn(4000, 4, generator=generator), torch.randn(4000, 3, generator=generator) * 1.5 - 3
+    K = torch.tensor([[focal, 0.0, cx], [0.0, 1.5 * focal, height / 2], [0.0, 0.0, 1.0]])
+    drawn = project(geometry(means, quats, scales.exp(), torch.eye(4), K, width, height)).radii > 0
+    away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    sizes = torch.tensor([[width, height]] * 2).float()
+    unseen, seen = may_be_seen(means, scales, torch.stack([away, torch.eye(4)]), K.expand(2, 3, 3), sizes)
+    assert not (drawn & unseen).any()  # one camera does not affect the other
+    assert not (drawn & ~seen).any()
+    # Looser bounds would send the whole field; these Gaussians are far larger and nearer than those of a scene.
+    assert 0 < seen.sum() < most * drawn.sum()
+
+
+def test_nan_depth_is_not_seen() -> None:
+    means = torch.tensor([[0.0, 0.0, 2.0], [torch.nan, 0.0, 2.0], [0.0, 0.0, torch.nan], [0.0, 0.0, 0.0]])
+    (seen,) = may_be_seen(
+        means, torch.full((4, 3), -2.3), torch.eye(4)[None], torch.eye(3)[None], torch.full((1, 2), 10.0)
+    )
+    assert seen.tolist()[0]
+    assert not seen[2:].any()

@@ -1,0 +1,313 @@
+"""Runs as packed scenes: what is stored, what is not, and headers with false claims."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import SceneBox
+from torch import Tensor
+
+from sundae_ns.core.errors import CheckpointError, DataError, PackError
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io import checkpoint
+from sundae_ns.io.pack.packed_scene import PackedScene
+from sundae_ns.plugin.datamanager import SundaeDatamanagerConfig
+from sundae_ns.plugin.finished_runs import (
+    _kept,
+    _seconds,
+    datamanager_of,
+    describe_capture,
+    load_run,
+    model_of,
+    stated_capture,
+)
+from sundae_ns.scene.initialization import from_points
+from sundae_ns.scene.packing import contents_of, scene_of
+
+Json = dict[str, Any]
+
+
+def field(degree: int = 1, features: int = 5) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(60, 3, generator=generator) - 0.5
+    made = from_points(points, points + 0.5, sh_degree=degree, num_features=features, generator=generator)
+    made["features_rest"] = 0.1 * torch.randn(60, (degree + 1) ** 2 - 1, 3, generator=generator)
+    return made
+
+
+def head() -> dict[str, Tensor]:
+    torch.manual_seed(1)
+    state = CompensationHead(HeadConfig(size="tiny", num_features=5)).state_dict()
+    return {name: value + 0.05 * torch.randn_like(value) for name, value in state.items()}
+
+
+def cameras(n: int = 3) -> dict[str, Tensor]:
+    pose = torch.eye(4)[:3]
+    pose[2, 3] = 2.0
+    poses = pose.repeat(n, 1, 1)
+    poses[:, 0, 3] = torch.arange(n) / 10
+    return {
+        "poses": poses,
+        "intrinsics": torch.tensor([[40.5, 41.0, 20.0, 16.0]]).double().repeat(n, 1),
+        "sizes": torch.tensor([[40, 32]]).repeat(n, 1),
+    }
+
+
+def meta() -> Json:
+    return {
+        "source": {"method": "sundae", "step": 30000},
+        "model": {
+            "sh_degree": 2,
+            "rasterize_mode": "antialiased",
+            "background_color": "white",
+            "head": {"mode": "residual", "size": "tiny", "pixel_unshuffle": 2, "num_features": 5, "precision": "bf16"},
+            "trained_focal": [40.0, 41.0],
+        },
+        "frame": {"transform": torch.eye(4)[:3].tolist(), "scale": 0.5},
+        "capture": {"parser": "colmap", "options": {"colmap_path": "sparse/0"}, "scale": 1.0},
+    }
+
+
+def scene() -> PackedScene:
+    return PackedScene(field(), head(), cameras(), meta())
+
+
+def test_a_packed_scene_becomes_a_model() -> None:
+    truth = scene()
+    model = model_of(scene_of(truth))
+    found = {name: value.detach() for name, value in model.gauss_params.items()}
+    assert torch.equal(found.pop("features_rest")[:, :3], truth.field["features_rest"])
+    assert all(torch.equal(value, truth.field[name]) for name, value in found.items())
+    assert model.head is not None
+    assert all(torch.equal(value, truth.head[name]) for name, value in model.head.state_dict().items())
+    assert model.state.head_enabled
+    assert model.state.trained_focal == (40.0, 41.0)
+    assert (model.config.rasterize_mode, model.config.background_color) == ("antialiased", "white")
+
+
+@pytest.mark.parametrize("parser", ["colmap", "nerfstudio-data"])
+@pytest.mark.parametrize("kind", ["missing", "empty", "images"])
+def test_a_folder_without_a_capture_is_refused(tmp_path: Path, kind: str, parser: str) -> None:
+    capture = tmp_path / "capture"
+    if kind != "missing":
+        capture.mkdir()
+    if kind == "images":
+        (capture / "a.jpg").touch()
+    found = scene()
+    found.meta["capture"] = {"parser": parser, "options": {}, "scale": 1.0}
+    with pytest.raises(DataError, match=str(capture)):
+        datamanager_of(scene_of(found), capture)
+
+
+LIES: dict[str, Json] = {
+    "no model": {"model": None},
+    "a model of text": {"model": "yes"},
+    "a huge degree": {"model": {"sh_degree": 10**6}},
+    "a true degree": {"model": {"sh_degree": True}},
+    "too low a degree": {"model": {"sh_degree": 0}},
+    "a strange rasteriser": {"model": {"rasterize_mode": "os.system"}},
+    "a list for a colour": {"model": {"background_color": ["white"]}},
+    "another head": {"model": {"head": {"size": "regular"}}},
+    "no head": {"model": {"head": None}},
+    "a head of text": {"model": {"head": "residual"}},
+    "a head that is off": {"model": {"head": {"mode": "off"}}},
+    "a huge head": {"model": {"head": {"pixel_unshuffle": 10**6}}},
+    "features of another number": {"model": {"head": {"num_features": 6}}},
+    "a head with more": {"model": {"head": {"_target": "os.system"}}},
+    "negative focal lengths": {"model": {"trained_focal": [-1.0, 2.0]}},
+    "one focal length": {"model": {"trained_focal": [1.0]}},
+}
+
+
+def merged(base: Json, changes: Json) -> Json:
+    made = dict(base)
+    for name, value in changes.items():
+        both = isinstance(value, dict) and isinstance(base.get(name), dict)
+        made[name] = merged(base[name], value) if both else value
+    return made
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_headers_that_lie_are_refused(lie: str) -> None:
+    stated = merged(meta(), LIES[lie])
+    with pytest.raises(PackError):
+        scene_of(PackedScene(field(), head(), cameras(), stated))
+
+
+@pytest.mark.parametrize(
+    "parser",
+    [
+        ColmapDataParserConfig(colmap_path=Path("sparse/0"), downscale_factor=2, eval_mode="interval", eval_interval=5),
+        NerfstudioDataParserConfig(auto_scale_poses=False, scale_factor=0.5, center_method="focus"),
+        BlenderDataParserConfig(scale_factor=0.5),
+        BlenderDataParserConfig(alpha_color=None),
+    ],
+)
+def test_the_options_of_a_capture_survive(parser: Any) -> None:
+    if hasattr(parser, "load_3D_points"):
+        parser.load_3D_points = False
+    manager = SundaeDatamanagerConfig(dataparser=parser, camera_res_scale_factor=0.5)
+    found, scale = stated_capture(describe_capture(manager))
+    assert scale == 0.5
+    assert type(found) is type(parser)
+    assert vars(found) == vars(parser)
+
+
+def test_captures_that_are_not_described() -> None:
+    for parser in (
+        BlenderDataParserConfig(alpha_color="pink"),
+        ColmapDataParserConfig(images_path=Path("/elsewhere/images")),
+    ):
+        assert describe_capture(SundaeDatamanagerConfig(dataparser=parser)) is None
+    for stated in (None, {}, {"parser": "dnerf-data", "options": {}}, {"parser": "colmap", "options": None}):
+        with pytest.raises(PackError, match="how its capture is read"):
+            stated_capture(stated)
+    for scale in (0, 2, "1", None, float("nan")):
+        with pytest.raises(PackError, match="an impossible scale"):
+            stated_capture({"parser": "colmap", "options": {}, "scale": scale})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("images_path", "../../home"),
+        ("images_path", "/etc"),
+        ("images_path", "$(touch x)"),
+        ("images_path", "a;b"),
+        ("images_path", "a\n"),
+        ("images_path", 3),
+        ("eval_mode", "whatever"),
+        ("eval_mode", ["all"]),
+        ("downscale_factor", 0),
+        ("downscale_factor", True),
+        ("scale_factor", float("nan")),
+        ("scale_factor", "1"),
+        ("auto_scale_poses", 1),
+        ("eval_interval", 2.5),
+        ("_target", "os.system"),
+        ("data", "/etc"),
+        ("masks_path", None),
+    ],
+)
+def test_impossible_options_of_a_capture(name: str, value: Any) -> None:
+    with pytest.raises(PackError, match="an impossible option"):
+        stated_capture({"parser": "colmap", "options": {name: value}, "scale": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("alpha_color", "pink"), ("alpha_color", ["white"]), ("ply_path", "a.ply")]
+)
+def test_impossible_options_of_a_capture_of_blender(name: str, value: Any) -> None:
+    with pytest.raises(PackError, match="an impossible option"):
+        stated_capture({"parser": "blender-data", "options": {name: value}, "scale": 1.0})
+
+
+# ------------------------------------------------------------------------------------------------------- runs to pack
+
+
+def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path, dict[str, Tensor]]:
+    """The folder of a run at a step, as ns-train writes it, without the training."""
+    config = copy.deepcopy(all_methods[method])
+    for name, value in model.items():
+        setattr(config.pipeline.model, name, value)
+    truth = field(degree=2, features=0 if method == "splatfacto" else 5)
+    state: Json = {f"gauss_params.{name}": value for name, value in truth.items()}
+    state["device_indicator_param"] = torch.zeros(0)
+    if method != "splatfacto":
+        made = config.pipeline.model.setup(
+            scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
+            num_train_data=0,
+            metadata={},
+            seed_points=(torch.rand(5, 3), torch.rand(5, 3)),
+        )
+        made.step = step
+        state = made.state_dict() | state
+        state["_extra_state"] = made.get_extra_state()
+        state |= {name: value + 0.01 for name, value in state.items() if name.startswith("networks.head.")}
+    # Stock nerfstudio saves these beside the model.
+    state["lpips.net.weight"] = torch.zeros(3)
+    state["camera_optimizer.pose_adjustment"] = torch.zeros(7, 6)
+    folder.mkdir()
+    (folder / "config.yml").write_text(yaml.dump(config))
+    (folder / "nerfstudio_models").mkdir()
+    saved = {"step": step, "pipeline": {f"_model.{name}": value for name, value in state.items()}}
+    checkpoint.write(saved, folder / "nerfstudio_models" / f"step-{step:09d}.ckpt")
+    return folder, truth
+
+
+def test_a_packed_run_holds_what_its_images_need(tmp_path: Path) -> None:
+    run, truth = run_folder(tmp_path / "run", "sundae-tiny", 1100)
+    found = contents_of(load_run(run, max_cameras=0))
+    assert set(found.field) == set(truth)
+    assert all(torch.equal(found.field[name], truth[name]) for name in truth)
+    assert found.head
+    assert found.cameras is None
+    assert found.meta["source"] == {"method": "sundae-tiny", "step": 1100}
+    assert found.meta["model"]["head"]["size"] == "tiny"
+    # No path of the machine that trained it.
+    assert str(tmp_path) not in str(found.meta)
+    assert contents_of(load_run(run / "config.yml", max_cameras=0)).meta == found.meta
+
+
+def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path: Path) -> None:
+    run, truth = run_folder(tmp_path / "run", "sundae-tiny", 30, sh_degree_interval=20)
+    found = contents_of(load_run(run, max_cameras=0))
+    assert found.head == {}
+    assert "features" not in found.field
+    assert torch.equal(found.field["features_rest"], truth["features_rest"][:, :3])
+    assert model_of(scene_of(found)).config.sh_degree == 1
+
+
+def test_a_run_of_splatfacto(tmp_path: Path) -> None:
+    run, truth = run_folder(tmp_path / "run", "splatfacto", 29999, sh_degree=2, rasterize_mode="antialiased")
+    found = contents_of(load_run(run, max_cameras=0))
+    assert found.head == {}
+    assert all(torch.equal(found.field[name], truth[name]) for name in truth)
+    assert found.meta["model"]["rasterize_mode"] == "antialiased"
+
+
+def test_runs_that_cannot_be_packed(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        contents_of(load_run(tmp_path / "nothing"))
+    (tmp_path / "config.yml").write_text("a: [1")
+    with pytest.raises(CheckpointError, match=r"is not a run's config\.yml"):
+        contents_of(load_run(tmp_path))
+    (tmp_path / "config.yml").write_text(yaml.dump(all_methods["nerfacto"]))
+    with pytest.raises(CheckpointError, match="without Gaussians"):
+        contents_of(load_run(tmp_path))
+    run, _ = run_folder(tmp_path / "run", "sundae-tiny", 30)
+    with pytest.raises(DataError):
+        contents_of(load_run(run))  # its capture is missing
+    (run / "nerfstudio_models" / "step-000000030.ckpt").write_bytes(b"PK")
+    with pytest.raises(CheckpointError, match="no whole checkpoint"):
+        contents_of(load_run(run, max_cameras=0))
+
+
+@pytest.mark.parametrize(
+    ("prunes", "kept"),
+    [
+        ([{"before": 200, "after": 60}], 0.3),  # one-shot
+        ([{"before": 100, "after": 50}, {"before": 80, "after": 40}], 0.25),  # continuous: the field grows in between
+        ([], None),
+        ([{"before": 100, "after": 50}, {"after": 40}], None),
+        ([{"before": 0, "after": 0}], None),
+        ([{"before": "many", "after": 1}], None),
+    ],
+)
+def test_the_share_is_the_kept_over_all_prunes(prunes: list[dict[str, Any]], kept: float | None) -> None:
+    assert _kept(prunes) == (None if kept is None else pytest.approx(kept))
+
+
+def test_seconds_are_summed() -> None:
+    assert _seconds([{"seconds": 1}, {"seconds": 0.5}]) == 1.5
+    assert _seconds([{"seconds": 1}, {}]) is None
+    assert _seconds([]) is None

@@ -1,0 +1,371 @@
+"""Where a capture's cameras and points stand: strays, survey coordinates and scales leave the scene as it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from colmap_models import write_model
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from plyfile import PlyData, PlyElement
+
+from sundae_ns.core.errors import DataError
+from sundae_ns.plugin.camera_models import other_frame
+from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanagerConfig
+from sundae_ns.plugin.finished_runs import datamanager_of, describe_capture
+from sundae_ns.scene.cameras import views_of
+from sundae_ns.scene.scene import Scene
+
+Load = Callable[..., Any]
+Edit = Callable[..., None]
+SURVEY = np.array([431_250.25, 5_412_330.5, 212.125])
+"""Coordinates of a place in UTM, metres."""
+
+
+def meta_of(data: Path) -> dict[str, Any]:
+    meta: dict[str, Any] = json.loads((data / "transforms.json").read_text())
+    return meta
+
+
+def moved(data: Path, offset: np.ndarray, edit: Edit) -> None:
+    """Shift cameras and cloud, with double numbers."""
+    frames = meta_of(data)["frames"]
+    for frame in frames:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += offset
+        frame["transform_matrix"] = pose.tolist()
+    edit(data, frames=frames)
+    vertex = PlyData.read(str(data / "sparse_pc.ply"))["vertex"].data
+    wide = vertex.astype([(name, "f8" if name in "xyz" else kind) for name, kind in vertex.dtype.descr])
+    for axis, shift in zip("xyz", offset, strict=True):
+        wide[axis] += shift
+    PlyData([PlyElement.describe(wide, "vertex")]).write(str(data / "sparse_pc.ply"))
+
+
+def stray(data: Path, times: float, edit: Edit, *, index: int = 4) -> str:
+    """Put one training camera so many times as far from the middle; returns its image's name."""
+    meta = meta_of(data)
+    centres = np.array([np.array(frame["transform_matrix"])[:3, 3] for frame in meta["frames"]])
+    middle = np.median(centres, axis=0)
+    frame = meta["frames"][index]
+    pose = np.array(frame["transform_matrix"])
+    away = (pose[:3, 3] - middle) / np.linalg.norm(pose[:3, 3] - middle)
+    pose[:3, 3] = middle + times * np.median(np.linalg.norm(centres - middle, axis=1)) * away
+    frame["transform_matrix"] = pose.tolist()
+    edit(data, frames=meta["frames"])
+    return Path(frame["file_path"]).name
+
+
+def without(data: Path, index: int, edit: Edit) -> None:
+    meta = meta_of(data)
+    name = meta["frames"].pop(index)["file_path"]
+    lists = {key: [file for file in meta[key] if file != name] for key in meta if key.endswith("_filenames")}
+    edit(data, frames=meta["frames"], **lists)
+
+
+def cameras_by_name(made: Any) -> dict[str, Any]:
+    names = [path.name for path in made.train_dataset.image_filenames]
+    return dict(zip(names, made.train_dataset.cameras.camera_to_worlds, strict=True))
+
+
+def points_of(made: Any) -> torch.Tensor:
+    points: torch.Tensor = made.train_dataparser_outputs.metadata["points3D_xyz"]
+    return points
+
+
+@pytest.mark.parametrize("times", [20.0, 100.0, 3000.0, 1e9])
+def test_a_stray_camera_does_not_shrink_the_scene(
+    capture: Path, tmp_path: Path, load: Load, edit: Edit, capsys: Any, times: float
+) -> None:
+    name = stray(capture, times, edit)
+    made = load(capture)
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"the camera of {name} is " in said
+    without(capture, 4, edit)
+    alone = load(capture)
+    assert "times as far away" not in capsys.readouterr().out
+    found, expected = cameras_by_name(made), cameras_by_name(alone)
+    assert found.keys() - expected.keys() == {name}
+    for other, pose in expected.items():
+        torch.testing.assert_close(found[other], pose, atol=2e-6, rtol=0)
+    torch.testing.assert_close(points_of(made), points_of(alone), atol=2e-6, rtol=0)
+    # The transform that the run states is the one of its cameras.
+    transform, scale = made.train_dataset.metadata[DATASET_FRAME]
+    torch.testing.assert_close(transform, alone.train_dataset.metadata[DATASET_FRAME][0], atol=2e-6, rtol=0)
+    assert scale == pytest.approx(alone.train_dataset.metadata[DATASET_FRAME][1], rel=1e-6)
+    assert float(found[name][:, 3].norm()) > 0.5 * times
+
+
+def test_a_stray_test_view_is_named(capture: Path, load: Load, edit: Edit, capsys: Any) -> None:
+    held_out = {Path(name).name for name in meta_of(capture)["val_filenames"]}
+    name = stray(capture, 100.0, edit, index=3)
+    assert name in held_out
+    made = load(capture)
+    assert f"the camera of {name}, a test view, stands far from all others (1 of 2 do)" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    assert float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].abs().max()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_earlier_runs_keep_the_frame_that_they_were_trained_in(capture: Path, load: Load, edit: Edit) -> None:
+    stray(capture, 100.0, edit)
+    made = load(capture, robust=False)
+    everywhere = made.train_dataset.cameras.camera_to_worlds[:, :, 3]
+    assert float(everywhere.abs().max()) == pytest.approx(1.0)  # as nerfstudio scales
+    assert float(everywhere.norm(dim=1).median()) < 0.2
+
+
+def test_a_run_that_is_resumed_in_other_coordinates_is_named(
+    capture: Path, load: Load, edit: Edit, tmp_path: Path
+) -> None:
+    stray(capture, 100.0, edit)
+    before = load(capture, robust=False).train_dataparser_outputs
+    before.save_dataparser_transform(tmp_path / "run" / "dataparser_transforms.json")
+    assert other_frame(tmp_path / "run", before.dataparser_transform, before.dataparser_scale) is None
+    now = load(capture).train_dataparser_outputs
+    said = other_frame(tmp_path / "run", now.dataparser_transform, now.dataparser_scale)
+    assert said is not None
+    assert "resume it with --pipeline.datamanager.robust-frame False" in said
+    assert other_frame(tmp_path / "none", now.dataparser_transform, now.dataparser_scale) is None
+
+
+@pytest.mark.parametrize("offset", [np.zeros(3), SURVEY])
+@pytest.mark.parametrize("times", [1.0, 300.0])
+def test_cameras_of_a_capture_in_the_coordinates_of_a_run(
+    capture: Path, load: Load, edit: Edit, tmp_path: Path, times: float, offset: np.ndarray
+) -> None:
+    """``views_of`` finds them by the transform that the run states."""
+    if times > 1:
+        stray(capture, times, edit)
+    moved(capture, offset, edit)
+    made = load(capture)
+    outputs = made.train_dataparser_outputs
+    frame = {"transform": outputs.dataparser_transform.tolist(), "scale": outputs.dataparser_scale}
+    points = torch.zeros(3, 3)
+    scene = Scene.from_points(points, points)
+    scene = replace(scene, in_model_frame=True, meta={"frame": json.loads(json.dumps(frame))})
+    seen = {tuple(view.center.tolist()) for view in views_of(capture, scene)}
+    nearest = torch.cdist(made.train_dataset.cameras.camera_to_worlds[:, :, 3], torch.tensor(sorted(seen)))
+    limit = 1e-5 * max(1.0, float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].abs().max()))
+    assert float(nearest.min(dim=1).values.max()) < limit
+
+
+def test_a_packed_scene_is_measured_in_the_frame_of_its_training(capture: Path, edit: Edit) -> None:
+    stray(capture, 100.0, edit)
+    parser = NerfstudioDataParserConfig(load_3D_points=True)
+    places = {}
+    for robust in (True, False):
+        manager = SundaeDatamanagerConfig(data=capture, dataparser=parser, robust_frame=robust)
+        stated = json.loads(json.dumps(describe_capture(manager)))
+        again = datamanager_of(SimpleNamespace(meta={"capture": stated}), capture)  # type: ignore[arg-type]
+        assert again.robust_frame is robust
+        made = again.setup(device="cpu", test_mode="test").train_dataset.cameras.camera_to_worlds
+        places[robust] = float(made[:, :, 3].norm(dim=1).median())
+    assert places[True] > 5 * places[False]
+
+
+@pytest.mark.parametrize("scale", [0.01, 7.5])
+def test_a_scale_in_the_rotations_is_none_of_the_cameras(
+    capture: Path, still_life: Path, load: Load, edit: Edit, scale: float
+) -> None:
+    frames = meta_of(capture)["frames"]
+    for frame in frames:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, :3] *= scale
+        frame["transform_matrix"] = pose.tolist()
+    edit(capture, frames=frames)
+    found, expected = (load(data).train_dataset.cameras.camera_to_worlds for data in (capture, still_life))
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(views_of(capture)[2].viewmat, views_of(still_life)[2].viewmat, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("change", [{(0, 0): 2.0}, {(0, 1): 0.5}], ids=["stretched", "sheared"])
+def test_axes_that_are_no_rotation_are_refused(
+    capture: Path, load: Load, edit: Edit, change: dict[tuple[int, int], float]
+) -> None:
+    frames = meta_of(capture)["frames"]
+    spoilt = np.eye(4)
+    for place, value in change.items():
+        spoilt[place] = value
+    frames[1]["transform_matrix"] = (np.array(frames[1]["transform_matrix"]) @ spoilt).tolist()
+    edit(capture, frames=frames)
+    with pytest.raises(DataError, match="frame 1 .*its first three columns are not a rotation"):
+        load(capture)
+
+
+def test_a_panorama_with_one_step_aside_keeps_its_scale(capture: Path, load: Load, edit: Edit, capsys: Any) -> None:
+    """All cameras but one stand within centimetres; the points are as far as that one, so it is no stray."""
+    meta = meta_of(capture)
+    rng = np.random.default_rng(0)
+    for index, frame in enumerate(meta["frames"]):
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] = 0.01 * rng.standard_normal(3) + (np.array([2.0, 0, 0]) if index == 4 else 0)
+        frame["transform_matrix"] = pose.tolist()
+    edit(capture, frames=meta["frames"])
+    made = load(capture)
+    assert float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].abs().max()) == pytest.approx(1.0, abs=1e-3)
+    assert "times as far away" not in capsys.readouterr().out
+
+
+def test_survey_coordinates_train_as_those_near_the_origin(
+    capture: Path, still_life: Path, load: Load, edit: Edit
+) -> None:
+    near = load(still_life)
+    moved(capture, SURVEY, edit)
+    far = load(capture)
+    own, theirs = near.train_dataset.cameras, far.train_dataset.cameras
+    torch.testing.assert_close(theirs.camera_to_worlds, own.camera_to_worlds, atol=1e-6, rtol=0)
+    torch.testing.assert_close(points_of(far), points_of(near), atol=2e-6, rtol=0)
+    assert points_of(far).dtype == theirs.camera_to_worlds.dtype == torch.float32
+
+
+@pytest.mark.parametrize("applied", [None, [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]])
+def test_survey_coordinates_come_back_from_the_transform_of_a_run(
+    capture: Path, load: Load, edit: Edit, tmp_path: Path, applied: Any
+) -> None:
+    moved(capture, SURVEY, edit)
+    edit(capture, applied_transform=applied)
+    outputs = load(capture).train_dataparser_outputs
+    outputs.save_dataparser_transform(tmp_path / "run" / "dataparser_transforms.json")
+    stated = json.loads((tmp_path / "run" / "dataparser_transforms.json").read_text())
+    transform = np.array(stated["transform"])
+    meta = meta_of(capture)
+    poses = {Path(frame["file_path"]).name: np.array(frame["transform_matrix"]) for frame in meta["frames"]}
+    centres = outputs.cameras.camera_to_worlds[:, :, 3].double().numpy() / stated["scale"]
+    original = np.linalg.solve(transform[:, :3], (centres - transform[:, 3]).T).T
+    axes = np.eye(3) if applied is None else np.array(applied, dtype=float)[:, :3]
+    expected = [np.linalg.solve(axes, poses[path.name][:3, 3]) for path in outputs.image_filenames]
+    np.testing.assert_allclose(original, expected, atol=1e-5)  # metres; float32 has steps of 0.5
+    again = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds, camera_convention="opengl")
+    np.testing.assert_allclose(again[:, :, 3].numpy(), expected, atol=1e-5)
+
+
+def test_survey_coordinates_that_shall_not_be_centred_are_refused(capture: Path, load: Load, edit: Edit) -> None:
+    moved(capture, SURVEY, edit)
+    with pytest.raises(
+        DataError, match=r"stand 5\.41e\+06 from the origin.* 0\.5 apart; leave out --center-method none"
+    ):
+        load(capture, center_method="none")
+
+
+def test_a_cloud_that_was_rounded_before_is_named(capture: Path, load: Load, edit: Edit, capsys: Any) -> None:
+    moved(capture, SURVEY, edit)
+    load(capture)
+    assert "sparse_pc.ply has float32 coordinates" not in capsys.readouterr().out
+    vertex = PlyData.read(str(capture / "sparse_pc.ply"))["vertex"].data
+    narrow = vertex.astype([(name, "f4" if name in "xyz" else kind) for name, kind in vertex.dtype.descr])
+    PlyData([PlyElement.describe(narrow, "vertex")]).write(str(capture / "sparse_pc.ply"))
+    load(capture)
+    assert "sparse_pc.ply has float32 coordinates that are 0.5 apart" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("axes", [True, False])
+def test_a_colmap_model_in_survey_coordinates(capture: Path, load: Load, axes: bool) -> None:
+    names = sorted(path.name for path in (capture / "images").iterdir())
+    write_model(capture / "sparse" / "0", names, (24, 24))
+    options: dict[str, Any] = {"assume_colmap_world_coordinate_convention": axes}
+    near = load(capture, colmap="sparse/0", **options)
+    write_model(capture / "sparse" / "0", names, (24, 24), origin=tuple(SURVEY))
+    far = load(capture, colmap="sparse/0", **options)
+    expected = near.train_dataset.cameras.camera_to_worlds
+    torch.testing.assert_close(far.train_dataset.cameras.camera_to_worlds, expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(points_of(far), points_of(near), atol=1e-6, rtol=0)
+    transform, scale = far.train_dataset.metadata[DATASET_FRAME]
+    point = scale * (transform[:, :3] @ torch.from_numpy(SURVEY + [0.1, 0.2, 0.3]) + transform[:, 3])
+    torch.testing.assert_close(point, points_of(near)[1].double(), atol=1e-6, rtol=0)
+
+
+def test_a_stray_camera_of_a_colmap_model(capture: Path, load: Load) -> None:
+    names = sorted(path.name for path in (capture / "images").iterdir())
+    write_model(capture / "sparse" / "0", names, (24, 24))
+    usual = load(capture, colmap="sparse/0")
+    write_model(capture / "sparse" / "0", names, (24, 24), stray=(5, 4000.0))
+    made = load(capture, colmap="sparse/0")
+    assert float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].norm(dim=1).median()) > 0.3
+    assert float(points_of(made).abs().max()) > 0.2 * float(points_of(usual).abs().max())
+
+
+def cloud_of(made: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    metadata = made.train_dataparser_outputs.metadata
+    return metadata["points3D_xyz"], metadata["points3D_rgb"]
+
+
+@pytest.mark.parametrize("scale", [0.1, 25.0])
+def test_applied_scale_leaves_the_cloud_beside_its_cameras(capture: Path, load: Load, edit: Edit, scale: float) -> None:
+    plain = load(capture)
+    edit(capture, applied_scale=scale)
+    made = load(capture)
+    torch.testing.assert_close(cloud_of(made)[0], cloud_of(plain)[0], atol=1e-6, rtol=0)
+    # Original coordinates times applied_scale are those of the file.
+    transform, factor = made.train_dataset.metadata[DATASET_FRAME]
+    vertex = PlyData.read(str(capture / "sparse_pc.ply"))["vertex"].data
+    original = torch.tensor([[float(vertex[axis][i]) for axis in "xyz"] for i in range(5)]) / scale
+    moved = factor * (original @ transform[:, :3].T + transform[:, 3])
+    torch.testing.assert_close(moved, cloud_of(plain)[0][:5], atol=1e-5, rtol=0)
+
+
+def test_colours_of_a_cloud_reach_the_model(capture: Path, load: Load) -> None:
+    _, expected = cloud_of(load(capture))
+    vertex = PlyData.read(str(capture / "sparse_pc.ply"))["vertex"].data
+    kinds = [
+        ("x", "f4"),
+        ("y", "f4"),
+        ("z", "f4"),
+        ("diffuse_red", "f4"),
+        ("diffuse_green", "f4"),
+        ("diffuse_blue", "f4"),
+    ]
+    names = ("x", "y", "z", "red", "green", "blue")
+    rows = np.array([tuple(float(row[name]) for name in names) for row in vertex], dtype=kinds)
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(capture / "sparse_pc.ply"))
+    assert torch.equal(cloud_of(load(capture))[1], expected)
+
+
+def test_a_cloud_that_the_views_do_not_show_is_named(capture: Path, load: Load, capsys: Any) -> None:
+    load(capture)
+    assert "show no point" not in capsys.readouterr().out
+    path = capture / "sparse_pc.ply"
+    cloud = PlyData.read(str(path), mmap=False)
+    cloud["vertex"]["x"] += 50
+    cloud.write(str(path))
+    load(capture)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "views show no point of the sparse cloud, so cloud and cameras are probably in different coordinates" in said
+
+
+def test_an_old_capture_takes_the_cloud_of_its_colmap_model(capture: Path, load: Load, edit: Edit) -> None:
+    """Made before ns-process-data wrote clouds; nerfstudio asks, and writes into the capture."""
+    (capture / "sparse_pc.ply").unlink()
+    edit(capture, ply_file_path=None)
+    write_model(capture / "colmap" / "sparse" / "0", [f"{index}.png" for index in range(4)], (24, 24))
+    before = (capture / "transforms.json").read_bytes()
+    made = load(capture)
+    points, colours = cloud_of(made)
+    assert colours.tolist() == [[10, 20, 30]] * 4
+    # The axes that these versions turned: x and y swapped, z negated.
+    saved = torch.tensor([[0.2, 0.1 * index, -0.3] for index in range(4)])
+    meta = json.loads(before)
+    pose = torch.tensor(meta["frames"][0]["transform_matrix"])
+    outputs = made.train_dataparser_outputs
+    turned = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    rotation = outputs.dataparser_transform[:, :3] @ turned
+    expected = outputs.dataparser_scale * (saved @ rotation.T + outputs.dataparser_transform[:, 3])
+    torch.testing.assert_close(points, expected, atol=1e-6, rtol=0)
+    centre = outputs.dataparser_scale * (rotation @ pose[:3, 3] + outputs.dataparser_transform[:, 3])
+    distances = (outputs.cameras.camera_to_worlds[:, :, 3] - centre).norm(dim=1)
+    assert float(distances.min()) < 1e-5
+    assert (capture / "transforms.json").read_bytes() == before
+    assert not (capture / "sparse_pc.ply").exists()
+
+
+def test_an_old_capture_without_points_starts_without_them(capture: Path, load: Load, edit: Edit) -> None:
+    (capture / "colmap" / "sparse" / "0").mkdir(parents=True)
+    edit(capture, ply_file_path=None)
+    assert "points3D_xyz" not in load(capture).train_dataparser_outputs.metadata

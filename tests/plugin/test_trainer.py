@@ -1,0 +1,366 @@
+"""Saving and finding checkpoints: whole ones only, and a full disk costs none."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import re
+import subprocess
+import sys
+import zipfile
+from copy import deepcopy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import forked
+import numpy as np
+import pytest
+import torch
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+
+from harness.still_life import write_still_life
+from sundae_ns import method_configs
+from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, StorageError
+from sundae_ns.io import checkpoint
+from sundae_ns.io.checkpoint import random_state, set_random_state
+from sundae_ns.io.config_file import load_config
+from sundae_ns.method_configs import sundae_tiny
+from sundae_ns.plugin.trainer import SundaeTrainer, SundaeTrainerConfig
+from sundae_ns.train.progress import Interruption
+from sundae_ns.train.schedules import set_schedule
+
+
+def state(step: int, n: int = 50) -> dict[str, Any]:
+    return {"step": step, "pipeline": {"_model.gauss_params.means": torch.full((n, 3), float(step))}}
+
+
+def name(step: int) -> str:
+    return f"step-{step:09d}.ckpt"
+
+
+def saved(folder: Path, *steps: int) -> None:
+    for step in steps:
+        checkpoint.write(state(step), folder / name(step))
+
+
+def test_what_is_saved_is_loaded_and_the_newest_is_by_step(tmp_path: Path) -> None:
+    models = tmp_path / "nerfstudio_models"
+    saved(models, 999, 1_000_000_000)
+    (models / "step-best.ckpt").write_text("a user's own file")
+    for folder in (tmp_path, models):
+        assert checkpoint.newest_whole(folder) == (models / name(1_000_000_000), [])
+        assert checkpoint.newest_step(folder) == 1_000_000_000
+        assert checkpoint.folder_of(folder) == models
+    loaded = checkpoint.read(models / name(999))
+    assert loaded["step"] == 999
+    assert torch.equal(loaded["pipeline"]["_model.gauss_params.means"], torch.full((50, 3), 999.0))
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def flip(path: Path) -> None:
+    """One bit of a tensor, which torch would load without a word."""
+    content = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        (entry,) = (entry for entry in archive.infolist() if entry.filename.endswith("data/0"))
+    content[entry.header_offset + 300] ^= 1
+    path.write_bytes(content)
+    torch.load(path, weights_only=True)
+
+
+@pytest.mark.parametrize("harm", [cut, empty, flip])
+def test_what_is_not_whole_is_passed_over(tmp_path: Path, harm: Any) -> None:
+    saved(tmp_path, 10, 20, 30)
+    harm(tmp_path / name(30))
+    path, passed_over = checkpoint.newest_whole(tmp_path)
+    assert path == tmp_path / name(20)
+    assert checkpoint.newest_step(tmp_path) == 20
+    (line,) = passed_over
+    assert name(30) in line
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        checkpoint.read(tmp_path / name(30))
+    for step in (10, 20):
+        harm(tmp_path / name(step))
+    with pytest.raises(CheckpointError, match="no whole checkpoint.*give the folder of a run") as caught:
+        checkpoint.newest_whole(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_full_disk_leaves_the_older_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved(tmp_path, 10)
+
+    def full(state: Any, file: Any) -> None:
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(StorageError, match=rf"disk is full; make room \({name(10)} is whole") as caught:
+        saved(tmp_path, 20)
+    assert "\n" not in str(caught.value)
+    assert os.listdir(tmp_path) == [name(10)]
+    assert checkpoint.newest_whole(tmp_path)[0] == tmp_path / name(10)
+
+
+def test_no_right_to_write_and_nothing_saved_before(tmp_path: Path) -> None:
+    (tmp_path / "models").write_text("a file where the folder should be")
+    with pytest.raises(StorageError, match="no older checkpoint"):
+        saved(tmp_path / "models", 10)
+
+
+def test_nerfstudio_finds_its_newest_beside_a_killed_save(tmp_path: Path) -> None:
+    """nerfstudio's own commands read a step off every name in the folder."""
+    saved(tmp_path, 10, 20)
+    killed = tmp_path / checkpoint._PARTIAL.format(os.getpid())
+    killed.write_bytes(b"half")
+    steps = sorted(int(x[x.find("-") + 1 : x.find(".")]) for x in os.listdir(tmp_path))
+    assert steps[-1] == 20
+    saved(tmp_path, 30)
+    assert sorted(os.listdir(tmp_path)) == [name(10), name(20), name(30)]
+
+
+def test_random_numbers_go_on_where_they_were_left(tmp_path: Path) -> None:
+    def draw() -> list[Any]:
+        return [random.random(), random.gauss(0, 1), np.random.rand(), np.random.randn(), torch.randn(3).tolist()]
+
+    draw()
+    checkpoint.write({**state(1), "random": random_state()}, tmp_path / name(1))
+    expected = draw()
+    assert draw() != expected
+    set_random_state(checkpoint.read(tmp_path / name(1))["random"])
+    assert draw() == expected
+
+
+def test_a_tensor_that_claims_more_than_it_has(tmp_path: Path) -> None:
+    bomb = {"step": 1, "pipeline": {"_model.gauss_params.means": torch.zeros(1).expand(10**12, 3)}}
+    torch.save(bomb, tmp_path / name(1))
+    with pytest.raises(CheckpointError, match="claims more than it has"):
+        checkpoint.read(tmp_path / name(1))
+
+
+def test_an_archive_that_unpacks_to_more_than_its_size(tmp_path: Path) -> None:
+    saved(tmp_path, 1)
+    with zipfile.ZipFile(tmp_path / name(1)) as archive:
+        entries = {entry: archive.read(entry) for entry in archive.namelist()}
+    with zipfile.ZipFile(tmp_path / name(2), "w", zipfile.ZIP_DEFLATED) as archive:
+        for entry, content in entries.items():
+            archive.writestr(entry, content)
+    with pytest.raises(CheckpointError, match="unpack to more"):
+        checkpoint.read(tmp_path / name(2))
+
+
+def test_a_second_training_in_a_folder_changes_nothing_there(tmp_path: Path) -> None:
+    config = deepcopy(sundae_tiny.config)
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path, "a", "now"
+    run = config.get_base_dir()
+    run.mkdir(parents=True)
+    with (run / "training.lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        print("process 17 on another", file=other, flush=True)
+        with pytest.raises(StorageError, match="^process 17 on another trains in .*/now; "):
+            config.save_config()
+    assert os.listdir(run) == ["training.lock"]
+    config.save_config()
+    assert sorted(os.listdir(run)) == ["config.yml", "training.lock"]
+
+
+def test_methods_train_with_it_and_end_by_themselves() -> None:
+    for method in vars(method_configs).values():
+        if isinstance(method, MethodSpecification):
+            config = method.config
+            assert isinstance(config, SundaeTrainerConfig)
+            assert config._target is SundaeTrainer
+            assert config.viewer.quit_on_train_completion, config.method_name
+
+
+def test_config_in_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    config = SundaeTrainerConfig(method_name="m", experiment_name="e", timestamp="t", output_dir=tmp_path)
+    config.set_timestamp()  # the user's own stays
+    config.save_config()
+    assert (
+        (tmp_path / "e" / "m" / "t" / "config.yml").read_text().startswith("!!python/object:sundae_ns.plugin.trainer.")
+    )
+    (tmp_path / "file").write_text("")
+    config.output_dir = tmp_path / "file"
+    with pytest.raises(StorageError, match="cannot make .*--output-dir"):
+        config.save_config()
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "cause"),
+    [
+        (OSError(28, "No space left on device"), StorageError, "cannot write to the run's folder .*disk is full"),
+        (DataError("a picture; mend it"), DataError, "a picture; mend it"),
+        (ConnectionResetError(104, "reset"), ConnectionResetError, "reset"),
+    ],
+)
+def test_faults_while_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, kind: type[Exception], cause: str
+) -> None:
+    def fail(_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(Trainer, "train", fail)
+    made = SundaeTrainer.__new__(SundaeTrainer)
+    made.base_dir, made._interruption = tmp_path, Interruption(lambda: None)
+    viewer: Any = SimpleNamespace(ready=False, render_statemachines={})
+    machine = viewer.render_statemachines[0] = RenderStateMachine(viewer, 1.0, None)  # type: ignore[arg-type]
+    machine.start()
+    made.viewer_state = viewer
+    with pytest.raises(kind, match=cause):
+        made.train()
+    assert not machine.is_alive(), "a thread that renders when Python exits aborts the process"
+
+
+HOOK = """
+import sys
+sys.argv = [{program!r}]
+from sundae_ns.core.errors import {error}, show_in_one_line
+show_in_one_line()
+raise {error}("the cause; the mend")
+"""
+
+
+@pytest.mark.parametrize(
+    ("program", "error", "variables", "lines"),
+    [
+        ("/usr/bin/ns-train", "DataError", {}, ["sundae: the cause; the mend"]),
+        ("/usr/bin/ns-train", "DataError", {"SUNDAE_TRACEBACK": "1"}, None),
+        ("/usr/bin/other", "DataError", {}, None),
+        ("/usr/bin/ns-train", "os", {}, None),
+    ],
+)
+def test_one_line_in_nerfstudios_commands_only(
+    program: str, error: str, variables: dict[str, str], lines: list[str] | None
+) -> None:
+    code = HOOK.format(program=program, error=error)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **variables}, check=False
+    )
+    assert result.returncode == 1
+    if lines is None:
+        assert "Traceback" in result.stderr
+    else:
+        assert result.stderr.splitlines() == lines
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        ("KeyboardInterrupt()", 130),
+        ("ProcessExitedException('rank', error_index=1, error_pid=2, exit_code=143)", 143),
+        ("passed_on.append(2) or ProcessExitedException('rank', 1, 2, exit_code=-15, signal_name='SIGTERM')", 130),
+    ],
+)
+def test_a_stopped_command_ends_without_a_traceback(tmp_path: Path, error: str, code: int) -> None:
+    text = HOOK[: HOOK.index("raise")].format(program="/usr/bin/ns-viewer", error="DataError")
+    text += "from sundae_ns.core.errors import passed_on\n"
+    text += f"from torch.multiprocessing.spawn import ProcessExitedException\nraise {error}"
+    (tmp_path / "program").write_text(text)
+    found, printed = forked.run(tmp_path / "program")
+    assert found == code
+    assert "Traceback" not in printed
+    assert len(printed.splitlines()) <= 2
+
+
+def configured(tmp_path: Path, *words: str) -> Any:
+    """The configuration of ``ns-train sundae`` with these options, and its schedule."""
+    arguments = ["sundae", "--output-dir", str(tmp_path), "--experiment-name", "e", *words]
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)  # type: ignore[call-overload]
+    config.timestamp = "t"
+    set_schedule(config, all_methods.get(str(config.method_name)), arguments)
+    return config
+
+
+def test_the_number_of_steps_alone_sets_the_schedule(tmp_path: Path) -> None:
+    words = ("--max-num-iterations", "3000", "--pipeline.model.stop-split-at", "15000")
+    config = configured(tmp_path, *words)
+    model = config.pipeline.model
+    assert (config.schedule_length, model.pruning.prune_at, model.stop_split_at) == (3000, 1200, 15000)
+    first_part = configured(tmp_path, *words, "--schedule-length=30000")
+    assert (first_part.schedule_length, first_part.pipeline.model.pruning.prune_at) == (30000, 12000)
+    for option in ("--max-num-iterations", "--schedule-length"):
+        with pytest.raises(ConfigError, match="length of the run is 0; give"):
+            configured(tmp_path, option, "0")
+
+
+def test_a_fine_tune_takes_the_place_of_the_last_steps(tmp_path: Path) -> None:
+    tuned = ("--finetune-steps", "1500")
+    config = configured(tmp_path, *tuned)
+    assert (config.max_num_iterations, config.schedule_length) == (28500, 30000)
+    assert config.pipeline.model.pruning.prune_at == 12000, "the schedule is that of the whole run"
+    for length, steps in ((29999, 29999), (60000, 58500)):  # at most a twentieth
+        assert configured(tmp_path, *tuned, "--max-num-iterations", str(length)).max_num_iterations == steps
+    first = configured(tmp_path, *tuned, "--max-num-iterations", "10000", "--schedule-length", "30000")
+    assert first.max_num_iterations == 10000
+    config.save_config()
+    checkpoints = config.get_base_dir() / "nerfstudio_models"
+    checkpoints.mkdir()
+    saved(checkpoints, 19999)
+    words = ("--load-dir", str(checkpoints))
+    assert configured(tmp_path, *words, *tuned).max_num_iterations == 8500
+    assert configured(tmp_path, *words).max_num_iterations == 10000
+    assert configured(tmp_path, *words, *tuned, "--max-num-iterations", "9000").max_num_iterations == 9000
+    saved(checkpoints, 28499)
+    assert configured(tmp_path, *words, *tuned).max_num_iterations == 1500, "all others are done"
+    with pytest.raises(ConfigError, match="finetune-steps is 0; give 1500, or leave it out"):
+        configured(tmp_path, "--finetune-steps", "0")
+
+
+def test_a_resumed_run_has_the_schedule_of_its_config(tmp_path: Path) -> None:
+    run = configured(tmp_path, "--max-num-iterations", "3000", "--pipeline.model.pruning.prune-at", "1000")
+    run.save_config()
+    folder = run.get_base_dir()
+    (folder / "nerfstudio_models").mkdir()
+    for place in (folder, folder / "nerfstudio_models"):
+        words = ("--load-dir", str(place), "--max-num-iterations", "700", "--pipeline.model.sh-degree-interval", "5")
+        again = configured(tmp_path, *words)
+        assert (again.schedule_length, again.max_num_iterations) == (3000, 700)
+        model = again.pipeline.model
+        assert (model.pruning.prune_at, model.resolution_schedule, model.sh_degree_interval) == (1000, 300, 5)
+        assert again.optimizers == run.optimizers
+    checkpoints = folder / "nerfstudio_models"
+    saved(checkpoints, 999, 1999)
+    (checkpoints / name(2999)).write_text("half")  # the steps that are lost are left
+    for words, left in (((), 1000), (("--load-step", "999"), 2000)):
+        for place in (folder, checkpoints):
+            assert configured(tmp_path, "--load-dir", str(place), *words).max_num_iterations == left
+    saved(checkpoints, 2999)
+    with pytest.raises(ConfigError, match="has trained all of its 3,000 steps; give .*--max-num-iterations"):
+        configured(tmp_path, "--load-dir", str(folder))
+    (folder / "config.yml").write_text("damaged: [")
+    alone = configured(tmp_path, "--load-dir", str(folder), "--max-num-iterations", "700")
+    assert alone.pipeline.model.pruning.prune_at == 12000, "nothing says how long the run was meant to be"
+
+
+def test_the_schedule_is_logged_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=["sundae", "--max-num-iterations", "3000"])  # type: ignore[call-overload]
+    config.output_dir, config.experiment_name, config.timestamp = Path("outputs"), "e", "t"
+    config.pipeline.datamanager.data = Path("capture")
+    monkeypatch.setattr(sys, "argv", ["ns-train", "sundae", "--max-num-iterations", "3000"])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DataError, match="capture does not exist"):
+        config.print_to_terminal()
+    assert list(tmp_path.iterdir()) == []
+    write_still_life(tmp_path / "capture", train_views=3, test_views=1, width=16, height=16, points=9, samples=1)
+    config.print_to_terminal()
+    config.save_config()
+    shown = capsys.readouterr().out
+    assert len(shown.splitlines()) <= 20
+    assert re.search(r"3,000 steps", shown)
+    assert re.search(r"prune .* after 1,200", shown)
+    saved = load_config(tmp_path / "outputs" / "e" / "sundae" / "t" / "config.yml")
+    assert saved.pipeline.datamanager.data == tmp_path / "capture"
+    assert saved.get_base_dir() == tmp_path / "outputs" / "e" / "sundae" / "t"
+    assert (saved.pipeline.model.pruning.prune_at, saved.schedule_length) == (1200, 3000)

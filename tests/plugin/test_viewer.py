@@ -1,0 +1,343 @@
+"""The preview of a prune in the viewer: what it shows, and that it changes nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any, get_args
+
+import pytest
+import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox, SceneBox
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerElement
+from torch import Tensor
+
+import sundae_ns.plugin.viewer
+import sundae_ns.pruning.decision
+from sundae_ns.head.head import HeadConfig
+from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
+from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
+from sundae_ns.plugin.viewer import RuleName, ViewerControls, previewed_rule
+from sundae_ns.pruning.decision import FieldPruner
+from sundae_ns.pruning.rule import PruneRule
+from sundae_ns.pruning.scores import response
+from sundae_ns.scene.render import LocalField, render_view
+from sundae_ns.train.curve import CurvePoint, expected_change
+from sundae_ns.train.pruning import PruningConfig, PruningSchedule
+
+N = 90
+RULES: tuple[RuleName, ...] = get_args(RuleName)
+
+
+def camera(shift: float = 0.0) -> Cameras:
+    pose = torch.eye(4)[None, :3].clone()
+    pose[0, :, 3] = torch.tensor([shift, 0.1, 3.0])
+    return Cameras(pose, fx=30.0, fy=30.0, cx=16.0, cy=12.0, width=32, height=24)
+
+
+class Views:
+    """A datamanager with two training cameras, which counts how often they are asked for."""
+
+    eval_dataset = None
+    place = (0, 1)
+    train_indices = (0, 1)
+    holdout_indices: tuple[int, ...] = ()
+    asked = 0
+
+    def training_views(self) -> Iterator[tuple[Cameras, None]]:
+        self.asked += 1
+        yield from ((camera(-0.5), None), (camera(0.5), None))
+
+
+def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:
+    """A model whose head takes part, as a viewer has set it up."""
+    generator = torch.Generator().manual_seed(1)
+    xyz = torch.randn(n, 3, generator=generator) * 0.5
+    rgb = torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
+    config = SundaeModelConfig(
+        pruning=PruningConfig(**{"prune_at": 3, "keep_ratio": 0.5, **pruning}),
+        head=HeadConfig(mode="residual", size="tiny", num_features=5, pixel_unshuffle=1),
+        camera_optimizer=CameraOptimizerConfig(mode="off"),
+        sh_degree=1,
+        num_downscales=0,
+        background_color="black",
+        dense_start_views=0,
+    )
+    box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    model = config.setup(scene_box=box, num_train_data=2, metadata={}, seed_points=(xyz, rgb))
+    assert model.head is not None
+    with torch.no_grad():
+        for value in model.head.parameters():
+            value += 0.05 * torch.randn(value.shape, generator=generator)
+    model.step = 10
+    views = Views()
+    pipeline = SimpleNamespace(model=model, datamanager=views)
+    model.viewer_controls.control._setup(SimpleNamespace(pipeline=pipeline, viser_server=None))  # type: ignore[arg-type]
+    return model.eval(), views
+
+
+def as_the_viewer(call: Callable[[], Any]) -> Any:
+    """What a function returns to a thread of the viewer."""
+    found: list[Any] = []
+
+    class Renderer(RenderStateMachine):
+        def run(self) -> None:
+            with torch.no_grad():
+                found.append(call())
+
+    thread = Renderer(None, 1.0, None)  # type: ignore[arg-type]
+    thread.start()
+    thread.join()
+    return found[0]
+
+
+def shown(model: SundaeModel, rule: RuleName, keep_ratio: float) -> Tensor | None:
+    model.viewer_controls.rule.value, model.viewer_controls.keep_ratio.value = rule, keep_ratio
+    preview = as_the_viewer(model.viewer_controls.preview)
+    return None if preview is None else preview.decision.mask
+
+
+def picture(model: SundaeModel) -> dict[str, Any]:
+    return model.get_outputs_for_camera(camera())
+
+
+def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    def equal(one: Any, other: Any) -> bool:
+        return torch.equal(one, other) if isinstance(one, Tensor) else one == other
+
+    return a.keys() == b.keys() and all(equal(a[name], b[name]) for name in a)
+
+
+def test_the_viewer_finds_slider_and_menu() -> None:
+    model, _ = build()
+    found = dict(parse_object(SimpleNamespace(model=model), ViewerElement, "Custom Elements"))
+    assert found["Custom Elements/model/viewer_controls/keep_ratio"] is model.viewer_controls.keep_ratio
+    assert found["Custom Elements/model/viewer_controls/rule"] is model.viewer_controls.rule
+    assert not list(model.viewer_controls.parameters())
+    assert not [name for name in model.state_dict() if "viewer_controls" in name]
+
+
+def test_the_slider_tells_what_fewer_primitives_lose() -> None:
+    points = [CurvePoint(n, None, 30.0, 0.9, loss, loss / 40, 0.0, 0.0) for n, loss in ((N, 0.0), (N // 3, 0.6))]
+    model, _ = build()
+    controls = ViewerControls(model.state, model.config.pruning, model.contribution, lambda: points)
+    for share, text in (
+        (1.0, f"{N:,} primitives: +0.00 dB, SSIM +0.0000"),
+        (1 / 3, f"{N // 3} primitives: -0.60 dB, SSIM -0.0150"),
+        (0.1, f"{N // 10} primitives"),  # nobody has tried so few
+    ):
+        controls.keep_ratio.value = share
+        controls._show_expected(controls.keep_ratio)
+        assert controls.expected.value == text
+    half = expected_change(points, N // 3, round(N / math.sqrt(3)))
+    assert half == pytest.approx((0.3, 0.0075), abs=0.01)
+    assert model.count_curve() == []
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("keep_ratio", [0.01, 0.1, 0.37, 0.99])
+def test_exactly_the_share_is_shown(rule: RuleName, keep_ratio: float) -> None:
+    model, _ = build()
+    mask = shown(model, rule, keep_ratio)
+    assert mask is not None
+    assert mask.shape == (N,)
+    assert int(mask.sum()) == max(1, round(keep_ratio * N))
+    again = shown(build()[0], rule, keep_ratio)
+    assert again is not None
+    assert torch.equal(mask, again)
+
+
+PRUNES: list[dict[str, Any]] = [
+    {},
+    {"redistribution": "none", "seed": 3},
+    {"score": "response", "selection": "band", "signal": "positions", "edges": "centres", "redistribution": "none"},
+]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("options", PRUNES, ids=lambda options: options.get("score", "default"))
+def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None:
+    model, views = build(**options)
+    model.viewer_controls.keep_ratio.value = 0.2
+    preview = as_the_viewer(model.viewer_controls.preview)
+    seen = as_the_viewer(lambda: picture(model))
+    model.config.pruning.keep_ratio = 0.2
+    optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in model.gauss_params.items()}
+    schedule = PruningSchedule(model.config.pruning)
+    report = schedule.after_step(
+        FieldPruner(model.state.field, optimizers),
+        schedule.initialize_state(),
+        model.config.pruning.prune_at,
+        lambda count: model.contribution(views, count),  # type: ignore[arg-type]
+    )
+    assert report is not None
+    assert report.after == int(preview.decision.mask.sum()) == 18
+    assert all(torch.equal(value, preview.field[name]) for name, value in model.state.field.items())
+    # A merge and growth show in the picture too.
+    settings = model.render_settings(training=False).without_head()
+    left, _ = render_view(model.source, model.view_of(camera()), seen["background"][0, 0], settings)
+    assert torch.equal(seen["rgb"], left["rgb"])
+
+
+def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
+    model, _ = build()
+    known = response(model.state.field, previewed_rule(model.config.pruning, "band: both"))
+    masks = {rule: shown(model, rule, 0.2) for rule in RULES}
+    high, low, both = (masks[rule] for rule in ("band: high", "band: low", "band: both"))
+    assert high is not None
+    assert low is not None
+    assert both is not None
+    assert known[high].min() >= known[~high].max()
+    assert known[low].max() <= known[~low].min()
+    assert torch.equal(both, (both & high) | (both & low))
+    assert int((both & high).sum()) == int((both & low).sum()) == 9
+    # The share of the slider counts, whatever budget the run had.
+    for options in (
+        {"keep_ratio": None, "max_bytes": 900},
+        {"mode": "continuous", "target_primitives": 7, "start": 20000},
+    ):
+        busy, _ = build(**{"stop": 20000, **options})
+        mask = shown(busy, "as configured", 0.2)
+        assert mask is not None
+        assert torch.equal(mask, masks["as configured"])  # type: ignore[arg-type]
+
+
+@torch.no_grad()
+def test_a_crop_box_cuts_the_preview_too() -> None:
+    model, _ = build()
+    model.viewer_controls.keep_ratio.value = 0.5
+    preview = as_the_viewer(model.viewer_controls.preview)
+    half = OrientedBox(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]), torch.tensor([2.0, 9.0, 9.0]))
+    seen = as_the_viewer(lambda: model.get_outputs_for_camera(camera(), half))
+    rows = half.within(model.means).squeeze(-1)[preview.decision.mask]
+    assert 0 < int(rows.sum()) < len(rows)
+    settings = model.render_settings(training=False).without_head()
+    expected, _ = render_view(
+        LocalField(preview.field.rows(rows)), model.view_of(camera()), seen["background"][0, 0], settings
+    )
+    assert torch.equal(seen["rgb"], expected["rgb"])
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("rule", RULES)
+def test_only_the_viewer_sees_the_preview_and_only_while_it_is_on(rule: RuleName) -> None:
+    """On, it shows base colours; it changes neither the model nor what training and evaluation see."""
+    model, views = build()
+    controls, before = model.viewer_controls, picture(model)
+    state = {name: value.clone() for name, value in model.state_dict().items() if isinstance(value, Tensor)}
+    versions = [value._version for value in model.parameters()]
+    controls.rule.value = rule
+    assert same(as_the_viewer(lambda: picture(model)), before)
+    assert views.asked == 0
+    controls.keep_ratio.value = 0.3
+    seen = as_the_viewer(lambda: picture(model))
+    assert torch.equal(seen["rgb"], seen["base_rgb"])
+    assert seen["response"].max() > 0
+    assert not same(seen, before)
+    assert same(picture(model), before)
+    trained = {}
+    for share in (0.3, 1.0):
+        controls.keep_ratio.value = share
+        trained[share] = {k: v for k, v in model.train().get_outputs_for_camera(camera()).items() if v is not None}
+        model.eval()
+    assert same(trained[0.3], trained[1.0])
+    assert same(as_the_viewer(lambda: picture(model)), before)
+    after = model.state_dict()
+    assert all(torch.equal(after[name], value) for name, value in state.items())
+    assert [value._version for value in model.parameters()] == versions
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sizes of the fields whose graph was built, by the preview or by a decision."""
+    seen: list[int] = []
+    original = sundae_ns.plugin.viewer.field_graph
+
+    def counted(params: Any, rule: PruneRule) -> Any:
+        seen.append(len(params["means"]))
+        return original(params, rule)
+
+    monkeypatch.setattr(sundae_ns.plugin.viewer, "field_graph", counted)
+    monkeypatch.setattr(sundae_ns.pruning.decision, "field_graph", counted)
+    return seen
+
+
+def test_graph_and_views_are_used_once_a_field(calls: list[int]) -> None:
+    model, views = build()
+    for rule in RULES:
+        for keep_ratio in (0.1, 0.2, 0.3):
+            shown(model, rule, keep_ratio)
+    # One graph with the configured edges and one with the paper's; the detail that counts depends on the share.
+    assert calls == [N, N]
+    assert views.asked == 3
+
+
+def test_a_changed_field_is_scored_anew(calls: list[int]) -> None:
+    model, views = build()
+    first = shown(model, "band: high", 0.2)
+    with torch.no_grad():
+        model.means[:45] *= 3  # the same tensor, other values
+    second = shown(model, "band: high", 0.2)
+    assert calls == [N, N]
+    assert first is not None
+    assert second is not None
+    assert not torch.equal(first, second)
+    other, _ = build(70)
+    model.load_state_dict(other.state_dict())
+    third = shown(model, "as configured", 0.2)
+    assert third is not None
+    assert third.shape == (70,)
+    assert calls == [N, N, 70]
+    assert views.asked == 1
+
+
+def test_a_prune_in_training_is_seen_and_a_step_is_not(calls: list[int]) -> None:
+    model, views = build()
+    model.step = 0
+    groups = model.get_param_groups()
+    configs = {name: {"optimizer": FusedAdamConfig(lr=5e-3), "scheduler": None} for name in groups}
+    optimizers = Optimizers(configs, groups)
+    pipeline = SimpleNamespace(datamanager=views, model=model)
+    callbacks = model.get_training_callbacks(
+        TrainingCallbackAttributes(optimizers, None, pipeline, None)  # type: ignore[arg-type]
+    )
+    truth = {"image": torch.zeros(24, 32, 3, dtype=torch.uint8)}
+    model.viewer_controls.rule.value, model.viewer_controls.keep_ratio.value = "band: both", 0.2
+    kept = []
+    for step in range(5):
+        model.train()
+        for callback in callbacks:
+            callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        outputs = model(camera())
+        sum(model.get_loss_dict(outputs, truth).values()).backward()  # type: ignore[union-attr]
+        optimizers.optimizer_step_all()
+        for callback in callbacks:
+            callback.run_callback_at_location(step, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        model.eval()
+        kept.append(int(shown(model, "band: both", 0.2).sum()))  # type: ignore[union-attr]
+    after = model.num_points
+    assert after == 45
+    assert kept == [18, 18, 18, 9, 9]
+    assert calls == [N, N, after]  # the second one by the prune itself
+
+
+@torch.no_grad()
+def test_a_rule_that_cannot_be_applied_shows_everything_and_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
+    few, _ = build(1)  # a graph needs two
+    before = picture(few)
+    few.viewer_controls.rule.value, few.viewer_controls.keep_ratio.value = "band: high", 0.5
+    for _ in range(2):
+        assert same(as_the_viewer(lambda: picture(few)), before)
+    assert capsys.readouterr().out.count("No preview of band: high") == 1
+    alone, _ = build()
+    del alone.viewer_controls.control.viewer
+    assert shown(alone, "as configured", 0.5) is None
+    assert "no training views" in " ".join(capsys.readouterr().out.split())
+    assert shown(alone, "band: low", 0.5) is not None

@@ -1,0 +1,529 @@
+"""The backends against a loop over pixels, finite differences, each other, and invariants; and hard scenes.
+
+Scenes are given before activation and in float32 numbers, so that both precisions render the same scene. Errors are the
+norm of the difference over the norm of the exact value, which is the reference's in float64.
+"""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import pytest
+import torch
+from hard_scenes import CASES, NEAR, Scene, scene
+from hypothesis import given
+from hypothesis import strategies as st
+from splat_inputs import geometry
+from torch import Tensor
+
+from sundae_ns.core.errors import BackendError
+from sundae_ns.rasterize.interface import blending_weights, rasterize, select_backend, spherical_harmonics
+from sundae_ns.rasterize.reference import project
+from sundae_ns.rasterize.types import Rasterization
+
+CPU, REFERENCE = select_backend("cpu", "cpu"), select_backend("reference", "cpu")
+each_backend = pytest.mark.parametrize("backend", [REFERENCE, CPU], ids=["reference", "cpu"])
+F32, F64 = torch.float32, torch.float64
+
+
+def make_view(width: int, height: int, *, turned: bool = True) -> dict[str, Any]:
+    """An off-axis camera; ``turned``, so that no term of a derivative vanishes."""
+    focal = 1.2 * max(width, height)
+    K = torch.tensor([[focal, 0, 0.45 * width], [0, 1.1 * focal, 0.55 * height], [0, 0, 1]])
+    viewmat = torch.eye(4)
+    if turned:
+        skew = torch.tensor([[0, -0.3, -0.2], [0.3, 0, -0.1], [0.2, 0.1, 0]])
+        viewmat[:3, :3] = torch.linalg.matrix_exp(skew)
+        viewmat[:3, 3] = torch.tensor([0.5, 0.3, 0.1])
+    return {"viewmat": viewmat, "K": K, "width": width, "height": height}
+
+
+def activated(values: Scene) -> Scene:
+    return {**values, "scales": values["scales"].exp(), "opacities": values["opacities"].sigmoid()}
+
+
+def splat(values: Scene, view: dict[str, Any], backend: Any, **options: Any) -> Rasterization:
+    """Rasterise a scene in the dtype and on the device of its values."""
+    camera = {k: v.to(values["means"]) if isinstance(v, Tensor) else v for k, v in view.items()}
+    return rasterize(**activated(values), **camera, **options, backend=backend)
+
+
+def leaves_of(values: Scene, dtype: torch.dtype, device: str = "cpu") -> Scene:
+    return {name: value.to(device, dtype, copy=True).requires_grad_() for name, value in values.items()}
+
+
+def render(
+    values: Scene, view: dict[str, Any], dtype: torch.dtype, backend: Any, device: str = "cpu", **options: Any
+) -> dict[str, Tensor]:
+    """Values, the gradients of a fixed random functional of all of them, and the statistics for densification."""
+    leaves = leaves_of(values, dtype, device)
+    ours = splat(leaves, view, backend, **{"absgrad": True, "render_depth": True, **options})
+    ours.info["means2d"].retain_grad()
+    outputs = {"image": ours.colors, "alpha": ours.alpha}
+    if ours.depth is not None:
+        outputs["depth"] = ours.depth
+    generator = torch.Generator().manual_seed(9)
+    weighted = [(value * torch.randn(value.shape, generator=generator).to(value)).sum() for value in outputs.values()]
+    torch.stack(weighted).sum().backward()
+    result = {name: value.detach() for name, value in outputs.items()} | {"radii": ours.radii}
+    result |= {f"d{name}": torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
+    return result | {"means2d.grad": ours.info["means2d"].grad, "means2d.absgrad": ours.info["means2d"].absgrad}
+
+
+def deviation(ours: Tensor, exact: Tensor) -> float:
+    assert ours.shape == exact.shape
+    return float((ours.double() - exact.double()).norm()) / max(float(exact.double().norm()), 1e-6)
+
+
+def compare(ours: dict[str, Tensor], exact: dict[str, Tensor], values: float, gradients: float) -> None:
+    assert ours.keys() == exact.keys()
+    errors = {name: deviation(ours[name], exact[name]) for name in exact if name != "radii"}
+    print({name: f"{error:.1e}" for name, error in errors.items()})
+    for name, error in errors.items():
+        assert torch.isfinite(ours[name]).all(), name
+        assert error <= (values if name in ("image", "alpha", "depth") else gradients), (name, error)
+
+
+# ------------------------------------------------------------------------------------------------- against other truths
+
+
+def loop_over_pixels(values: Scene, view: dict[str, Any], antialiased: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Image, alpha, expected depth and weights, blended pixel by pixel in a Python loop."""
+    width, height = view["width"], view["height"]
+    camera = (view["viewmat"].double(), view["K"].double(), width, height)
+    splats = project(geometry(values["means"], values["quats"], values["scales"], *camera))
+    opacities = values["opacities"] * (splats.compensations if antialiased else 1.0)
+    mean, conic, radius = splats.means2d.tolist(), splats.conics.tolist(), splats.radii.tolist()
+    opacity, depth = opacities.tolist(), splats.depths.tolist()
+    order = sorted(range(len(depth)), key=lambda i: (depth[i], i))
+    channels = torch.cat([values["colors"], splats.depths[:, None], torch.ones_like(opacities)[:, None]], dim=1)
+    image = torch.zeros(height, width, channels.shape[1], dtype=F64)
+    weights = torch.zeros(len(opacities), dtype=F64)
+    for row in range(height):
+        for column in range(width):
+            through = 1.0
+            for i in order:
+                bins = [
+                    math.floor((m - radius[i]) / 16) <= p // 16 < math.ceil((m + radius[i]) / 16)
+                    for m, p in zip(mean[i], (column, row), strict=True)
+                ]
+                if radius[i] == 0 or not all(bins):
+                    continue
+                dx, dy = column + 0.5 - mean[i][0], row + 0.5 - mean[i][1]
+                a, b, c = conic[i]
+                alpha = min(0.999, opacity[i] * math.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy)))
+                if alpha < 1 / 255:
+                    continue
+                if through * (1 - alpha) <= 1e-4:
+                    break
+                image[row, column] += alpha * through * channels[i]
+                weights[i] += alpha * through
+                through *= 1 - alpha
+    alphas = image[..., -1:]
+    return image[..., :-2], alphas, torch.where(alphas > 0, image[..., -2:-1] / alphas, 0.0), weights
+
+
+@each_backend
+@pytest.mark.parametrize(
+    ("width", "height", "antialiased", "opaque"),
+    [(21, 19, False, 0.0), (33, 8, True, 0.0), (1, 1, False, 0.0), (24, 17, False, 4.0)],
+)
+def test_matches_a_loop_over_pixels(
+    backend: Any, width: int, height: int, antialiased: bool, opaque: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values, view = scene(120), make_view(width, height)
+    values["opacities"] += opaque  # pixels are finished after a few
+    values = {name: value.double() for name, value in values.items()}
+    values["scales"][0], values["opacities"][0] = 4.0, 30.0  # alpha is clamped in every pixel
+    expected = loop_over_pixels(activated(values), view, antialiased)
+    monkeypatch.setattr("sundae_ns.rasterize.reference._SEGMENT", 7)
+    ours = splat(values, view, backend, antialiased=antialiased, render_depth=True)
+    camera = {k: v.double() if isinstance(v, Tensor) else v for k, v in view.items()}
+    solid = {name: value for name, value in activated(values).items() if name != "colors"}
+    weights = blending_weights(**solid, **camera, antialiased=antialiased, backend=backend)
+    for value, exact in zip((ours.colors, ours.alpha, ours.depth, weights), expected, strict=True):
+        torch.testing.assert_close(value, exact, rtol=1e-13, atol=1e-12)  # measured: 5.2e-15 of weights
+
+
+@each_backend
+@pytest.mark.parametrize(
+    ("n", "size", "antialiased", "fast"),
+    [(4, (3, 3), False, False), (60, (19, 18), False, True), (60, (19, 18), True, True)],
+)
+def test_gradcheck(backend: Any, n: int, size: tuple[int, int], antialiased: bool, fast: bool) -> None:
+    """With and without the camera; fast mode compares random projections, which allows a crowded scene."""
+    values, view = scene(n, 3), make_view(*size)
+    values["scales"][0], values["opacities"][0] = 4.0, 30.0
+    viewmat = view.pop("viewmat").double().requires_grad_()
+
+    def outputs(viewmat: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+        leaves = dict(zip(values, inputs, strict=True))
+        ours = splat(leaves, {"viewmat": viewmat, **view}, backend, antialiased=antialiased, render_depth=True)
+        assert ours.depth is not None
+        return ours.colors, ours.alpha, ours.depth
+
+    leaves = leaves_of(values, F64).values()
+    check = {"eps": 1e-7, "atol": 1e-5, "rtol": 1e-4, "fast_mode": fast}
+    assert torch.autograd.gradcheck(outputs, (viewmat, *leaves), **check)
+    assert torch.autograd.gradcheck(outputs, (viewmat.detach(), *leaves), **check)
+
+
+@each_backend
+def test_absgrad_is_the_sum_of_absolute_pixel_gradients(backend: Any) -> None:
+    values, view = scene(9), make_view(10, 7)
+    ours = splat(leaves_of(values, F64), view, backend, absgrad=True)
+    target = torch.rand(7, 10, 3, dtype=F64)
+    losses = (ours.colors - target).square().sum(dim=-1) + ours.alpha[..., 0]
+    expected, signed = torch.zeros(2, 1, 9, 2, dtype=F64)
+    for loss in losses.flatten():
+        (gradient,) = torch.autograd.grad(loss, ours.info["means2d"], retain_graph=True)
+        expected += gradient.abs()
+        signed += gradient
+    for _ in range(2):  # each backward pass sums anew
+        (gradient,) = torch.autograd.grad(losses.sum(), ours.info["means2d"], retain_graph=True)
+        torch.testing.assert_close(ours.info["means2d"].absgrad, expected, rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(gradient, signed, rtol=1e-10, atol=1e-12)
+    assert (expected > signed.abs() + 1e-6).any()
+
+
+@pytest.mark.parametrize(
+    ("n", "width", "height", "channels", "options"),
+    [
+        (300, 48, 40, 3, {}),
+        (300, 48, 40, 3, {"antialiased": True}),
+        (300, 33, 9, 16, {"render_depth": False}),
+        (60, 1, 1, 5, {"near_plane": 2.9}),
+        (200, 17, 23, 9, {"far_plane": 3.1}),
+        (0, 20, 20, 3, {}),
+        (1, 20, 20, 4, {}),
+    ],
+)
+def test_the_compiled_loops_match_the_reference_up_to_rounding(
+    n: int, width: int, height: int, channels: int, options: dict[str, Any]
+) -> None:
+    values, view = scene(n), make_view(width, height)
+    values["colors"] = torch.rand(n, channels)
+    ours, exact = (render(values, view, F64, backend, **options) for backend in (CPU, REFERENCE))
+    assert torch.equal(ours["radii"], exact["radii"])
+    compare(ours, exact, 1e-12, 1e-10)  # measured: 3.0e-15 and 1.6e-13
+
+
+@given(
+    seed=st.integers(0, 2**32),
+    n=st.integers(0, 60),
+    size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    channels=st.integers(1, 9),
+    log_scale=st.floats(-9.0, 3.0),
+    logit=st.floats(-8.0, 8.0),
+    antialiased=st.booleans(),
+)
+def test_any_scene(
+    seed: int, n: int, size: tuple[int, int], channels: int, log_scale: float, logit: float, antialiased: bool
+) -> None:
+    values, view = scene(n, seed), make_view(*size)
+    values["colors"] = torch.rand(n, channels)
+    values["scales"] += log_scale + 2.5
+    values["opacities"] += logit
+    values["means"][: n // 3, 2] -= 2.5  # near the camera, and behind it
+    values["means"][::5, 2] = 3.0  # ties are broken by index
+    ours, exact = (render(values, view, F64, b, antialiased=antialiased) for b in (CPU, REFERENCE))
+    assert torch.equal(ours["radii"], exact["radii"])
+    compare(ours, exact, 1e-9, 1e-7)
+
+
+@pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
+@pytest.mark.parametrize("name", CASES)
+def test_hard_scenes(name: str, antialiased: bool) -> None:
+    make, size, *bounds = CASES[name]
+    values, view = make(), make_view(size, size, turned=False)  # so that some lie on the near plane in both precisions
+    options = {"antialiased": antialiased, "near_plane": NEAR}
+    exact = render(values, view, F64, REFERENCE, **options)
+    double = render(values, view, F64, CPU, **options)
+    assert torch.equal(double["radii"], exact["radii"])
+    compare(double, exact, 1e-9, 1e-7)  # measured: 2.2e-12 and 1.9e-10, of needles; else 3.3e-15 and 2.9e-13
+    for backend in (CPU, REFERENCE):
+        ours = render(values, view, F32, backend, **options)
+        compare(ours, exact, *bounds)
+        assert 0 <= ours["alpha"].min() <= ours["alpha"].max() <= 1
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
+@pytest.mark.parametrize("name", CASES)
+def test_gsplat_is_finite_on_hard_scenes(name: str, antialiased: bool) -> None:
+    make, size, _, _ = CASES[name]
+    view, gsplat = make_view(size, size, turned=False), select_backend("gsplat", "cuda")
+    ours = render(make(), view, F32, gsplat, "cuda", antialiased=antialiased, near_plane=NEAR)
+    assert all(value.isfinite().all() for value in ours.values())
+    assert 0 <= ours["alpha"].min() <= ours["alpha"].max() <= 1
+
+
+EXTREMES = {
+    "vanishing": {"scales": -70.0},  # squares underflow
+    "transparent": {"opacities": -200.0},
+    "at the camera": {"means": 0.0},
+    "beside": {"means": 1e6},
+    "behind": {"means": -10.0},
+}
+
+
+@each_backend
+@pytest.mark.parametrize("case", [*EXTREMES, "none", "huge at the near plane"])
+def test_extremes_are_finite(backend: Any, case: str) -> None:
+    values = scene(40 if case != "none" else 0)
+    for name, value in EXTREMES.get(case, {}).items():
+        values[name].fill_(value)
+    if case == "huge at the near plane":
+        values["means"][:, 2] = torch.linspace(-0.02, 0.03, 40)
+        values["scales"][::2] = math.log(1e3)
+    for antialiased in (False, True):
+        ours = render(values, make_view(20, 20, turned=False), F32, backend, antialiased=antialiased)
+        assert all(value.isfinite().all() for value in ours.values())
+        if case not in ("vanishing", "huge at the near plane"):
+            assert not ours["image"].any()
+            assert not ours["depth"].any()
+
+
+@pytest.mark.parametrize("dtype", [F32, F64], ids=str)
+@pytest.mark.parametrize("scale", [1e9, 1e18, 1e30, math.inf, math.nan], ids=str)
+def test_footprints_that_overflow_integers(dtype: torch.dtype, scale: float) -> None:
+    """Wide Gaussians are rendered while their size is finite, and broken ones do not harm the others."""
+    values, view = scene(40), make_view(20, 20)
+    values["opacities"][:] = 0.0
+    values["scales"][:10] = math.log(scale) if scale > 0 else math.nan
+    ours = render(values, view, dtype, CPU)
+    for name, value in ours.items():
+        # The gradient behind the activation is NaN: zero times infinity.
+        assert torch.isfinite(value[10:] if name == "dscales" else value).all(), name
+    if scale <= 1e18:
+        assert (ours["radii"][:10] > 10**9 - 100).all()
+        assert (ours["alpha"] > 0.99).all()
+    if math.isnan(scale):
+        others = {name: value[10:] for name, value in values.items()}
+        assert torch.equal(ours["alpha"], render(others, view, dtype, CPU)["alpha"])
+
+
+# ----------------------------------------------------------------------------------------------------------- invariants
+
+
+@each_backend
+def test_order_and_unseen_gaussians_do_not_matter_and_weights_sum_up(backend: Any) -> None:
+    values, view = leaves_of(scene(300), F64), make_view(32, 24)
+    values = {name: value.detach() for name, value in values.items()}
+    ours = splat(values, view, backend)
+    shuffle = torch.randperm(300)
+    other = splat({name: value[shuffle] for name, value in values.items()}, view, backend)
+    torch.testing.assert_close(ours.colors, other.colors, rtol=0, atol=1e-13)
+    assert torch.equal(ours.radii[shuffle], other.radii)
+    camera = {k: v.double() if isinstance(v, Tensor) else v for k, v in view.items()}
+    solid = {name: value for name, value in activated(values).items() if name != "colors"}
+    weights = blending_weights(**solid, **camera, backend=backend)
+    assert (weights >= 0).all()
+    torch.testing.assert_close(weights.sum(), ours.alpha.sum())
+    torch.testing.assert_close((weights[:, None] * values["colors"]).sum(0), ours.colors.sum((0, 1)))
+    assert (weights == 0).any()
+    seen = splat({name: value[weights > 0] for name, value in values.items()}, view, backend)
+    torch.testing.assert_close(seen.colors, ours.colors, rtol=0, atol=1e-13)
+
+
+@each_backend
+def test_rigid_motion_of_scene_and_camera(backend: Any) -> None:
+    values, view = {name: value.double() for name, value in scene(200).items()}, make_view(32, 24, turned=False)
+    c, s, shift = math.cos(0.35), math.sin(0.35), torch.tensor([0.3, -1.0, 2.0], dtype=F64)
+    rotation = torch.tensor([[c * c - s * s, 0, 2 * s * c], [0, 1, 0], [-2 * s * c, 0, c * c - s * s]], dtype=F64)
+    w, x, y, z = values["quats"].unbind(-1)
+    quats = torch.stack([c * w - s * y, c * x + s * z, c * y + s * w, c * z - s * x], dim=-1)
+    moved, viewmat = {**values, "means": values["means"] @ rotation.T + shift, "quats": quats}, torch.eye(4).double()
+    viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ shift
+    images = splat(values, view, backend).colors, splat(moved, {**view, "viewmat": viewmat}, backend).colors
+    torch.testing.assert_close(*images, rtol=0, atol=1e-11)
+
+
+@each_backend
+def test_footprints_end_with_the_bins_of_gsplat(backend: Any) -> None:
+    """A 16-pixel bin that the three-sigma square does not reach stays empty, though alphas there would be visible."""
+    values, view = scene(1), make_view(40, 20, turned=False)
+    values["means"][:] = torch.tensor([0.0, 0.0, 1.0])
+    # 8.8 square pixels with the blur: 3 sigma = 8.9, 3.33 = 9.9
+    values["scales"][:], values["opacities"][:] = math.log(math.sqrt(8.5) / float(view["K"][0, 0])), 30.0
+    view["K"][1, 1], view["K"][1, 2] = view["K"][0, 0].clone(), 10.5
+    ends = {}
+    for centre in (6.9, 7.1, -1.1):
+        view["K"][0, 2] = centre
+        ours = splat({name: value.double() for name, value in values.items()}, view, backend)
+        assert ours.radii.tolist() == [9]
+        ends[centre] = int(ours.alpha[10, :, 0].nonzero().max())
+    # 6.9 + 9 is inside the first bin; 7.1 + 9 is not; -1.1 + 9 is, and all of that bin is blended.
+    assert ends == {6.9: 15, 7.1: 16, -1.1: 8}
+
+
+@each_backend
+def test_zero_quaternions_are_the_identity_and_zero_directions_have_no_gradient(backend: Any) -> None:
+    values, view = scene(30), make_view(16, 16)
+    identity = torch.tensor([[1.0, 0, 0, 0]]).expand(30, 4)
+    images = [splat({**values, "quats": quats}, view, backend).colors for quats in (torch.zeros(30, 4), identity)]
+    assert torch.equal(*images)
+    directions, coeffs = torch.zeros(2, 3, requires_grad=True), torch.randn(2, 16, 3, requires_grad=True)
+    value = spherical_harmonics(3, directions, coeffs, backend=backend)
+    value.sum().backward()
+    ahead = torch.tensor([[0.0, 0.0, 5.0]]).expand(2, 3)
+    torch.testing.assert_close(value, spherical_harmonics(3, ahead, coeffs, backend=backend))
+    assert directions.grad is None or not directions.grad.any()
+    assert coeffs.grad is not None
+    assert coeffs.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("wanted", [("colors",), ("opacities",), ("means", "scales"), ("colors", "quats")])
+@pytest.mark.parametrize("output", ["colors", "alpha", "depth"])
+def test_gradients_of_some_inputs_by_some_outputs(wanted: tuple[str, ...], output: str) -> None:
+    values, grads = scene(100), []
+    for backend in (CPU, REFERENCE):
+        leaves = {name: value.double().requires_grad_(name in wanted) for name, value in values.items()}
+        loss = getattr(splat(leaves, make_view(24, 20), backend, render_depth=True), output).square().sum()
+        grads.append(
+            torch.autograd.grad(loss, [leaves[name] for name in wanted], materialize_grads=True, allow_unused=True)
+        )
+    for ours, exact in zip(*grads):
+        assert deviation(ours, exact) < 1e-10  # measured: 1.5e-14
+
+
+@each_backend
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_default_strategy_grows(backend: Any, absgrad: bool) -> None:
+    gsplat = pytest.importorskip("gsplat")
+    params = {name: torch.nn.Parameter(value) for name, value in scene(50).items()}
+    optimizers = {name: torch.optim.Adam([param], 1e-3) for name, param in params.items()}
+    strategy = gsplat.DefaultStrategy(
+        absgrad=absgrad, refine_start_iter=0, refine_every=2, grow_grad2d=1e-7, refine_scale2d_stop_iter=10
+    )
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state()
+    for step in (1, 2):
+        ours = splat(params, make_view(24, 24), backend, absgrad=absgrad)
+        strategy.step_pre_backward(params, optimizers, state, step, ours.info)
+        (ours.colors - 0.5).square().mean().backward()
+        strategy.step_post_backward(params, optimizers, state, step, ours.info)
+        if step == 1:
+            # One count per visible Gaussian and view.
+            assert torch.equal(state["count"] > 0, ours.radii > 0)
+            assert state["grad2d"].sum() > 0
+    assert params["means"].shape[0] > 50
+
+
+# ------------------------------------------------------------------------------------------------------------ harmonics
+
+
+def harmonics(degree: int, directions: Tensor, coeffs: Tensor, backend: Any) -> list[Tensor]:
+    """Values, and the gradients of a random functional of them."""
+    leaves = [value.detach().clone().requires_grad_() for value in (directions, coeffs)]
+    value = spherical_harmonics(degree, *leaves, backend=backend)
+    weights = torch.randn(value.shape, generator=torch.Generator().manual_seed(7), dtype=F64)
+    weights[::5] = 0  # Gaussians that no pixel sees
+    grads = torch.autograd.grad((value * weights).sum(), leaves, materialize_grads=True, allow_unused=True)
+    return [value.detach(), *grads]
+
+
+@pytest.mark.parametrize("dtype", [F64, F32])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_compiled_harmonics_match_the_reference(degree: int, dtype: torch.dtype) -> None:
+    directions, coeffs = 3 * torch.randn(200, 3, dtype=dtype), torch.randn(200, 25, 3, dtype=dtype)
+    directions[0] = 0
+    bound = 1e-13 if dtype == F64 else 1e-6
+    exact = harmonics(degree, directions.double(), coeffs.double(), REFERENCE)
+    odd = directions.T.contiguous().T, coeffs.transpose(0, 1).contiguous().transpose(0, 1)  # not contiguous
+    ours = harmonics(degree, directions, coeffs, CPU)
+    for value, same, expected in zip(ours, harmonics(degree, *odd, CPU), exact, strict=True):
+        assert value.dtype == dtype
+        assert (value - expected).norm() <= bound * expected.norm()
+        assert torch.equal(value, same)
+
+
+def test_only_what_needs_a_gradient_gets_one() -> None:
+    directions, coeffs = torch.randn(8, 3), torch.randn(8, 9, 3, requires_grad=True)
+    spherical_harmonics(2, directions, coeffs, backend=CPU).sum().backward()
+    assert directions.grad is None
+    assert coeffs.grad is not None
+    with torch.no_grad():
+        assert not spherical_harmonics(2, directions, coeffs, backend=CPU).requires_grad
+
+
+# ------------------------------------------------------------------------------------------ promises of compiled loops
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def test_results_do_not_depend_on_the_number_of_threads(threads: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("backend._MIN_PER_THREAD", "backend._MIN_TO_EVALUATE", "tiles._MIN_PER_THREAD"):
+        monkeypatch.setattr(f"sundae_ns.rasterize.cpu.{name}", 100)
+    monkeypatch.setattr("sundae_ns.rasterize.cpu.compositing._MIN_PER_THREAD_TO_SUM", 100)
+    values, view = scene(3000), make_view(130, 70)
+    values["colors"] = torch.rand(3000, 8)
+    directions, coeffs = torch.randn(500, 3), torch.randn(500, 16, 3)
+    results = []
+    for count in (1, 2, 3, 7, 1):
+        torch.set_num_threads(count)
+        results.append([*render(values, view, F32, CPU).values(), *harmonics(3, directions, coeffs, CPU)])
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+
+
+def test_threads_that_rasterise_at_once(threads: None) -> None:
+    """A viewer renders beside a training run."""
+    torch.set_num_threads(2)
+    values, view = scene(800), make_view(60, 50)
+    alone = render(values, view, F32, CPU)
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda _: render(values, view, F32, CPU), range(12)))
+    assert all(torch.equal(value, other[name]) for other in together for name, value in alone.items())
+
+
+def test_layouts_that_are_not_contiguous() -> None:
+    values, view = activated(scene(100)), make_view(24, 20)
+    odd = {name: torch.stack([value, value], dim=-1)[..., 0] for name, value in values.items()}
+    odd["scales"] = values["scales"].T.contiguous().T
+    assert not odd["means"].is_contiguous()
+    images = [rasterize(**each, **view, backend=CPU).colors for each in (values, odd)]
+    assert torch.equal(*images)
+
+
+def test_unsupported_dtypes_are_refused() -> None:
+    values = {name: value.bfloat16() for name, value in scene(5).items()}
+    with pytest.raises(BackendError, match="^the cpu rasterizer takes float32 or float64 on a CPU, not torch.bfl"):
+        splat(values, make_view(8, 8), CPU)
+    with pytest.raises(BackendError, match="float32 or float64"):
+        spherical_harmonics(1, torch.ones(2, 3).half(), torch.ones(2, 4, 3).half(), backend=CPU)
+
+
+def test_a_forked_process_rasterises(threads: None) -> None:
+    """Data loaders fork; numba's own thread pools would end such a process."""
+    code = """
+import os, sys, torch
+from sundae_ns.rasterize.interface import blending_weights, select_backend
+torch.set_num_threads(2)
+scene = torch.rand(2000, 3) + torch.tensor([-0.5, -0.5, 2]), torch.ones(2000, 4), 0.02 * torch.ones(2000, 3)
+camera = torch.eye(4), torch.tensor([[90.0, 0, 40], [0, 90, 40], [0, 0, 1]]), 80, 80
+def work():
+    return blending_weights(*scene, torch.full((2000,), 0.5), *camera, backend=select_backend("auto", "cpu")).sum()
+before = work()
+child = os.fork()
+if child == 0:
+    torch.set_num_threads(2)
+    from sundae_ns.rasterize.cpu import parallel
+    parallel.torch.get_num_threads = lambda: 2  # torch's own pool does not survive a fork
+    from sundae_ns.rasterize.cpu.tiles import _sort_by_tile
+    import numpy as np
+    done = np.zeros(1 << 16)
+    parallel.parallel_for(lambda begin, end: done[begin:end].fill(1), 1 << 16)
+    os._exit(0 if done.all() else 3)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120).returncode == 0

@@ -1,0 +1,361 @@
+"""Our kernels in gsplat's pipeline: the CUDA source, compiled for the CPU, against the reference in float64."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from sundae_ns.core.errors import SundaeError
+from sundae_ns.rasterize import gsplat_backend, gsplat_kernels
+from sundae_ns.rasterize.gsplat_backend import GsplatBackend, RecordableGsplat
+from sundae_ns.rasterize.gsplat_kernels import TILE, Capacity, GsplatLists, Splats, blend, tile_lists
+from sundae_ns.rasterize.interface import harmonic_colors, select_backend
+from sundae_ns.rasterize.reference import Projection, composite
+
+Field = dict[str, Tensor]
+
+
+@pytest.fixture(autouse=True)
+def on_cpu(load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gsplat_kernels, "load_kernels", load_on_cpu)
+    monkeypatch.setattr(gsplat_kernels, "LANES", 1)
+    monkeypatch.setattr(gsplat_backend, "_check_kernels_take", lambda _: None)
+
+
+def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gsplat_kernels, "LANES", 32)
+    for dtype in (torch.int16, torch.int32):
+        compile_for_gpu("tiles.cu", "sm_75", gsplat_kernels.listing_options(dtype))
+    compile_for_gpu("colors.cu", "sm_90", gsplat_kernels.COLOR_OPTIONS)
+    for architecture, channels, absgrad in (("sm_75", 3, True), ("sm_90", 16, False), ("sm_90", 32, False)):
+        compile_for_gpu("blending.cu", architecture, gsplat_kernels.blending_options(channels, absgrad=absgrad))
+
+
+def test_second_derivatives_are_refused() -> None:
+    primitives = ellipses(5, 3, 20, 20)
+    leaves = leaves_of(primitives, torch.float32)
+    image, _ = blend(*leaves.values(), every_tile(primitives, 20, 20, spare=0), False)
+    means, center, dc, rest = colors_inputs()
+    colors = gsplat_kernels.harmonic_colors(1, means.requires_grad_(), center, dc, rest)
+    for value, leaf in ((image, leaves["means2d"]), (colors, means)):
+        with pytest.raises(SundaeError, match="second derivative"):
+            torch.autograd.grad(value.sum(), leaf, create_graph=True)
+
+
+# --------------------------------------------------------------------------------------------------------------- tiles
+
+
+def field(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Field:
+    """Footprints of all sizes and shapes, up to needles across the image, in and around it."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    angle, sides = uniform(n) * 6.3, 10 ** (uniform(2, n) * (largest + 1) - 1)
+    c, s = angle.cos(), angle.sin()
+    xx = sides[0] * c * c + sides[1] * s * s + 0.3
+    yy = sides[0] * s * s + sides[1] * c * c + 0.3
+    xy = (sides[0] - sides[1]) * c * s
+    det = (xx.double() * yy.double() - xy.double() ** 2).float()
+    radii = (3 * sides.amax(0).add(0.3).sqrt()).ceil().int()
+    radii[::17] = 0
+    depths = uniform(n) + 0.1
+    depths[1::9] = depths[0]  # ties
+    return {
+        "means2d": (uniform(n, 2) * 1.4 - 0.2) * torch.tensor([float(width), float(height)]),
+        "conics": torch.stack([yy / det, -xy / det, xx / det], dim=1),
+        "opacities": uniform(n) ** 3,
+        "depths": depths,
+        "radii": radii,
+    }
+
+
+def in_square(primitives: Field, column: int, row: int, columns: int, rows: int) -> Tensor:
+    """Whether gsplat's square of each primitive contains a tile ``[N]``."""
+    radii = primitives["radii"].float().view(len(primitives["depths"]), -1).expand(-1, 2) / TILE
+    low = (primitives["means2d"] / TILE - radii).floor().clamp(min=0).minimum(torch.tensor([columns, rows]))
+    high = (primitives["means2d"] / TILE + radii).ceil().clamp(min=0).minimum(torch.tensor([columns, rows]))
+    at = torch.tensor([column, row])
+    return (radii > 0).all(dim=1) & (low <= at).all(dim=1) & (high > at).all(dim=1)
+
+
+def most_alpha(primitives: Field, column: int, row: int, width: int, height: int) -> Tensor:
+    """Largest alpha of each primitive over the pixels of a tile, float64 ``[N]``."""
+    ys, xs = torch.meshgrid(
+        torch.arange(row * TILE, min(row * TILE + TILE, height)) + 0.5,
+        torch.arange(column * TILE, min(column * TILE + TILE, width)) + 0.5,
+        indexing="ij",
+    )
+    dx = xs.reshape(1, -1).double() - primitives["means2d"][:, :1].double()
+    dy = ys.reshape(1, -1).double() - primitives["means2d"][:, 1:].double()
+    a, b, c = primitives["conics"].double().T[..., None]
+    exponents = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    return (primitives["opacities"][:, None].double() * (-exponents).exp()).amax(dim=1)
+
+
+def by_tile(primitives: Field, width: int, height: int, capacity: Capacity | None = None) -> list[Tensor]:
+    splats = Splats(**{name: value[None] for name, value in primitives.items()})
+    lists = tile_lists(splats, width, height, capacity=capacity or Capacity())
+    ends = [*lists.starts.flatten()[1:].tolist(), len(lists.primitives)]
+    starts = lists.starts.flatten().tolist()
+    return [lists.primitives[start:end].long() for start, end in zip(starts, ends, strict=True)]
+
+
+@pytest.mark.parametrize(("width", "height"), [(150, 100), (1, 1), (400, 37), (20, 700)])
+def test_all_blended_primitives_are_listed_and_hardly_any_others(width: int, height: int) -> None:
+    primitives = field(300, width, height, largest=5.5)
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    needed = listed = squares = 0
+    for tile, found in enumerate(by_tile(primitives, width, height)):
+        row, column = divmod(tile, columns)
+        square = in_square(primitives, column, row, columns, rows)
+        blended = square & (most_alpha(primitives, column, row, width, height) >= 1 / 255)
+        there = torch.zeros_like(square).index_fill(0, found, True)
+        assert not (blended & ~there).any()
+        assert not (there & ~square).any()
+        order = primitives["depths"][found] * 1000 + found  # by depth, and ties by index
+        assert (primitives["depths"][found].diff() >= 0).all()
+        assert (order.diff()[primitives["depths"][found].diff() == 0] > 0).all()
+        needed, listed, squares = (
+            needed + int(blended.sum()),
+            listed + len(found),
+            squares + int(square.sum()),
+        )
+    assert listed <= 1.02 * needed + 2
+    if columns * rows > 1:  # gsplat's own lists would fail this test
+        assert squares > 2 * listed
+
+
+@given(seed=st.integers(0, 10**6), largest=st.sampled_from([1.0, 4.0, 7.0]), shift=st.sampled_from([0.0, 3000.0]))
+def test_needles_far_away_are_not_dropped(seed: int, largest: float, shift: float) -> None:
+    width, height = 70, 50
+    primitives = field(40, width, height, largest=largest, seed=seed)
+    primitives["means2d"] += shift * torch.randn(40, 2, generator=torch.Generator().manual_seed(seed))
+    primitives["radii"][:] = 10000
+    for tile, found in enumerate(by_tile(primitives, width, height)):
+        row, column = divmod(tile, 5)
+        # gsplat sums the exponent in float32: primitives that are visible by rounding may be listed, visible ones must
+        # be.
+        blended = most_alpha(primitives, column, row, width, height) >= 1.01 / 255
+        assert not (blended & ~torch.zeros(40, dtype=torch.bool).index_fill(0, found, True)).any()
+
+
+def test_least_exponent_between_two_tiles() -> None:
+    """A faint needle across the gap between two tiles reaches the tile on the far side of the border."""
+    primitives = field(1, 64, 64)
+    c, s = math.cos(1.7074472511921694), math.sin(1.7074472511921694)
+    xx, xy, yy = 625.1582971 * c * c + 0.3, 625.1582971 * c * s, 625.1582971 * s * s + 0.3
+    primitives["conics"][0] = torch.tensor([yy, -xy, xx], dtype=torch.float64) / (xx * yy - xy * xy)
+    primitives["means2d"][0] = torch.tensor([32.12918686614097, 32.5 - 0.9142656220370688])
+    primitives["opacities"][0], primitives["radii"][0] = math.exp(0.1) / 255, 100
+    alphas = [float(most_alpha(primitives, column, 2, 64, 64)) for column in range(4)]
+    assert [alpha >= 1 / 255 for alpha in alphas] == [False, True, False, False]
+    assert len(by_tile(primitives, 64, 64)[2 * 4 + 1]) == 1
+
+
+def test_nan_is_left_to_gsplat() -> None:
+    primitives = field(20, 64, 64)
+    primitives["radii"][:] = 100
+    primitives["conics"][3], primitives["opacities"][5], primitives["conics"][7] = torch.nan, torch.nan, 0.0
+    for found in by_tile(primitives, 64, 64):
+        assert {3, 5, 7} <= set(found.tolist())
+
+
+def test_radii_per_axis() -> None:
+    primitives = field(200, 150, 100)
+    per_axis = {**primitives, "radii": primitives["radii"][:, None].repeat(1, 2)}
+    assert all(
+        torch.equal(a, b) for a, b in zip(by_tile(per_axis, 150, 100), by_tile(primitives, 150, 100), strict=True)
+    )
+    per_axis["radii"][:, 1] = per_axis["radii"][:, 1] // 3
+    for tile, found in enumerate(by_tile(per_axis, 150, 100)):
+        assert in_square(per_axis, tile % 10, tile // 10, 10, 7)[found].all()
+
+
+def test_capacity_keeps_the_lists_and_reports_the_number_of_pairs() -> None:
+    primitives, capacity = field(200, 150, 100), Capacity()
+    exact = by_tile(primitives, 150, 100, capacity)
+    (needed,) = capacity.needed
+    assert int(needed) == sum(map(len, exact))
+    for spare in (0, 1000):
+        spacious = Capacity(int(needed) + spare)
+        *found, below = by_tile(primitives, 150, 100, spacious)[: len(exact) + 1]
+        assert all(torch.equal(a, b) for a, b in zip(found, exact, strict=True))
+        assert len(below) == spare  # a tile below the image takes the unused pairs
+    short = Capacity(int(needed) - 5)
+    by_tile(primitives, 150, 100, short)
+    assert int(short.needed[0]) == int(needed)
+
+
+def test_more_tiles_than_16_bits_count() -> None:
+    primitives = field(5, 30, 30)
+    primitives["means2d"] = torch.tensor([[3275.0 * TILE, 5.0]] * 5)
+    found = by_tile(primitives, 3300 * TILE, 10 * TILE)
+    assert {tile % 3300 // 100 for tile, list_ in enumerate(found) if len(list_)} == {32}
+
+
+# ------------------------------------------------------------------------------------------------------------ blending
+
+NAMES = ("means2d", "conics", "colors", "opacities")
+
+
+def ellipses(n: int, channels: int, width: int, height: int, *, opacity: float = 1.0) -> dict[str, Tensor]:
+    """Ellipses in and around an image, float64; some are opaque, and some are too faint to be blended."""
+    angle, sides = torch.rand(n) * 3.2, 10 ** (torch.rand(2, n) * 2.5 - 0.5)
+    c, s = angle.cos(), angle.sin()
+    xx, yy = sides[0] * c * c + sides[1] * s * s + 0.3, sides[0] * s * s + sides[1] * c * c + 0.3
+    xy = (sides[0] - sides[1]) * c * s
+    covariances = torch.stack([xx, xy, yy], dim=1).double()
+    det = covariances[:, 0] * covariances[:, 2] - covariances[:, 1] ** 2
+    opacities = (torch.rand(n).double() * 1.3).clamp(max=1) * opacity
+    opacities[::13] = 1e-3
+    return {
+        "covariances": covariances,
+        "depths": torch.rand(n).double() + 0.1,
+        "means2d": (torch.rand(1, n, 2).double() * 1.4 - 0.2) * torch.tensor([width, height]),
+        "conics": (covariances[:, [2, 1, 0]] * torch.tensor([1, -1, 1]) / det[:, None])[None],
+        "colors": torch.rand(1, n, channels).double(),
+        "opacities": opacities[None],
+    }
+
+
+def every_tile(primitives: dict[str, Tensor], width: int, height: int, spare: int) -> GsplatLists:
+    """Every primitive in every tile, by depth, and a tile below the image with ``spare`` pairs."""
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    order = primitives["depths"].argsort(stable=True).int()
+    starts = torch.arange(columns * (rows + (spare > 0)), dtype=torch.int32).clamp(max=columns * rows) * len(order)
+    pairs = torch.cat([order.repeat(columns * rows), torch.zeros(spare, dtype=torch.int32)])
+    return GsplatLists(width, height, starts.view(1, -1, columns), pairs)
+
+
+def expected(
+    primitives: dict[str, Tensor], leaves: dict[str, Tensor], width: int, height: int, absgrad: bool
+) -> tuple[Tensor, Tensor]:
+    radii = (3 * primitives["covariances"][:, [0, 2]].amax(1).sqrt()).ceil() + 1000  # no squares: every tile
+    projection = Projection(
+        means2d=primitives["means2d"][0],
+        covars2d=primitives["covariances"],
+        conics=leaves["conics"][0],
+        depths=primitives["depths"],
+        compensations=torch.ones_like(primitives["depths"]),
+        radii=radii.int(),
+    )
+    opacities = leaves["opacities"][0]
+    return composite(leaves["means2d"], projection, opacities, leaves["colors"][0], width, height, absgrad=absgrad)
+
+
+def leaves_of(primitives: dict[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
+    return {name: primitives[name].to(dtype, copy=True).requires_grad_() for name in NAMES}
+
+
+@pytest.mark.parametrize(
+    ("n", "channels", "width", "height", "absgrad"),
+    [
+        (60, 3, 40, 23, False),
+        (60, 3, 16, 16, True),
+        (400, 16, 33, 17, False),  # more than a batch, and pixels that are finished early
+        (20, 35, 20, 20, True),
+        (1, 1, 1, 1, False),
+    ],
+)
+@pytest.mark.parametrize("opacity", [0.3, 1.0], ids=["faint", "opaque"])
+def test_image_and_gradients_match_the_reference(
+    n: int, channels: int, width: int, height: int, absgrad: bool, opacity: float
+) -> None:
+    primitives = ellipses(n, channels, width, height, opacity=opacity)
+    ours, exact = leaves_of(primitives, torch.float32), leaves_of(primitives, torch.float64)
+    lists = every_tile(primitives, width, height, spare=7 if absgrad else 0)
+    image, alpha = blend(*ours.values(), lists, absgrad)
+    other_image, other_alpha = expected(primitives, exact, width, height, absgrad)
+    assert image.shape == (1, height, width, channels)
+    torch.testing.assert_close(image[0].double(), other_image, rtol=0, atol=2e-5)
+    torch.testing.assert_close(alpha[0].double(), other_alpha, rtol=0, atol=2e-5)
+    weights = torch.randn(height, width, channels + 1, dtype=torch.float64)
+    for images, alphas in ((image[0], alpha[0]), (other_image, other_alpha)):
+        (torch.cat([images, alphas], dim=-1) * weights).sum().backward()
+    pairs = [(ours[name].grad, exact[name].grad) for name in NAMES]
+    if absgrad:
+        pairs.append((ours["means2d"].absgrad, exact["means2d"].absgrad))  # type: ignore[attr-defined]
+    for found, truth in pairs:
+        assert found is not None
+        assert truth is not None
+        assert (found - truth).norm() <= 1e-4 * truth.norm() + 1e-6
+
+
+def test_gradients_flow_into_some_inputs_only() -> None:
+    primitives = ellipses(30, 3, 20, 20)
+    ours = {name: primitives[name].float() for name in NAMES}
+    ours["colors"].requires_grad_()
+    lists = every_tile(primitives, 20, 20, spare=0)
+    image, _ = blend(*ours.values(), lists, False)
+    (gradient,) = torch.autograd.grad(image.sum(), ours["colors"])
+    assert (gradient >= 0).all()
+    assert gradient.sum() > 0
+
+
+def test_an_empty_list_leaves_the_background() -> None:
+    ours = leaves_of(ellipses(5, 3, 20, 20), torch.float32)
+    lists = GsplatLists(20, 20, torch.zeros(1, 2, 2, dtype=torch.int32), torch.zeros(0, dtype=torch.int32))
+    image, alpha = blend(*ours.values(), lists, False)
+    assert not image.any()
+    assert not alpha.any()
+    (image.sum() + alpha.sum()).backward()
+    assert all(not leaf.grad.any() for leaf in ours.values() if leaf.grad is not None)
+
+
+# ------------------------------------------------------------------------------------------------------------- colours
+
+
+def colors_inputs() -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Centres, a camera's centre, and coefficients of degree 4.
+
+    Some colours are negative, and one centre is the camera's.
+    """
+    means, center = torch.randn(300, 3) * 3, torch.tensor([0.5, -1.0, 2.0])
+    means[7] = center
+    return means, center, torch.randn(300, 3) * 2, torch.randn(300, 24, 3)
+
+
+@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("each", [False, True], ids=["one place", "a place each"])
+def test_colors_and_gradients_match_the_reference(degree: int, each: bool) -> None:
+    means, center, dc, rest = colors_inputs()
+    center = center + torch.randn(300, 3) if each else center
+    rest = rest[:, : max((degree + 1) ** 2 - 1, 8)]  # some coefficients are of higher degrees
+    weights = torch.randn(300, 3)
+    ours = [value.clone().requires_grad_() for value in (means, dc, rest)]
+    exact = [value.double().requires_grad_() for value in (means, dc, rest)]
+    found = harmonic_colors(degree, ours[0], center, *ours[1:], backend=RecordableGsplat(Capacity()))
+    expected = harmonic_colors(
+        degree, exact[0], center.double(), *exact[1:], backend=select_backend("reference", "cpu")
+    )
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-5)
+    assert 0.1 < (found == 0).float().mean() < 0.9
+    (found * weights).sum().backward()
+    (expected * weights).sum().backward()
+    for one, other in zip(ours, exact, strict=True):
+        assert one.grad is not None
+        # The constant harmonic does not depend on the place.
+        gradient = torch.zeros_like(other) if other.grad is None else other.grad
+        torch.testing.assert_close(one.grad.double(), gradient, rtol=1e-4, atol=5e-5)
+
+
+def test_harmonics_that_are_not_recorded_are_gsplats(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU on which our kernels do not compile can still use gsplat's, and an error of gsplat's is raised."""
+
+    def refuse(*_: Any) -> Tensor:
+        raise RuntimeError("no kernel image")
+
+    monkeypatch.setattr("gsplat.spherical_harmonics", refuse)
+    directions, coeffs = torch.ones(1, 3), torch.ones(1, 1, 3)
+    for gradients in (True, False):
+        with torch.set_grad_enabled(gradients), pytest.raises(RuntimeError, match="no kernel image"):
+            GsplatBackend().spherical_harmonics(0, directions, coeffs)

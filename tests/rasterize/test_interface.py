@@ -1,0 +1,272 @@
+"""Choice of a backend, the errors users see, and bounds of a view: terabytes are refused, real views are not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from splat_inputs import several_views
+from torch import Tensor
+
+from sundae_ns.core.errors import BackendError, ConfigError, DataError, MemoryExhaustedError
+from sundae_ns.rasterize import types as limits
+from sundae_ns.rasterize.interface import (
+    BackendName,
+    blending_weights,
+    rasterize,
+    rasterize_views,
+    select_backend,
+    spherical_harmonics,
+)
+
+REFERENCE = select_backend("reference", "cpu")
+
+
+def _arguments(n: int = 3) -> dict:
+    return {
+        "means": torch.ones(n, 3),
+        "quats": torch.ones(n, 4),
+        "scales": torch.ones(n, 3),
+        "opacities": torch.ones(n),
+        "colors": torch.ones(n, 3),
+        "viewmat": torch.eye(4),
+        "K": torch.eye(3),
+        "width": 4,
+        "height": 4,
+        "backend": REFERENCE,
+    }
+
+
+@pytest.mark.parametrize("device", ["cpu", torch.device("cpu")])
+def test_auto_takes_the_compiled_loops_on_a_cpu(device: torch.device | str) -> None:
+    assert select_backend("auto", device).name == "cpu"
+
+
+def test_without_numba_auto_takes_the_reference() -> None:
+    """In a fresh interpreter that cannot import numba; selected by name, the backend raises the cause."""
+    code = """
+import sys
+sys.modules["numba"] = None
+from sundae_ns.core.errors import BackendError
+from sundae_ns.rasterize.interface import select_backend
+assert select_backend("auto", "cpu").name == "reference"
+try:
+    select_backend("cpu", "cpu")
+except BackendError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    (line,) = done.stdout.splitlines()
+    assert line.startswith("the cpu backend cannot rasterize: numba does not import (")
+    assert line.endswith("; pip install numba; or use the backend 'reference'")
+
+
+def test_cpu_backend_off_the_cpu_is_refused() -> None:
+    with pytest.raises(BackendError, match=r"on the device 'meta'; move them to 'cpu'; or use the backend 'reference'"):
+        select_backend("cpu", "meta")
+
+
+def test_gsplat_without_a_gpu_is_one_line_with_cause_and_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(BackendError, match=r"CUDA is not available; use .* or use the backend 'reference'") as caught:
+        select_backend("gsplat", "cuda")
+    assert "\n" not in str(caught.value)
+    assert select_backend("auto", "cuda").name == "reference"
+
+
+def test_gsplat_on_cpu_tensors_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    with pytest.raises(BackendError, match="on the device 'cpu'"):
+        select_backend("gsplat", "cpu")
+    assert select_backend("auto", "cpu").name == "cpu"
+
+
+def test_kernels_that_fail_are_reported_and_auto_falls_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr("sundae_ns.rasterize.interface._kernel_problem", lambda: "its kernels do not run (x); mend")
+    with pytest.raises(BackendError, match="its kernels do not run"):
+        select_backend("gsplat", "cuda")
+    assert select_backend("auto", "cuda:0").name == "reference"
+
+
+def test_unknown_backend() -> None:
+    with pytest.raises(ConfigError, match="auto, gsplat, cpu or reference"):
+        select_backend("vulkan", "cpu")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("chosen", "missing"), [("'auto', 'cpu'", "gsplat"), ("'reference', 'cpu'", "numba")])
+def test_selecting_does_not_import_other_backends(chosen: str, missing: str) -> None:
+    code = (
+        f"import sys; from sundae_ns.rasterize.interface import select_backend; select_backend({chosen}); "
+        f"sys.exit(any(name.split('.')[0] == '{missing}' for name in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("means", torch.ones(3, 2), r"means has shape \[3, 2\]; pass \[3, 3\]"),
+        ("quats", torch.ones(2, 4), r"quats has shape \[2, 4\]"),
+        ("scales", torch.ones(3), "scales has shape"),
+        ("opacities", torch.ones(3, 1), r"opacities has shape \[3, 1\]; pass \[3\]"),
+        ("colors", torch.ones(3, 0), "at least one channel"),
+        ("viewmat", torch.eye(4)[:3], "viewmat has shape"),
+        ("K", torch.eye(4), "K has shape"),
+        ("K", torch.eye(3, dtype=torch.float64), "K is torch.float64"),
+        ("width", 0, "empty"),
+    ],
+)
+def test_wrong_arguments(name: str, value: object, message: str) -> None:
+    arguments = _arguments()
+    arguments[name] = value
+    with pytest.raises(DataError, match=message):
+        rasterize(**arguments)
+
+
+def test_wrong_harmonics() -> None:
+    with pytest.raises(DataError, match="degree 5"):
+        spherical_harmonics(5, torch.ones(2, 3), torch.ones(2, 36, 3), backend=REFERENCE)
+    with pytest.raises(DataError, match="needs"):
+        spherical_harmonics(2, torch.ones(2, 3), torch.ones(2, 8, 3), backend=REFERENCE)
+
+
+def test_blending_weights_work_without_grad() -> None:
+    arguments = _arguments()
+    arguments.pop("colors")
+    with torch.no_grad():
+        weights = blending_weights(**arguments)
+    assert weights.shape == (3,)
+    assert not weights.requires_grad
+
+
+def test_blending_weights_with_pixel_weights() -> None:
+    arguments = {**_arguments(), "scales": torch.full((3, 3), 0.3), "opacities": torch.full((3,), 0.5), "height": 5}
+    arguments.pop("colors")
+    left = torch.zeros(5, 4)
+    left[:, :2] = 2.5
+    total, of_left, of_right = (blending_weights(**arguments, pixels=p) for p in (None, left, 2.5 - left))
+    torch.testing.assert_close(of_left + of_right, 2.5 * total)
+    assert not torch.equal(of_left, of_right)
+    with pytest.raises(DataError, match="pixels has shape"):
+        blending_weights(**arguments, pixels=left[1:])
+
+
+@pytest.mark.parametrize("name", ["cpu", "reference"])
+def test_several_views_are_those_of_single_passes(name: BackendName) -> None:
+    shared, views = several_views()
+    options = {"width": 40, "height": 30, "antialiased": True, "backend": select_backend(name, "cpu")}
+    images = rasterize_views(**shared, **views, **options)
+    assert images.shape == (3, 30, 40, 4)
+    for image, colors, viewmat, K in zip(images, *views.values(), strict=True):
+        assert float(image.max()) > 0.1
+        torch.testing.assert_close(image, rasterize(**shared, colors=colors, viewmat=viewmat, K=K, **options).colors)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"viewmats": torch.ones(0, 4, 4)}, "there is no view to rasterize"),
+        ({"Ks": torch.ones(2, 3, 3)}, r"Ks has shape \[2, 3, 3\]; pass \[3, 3, 3\]"),
+        ({"colors": torch.ones(2, 50, 4)}, r"colors has shape \[2, 50, 4\]; pass \[3, 50, C\]"),
+        ({"colors": torch.ones(3, 49, 4)}, r"colors has shape \[49, 4\]; pass \[50, C\]"),
+    ],
+)
+def test_wrong_views(change: dict, message: str) -> None:
+    shared, views = several_views()
+    with pytest.raises(DataError, match=message):
+        rasterize_views(**shared, **{**views, **change}, width=4, height=4, backend=REFERENCE)
+
+
+# --------------------------------------------------------------------------------------------------------------- memory
+
+BACKENDS = ("cpu", "reference")
+
+
+def view(
+    count: int, size: int, scale: float, *, spread: float = 0.0, backend: str = "reference", **options: Any
+) -> Tensor:
+    """The image of faint primitives in front of a camera."""
+    torch.manual_seed(0)
+    means = torch.cat([spread * (torch.rand(count, 2) - 0.5), torch.full((count, 1), 2.0)], dim=1)
+    values = {
+        "means": means.requires_grad_(options.get("training", False)),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        "scales": torch.full((count, 3), scale),
+        "opacities": torch.full((count,), 0.01),
+        "colors": torch.ones(count, 1),
+    }
+    K = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
+    return rasterize(
+        **values, viewmat=torch.eye(4), K=K, width=size, height=size, backend=select_backend(backend, "cpu")
+    ).colors
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_more_primitives_than_in_any_scene_are_refused(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "MOST_PER_TILE", 100)
+    monkeypatch.setattr(limits, "ALWAYS", 0)
+    tiles = {"cpu": 64, "reference": 16}[backend]
+    # Each primitive touches all tiles; four of them are its own.
+    most = 100 * tiles // (tiles - 4)
+    assert view(most, 64, 20.0, backend=backend).shape == (64, 64, 1)
+    with pytest.raises(MemoryExhaustedError, match=r"the view has \d+ primitives in each tile .* less than 100;"):
+        view(most + 1, 64, 20.0, backend=backend)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_step_of_a_training_is_not_refused(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "MOST_PER_TILE", 100)
+    monkeypatch.setattr(limits, "ALWAYS", 0)
+    view(200, 64, 20.0, backend=backend, training=True)
+    with torch.no_grad(), pytest.raises(MemoryExhaustedError):
+        view(200, 64, 20.0, backend=backend)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_many_small_primitives_in_a_small_image_are_drawn(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A large scene from far away, or as a thumbnail."""
+    monkeypatch.setattr(limits, "ALWAYS", 0)
+    assert view(60_000, 16, 1e-3, spread=1.9, backend=backend).min() > 0
+    # On the corner of four tiles.
+    assert view(60_000, 16, 1e-3, backend=backend).max() > 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_small_image_of_large_primitives_is_drawn(backend: str) -> None:
+    """It takes little, whatever its lists."""
+    assert view(20_000, 40, 20.0, backend=backend).shape == (40, 40, 1)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_lists_that_exceed_the_memory_are_refused(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "_NEGLIGIBLE", 0)
+    monkeypatch.setattr(limits, "available_memory", lambda: 100_000)
+    # In a training too, where the memory would be full all the same.
+    with pytest.raises(MemoryExhaustedError, match="pairs of a tile and a primitive take .* GB, but .* are available"):
+        view(1000, 64, 20.0, backend=backend, training=True)
+
+
+def test_images_that_exceed_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "available_memory", lambda: 1 << 30)
+    with pytest.raises(MemoryExhaustedError, match=r"images of 65,536 x 65,536 pixels take 51\.5 GB, but 1\.1 GB are"):
+        view(10, 65_536, 1e-3)
+
+
+def test_the_memory_is_that_of_machine_and_control_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = tmp_path / "meminfo"
+    monkeypatch.setattr(limits, "_MEMORY", memory)
+    monkeypatch.setattr(limits, "_CONTROL_GROUP", tmp_path)
+    assert limits.available_memory() is None
+    memory.write_text("MemTotal:  9000 kB\nMemAvailable:    5000 kB\n")
+    assert limits.available_memory() == 5000 * 1024
+    (tmp_path / "memory.max").write_text("3000000\n")
+    (tmp_path / "memory.current").write_text("2500000\n")
+    (tmp_path / "memory.stat").write_text("anon 1\nactive_file 100000\ninactive_file 200000\n")
+    assert limits.available_memory() == 800_000
+    (tmp_path / "memory.max").write_text("max\n")
+    assert limits.available_memory() == 5000 * 1024

@@ -1,0 +1,191 @@
+"""Compiled loops: SIMD lanes against numpy, the pixel rows of a Gaussian against all pixels, and compilation."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import torch
+from splat_inputs import geometry
+
+from sundae_ns.rasterize.cpu import parallel
+from sundae_ns.rasterize.cpu.backend import project
+from sundae_ns.rasterize.cpu.lanes import (
+    WIDTH,
+    absolute,
+    any_lane,
+    broadcast,
+    exp_negative,
+    fma,
+    load,
+    logical_and,
+    minimum,
+    select,
+    store,
+    store_sums,
+)
+from sundae_ns.rasterize.cpu.parallel import compiled
+from sundae_ns.rasterize.cpu.tiles import HALF_XX, HALF_YY, LIMIT, STEP, TILE, XY, U, V, build_lists
+
+DTYPES = [np.float32, np.float64]
+
+
+@compiled
+def _try_all(a: Any, b: Any, whole: Any, out: Any, count: Any) -> Any:
+    x, y = load(a, 0), load(b, 0)
+    store(out, 0 * WIDTH, x + y)
+    store(out, 1 * WIDTH, 1.5 - x)
+    store(out, 2 * WIDTH, x * 0.1)
+    store(out, 3 * WIDTH, x / y)
+    store(out, 4 * WIDTH, fma(x, y, -1.0))
+    store(out, 5 * WIDTH, select(logical_and(x < y, y >= 0.0), x, 7.0))
+    store(out, 6 * WIDTH, minimum(x, y) - absolute(y))
+    store(out, 7 * WIDTH, broadcast(a, 3) * x)
+    store(out, 8 * WIDTH, 2.5)
+    store(count, 0, select(x > 0.0, 5, load(whole, 0)))
+    store_sums(out, 9 * WIDTH, x, y, x + 1.0, y + 1.0, x + 2.0, y + 2.0, x + 3.0, y + 3.0)
+    return any_lane(x > y), any_lane(x > 1e6), any_lane(load(whole, 0) <= 2)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_lanes_match_numpy(dtype: Any) -> None:
+    generator = np.random.default_rng(0)
+    a, b = generator.normal(size=(2, WIDTH)).astype(dtype)
+    whole, count, out = np.arange(WIDTH, dtype=np.int32), np.zeros(WIDTH, np.int32), np.zeros(10 * WIDTH, dtype)
+    assert _try_all(a, b, whole, out, count) == ((a > b).any(), False, True)
+    rows = out.reshape(-1, WIDTH)
+    exact = [a + b, dtype(1.5) - a, a * dtype(0.1), a / b, None, np.where((a < b) & (b >= 0), a, dtype(7))]
+    for row, expected in zip(rows, exact):
+        assert expected is None or np.array_equal(row, expected)
+    # Rounded once: in float32 equal to the float64 result rounded to float32.
+    once = (a.astype(np.float64) * b - 1).astype(dtype)
+    assert np.array_equal(rows[4], once) if dtype == np.float32 else np.allclose(rows[4], once, rtol=1e-14)
+    assert np.array_equal(rows[6], np.minimum(a, b) - np.abs(b))
+    assert np.array_equal(rows[7], a[3] * a)
+    assert (rows[8] == 2.5).all()
+    assert np.array_equal(count, np.where(a > 0, 5, whole))
+    sums = [value.sum(dtype=np.float64) + WIDTH * more for more in range(4) for value in (a, b)]
+    assert np.allclose(rows[9, :8], sums, rtol=1e-5 if dtype == np.float32 else 1e-14)
+
+
+@compiled
+def _apply_exp_negative(x: Any, out: Any) -> None:
+    for place in range(0, len(x), WIDTH):
+        store(out, place, exp_negative(load(x, place)))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_exp_negative_is_within_one_and_a_half_units_in_the_last_place(dtype: Any) -> None:
+    x = np.concatenate([np.linspace(0, 80, 2**16 - WIDTH), np.linspace(0, 1e-6, WIDTH)]).astype(dtype)
+    out = np.empty_like(x)
+    _apply_exp_negative(x, out)
+    exact = np.exp(-x.astype(np.longdouble))
+    error = float((np.abs(out - exact) / exact).max()) / np.finfo(dtype).eps
+    assert error < 1.5  # measured: 1.37 and 1.32
+    assert out[0] == 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_every_blended_pixel_is_listed_and_few_others(dtype: torch.dtype) -> None:
+    """Round primitives, oblique needles, and some that the image's edge cuts off."""
+    generator = torch.Generator().manual_seed(0)
+    n, width, height = 400, 70, 50
+    means = torch.rand(n, 3, generator=generator) * torch.tensor([2.0, 1.6, 1.0]) + torch.tensor([-1.0, -0.8, 2.0])
+    scales = 10 ** (2 * torch.rand(n, 3, generator=generator) - 2.5)
+    camera = torch.eye(4), torch.tensor([[80.0, 0, 35], [0, 80, 25], [0, 0, 1]])
+    values = (means, torch.randn(n, 4, generator=generator), scales, *camera)
+    projection = project(geometry(*(value.to(dtype) for value in values), width, height))
+    # The faint opacity ends footprints inside gsplat's three-sigma bins, so the bins do not matter here.
+    lists = build_lists(projection, torch.full((n,), 0.2, dtype=dtype), width, height)
+    table = lists.table.astype(np.float64)
+    y, x = np.mgrid[: lists.rows * TILE, : lists.columns * TILE] + 0.5
+    listed = np.zeros((len(lists.ids), *x.shape), bool)
+    for tile in range(lists.rows * lists.columns):
+        left, top = tile % lists.columns * TILE, tile // lists.columns * TILE
+        for entry in range(lists.starts[tile], lists.starts[tile + 1]):
+            first, beyond = (top + STEP * int(step) for step in lists.spans[entry])
+            listed[lists.ranks[entry], first:beyond, left : left + TILE] = True
+    dx, dy = x - table[:, U, None, None], y - table[:, V, None, None]
+    xx, xy, yy, limit = (table[:, column, None, None] for column in (HALF_XX, XY, HALF_YY, LIMIT))
+    visible = xx * dx * dx + xy * dx * dy + yy * dy * dy <= limit - 1e-3
+    assert not (visible & ~listed).any()
+    assert visible.sum() > 0.3 * listed.sum()  # measured: 0.42
+
+
+# ---------------------------------------------------------------------------------------------------------- compilation
+
+LOOP = """
+import numpy as np
+from sizes_of_this_test import SIZE
+from sundae_ns.rasterize.cpu.parallel import compiled, parallel_for
+
+@compiled
+def loop(begin, end, out):
+    for i in range(begin, end):
+        out[i] = SIZE
+
+out = np.zeros(3)
+parallel_for(loop, 3, out)
+"""
+
+
+def test_cached_code_is_renewed_when_a_constant_of_another_module_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = tmp_path / "loop.py"
+    source.write_text(LOOP)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+
+    def run(size: int) -> tuple[list[float], int]:
+        module = ModuleType("sizes_of_this_test")
+        module.SIZE = size  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "sizes_of_this_test", module)
+        made: dict[str, Any] = {"__name__": "loop"}
+        exec(compile(LOOP, str(source), "exec"), made)
+        return made["out"].tolist(), sum(made["loop"].stats.cache_hits.values())
+
+    assert run(1) == ([1.0, 1.0, 1.0], 0)
+    assert run(1) == ([1.0, 1.0, 1.0], 1)
+    assert run(2) == ([2.0, 2.0, 2.0], 0)
+
+
+def test_compiles_without_a_cache_folder() -> None:
+    """numba finds no folder for a function without a file, as if neither package nor home were writable."""
+    made: dict[str, Any] = {}
+    exec(compile("def double(x):\n    return 2 * x", "<nowhere>", "exec"), made)
+    assert parallel.compiled(made["double"])(4) == 8
+
+
+def test_a_notice_is_printed_for_long_compilation(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parallel._print_once.cache_clear()
+    monkeypatch.setattr(parallel, "_NOTICE_AFTER", 0.05)
+    monkeypatch.setattr(parallel, "_ready", set())
+
+    class Loop:
+        """As numba's: it counts the calls that found no code on disk."""
+
+        def __init__(self, seconds: float, misses: int) -> None:
+            self.seconds, self.stats = seconds, SimpleNamespace(cache_misses={"types": misses} if misses else {})
+
+        def __call__(self, begin: int, end: int) -> None:
+            time.sleep(self.seconds if begin == end else 0.0)
+
+    slow = Loop(0.5, misses=1)
+    for quiet in (Loop(0.0, misses=1), Loop(0.5, misses=0)):
+        parallel.parallel_for(quiet, 3)
+        assert capsys.readouterr().err == ""
+    parallel.parallel_for(slow, 3)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "compiling" in line
+    parallel._ready.clear()
+    parallel.parallel_for(slow, 3)
+    parallel.parallel_for(slow, 3)
+    assert capsys.readouterr().err == ""

@@ -1,0 +1,413 @@
+"""The report as a web page: what it holds, that it asks nobody for anything, and its sliders in a browser."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from chromium import CHROMIUM, browser, needs_chromium
+from pages import touch
+from PIL import Image
+
+from sundae_ns.core.errors import DataError
+from sundae_ns.report.measured import Measured, rows_of
+from sundae_ns.report.report_page import (
+    ERROR_COLORS,
+    EXACT_SIDE,
+    LARGEST_ERROR,
+    LONGEST_SIDE,
+    MOST_ON_A_PAGE,
+    MOST_VIEWS,
+    ShownRun,
+    ShownView,
+    choose_views,
+    error_map,
+    report_page,
+    shown_view,
+    views_for_each,
+)
+from sundae_ns.train.curve import CountCurve, CurvePoint
+
+HOSTILE = """"'></h4><script>window.harmed = 1</script><img src=x onerror='window.harmed = 1'>{{ 7*7 }}&amp;"""
+VOID = {"meta", "img", "input", "br", "link"}
+CURVE = CountCurve(
+    chosen=3000,
+    full=9000,
+    reason=f"the smallest within 0.1 dB {HOSTILE}",
+    points=tuple(
+        CurvePoint(count, None, 26 - loss, 0.9 - loss / 20, loss, loss / 20, 0.05, 0.001)
+        for count, loss in ((9000, 0.0), (3000, 0.1), (1000, 1.0))
+    ),
+)
+
+
+class Page(HTMLParser):
+    """The elements of a page, with their attributes and text; refuses elements that are not closed in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert len(dict(attrs)) == len(attrs), "an attribute stands twice"
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not {"style", "script"} & set(self.open):
+            self.text.append(data)
+
+    @property
+    def words(self) -> str:
+        return " ".join(" ".join(self.text).split())
+
+    def all(self, tag: str) -> Iterator[dict[str, str | None]]:
+        return (attributes for name, attributes in self.elements if name == tag)
+
+
+def decoded(address: str | None) -> Image.Image:
+    found = re.fullmatch(r"data:image/(png|webp);base64,([\w+/=]+)", address or "")
+    assert found
+    image = Image.open(BytesIO(base64.b64decode(found[2], validate=True)))
+    assert image.format == found[1].upper()
+    image.load()
+    return image
+
+
+def images(seed: int = 0, height: int = 24, width: int = 32) -> Any:
+    """A photo, its rendering, and that without the head."""
+    return torch.rand(3, height, width, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def shown(run: Measured, *, name: str = "", **options: Any) -> ShownRun:
+    bases = run.base.views if run.has_head else [None] * len(run.full.views)
+    pairs = enumerate(zip(run.full.views, bases, strict=True))
+    return ShownRun(run, [shown_view(i, f"{i}{name}", *images(i), *pair) for i, pair in pairs], **options)
+
+
+def page_of(*runs: ShownRun, notes: tuple[str, ...] = ()) -> str:
+    return report_page(runs, notes, "sundae report x")
+
+
+# ------------------------------------------------------------------------------------------------- the choice of views
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 23, 24, 25, 300, 1000])
+def test_the_worst_and_the_best_view_are_among_those_that_are_shown(count: int) -> None:
+    random = np.random.default_rng(count)
+    for _ in range(20):
+        qualities = random.uniform(10, 40, count).tolist()
+        for most in (2, 3, 7, MOST_VIEWS):
+            chosen = choose_views(qualities, most)
+            assert len(chosen) == min(most, count)
+            assert chosen == sorted(set(chosen))
+            assert {int(np.argmin(qualities)), int(np.argmax(qualities))} <= set(chosen)
+
+
+def test_other_views_are_evenly_spaced() -> None:
+    qualities = [25.0] * 300
+    qualities[107], qualities[206] = 10.0, 40.0  # not among the evenly spaced ones
+    chosen = [index for index in choose_views(qualities, 24) if index not in (107, 206)]
+    assert (chosen[0], chosen[-1], len(chosen)) == (0, 299, 22)
+    assert set(np.diff(chosen)) <= {14, 15}
+
+
+def test_a_view_without_a_figure_counts_as_worst() -> None:
+    qualities = [20.0 + index for index in range(50)]
+    qualities[31], qualities[17] = math.nan, math.inf
+    assert choose_views(qualities, 2) == [17, 31]
+
+
+def test_a_page_of_many_runs_shows_fewer_views_of_each() -> None:
+    assert views_for_each(1) == MOST_VIEWS
+    assert all(runs * views_for_each(runs) <= MOST_ON_A_PAGE for runs in range(1, MOST_ON_A_PAGE // 2 + 1))
+    assert views_for_each(1000) == 2
+
+
+# ------------------------------------------------------------------------------------------------------- the error map
+
+
+def test_the_error_map_of_equal_images_has_one_color() -> None:
+    image = torch.rand(9, 12, 3)
+    found = error_map(image, image.clone())
+    assert found.size == (12, 9)
+    assert np.array_equal(np.unique(np.asarray(found.convert("RGB")).reshape(-1, 3), axis=0), ERROR_COLORS[:1])
+
+
+def test_errors_have_their_place_among_the_colors() -> None:
+    photo = torch.zeros(1, 4, 3)
+    levels = torch.tensor([0.0, LARGEST_ERROR / 2, LARGEST_ERROR, 255]) / 255
+    found = np.asarray(error_map(levels[None, :, None].expand(1, 4, 3), photo).convert("RGB"))[0]
+    colors = ERROR_COLORS
+    middle = len(colors) // 2
+    assert found[0].tolist() == colors[0].tolist()
+    assert found[1].tolist() in colors[middle - 1 : middle + 1].tolist()
+    assert found[2].tolist() == found[3].tolist() == colors[-1].tolist()
+    # The mean of the channels, whatever the sign.
+    one = torch.tensor([LARGEST_ERROR / 255, 0.0, 0.0]).expand(1, 4, 3)
+    three = torch.full((1, 4, 3), LARGEST_ERROR / 255 / 3)
+    assert np.array_equal(error_map(one, photo), error_map(photo, three))
+
+
+def test_a_smaller_error_map_has_the_mean_of_its_pixels() -> None:
+    photo, rendering = torch.zeros(2, 8, 16, 3)
+    rendering[:, ::2] = LARGEST_ERROR / 255
+    half = torch.full((4, 8, 3), LARGEST_ERROR / 255 / 2)
+    assert np.array_equal(error_map(rendering, photo, (8, 4)), error_map(half, torch.zeros(4, 8, 3)))
+
+
+def test_an_error_map_needs_two_images_of_one_size() -> None:
+    for shape in ((8, 9, 3), (8, 8, 1), (8, 8)):
+        with pytest.raises(DataError, match="give two of one size"):
+            error_map(torch.zeros(shape), torch.zeros(8, 8, shape[-1]))
+
+
+# ------------------------------------------------------------------------------------------------------------ one view
+
+
+def view_of(measured: Callable[..., Measured], height: int, width: int, *, head: bool = True) -> tuple[ShownView, Any]:
+    run, photos = measured(), images(0, height, width)
+    return shown_view(3, "a.png", *photos, run.full.views[0], run.base.views[0] if head else None), photos
+
+
+@pytest.mark.parametrize(("size", "expected"), [((24, 32), (32, 24)), ((700, 2400), (LONGEST_SIDE, 350))])
+def test_images_of_a_view_have_one_size(
+    measured: Callable[..., Measured], size: tuple[int, int], expected: tuple[int, int]
+) -> None:
+    view, _ = view_of(measured, *size)
+    assert (view.index, view.name, view.size, view.shown) == (3, "a.png", size[::-1], expected)
+    assert list(view.images) == ["rendering", "head off", "error map"]
+    for address in (view.photo, *view.images.values()):
+        assert decoded(address).size == expected
+    assert list(view_of(measured, *size, head=False)[0].images) == ["rendering", "error map"]
+
+
+@pytest.mark.parametrize(("width", "exact"), [(EXACT_SIDE, True), (EXACT_SIDE + 2, False)])
+def test_small_images_lose_nothing(measured: Callable[..., Measured], width: int, exact: bool) -> None:
+    view, (photo, rendering, bare) = view_of(measured, 24, width)
+    addresses = (view.photo, view.images["rendering"], view.images["head off"])
+    for address, image in zip(addresses, (photo, rendering, bare), strict=True):
+        assert np.array_equal(np.asarray(decoded(address)), (255 * image).round().numpy()) is exact
+    errors = error_map(rendering, photo).convert("RGB")
+    assert np.array_equal(decoded(view.images["error map"]).convert("RGB"), errors)
+
+
+def test_a_rendering_that_is_not_finite_is_shown(measured: Callable[..., Measured]) -> None:
+    broken = torch.full((16, 16, 3), math.nan)
+    view = shown_view(0, "a", torch.ones(16, 16, 3), broken, broken, measured().full.views[0], None)
+    assert np.asarray(decoded(view.images["rendering"])).max() == 0
+    errors = np.asarray(decoded(view.images["error map"]).convert("RGB"))
+    assert np.array_equal(np.unique(errors), np.unique(ERROR_COLORS[-1]))
+
+
+# ------------------------------------------------------------------------------------------------------------ the page
+
+
+def outside(text: str) -> list[str]:
+    """Addresses in a page that are not in it."""
+    plain = re.sub(r"data:[\w/+]+;base64,[\w+/=]+", "", text)
+    named = r"\b(?:https?|ftp|file|wss?):|@import|url\((?!#)|<(?:link|iframe|object|base)\b"
+    named += r"""|(?:src|href|action|srcset)=["'](?!["'#])[^"']+"""
+    return re.findall(named, plain, re.IGNORECASE)
+
+
+def test_it_asks_nobody_for_anything(measured: Callable[..., Measured]) -> None:
+    text = page_of(shown(measured(), curve=CURVE), shown(measured("b", head=False)))
+    assert outside(text) == []
+    for wrong in ('<img src="a.png">', "fetch('https://a')", "url(a.png)", "<link>"):
+        assert outside(wrong)
+    ((policy,),) = [[value["content"]] for value in Page(text).all("meta") if value.get("http-equiv")]
+    assert policy is not None
+    rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
+    assert (rules["default-src"], rules["img-src"]) == ("'none'", "data:")
+    assert re.fullmatch(r"'sha256-[\w+/=]+'", rules["script-src"])
+
+
+def test_every_image_decodes(measured: Callable[..., Measured]) -> None:
+    page = Page(page_of(shown(measured()), shown(measured("b", head=False))))
+    found = [image for image in page.all("img") if "width" in image]
+    # Photo, rendering, rendering without the head and error map; photo, rendering and error map.
+    assert len(found) == 3 * 4 + 3 * 3
+    for image in found:
+        assert decoded(image["src"]).size == (32, 24) == (int(image["width"] or 0), int(image["height"] or 0))
+        assert (image["loading"], image["decoding"]) == ("lazy", "async")
+    assert all(image["alt"] for image in page.all("img"))
+
+
+def test_its_figures_are_those_of_the_report(measured: Callable[..., Measured]) -> None:
+    run = measured()
+    page = Page(page_of(shown(run)))
+    for row in rows_of([run]):
+        assert " ".join(row) in page.words
+    for view, base in zip(run.full.views, run.base.views, strict=True):
+        assert (
+            f"PSNR {view.psnr:.2f} dB, SSIM {view.ssim:.4f}, FLIP 0.2000 head off: PSNR {base.psnr:.2f}" in page.words
+        )
+    cards = [card for card in page.all("article")]
+    assert [float(card["data-psnr"] or 0) for card in cards] == [view.psnr for view in run.full.views]
+    assert "sundae report x" in page.words
+    assert "All 3 test views" in page.words
+
+
+def test_hostile_names_stay_text(measured: Callable[..., Measured]) -> None:
+    run = replace(measured(HOSTILE, scene=HOSTILE), source=HOSTILE, method=HOSTILE, variant=HOSTILE)
+    text = page_of(shown(run, name=HOSTILE, curve=CURVE), notes=(HOSTILE,))
+    hostile = Page(text)
+    plain = Page(page_of(shown(measured(), name="b", curve=CURVE), notes=("a note",)))
+    assert [name for name, _ in hostile.elements] == [name for name, _ in plain.elements]
+    assert [list(found) for _, found in hostile.elements] == [list(found) for _, found in plain.elements]
+    assert sum(name == "script" for name, _ in hostile.elements) == 1
+    assert hostile.words.count(" ".join(HOSTILE.split())) > 10
+    assert any(f"0{HOSTILE}" == card["data-name"] for card in hostile.all("article"))
+
+
+def test_names_of_elements_are_unique(measured: Callable[..., Measured]) -> None:
+    page = Page(page_of(shown(measured(), curve=CURVE), shown(measured("b"), curve=CURVE)))
+    names = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(names) == len(set(names))
+    wanted = [
+        value for _, attributes in page.elements for key in ("for", "aria-labelledby") if (value := attributes.get(key))
+    ]
+    assert set(wanted) <= set(names)
+
+
+def test_the_curve_marks_the_choice(measured: Callable[..., Measured]) -> None:
+    page = Page(page_of(shown(measured(), curve=CURVE)))
+    assert "Chosen: 3,000 of 9,000 primitives" in page.words
+    (plot,) = [image for image in page.all("img") if (image["src"] or "").startswith("data:image/svg+xml;base64,")]
+    assert "3,000 of 9,000 were chosen" in (plot["alt"] or "")
+    drawing = base64.b64decode((plot["src"] or "").partition(",")[2]).decode().lower()
+    assert drawing.count("#d55e00") >= 2
+    assert drawing.count("#0072b2") > 2 * len(CURVE.points)
+    assert "svg+xml" not in page_of(shown(measured()))
+
+
+def test_views_of_other_runs_stand_beside_those_of_the_same_capture(measured: Callable[..., Measured]) -> None:
+    page = Page(
+        page_of(
+            shown(measured("a"), capture="x"),
+            shown(measured("b"), capture="x"),
+            shown(measured("c"), capture="y"),
+            shown(measured("d", scene="other"), capture="x"),
+        )
+    )
+    choices = [choice["value"] for choice in page.all("option") if (choice.get("value") or "").startswith("v")]
+    places = [card["id"] for card in page.all("article") if (card["id"] or "").startswith(("v0", "v1"))]
+    assert choices == [*places[3:], *places[:3]] == ["v1-0", "v1-1", "v1-2", "v0-0", "v0-1", "v0-2"]
+
+
+# --------------------------------------------------------------------------------------------------------- in a browser
+
+
+@pytest.fixture
+def opened(measured: Callable[..., Measured], tmp_path: Path) -> Iterator[Any]:
+    runs = [shown(measured("a"), curve=CURVE, capture="x", name=HOSTILE), shown(measured(HOSTILE, head=False))]
+    runs.append(shown(measured("c"), capture="x", name=HOSTILE))
+    (tmp_path / "report.html").write_text(page_of(*runs), encoding="utf-8")
+    with browser.Browser(CHROMIUM, 400, 700) as page:
+        page.open((tmp_path / "report.html").as_uri())
+        ready = "document.documentElement?.classList.contains('ready') ?? false"
+        browser.wait_for(lambda: page.evaluate(ready), "the page", 60)
+        yield page
+        assert page.evaluate("typeof window.harmed") == "undefined"
+        assert page.errors == []
+
+
+def of_first(page: Any, body: str) -> Any:
+    """A value that a script finds in the first view of the page."""
+    return page.evaluate(f"(() => {{ const card = document.querySelector('.view'); return {body}; }})()")
+
+
+def place(page: Any) -> tuple[float, float, float, float]:
+    """Left, top, width and height of the first view's image in the window, in pixels."""
+    found = "[r.x, r.y, r.width, r.height]"
+    stage = "card.querySelector('.stage')"
+    x, y, width, height = of_first(page, f"({stage}.scrollIntoView(), (r => {found})({stage}.getBoundingClientRect()))")
+    return x, y, width, height
+
+
+CLIP = "getComputedStyle(card.querySelector('.over:not([hidden])')).clipPath"
+
+
+@pytest.mark.browser
+@needs_chromium
+def test_keys_and_pointer_move_the_slider(opened: Any) -> None:
+    assert of_first(opened, CLIP) == "inset(0px 0px 0px 50%)"
+    of_first(opened, "card.querySelector('input[type=range]').focus()")
+    for _ in range(3):
+        opened.key("ArrowRight", 39)
+    assert of_first(opened, CLIP) == "inset(0px 0px 0px 53%)"
+    text = of_first(opened, "card.querySelector('input[type=range]').getAttribute('aria-valuetext')")
+    assert text == "53% photo, the rest rendering"
+    x, y, width, height = place(opened)
+    opened.drag(x + width / 2, y + height / 2, x + width / 4, y + height / 2)
+    value = int(of_first(opened, "card.querySelector('input[type=range]').value"))
+    assert abs(value - 25) <= 1
+    assert of_first(opened, CLIP) == f"inset(0px 0px 0px {value}%)"
+    assert opened.evaluate("document.activeElement.type") == "range"
+    # Wider than the window, nothing is: a phone would scroll sideways.
+    assert opened.evaluate("document.documentElement.scrollWidth") == 400
+
+
+@pytest.mark.browser
+@needs_chromium
+def test_a_finger_moves_the_slider_or_scrolls_the_page(opened: Any) -> None:
+    x, y, width, height = place(opened)
+    value, scrolled = "card.querySelector('input[type=range]').value", "window.scrollY"
+    middle = round(y + height / 2)
+    touch(opened, (round(x + width / 2), middle), (round(x + width * 0.8), middle))
+    browser.wait_for(lambda: of_first(opened, value) == "80", "the slider", 30)
+    before = opened.evaluate(scrolled)
+    touch(opened, (round(x + width / 2), middle + 100), (round(x + width / 2), middle - 200))
+    browser.wait_for(lambda: opened.evaluate(scrolled) > before, "the page to scroll", 30)
+    assert of_first(opened, value) == "80"
+
+
+@pytest.mark.browser
+@needs_chromium
+def test_layers_order_and_the_other_run(opened: Any) -> None:
+    drawn = "[...card.querySelectorAll('.over:not([hidden])')].map(e => e.dataset.layer).join()"
+    assert of_first(opened, drawn) == "rendering"
+    of_first(opened, "card.querySelector('input[value=\"error map\"]').click()")
+    assert of_first(opened, drawn) == "error map"
+    assert of_first(opened, "card.querySelector('.tag.right').textContent") == "error map"
+    choose = "(select => (select.value = %s, select.dispatchEvent(new Event('change'))))(document.querySelector('.%s'))"
+    opened.evaluate(choose % ("'head off'", "all"))
+    assert of_first(opened, drawn) == "head off"
+
+    order = "[...document.querySelector('.views').children].map(e => Number(e.dataset.psnr))"
+    assert opened.evaluate(order) == sorted(opened.evaluate(order))
+    opened.evaluate(choose % ("'best'", "order"))
+    assert opened.evaluate(order) == sorted(opened.evaluate(order), reverse=True)
+    opened.evaluate(choose % ("'capture'", "order"))
+    assert opened.evaluate("[...document.querySelector('.views').children].map(e => e.dataset.index).join()") == "0,1,2"
+
+    source = "card.querySelector('.under').src"
+    photo = of_first(opened, source)
+    opened.evaluate(choose % ("document.querySelector('.beside').options[1].value", "beside"))
+    assert of_first(opened, source) == opened.evaluate("document.querySelector('#v2-0 [data-layer=rendering]').src")
+    assert of_first(opened, "card.querySelector('.tag.left').textContent") == "c"
+    opened.evaluate(choose % ("''", "beside"))
+    assert of_first(opened, source) == photo

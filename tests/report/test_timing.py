@@ -1,0 +1,51 @@
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sundae_ns.core import timing as timing_module
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.core.timing import median_ms, peak_memory
+
+
+def test_statistics_of_a_fake_clock(monkeypatch):
+    seconds = iter([0.010, 0.030, 0.020, 0.500, 0.040])
+    now, calls = [0.0], []
+
+    def work():
+        calls.append(None)
+        if len(calls) > 2:
+            now[0] += next(seconds)
+
+    monkeypatch.setattr(timing_module.time, "perf_counter", lambda: now[0])
+    result = median_ms(work, device="cpu", warmup=2, repeats=5)
+    assert len(calls) == 7
+    assert result == pytest.approx(30)
+
+
+def test_waits_for_the_device_on_both_sides(monkeypatch):
+    events = []
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: events.append("wait"))
+    clock = time.perf_counter
+    monkeypatch.setattr(timing_module.time, "perf_counter", lambda: events.append("clock") or clock())
+    median_ms(lambda: events.append("work"), device="cuda", warmup=0, repeats=2)
+    assert events == ["wait", "clock", "work", "wait", "clock"] * 2
+
+
+@pytest.mark.parametrize("wrong", [{"warmup": -1}, {"repeats": 0}])
+def test_impossible_options(wrong):
+    with pytest.raises(ConfigError):
+        median_ms(lambda: None, device="cpu", **wrong)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="compares with Linux's own number")
+def test_the_peak_is_in_bytes_and_at_least_the_current_memory():
+    held = np.ones(64 << 20, np.uint8)
+    now = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    peak = peak_memory(torch.device("cpu"))
+    assert held.nbytes <= now <= peak * 1.01
+    del held
+    assert peak_memory(torch.device("cpu")) >= peak

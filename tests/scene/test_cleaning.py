@@ -1,0 +1,133 @@
+"""Boxes around scenes, and floaters."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import sundae_ns as sn
+from sundae_ns.core.errors import ConfigError, DataError
+from sundae_ns.core.gaussians import Field
+from sundae_ns.scene.cleaning import crop_mask, floater_mask, within
+
+VIEWS = tuple(sn.View.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=96, height=72) for x in (-2.0, 0.0, 2.0))
+
+
+def scene_of(points: Tensor, scale: float) -> sn.Scene:
+    made = sn.Scene.from_points(points, points.sigmoid())
+    values = {
+        "scales": torch.full_like(made.field["scales"], math.log(scale)),
+        "opacities": made.field["opacities"] + 9,
+    }
+    return dataclasses.replace(made, field=made.field.replaced(values), views=VIEWS)
+
+
+def wall(n: int = 4000) -> Tensor:
+    """Points of a square of side 4, which faces the views."""
+    generator = torch.Generator().manual_seed(0)
+    return (torch.rand(n, 3, generator=generator) - 0.5) * torch.tensor([4.0, 0.02, 4.0])
+
+
+def planted(n: int = 30) -> Tensor:
+    """Points in the air between wall and views, some of them in threes."""
+    generator = torch.Generator().manual_seed(1)
+    alone = torch.rand(n, 3, generator=generator) * torch.tensor([3.0, 1.5, 3.0]) + torch.tensor([-1.5, -2.5, -1.5])
+    return torch.cat([alone, alone[:5] + 0.04, alone[:5] - 0.04])
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e-3, 1e3])
+@pytest.mark.parametrize("with_views", [True, False])
+def test_planted_floaters_vanish_and_the_surface_stays(factor: float, with_views: bool) -> None:
+    floaters, surface = planted(), wall()
+    whole = scene_of(factor * torch.cat([surface, floaters]), factor * 0.02)
+    views = [view._replace(viewmat=view.viewmat.clone()) for view in VIEWS]
+    for view in views:
+        view.viewmat[:3, 3] *= factor
+    found = floater_mask(whole, views if with_views else ())
+    assert bool(found[len(surface) :].all())
+    assert int(found[: len(surface)].sum()) <= 2
+    if factor == 1:
+        clean = sn.remove_floaters(whole, views=views if with_views else ())
+        assert clean.num_primitives == int((~found).sum())
+        truth = scene_of(surface, 0.02)
+        assert sn.measure(clean, truth).psnr > 50
+        assert sn.measure(whole, truth).psnr < 35
+
+
+def test_what_no_view_sees_goes_and_no_image_changes() -> None:
+    """A second wall right behind the first, and one behind the cameras; both touch themselves."""
+    hidden = torch.cat([wall() * 0.5 + torch.tensor([0.0, 0.9, 0.0]), wall() + torch.tensor([0.0, -9.0, 0.0])])
+    whole = scene_of(torch.cat([wall(), hidden]), 0.12)
+    found = floater_mask(whole, VIEWS)
+    assert float(found[:4000].float().mean()) < 0.05
+    assert float(found[4000:8000].float().mean()) > 0.9
+    assert bool(found[8000:].all())
+    assert sn.measure(sn.remove_floaters(whole), whole).psnr > 70
+    assert int(floater_mask(whole, ())[4000:].sum()) <= 4, "without views, walls are supported"
+
+
+def test_floaters_are_counted_after_values_without_meaning() -> None:
+    whole = scene_of(torch.cat([wall(), planted()]), 0.02)
+    means = whole.field["means"].clone()
+    means[7] = math.nan
+    found = floater_mask(dataclasses.replace(whole, field=whole.field.replaced({"means": means})), VIEWS)
+    assert bool(found[7])
+    assert int(found[:4000].sum()) <= 3
+    assert bool(found[4000:].all())
+    nothing = dataclasses.replace(whole, field=whole.field.replaced({"means": means * math.nan}))
+    with pytest.raises(DataError, match="no primitive is finite"):
+        sn.remove_floaters(nothing)
+    away = [sn.View.look_at((0.0, -40.0, 0.0), (0.0, -80.0, 0.0), width=32, height=32)]
+    with pytest.raises(DataError, match="1 views see none"):
+        sn.remove_floaters(whole, views=away)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_few_primitives(n: int) -> None:
+    points = torch.arange(3.0 * n).view(n, 3)
+    assert int(floater_mask(scene_of(points, 9.0), ()).sum()) == 0
+    assert int(floater_mask(scene_of(points, 0.01), ()).sum()) == (n if n > 1 else 0)
+
+
+def test_a_box_is_exact_and_keeps_all_else() -> None:
+    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.1, 0.5, 0.5], [1.0, 1.0, 1.0000001], [-1e-30, 0, 0]])
+    whole = dataclasses.replace(scene_of(points, 0.1), up=(0.0, 0.0, 1.0), start=VIEWS[1], antialiased=True)
+    assert crop_mask(whole, (0, 0, 0), (1, 1, 1)).tolist() == [True, True, True, False, False]
+    # 0.1 is not a float32: the box is compared in float64.
+    assert crop_mask(whole, (0.1, 0, 0), (2, 2, 2)).tolist()[2] == (float(torch.tensor(0.1).double()) >= 0.1)
+    found = sn.crop(whole, (0, 0, 0), (1, 1, 1))
+    assert torch.equal(found.field["means"], points[:3])
+    assert torch.equal(found.field["scales"], whole.field["scales"][:3])
+    assert (found.views, found.up, found.start, found.antialiased) == (whole.views, whole.up, whole.start, True)
+    assert whole.num_primitives == 5
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "message"),
+    [
+        ((0, 0, 0), (1, 1, 0), "the box is empty"),
+        ((0, 0, 0), (1, 1, math.nan), "not six finite numbers"),
+        ((0, 0), (1, 1), "not six finite numbers"),
+    ],
+)
+def test_impossible_boxes_are_refused(low: tuple[float, ...], high: tuple[float, ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        sn.crop(scene_of(wall(10), 0.1), low, high)
+
+
+def test_an_empty_result_says_where_the_scene_is() -> None:
+    with pytest.raises(DataError, match=r"most of them lie between -1\.\d+ .* and 1\.\d+ "):
+        sn.crop(scene_of(wall(), 0.1), (50, 50, 50), (51, 51, 51))
+    broken = sn.Scene(Field({name: value * math.nan for name, value in scene_of(wall(9), 0.1).field.items()}))
+    with pytest.raises(DataError, match="no primitive is in the box"):
+        sn.crop(broken, (0, 0, 0), (1, 1, 1))
+
+
+def test_masks_within_masks() -> None:
+    outer, inner = torch.tensor([True, False, True, True]), torch.tensor([False, True, True])
+    assert within(outer, inner).tolist() == [False, False, True, True]
+    assert within(None, inner) is inner

@@ -1,0 +1,113 @@
+"""What each primitive contributes to the training pictures."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from fields import random_field
+from torch import Tensor
+
+import sundae_ns as sn
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.gaussians import Field
+from sundae_ns.plugin.model import SundaeModel
+from sundae_ns.pruning.scores import pixel_detail
+from sundae_ns.rasterize.interface import blending_weights, rasterize
+from sundae_ns.scene.render import LocalField, TrainingView, contribution, pass_options
+
+Build = Callable[..., SundaeModel]
+TrainingOf = Callable[[SundaeModel], Any]
+
+N = 60
+"""Primitives of a model that is built without a count."""
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: Any, mode: str) -> None:
+    model = build(rasterize_mode=mode)
+    # Thinner than a pixel, where the two modes differ by far.
+    model.gauss_params["scales"].data[:30] = -6.0
+    model.gauss_params["means"].data[4] = torch.tensor([0.0, 0.0, 50.0])
+    total = model.contribution(datamanager)
+    assert total.shape == (N,)
+    assert not total.requires_grad
+    assert (total >= 0).all()
+    assert total[4] == 0
+    model.eval()
+    with torch.no_grad():
+        alphas = [model.get_outputs_for_camera(view)["accumulation"] for view, _ in datamanager.training_views()]
+    assert float(total.sum()) == pytest.approx(float(torch.stack(alphas).sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize("count", [None, N // 2])
+def test_what_masks_leave_out_of_training_asks_for_no_primitives(
+    build: Build, datamanager: Any, count: int | None
+) -> None:
+    """The two halves of an image add up to the whole; many primitives contribute to one half only."""
+    model = build()
+    model.gauss_params["scales"].data[:] = -4.0
+    whole = model.contribution(datamanager, count)
+    left = torch.zeros(32, 40, 1, dtype=torch.bool)
+    left[:, :20] = True
+    parts = []
+    for datamanager.mask in (left, ~left):
+        parts.append(model.contribution(datamanager, count))
+    torch.testing.assert_close(parts[0] + parts[1], whole)
+    for only, other in (parts, parts[::-1]):
+        assert ((only == 0) & (other > 0)).any()
+    datamanager.mask = torch.ones_like(left)
+    torch.testing.assert_close(model.contribution(datamanager, count), whole)
+    for datamanager.mask in (left[:-1], left[..., 0], left[:1]):
+        with pytest.raises(DataError, match="its view is 40 x 32 px"):
+            model.contribution(datamanager, count)
+
+
+def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time(build: Build, datamanager: Any) -> None:
+    model = build()
+    found = [model.contribution(datamanager, count) for count in (None, N // 2, N // 2)]
+    assert torch.equal(found[1], found[2])
+    assert torch.equal(found[1] > 0, found[0] > 0)
+    seen = found[0] > 0
+    ratio = found[1][seen] / found[0][seen]
+    assert float(ratio.max()) > 1.1
+    assert float(ratio.min()) < 0.9
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_weights_by_detail_are_those_of_an_image_and_a_second_pass(masked: bool) -> None:
+    scene = sn.Scene(Field(random_field(60, features=0)))
+    view, settings = sn.virtual_views(scene, 1, size=40)[0], scene.settings()
+    mask = torch.rand(40, 40, 1, generator=torch.Generator().manual_seed(0)) < 0.5 if masked else None
+    found = contribution(LocalField(scene.field), [TrainingView(view, mask)], scene.background, settings, 20)
+    image = sn.render(scene, view)
+    visible = rasterize(colors=scene.field["features_dc"], **pass_options(scene.field, view, settings)).radii > 0
+    pixels = pixel_detail(image.rgb, 20 / 60 * float(visible.sum()))
+    pixels = pixels if mask is None else pixels * mask[..., 0]
+    expected = blending_weights(pixels=pixels, **pass_options(scene.field, view, settings))
+    assert float(expected.max()) > 0.1
+    torch.testing.assert_close(found, expected)
+    assert not any(value.requires_grad for value in scene.field.values())
+
+
+def test_a_prune_weighs_detail_for_the_count_that_it_keeps(
+    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training = training_of(build(pruning={"mode": "continuous", "start": 3, "stop": 3, "target_primitives": 15}))
+    asked: list[float] = []
+
+    def spy(image: Tensor, cells: float) -> Tensor:
+        asked.append(cells)
+        return pixel_detail(image, cells)
+
+    monkeypatch.setattr(sys.modules[contribution.__module__], "pixel_detail", spy)
+    counts = []
+    for step in range(6):
+        training.step(step)
+        counts.append(training.model.num_points)
+    assert counts == [60, 60, 60, 15, 15, 15]
+    # All primitives are visible in each of three views, and 15 of them stay.
+    assert asked == [15.0] * 3

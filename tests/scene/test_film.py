@@ -1,0 +1,140 @@
+"""Films: closed, smooth paths through a scene's views, or around a scene without any."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import sundae_ns as sn
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.scene.camera_path import MOST_FRAMES, film_views
+
+COUNT = 120
+
+
+def ball(n: int = 4000) -> sn.Scene:
+    """A solid one of radius 1."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1)
+    points = points * torch.rand(n, 1, generator=generator) ** (1 / 3)
+    scene = sn.Scene.from_points(points, torch.rand(n, 3, generator=generator))
+    return dataclasses.replace(scene, field=scene.field.replaced({"opacities": scene.field["opacities"] + 4}))
+
+
+def looking(
+    eyes: list[tuple[float, float, float]], targets: list[tuple[float, float, float]], roll: float = 0.0
+) -> tuple:
+    up = (math.sin(roll), 0.0, math.cos(roll))
+    pairs = zip(eyes, targets, strict=True)
+    return tuple(sn.View.look_at(eye, target, up, fov=50, width=40, height=30) for eye, target in pairs)
+
+
+def on_a_ring(n: int, radius: float = 4.0) -> list[tuple[float, float, float]]:
+    """In no order, some higher than others."""
+    turns = [2 * math.pi * (7 * i % n) / n for i in range(n)]
+    return [(radius * math.cos(turn), radius * math.sin(turn), 0.5 * math.cos(3 * turn)) for turn in turns]
+
+
+def film(scene: sn.Scene) -> list[sn.View]:
+    return film_views(scene, seconds=COUNT / 24, frames_per_second=24)
+
+
+def steps(views: list[sn.View], distance: float) -> Tensor:
+    """Motion and turning from each frame to the next, and from the last to the first ``[V]``."""
+    parts = torch.stack([torch.cat([view.center / distance, -view.pose[:, 2]]) for view in views]).double()
+    return (parts.roll(-1, dims=0) - parts).norm(dim=1)
+
+
+def check_upright(views: list[sn.View], up: Tensor) -> None:
+    for view in views:
+        assert abs(float(view.pose[:, 0] @ up)) < 1e-5
+        assert float(view.pose[:, 1] @ up) > 0.3
+
+
+def test_the_path_leads_through_views_and_closes() -> None:
+    eyes = on_a_ring(23)
+    scene = dataclasses.replace(ball(), views=looking(eyes, len(eyes) * [(0.0, 0.0, 0.0)]))
+    views = film(scene)
+    assert len(views) == COUNT
+    assert (views[0].width, views[0].height) == (40, 30)
+    assert torch.equal(views[0].K, scene.views[0].K)
+    assert torch.allclose(views[0].viewmat, scene.views[0].viewmat, atol=1e-5)
+    found = steps(views, 3.0)  # the ball's near side is 3 away
+    assert float(found.max() / found.min()) < 1.2
+    check_upright(views, torch.tensor([0.0, 0.0, 1.0]))
+    centers = torch.stack([view.center for view in views])
+    turns = torch.atan2(centers[:, 1], centers[:, 0])
+    whole = (turns.roll(-1) - turns + math.pi).remainder(2 * math.pi) - math.pi
+    assert abs(float(whole.sum())) == pytest.approx(2 * math.pi, rel=1e-5), "once around, not to and fro"
+    apart = torch.cdist(torch.tensor(eyes), centers).amin(dim=1)
+    assert int((apart < 0.1).sum()) >= 6
+    assert float(centers.norm(dim=1).min()) > 3.5, "the spline cuts no corner"
+
+
+def test_it_begins_with_the_start_view_and_keeps_the_up_axis() -> None:
+    eyes = on_a_ring(9)
+    rolled = looking(eyes, len(eyes) * [(0.0, 0.0, 0.0)], roll=0.3)
+    start = sn.View.look_at((0, -5, 1), (0, 0, 0), fov=30, width=3000, height=2000)
+    up = (math.sin(0.3), 0.0, math.cos(0.3))
+    views = film(dataclasses.replace(ball(), views=rolled, start=start, up=up))
+    assert torch.allclose(views[0].center, start.center, atol=1e-4)
+    assert (views[0].width, views[0].height) == (1280, 853)
+    assert views[0].focal == pytest.approx(start.focal * 1280 / 3000, rel=1e-3)
+    check_upright(views, torch.tensor(up))
+
+
+def test_views_that_look_in_opposite_directions_are_turned_between() -> None:
+    eyes = [(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.2, 0.0, 0.0)]
+    scene = dataclasses.replace(ball(), views=looking(eyes, [(0.0, 9.0, 0.0), (0.1, -9.0, 0.0), (0.2, 9.0, 0.0)]))
+    views = film(scene)
+    found = steps(views, 1.0)
+    assert float(found.max()) < 3 * float(found.mean())
+    check_upright(views, torch.tensor([0.0, 0.0, 1.0]))
+
+
+def test_views_that_see_nothing_make_a_path_too() -> None:
+    eyes = on_a_ring(9, radius=400.0)
+    outward = [(2 * x, 2 * y, z) for x, y, z in eyes]
+    views = film(dataclasses.replace(ball(), views=looking(eyes, outward)))
+    found = steps(views, 400.0)
+    assert float(found.max() / found.min()) < 1.5
+    assert min(float(view.center.norm()) for view in views) > 300
+
+
+def test_a_view_straight_down_is_passed_over() -> None:
+    eyes = on_a_ring(5)
+    views = looking([(0.0, 0.0, 6.0), *eyes], 6 * [(0.0, 0.0, 0.0)])
+    found = film(dataclasses.replace(ball(), views=views, up=(0.0, 0.0, 1.0)))
+    check_upright(found, torch.tensor([0.0, 0.0, 1.0]))
+    assert max(float(view.center[2]) for view in found) < 2
+
+
+@pytest.mark.parametrize(("stored", "factor"), [(0, 1.0), (1, 1000.0), (4, 1.0)])
+def test_a_scene_without_a_path_is_seen_from_all_around(stored: int, factor: float) -> None:
+    scene = ball(1500)
+    grown = {"means": factor * scene.field["means"], "scales": scene.field["scales"] + math.log(factor)}
+    view = looking([(0.0, -5.0 * factor, 0.0)], [(0.0, 0.0, 0.0)])
+    scene = dataclasses.replace(scene, field=scene.field.replaced(grown), views=stored * view, up=(0.0, -1.0, 0.0))
+    views = film(scene)
+    found = steps(views, float(views[0].center.norm()))
+    assert float(found.max() / found.min()) < 1.2
+    check_upright(views, torch.tensor([0.0, -1.0, 0.0]))
+    centers = torch.stack([view.center for view in views])
+    turns = torch.atan2(centers[:, 0], centers[:, 2])
+    whole = (turns.roll(-1) - turns + math.pi).remainder(2 * math.pi) - math.pi
+    assert abs(float(whole.sum())) == pytest.approx(2 * math.pi, rel=1e-4)
+    seen = [float(sn.render(scene, view.zoomed(0.05)).accumulation.mean()) for view in views[::20]]
+    assert min(seen) > 0.1
+    assert (views[0].width, views[0].height) == ((40, 30) if stored else (1280, 720))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "speed"), [(0, 24), (-1, -24), (0.01, 24), (math.nan, 24), (math.inf, 24), (9, MOST_FRAMES)]
+)
+def test_impossible_lengths_are_refused(seconds: float, speed: float) -> None:
+    with pytest.raises(ConfigError, match="is impossible"):
+        film_views(ball(), seconds=seconds, frames_per_second=speed)

@@ -1,0 +1,105 @@
+"""``import sundae_ns``: its names, its doctests, the lines of README, and that none of it needs nerfstudio."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from fields import random_field
+from short_prunes import SHORT
+
+import sundae_ns as sn
+from sundae_ns.core.gaussians import Field
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io.ply import write_ply
+
+ROOT = Path(__file__).parents[2]
+FUNCTIONS = ("crop", "load", "measure", "prune", "remove_floaters", "render", "save", "show", "views_of")
+FUNCTIONS += ("virtual_views",)
+WITHOUT_NERFSTUDIO = """
+import sys
+sys.modules["nerfstudio"] = None
+%s
+import sundae_ns as sn
+scene = sn.load("headed.sundae")
+sn.render(scene, sn.View.look_at((2.0, 2.0, 2.0), (0.5, 0.5, 0.5), width=64, height=48))
+assert scene.head and "torch._dynamo" not in sys.modules  # the import of torch's compiler takes most of a second
+exec(sys.stdin.read())
+assert not any(name.split(".")[0] == "nerfstudio" and module for name, module in sys.modules.items())
+"""
+
+
+def five_lines(text: str) -> str:
+    """The Python of the page's first block that imports the library."""
+    blocks = re.findall(r"(?:^    .*\n|^\n)+", text, re.MULTILINE)
+    block = next(block for block in blocks if "import sundae_ns as sn" in block)
+    return "\n".join(line[4:] for line in block.splitlines())
+
+
+@pytest.fixture
+def garden(tmp_path: Path) -> Path:
+    field = random_field(200, features=0)
+    field["scales"] += 2
+    write_ply(tmp_path / "garden.ply", field)
+    # With a head for its one feature.
+    field["features"] = torch.zeros(200, 1)
+    head = CompensationHead(HeadConfig(size="tiny", num_features=1))
+    sn.save(sn.Scene(Field(field), head), tmp_path / "headed.sundae")
+    return tmp_path
+
+
+def test_the_lines_of_the_pages_run_without_nerfstudio(garden: Path) -> None:
+    programs = [five_lines((ROOT / page).read_text()) for page in ("README.md", "sundae_ns/__init__.py")]
+    for program in programs:
+        for name in ("load", "prune", "render", "save"):
+            assert f"sn.{name}(" in program
+    code = [sys.executable, "-c", WITHOUT_NERFSTUDIO % SHORT]
+    # Each in names of its own.
+    told = "\n".join(
+        f"exec({program!r}, {{}})\nimport os; os.rename('small.sundae', 'small-{number}.sundae')"
+        for number, program in enumerate(programs)
+    )
+    done = subprocess.run(code, input=told, cwd=garden, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert [sn.load(garden / f"small-{number}.sundae").num_primitives for number in range(2)] == [20, 20]
+
+
+def test_every_public_name_is_there_and_documented() -> None:
+    for name in sn.__all__:
+        value = getattr(sn, name)
+        assert inspect.getdoc(value), name
+        assert name in dir(sn)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        sn.nothing  # noqa: B018
+
+
+def test_the_page_of_the_library_lists_every_name() -> None:
+    page = (ROOT / "docs" / "api.md").read_text()
+    assert sorted(re.findall(r"^::: sundae_ns\.(\w+)$", page, re.MULTILINE)) == sorted(sn.__all__)
+    assert all(f"[`{name}`](#{name.lower()})" in page for name in sn.__all__)
+
+
+def test_names_are_imported_on_first_use() -> None:
+    code = "import sys, sundae_ns; sundae_ns.__version__; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("name", [*FUNCTIONS, "Scene", "View"])
+def test_doctests(name: str) -> None:
+    """Each public function has an example, and all examples run."""
+    module = importlib.import_module(getattr(sn, name).__module__)
+    finder = doctest.DocTestFinder(recurse=True)
+    found = [test for test in finder.find(getattr(sn, name), name, module=module, globs={}) if test.examples]
+    assert found, f"{name} has no example"
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    for test in found:
+        torch.manual_seed(0)
+        report: list[str] = []
+        assert runner.run(test, out=report.append).failed == 0, "".join(report)

@@ -1,0 +1,413 @@
+"""The web page of a packed scene: what Python writes, and the page's decoder against Python's."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import io
+import json
+import logging
+import re
+import struct
+import subprocess
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import fuzz_packs
+import numpy as np
+import pytest
+import torch
+from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_node
+from packed_scenes import KINDS, write_bomb, write_kind
+from PIL import Image
+
+import sundae_ns as sn
+from sundae_ns.cli import main
+from sundae_ns.core.errors import ConfigError, PackError
+from sundae_ns.io.pack.packed_scene import read_scene
+from sundae_ns.rasterize.reference import project
+from sundae_ns.rasterize.types import Inputs
+from sundae_ns.scene import page as page_module
+from sundae_ns.scene.load_save import load, packed_file
+from sundae_ns.scene.packing import packed_bytes
+from sundae_ns.scene.page import page_of, render_first, write_page
+
+ROOT = Path(__file__).parents[2]
+WEB = ROOT / "web"
+Json = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_kind(tmp_path_factory.mktemp("scenes") / "a.sundae", KINDS["residual"])
+
+
+# -------------------------------------------------------------------------------------------------------------- writing
+
+
+def test_a_page_holds_the_scene_and_no_address(packed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.html"
+    assert write_page(out, *packed_file(packed), title="a <b> & c") == out.stat().st_size
+    page = out.read_text()
+    (scene,) = re.findall(r'<script type="application/octet-stream"[^>]*>([^<]*)</script>', page)
+    assert base64.b64decode(scene, validate=True) == packed.read_bytes()
+    assert "<title>a &lt;b&gt; &amp; c</title>" in page
+    assert "@@" not in page
+    # The namespace of XHTML is a name, which nothing loads.
+    assert set(re.findall(r"https?://[\w./]*", page)) <= {"http://www.w3.org/1999/xhtml"}
+    assert "default-src 'none'" in page
+
+
+def test_a_page_shows_the_first_camera_until_it_draws(packed: Path) -> None:
+    (code,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page_of(*packed_file(packed), title="a"))
+    found = np.asarray(Image.open(io.BytesIO(base64.b64decode(code))), dtype=np.float32)
+    truth = np.asarray(render_first(packed_file(packed)[0]), dtype=np.float32)
+    assert found.shape == truth.shape == (37, 50, 3)
+    assert np.abs(found - truth).mean() < 6  # JPEG
+
+
+def test_a_page_of_too_many_primitives_has_no_first_image(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    bomb = write_bomb(tmp_path / "a.sundae")
+    assert bomb.stat().st_size < 100_000
+    with pytest.raises(SystemExit) as caught:
+        main(["export", str(bomb), "-o", str(tmp_path / "a.html")])
+    assert caught.value.code == 0, capsys.readouterr().err
+    (line,) = caplog.messages
+    assert "the page has no first image: the view has 20,000 primitives in each tile" in line
+    page = (tmp_path / "a.html").read_text()
+    assert "image/jpeg" not in page
+    (code,) = re.findall(r'src="data:image/gif;base64,([^"]*)"', page)
+    assert Image.open(io.BytesIO(base64.b64decode(code))).convert("RGBA").getpixel((0, 0))[3] == 0
+    # An image is refused, and its other view is rendered.
+    for view in (0, 1):
+        with pytest.raises(SystemExit) as caught:
+            main(["render", str(bomb), "-o", str(tmp_path / "a.png"), "--view", str(view)])
+        assert caught.value.code == (0 if view else 2)
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "primitives in each tile of its image" in err
+
+
+def test_a_folder_has_page_and_scene_apart(packed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "site"
+    assert write_page(out, *packed_file(packed), title="a") == sum(path.stat().st_size for path in out.iterdir())
+    assert (out / "scene.sundae").read_bytes() == packed.read_bytes()
+    assert 'data-source="scene.sundae"></script>' in (out / "index.html").read_text()
+    write_page(out, *packed_file(packed), title="a")
+
+
+def test_export_writes_pages(packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for out in ("a.html", "folder", "no/folder"):
+        with pytest.raises(SystemExit) as caught:
+            main(["export", str(packed), "-o", str(tmp_path / out)])
+        assert caught.value.code == 0, capsys.readouterr().err
+    assert (tmp_path / "a.html").is_file()
+    assert (tmp_path / "folder" / "index.html").is_file()
+    with pytest.raises(SystemExit) as caught:
+        main(["export", str(packed), "-o", str(tmp_path / "b.html"), "--upright"])
+    assert caught.value.code == 2
+    assert "--upright" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------------------------------- building
+
+
+@needs_node
+def test_the_page_is_built_from_its_sources(tmp_path: Path) -> None:
+    built = tmp_path / "page.html"
+    subprocess.run(["node", "build.mjs", built], cwd=WEB, check=True)
+    assert built.read_text() == (ROOT / "sundae_ns" / "api" / "page.html").read_text(), "run make web"
+
+
+@needs_node
+def test_the_sources_pass_their_checks() -> None:
+    for command in (["tsc"], ["biome", "ci", "."]):
+        subprocess.run([WEB / "node_modules" / ".bin" / command[0], *command[1:]], cwd=WEB, check=True)
+
+
+# ------------------------------------------------------------------------------------------------------------- decoding
+
+
+@pytest.fixture(scope="module")
+def decode(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[Json]]:
+    """The page's decoder under Node: a JSON object for each file."""
+    program = tmp_path_factory.mktemp("node") / "dump.mjs"
+    bundle = [WEB / "node_modules/.bin/esbuild", "tests/dump.ts", "--bundle", "--platform=node", "--format=esm"]
+    subprocess.run([*bundle, "--log-level=error", f"--outfile={program}"], cwd=WEB, check=True)
+
+    def run(*files: Path) -> list[Json]:
+        found = subprocess.run(["node", program, *files], check=True, capture_output=True, text=True)
+        return [json.loads(line) for line in found.stdout.splitlines()]
+
+    return run
+
+
+@needs_node
+def test_the_decoder_agrees_with_python(decode: Callable[..., list[Json]], tmp_path: Path) -> None:
+    files = [write_kind(tmp_path / f"{i}.sundae", kind) for i, kind in enumerate(KINDS.values())]
+    for file, found, kind in zip(files, decode(*files), KINDS.values(), strict=True):
+        truth = read_scene(file)
+        assert found["count"] == len(truth.field["means"])
+        assert (found["degree"], found["logits"], found["antialiased"]) == (
+            kind.degree,
+            kind.degree == 0,
+            kind.antialiased,
+        )
+        for name, value in {**truth.field, **truth.head}.items():
+            array = np.fromfile(f"{file}.{name}", np.float32)
+            # Sums of the transform and lengths of quaternions round in another order.
+            exact = name == "means" or name in truth.head
+            tolerance = {"rtol": 0.0, "atol": 2e-7} if name == "quats" else {"rtol": 2e-7, "atol": 1e-6}
+            found_as = np.testing.assert_array_equal if exact else partial(np.testing.assert_allclose, **tolerance)
+            found_as(array, value.numpy().reshape(-1), err_msg=name)
+        assert truth.cameras is not None
+        poses = [camera["pose"] for camera in found["cameras"]]
+        assert torch.equal(torch.tensor(poses).reshape(-1, 3, 4), truth.cameras["poses"])
+
+
+def parts(content: bytes) -> tuple[Json, bytes]:
+    (length,) = struct.unpack("<I", content[12:16])
+    return json.loads(content[48 : 48 + length]), content[48 + length :]
+
+
+def sealed(meta: Json, body: bytes) -> bytes:
+    """A file with this header and body, and a valid checksum of the header."""
+    text = json.dumps(meta).encode()
+    return b"\x89SUNDAE\n" + struct.pack("<II", 3, len(text)) + hashlib.sha256(text).digest() + text + body
+
+
+def compressed(sections: list[Json]) -> tuple[int, int, Json]:
+    """First byte, length and entry of a deflated section."""
+    start = 0
+    for entry in sections:
+        length = sum(entry["parts"])
+        if length < np.prod(entry["shape"]) * np.dtype(entry["dtype"]).itemsize:
+            return start, length, entry
+        start += length
+    raise AssertionError("no section is compressed")
+
+
+def put(path: str, value: Any) -> Callable[[Json], None]:
+    """Set one value of the header. ``path`` is dotted keys; after a leading colon the first names a section."""
+
+    def apply(meta: Json) -> None:
+        *keys, last = path.split(".")
+        place: Any = meta
+        if path.startswith(":"):
+            name = keys.pop(0)[1:]
+            place = next(entry for entry in meta["sections"] if entry["name"] == name)
+        for key in keys:
+            place = place[int(key) if isinstance(place, list) else key]
+        place[int(last) if isinstance(place, list) else last] = value
+
+    return apply
+
+
+POSE = [[1, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 0]]
+LIES: dict[str, Callable[[Json], None]] = {
+    "a billion primitives": put("primitives", 10**9),
+    "no primitives": put("primitives", 0),
+    "half a primitive": put("primitives", 0.5),
+    "more primitives than it has": put("primitives", 401),
+    "no attributes": put("attributes", 3),
+    "an attribute of another codec": put("attributes.scales.codec", "pickle"),
+    "harmonics of an older codec": put("attributes.features_rest.codec", "codebooks"),
+    "a head of an older codec": put("attributes.head.codec", "steps"),
+    "too many bits": put("attributes.means.bits", 200),
+    "an infinite step": put("attributes.opacities.step", 1e308),
+    "a word for a number": put("attributes.opacities.step", "nan"),
+    "empty blocks": put("attributes.means.block", 0),
+    "a huge shape": put(":opacities/levels.shape", [2**27]),
+    "a shape that overflows": put(":opacities/levels.shape", [2**27, 2**27, 2**27]),
+    "a negative length": put(":opacities/levels.parts.0", -5),
+    "a huge length": put(":opacities/levels.parts.0", 2**50),
+    "no parts": put(":opacities/levels.parts", []),
+    "a dtype of objects": put(":opacities/levels.dtype", "|O"),
+    "a section of another name": put(":means/low.name", "means/lower"),
+    "two sections of one name": put(":means/low.name", "means/high"),
+    "a head of another shape": put("attributes.head.tensors.0.1", [2**27, 2**27]),
+    "tensors that are no list": put("attributes.head.tensors", 7),
+    "a tensor named twice": put("attributes.head.tensors.1.0", "net.decoder.0.0.bias"),
+    "a name in two lines": put(":means/low.name", "means\nlow"),
+    "no list of sections": put("sections", {}),
+    "an up axis of no length": put("up", [0, 0, 0]),
+    "an up axis that is not finite": put("up", [0, 0, float("nan")]),
+    "an up axis of huge length": put("up", [0, 0, 1e30]),
+    "an up axis of words": put("up", ["0", "0", "1"]),
+    "an up axis of two numbers": put("up", [0, 1]),
+    "a start view that is no object": put("start", [1]),
+    "a start view without a lens": put("start", {"pose": POSE, "size": [4, 3]}),
+    "a start view that sees a point": put("start", {"pose": [[0] * 4] * 3, "intrinsics": [9, 9, 0, 0], "size": [4, 3]}),
+    "a mirrored start view": put("start", {"pose": POSE[::-1], "intrinsics": [9, 9, 0, 0], "size": [4, 3]}),
+    "a start view far away": put(
+        "start", {"pose": [[1, 0, 0, 1e30], *POSE[1:]], "intrinsics": [9, 9, 0, 0], "size": [4, 3]}
+    ),
+    "a start view of no pixels": put("start", {"pose": POSE, "intrinsics": [9, 9, 0, 0], "size": [0, 3]}),
+}
+
+
+@needs_node
+def test_the_decoder_refuses_what_python_refuses(
+    decode: Callable[..., list[Json]], packed: Path, tmp_path: Path
+) -> None:
+    good = packed.read_bytes()
+    files = {"truncated": good[:-1], "longer": good + b"x", "empty": b"", "another file": b"ply\n" + good[4:]}
+    files |= {"cut in its header": good[:100], "another version": good[:8] + b"\x02" + good[9:]}
+    files |= {"an altered header": good[:60] + b"~" + good[61:], "an altered section": good[:-1] + b"~"}
+    meta, body = parts(good)
+    for name, lie in LIES.items():
+        changed = json.loads(json.dumps(meta))
+        lie(changed)
+        files[name] = sealed(changed, body)
+    # Streams that cannot be decompressed, under a valid checksum.
+    broken = json.loads(json.dumps(meta))
+    start, length, entry = compressed(broken["sections"])
+    frames = body[start : start + length // 2] + bytes(length - length // 2)
+    entry["sha256"] = hashlib.sha256(frames).hexdigest()
+    files["broken streams"] = sealed(broken, body[:start] + frames + body[start + length :])
+    paths = []
+    for i, content in enumerate(files.values()):
+        paths.append(tmp_path / f"{i}.sundae")
+        paths[-1].write_bytes(content)
+        with pytest.raises(PackError):
+            read_scene(paths[-1])
+    for name, found in zip(files, decode(*paths), strict=True):
+        assert "error" in found, name
+        assert re.fullmatch(r"The [^\n]{10,200}\.", found["error"]), found
+
+
+@needs_node
+def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]], packed: Path, tmp_path: Path) -> None:
+    meta, body = parts(packed.read_bytes())
+    lies = {
+        "model": None,
+        "model.sh_degree": 1,
+        "model.rasterize_mode": "other",
+        "model.background_color": "__proto__",
+        "model.head": {"mode": "residual"},
+        "model.head.size": "compact",
+        "model.head.num_features": 4,
+        "model.head.pixel_unshuffle": 2,
+        "model.head.precision": "fp8",
+        "model.trained_focal": [0, 1],
+        "model.trained_focal.0": 1e30,
+        "source": [],
+    }
+    paths = []
+    for i, (place, value) in enumerate(lies.items()):
+        changed = json.loads(json.dumps(meta))
+        put(place, value)(changed)
+        paths.append(tmp_path / f"{i}.sundae")
+        paths[-1].write_bytes(sealed(changed, body))
+        with pytest.raises(PackError):
+            load(paths[-1])
+    for name, found in zip(lies, decode(*paths), strict=True):
+        assert "error" in found, name
+
+
+@needs_node
+def test_the_page_counts_fragments_before_it_draws(tmp_path: Path) -> None:
+    """Without WebGPU; the sums of the quads' rectangles, by Python's projection."""
+    files = [write_kind(tmp_path / f"{i}.sundae", kind) for i, kind in enumerate([*KINDS.values()][::2])]
+    files.append(write_bomb(tmp_path / "bomb.sundae", 30_000))
+    program = bench_page.bundled("overdraw.ts", tmp_path / "overdraw.mjs", "--platform=node")
+    found = subprocess.run(["node", program, *files], check=True, capture_output=True, text=True)
+    for file, line in zip(files, found.stdout.splitlines(), strict=True):
+        scene, counted = load(file), json.loads(line)
+        field, view = scene.field, scene.views[0]
+        opacities = field["opacities"].sigmoid()[:, 0]
+        K, size = view.K, (view.width, view.height)
+        shapes = (field["means"], field["quats"], field["scales"].exp(), opacities, field["means"])
+        flags = {"antialiased": False, "absgrad": False, "render_depth": False}
+        splats = project(Inputs(*shapes, view.viewmat, K, *size, near_plane=0.01, far_plane=1e10, **flags))
+        reach = (2 * (255 * opacities).log()).clamp(min=0).sqrt().clamp(max=3.4)[:, None]
+        reach = reach * splats.covars2d[:, [0, 2]].sqrt()
+        low = (splats.means2d - reach).clamp(min=0)
+        high = torch.minimum(splats.means2d + reach, torch.tensor(size))
+        areas = (high - low).clamp(min=0).prod(dim=1) * ((splats.depths >= 0.01) & (opacities >= 1 / 255))
+        assert counted["fragments"] == pytest.approx(float(areas.double().sum()), rel=1e-3)
+        assert counted["bound"] >= counted["fragments"]
+        assert (counted["fragments"] > 256 * counted["most"]) == (file == files[-1])
+
+
+@needs_node
+def test_both_readers_give_the_same_verdicts() -> None:
+    """A short version of ``python benchmarks/fuzz_packs.py``, from another seed."""
+    tally, problems = fuzz_packs.run(150, seed=1_000_000)
+    assert not problems
+    assert min(tally["valid"], tally["refused"]) > 10
+
+
+# ------------------------------------------------------------------------------------------------------------ notebooks
+
+HOSTILE = """"></iframe><script>alert('&amp;')</script><b x='"""
+
+
+def frame_of(text: str) -> dict[str, str]:
+    """Attributes of the one element of a fragment, an ``iframe``."""
+    ((attributes,),) = [re.findall(r"<iframe ([^<>]*)></iframe>", text)]
+    assert text == f"<iframe {attributes}></iframe>"
+    return {name: html.unescape(value) for name, value in re.findall(r'([\w-]+)="([^"]*)"', attributes)}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> sn.Scene:
+    return sn.load(write_kind(tmp_path_factory.mktemp("scenes") / "a.sundae", KINDS["residual"]))
+
+
+def test_the_page_in_the_frame_holds_the_scene(scene: sn.Scene, tmp_path: Path) -> None:
+    frame = frame_of(sn.show(scene, height=321)._repr_html_())
+    assert (frame["height"], frame["width"]) == ("321", "100%")
+    assert frame["srcdoc"] == page_of(scene, packed_bytes(scene), title="Scene")
+    (inside,) = re.findall(r'<script type="application/octet-stream"[^>]*>([^<]*)</script>', frame["srcdoc"])
+    (tmp_path / "shown.sundae").write_bytes(base64.b64decode(inside, validate=True))
+    sn.save(scene, tmp_path / "saved.sundae")
+    shown, saved = sn.load(tmp_path / "shown.sundae"), sn.load(tmp_path / "saved.sundae")
+    assert shown.num_primitives == scene.num_primitives
+    view = scene.views[0]
+    torch.testing.assert_close(sn.render(shown, view).rgb, sn.render(saved, view).rgb, atol=0, rtol=0)
+    assert float((sn.render(shown, view).rgb - sn.render(scene, view).rgb).abs().mean()) < 0.02  # packed once more
+
+
+def test_a_hostile_title_stays_text(scene: sn.Scene) -> None:
+    frame = frame_of(sn.show(scene, title=HOSTILE)._repr_html_())
+    assert frame["title"] == HOSTILE
+    plain = frame_of(sn.show(scene, title="plain")._repr_html_())
+    assert frame["srcdoc"].replace(re.findall("<title>(.*)</title>", frame["srcdoc"])[0], "plain") == plain["srcdoc"]
+    assert set(frame) == set(plain) == {"srcdoc", "title", "width", "height", "style", "allow"}
+
+
+@pytest.mark.parametrize("height", [0, -1, 1.5, True, "400", '1" onload="alert(1)'])
+def test_a_height_is_a_number_of_pixels(scene: sn.Scene, height: Any) -> None:
+    with pytest.raises(ConfigError, match="the height of a frame is .*; give a positive number of pixels"):
+        sn.show(scene, height=height)
+
+
+def test_a_large_page_is_shown_with_a_warning(
+    scene: sn.Scene, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    assert sn.show(scene).page
+    assert caplog.text == ""
+    monkeypatch.setattr(page_module, "LARGE", 100_000)
+    shown = sn.show(scene)
+    assert frame_of(shown._repr_html_())["srcdoc"] == shown.page
+    assert re.search(r"a page of 0\.[2-9] MB; prune the scene first, or save it as scene.html", caplog.text)
+
+
+@pytest.mark.browser
+@needs_chromium
+def test_a_browser_renders_the_scene_in_the_frame(scene: sn.Scene, tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text(f"<body style='margin: 0'>{sn.show(scene, height=120)._repr_html_()}")
+    with browser.Browser(CHROMIUM, 160, 120, browser.WEBGPU) as page:
+        page.open((tmp_path / "a.html").as_uri())
+        inside = "document.querySelector('iframe')?.contentWindow.sundae"
+        browser.wait_for(lambda: page.evaluate(f"({inside}?.state ?? 'loading') !== 'loading'"), "the page", 180)
+        assert page.evaluate(f"{inside}.state") == "ready", page.evaluate(f"{inside}.message")
+        browser.wait_for(lambda: page.evaluate(f"{inside}.still"), "the image at rest", 180)
+        assert page.errors == []

@@ -1,0 +1,248 @@
+"""Scenes as values: opening, saving, rendering, pruning and measuring them."""
+
+from __future__ import annotations
+
+import dataclasses
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+from fields import random_field
+from packed_scenes import KINDS, write_kind
+
+import sundae_ns as sn
+from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, PackError
+from sundae_ns.core.gaussians import Field
+
+
+def scene(n: int = 200, degree: int = 2) -> sn.Scene:
+    field = random_field(n, degree=degree, features=0)
+    field["scales"] += 2
+    return sn.Scene(Field(field))
+
+
+def views(n: int = 3) -> list[sn.View]:
+    return sn.virtual_views(scene(), n, size=32)
+
+
+# --------------------------------------------------------------------------------------------------------------- files
+
+
+@pytest.mark.parametrize(
+    ("suffix", "least"), [(".ply", 80.0), (".glb", 80.0), (".spz", 35.0), (".sog", 33.0), (".sundae", 33.0)], ids=str
+)
+@pytest.mark.parametrize("degree", [0, 2])
+def test_a_file_gives_the_scene_back(suffix: str, least: float, degree: int, tmp_path: Path) -> None:
+    """Measured: exact for .ply, else 36 dB and more."""
+    truth = scene(degree=degree)
+    sn.save(truth, tmp_path / f"a{suffix}")
+    found = sn.load(tmp_path / f"a{suffix}")
+    assert found.num_primitives == 200
+    assert found.field.sh_degree == degree
+    assert not found.in_model_frame
+    assert sn.measure(found, truth, views()).psnr > least
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".glb", ".sundae"])
+def test_files_say_that_a_scene_is_antialiased(suffix: str, tmp_path: Path) -> None:
+    for antialiased in (True, False):
+        path = tmp_path / f"{antialiased}{suffix}"
+        sn.save(sn.Scene(scene().field, antialiased=antialiased), path)
+        assert sn.load(path).antialiased == antialiased
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_packed_scenes_are_packed_again(name: str, tmp_path: Path) -> None:
+    found = sn.load(write_kind(tmp_path / "a.sundae", KINDS[name]))
+    assert len(found.views) == 2
+    sn.save(found, tmp_path / "b.sundae")
+    again = sn.load(tmp_path / "b.sundae")
+    assert (again.head is None) == (found.head is None)
+    assert (again.background_color, again.trained_focal) == (found.background_color, found.trained_focal)
+    torch.testing.assert_close(again.views[0].viewmat, found.views[0].viewmat)
+    assert sn.measure(again, found, found.views, head=False).psnr > 30
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "error", "message"),
+    [
+        ("gone.ply", None, DataError, "cannot be read"),
+        ("gone.spz", None, DataError, "cannot be read"),
+        ("gone.sog", None, DataError, "cannot be read"),
+        ("gone.sundae", None, PackError, "cannot be read"),
+        ("gone", None, CheckpointError, "does not exist"),
+        ("a.txt", b"a text", CheckpointError, "is no run"),
+        ("a.spz", b"\x1f\x8b\x08\x00", DataError, "is no"),
+        ("a.spz", b"NGSP" + bytes(40), DataError, "states 0 primitives"),
+        ("a.sog", b"PK\x03\x04", DataError, "is not a complete .sog"),
+        ("a.ply", b"ply\nformat ascii 1.0\nend_header\n", DataError, "a.ply"),
+    ],
+)
+def test_what_is_no_scene_is_refused_in_one_line(
+    name: str, content: bytes | None, error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(error, match=message) as caught:
+        sn.load(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog"])
+def test_damaged_files_are_refused(suffix: str, tmp_path: Path) -> None:
+    sn.save(scene(), tmp_path / f"a{suffix}")
+    whole = (tmp_path / f"a{suffix}").read_bytes()
+    for length in (10, len(whole) // 2, len(whole) - 1):
+        (tmp_path / f"b{suffix}").write_bytes(whole[:length])
+        with pytest.raises(DataError):
+            sn.load(tmp_path / f"b{suffix}")
+
+
+def test_a_sog_that_would_grow_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as bundle:
+        bundle.writestr("meta.json", " " * (1 << 27))
+    assert (tmp_path / "a.sog").stat().st_size < 1 << 18
+    with pytest.raises(DataError, match="inflates to"):
+        sn.load(tmp_path / "a.sog")
+
+
+def test_a_field_without_a_finite_primitive_is_refused(tmp_path: Path) -> None:
+    broken = {name: torch.full_like(value, torch.nan) for name, value in scene().field.items()}
+    sn.save(scene(), tmp_path / "a.ply")
+    from sundae_ns.io.ply import write_ply
+
+    write_ply(tmp_path / "a.ply", broken)
+    with pytest.raises(DataError, match="none is finite"):
+        sn.load(tmp_path / "a.ply")
+
+
+def test_saving_refuses_what_it_cannot(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no supported suffix"):
+        sn.save(scene(), tmp_path / "a.png")
+    with pytest.raises(ConfigError, match="leave out upright"):
+        sn.save(scene(), tmp_path / "a.sundae", upright=True)
+    (tmp_path / "file").touch()
+    with pytest.raises(sn.SundaeError, match="a file stands where a folder should be"):
+        sn.save(scene(), tmp_path / "file" / "a.ply")
+    sn.save(scene(), tmp_path / "new" / "folder" / "a.ply")
+    assert sn.load(tmp_path / "new" / "folder" / "a.ply").num_primitives == scene().num_primitives
+
+
+# -------------------------------------------------------------------------------------------------------------- images
+
+
+def test_a_head_corrects_images_unless_it_is_left_out(tmp_path: Path) -> None:
+    found = sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
+    images, without = (sn.render(found, found.views[0], head=head) for head in (True, False))
+    assert (images.rgb - images.base_rgb).abs().max() > 1e-3
+    assert torch.equal(without.rgb, images.base_rgb)
+    assert [tuple(image.shape) for image in images] == [(37, 50, 3), (37, 50, 3), (37, 50, 1), (37, 50, 1)]
+
+
+def test_a_head_moves_to_another_device(tmp_path: Path) -> None:
+    found = sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
+    assert found.head is not None
+    before = torch.get_rng_state()
+    moved = found.to("meta")
+    assert moved.device.type == "meta"
+    assert moved.head is not None
+    assert {value.device.type for value in moved.head.parameters()} == {"meta"}
+    assert found.device.type == next(found.head.parameters()).device.type == "cpu"
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+# ------------------------------------------------------------------------------------------------------------- pruning
+
+
+@pytest.mark.parametrize("kept", [{"keep": 0.25}, {"count": 50}])
+def test_a_prune_keeps_exactly_what_was_asked_for(kept: dict[str, float]) -> None:
+    small = sn.prune(scene(), views=views(), **kept)  # type: ignore[arg-type]
+    assert small.num_primitives == 50
+
+
+def test_a_prune_merges_what_it_drops() -> None:
+    """A wall keeps its cover if the dropped quarter is merged, and gets holes otherwise."""
+    across = torch.linspace(-1, 1, 40)
+    points = torch.stack([*torch.meshgrid(across, across, indexing="ij"), torch.zeros(40, 40)], dim=-1).reshape(-1, 3)
+    truth = sn.Scene.from_points(points, 0.5 + 0.4 * points.sin())
+    truth.field["opacities"] += 4
+    seen = [sn.View.look_at((0.3, 0.2, 2.0), (0.0, 0.0, 0.0), (0, 1, 0), width=48, height=48)]
+    merged, dropped = (
+        sn.prune(truth, keep=0.5, views=seen, rule=sn.PruneRule(redistribution=way)) for way in ("merge", "none")
+    )
+    assert merged.num_primitives == dropped.num_primitives == 800
+    assert sn.measure(merged, truth, seen).psnr > sn.measure(dropped, truth, seen).psnr + 1
+
+
+def test_views_choose_what_stays() -> None:
+    """What no view sees goes first."""
+    truth = scene(400)
+    truth.field["means"][:200, 0] += 50
+    eye = (0.0, -6.0, 0.0)
+    view = sn.View.look_at(eye, (0.0, 0.0, 0.0), width=64, height=64)
+    small = sn.prune(truth, keep=0.4, views=[view], rule=sn.PruneRule(redistribution="none"))
+    assert (small.field["means"][:, 0] < 25).all()
+
+
+def test_primitives_that_are_not_finite_are_dropped() -> None:
+    truth = scene()
+    truth.field["means"][:100] = torch.nan
+    assert sn.prune(truth, keep=1.0, views=views()).num_primitives == 100
+    assert torch.isfinite(sn.prune(truth, keep=0.5, views=views()).field["means"]).all()
+    assert len(sn.virtual_views(truth, 4)) == 4
+
+
+@pytest.mark.parametrize("kind", [".ply", ".spz", ".sog", ".glb", ".sundae", ".html"])
+def test_a_scene_of_opaque_and_flat_primitives_is_saved_whole(tmp_path: Path, kind: str) -> None:
+    """One that was made in memory: files are mended when they are opened."""
+    truth = scene()
+    truth.field["opacities"][:90], truth.field["scales"][80:, 1] = torch.inf, -torch.inf
+    truth.field["means"][5] = torch.nan
+    truth = dataclasses.replace(truth, views=tuple(sn.virtual_views(truth, 2, size=32)))
+    sn.save(truth, tmp_path / f"a{kind}")
+    if kind != ".html":
+        found = sn.load(tmp_path / f"a{kind}")
+        assert found.num_primitives == truth.num_primitives - 1
+        assert all(value.isfinite().all() for value in found.field.values())
+        assert int((found.field["opacities"].sigmoid() > 0.999).sum()) == 89
+    if kind == ".ply":
+        small = sn.prune(truth, keep=0.5, views=truth.views)
+        assert all(value.isfinite().all() for value in small.field.values())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "either keep .* or count"),
+        ({"keep": 0.5, "count": 5}, "either keep .* or count"),
+        ({"keep": 0.0}, "keep is 0.0"),
+        ({"keep": 1.5}, "keep is 1.5"),
+        ({"count": 0}, "count is 0"),
+    ],
+)
+def test_a_prune_without_a_meaning_is_refused(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        sn.prune(scene(), views=views(), **options)  # type: ignore[arg-type]
+
+
+# ------------------------------------------------------------------------------------------------------------- quality
+
+
+def test_quality_against_images_and_against_a_scene() -> None:
+    truth, seen = scene(), views()
+    small = sn.prune(truth, keep=0.5, views=seen)
+    images = [sn.render(truth, view).rgb for view in seen]
+    found = sn.measure(small, images, seen)
+    assert found == sn.measure(small, truth, seen)
+    assert found.psnr == pytest.approx(sum(found.psnrs) / 3)
+    assert sn.measure(truth, truth, seen).ssim == pytest.approx(1.0)
+    with pytest.raises(DataError, match="one image for each view"):
+        sn.measure(small, images[:1], seen)
+    with pytest.raises(DataError, match="no view to measure in"):
+        sn.measure(small, truth)
+
+
+def test_both_scenes_have_the_background_of_the_reference() -> None:
+    truth, seen = sn.Scene(scene().field, background_color="white"), views()
+    assert sn.measure(scene(), truth, seen).psnr > 80

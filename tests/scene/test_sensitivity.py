@@ -1,0 +1,101 @@
+"""What errors of a pack do to images: predicted changes are those of renderings."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from fields import random_field
+from torch import Tensor
+
+from sundae_ns.core.camera import View
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io.pack.packed_scene import PackedScene
+from sundae_ns.scene.packing import scene_of, sensitivity_of, views_of_arrays
+from sundae_ns.scene.render import LocalField, render_view
+from sundae_ns.scene.scene import Scene
+
+
+def head() -> dict[str, Tensor]:
+    torch.manual_seed(0)
+    state = dict(CompensationHead(HeadConfig(size="tiny", num_features=5)).state_dict())
+    state["net.out.weight"] = 0.1 * torch.randn_like(state["net.out.weight"])
+    return state
+
+
+def cameras(n: int, *, turn: float, away: float = 0.0) -> tuple[View, ...]:
+    """Cameras on a circle around the origin, or on a part of it, which look at its centre."""
+    angles = torch.arange(n) * (turn / n)
+    zero, one = torch.zeros(n), torch.ones(n)
+    axes = [
+        torch.stack([angles.cos(), zero, -angles.sin()], dim=1),
+        torch.stack([zero, one, zero], dim=1),
+        torch.stack([angles.sin(), zero, angles.cos()], dim=1),
+    ]
+    poses = torch.stack([*axes, 6 * axes[2]], dim=2)
+    poses[:, :, 3] += away * poses[:, :, 2].roll(1, dims=1)
+    sizes = torch.tensor([[48, 32]]).expand(n, 2)
+    intrinsics = torch.tensor([[40.0, 40, 24, 16]]).double().expand(n, 4)
+    return views_of_arrays({"poses": poses, "intrinsics": intrinsics, "sizes": sizes})
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    kind = {"mode": "residual", "size": "tiny", "pixel_unshuffle": 2, "num_features": 5, "precision": "fp32"}
+    stated = {"sh_degree": 2, "rasterize_mode": "classic", "background_color": "black", "head": kind}
+    field = random_field(300)
+    field["scales"] += 2
+    return scene_of(PackedScene(field, head(), None, {"model": {**stated, "trained_focal": [40.0, 40.0]}}))
+
+
+@torch.no_grad()
+def image(scene: Scene, view: View) -> Tensor:
+    settings = dataclasses.replace(scene.settings(), training=True)
+    found: Tensor = render_view(LocalField(scene.field), view, scene.background, settings, depth=False)[0]["rgb"]
+    return found.double()
+
+
+def changed(scene: Scene, views: tuple[View, ...], parameters: list[Tensor], size: float) -> float:
+    """Mean squared change of images by random changes of parameters, for a change of length 1 of each number."""
+    before = [value.detach().clone() for value in parameters]
+    images = [image(scene, view) for view in views]
+    total, tries = 0.0, 8
+    for _ in range(tries):
+        for value, old in zip(parameters, before, strict=True):
+            value.data = old + size * torch.randn_like(old)
+        total += sum(float((image(scene, view) - old).square().sum()) for view, old in zip(views, images, strict=True))
+    for value, old in zip(parameters, before, strict=True):
+        value.data = old
+    return total / tries / size**2
+
+
+def test_predicted_changes_are_those_of_images(scene: Scene) -> None:
+    torch.manual_seed(1)
+    seen = cameras(8, turn=6.28)
+    found = sensitivity_of(scene, seen)
+    measured = changed(scene, seen, [scene.field["features"]], 1e-3)
+    assert float(found.rows["features"].trace()) == pytest.approx(measured, rel=0.35)
+    assert scene.head is not None
+    weights = dict(scene.head.named_parameters())
+    for name in ("net.encoder.0.2.weight", "net.encoder.3.0.weight", "net.out.weight"):
+        predicted = float(found.head[name].sum()) * weights[name][0, 0].numel()
+        assert predicted == pytest.approx(changed(scene, seen, [weights[name]], 1e-3), rel=0.35), name
+    again = sensitivity_of(scene, seen)
+    assert all(torch.equal(found.rows[name], again.rows[name]) for name in found.rows)
+    assert all(torch.equal(found.head[name], again.head[name]) for name in found.head)
+
+
+def test_cameras_of_one_side_tell_fewer_harmonics_apart(scene: Scene) -> None:
+    forms = [sensitivity_of(scene, cameras(24, turn=turn)).rows["features_rest"] for turn in (6.28, 0.1)]
+    assert all(form.shape == (24, 24) for form in forms)
+    values = [torch.linalg.eigvalsh(form) for form in forms]
+    assert all(float(part[0]) > 0 for part in values)
+    around, aside = ((part / part.sum()).clamp_min(1e-12).log().mean() for part in values)
+    assert around > aside + 1
+
+
+def test_primitives_that_no_camera_sees(scene: Scene) -> None:
+    form = sensitivity_of(scene, cameras(2, turn=0.1, away=1000.0)).rows["features_rest"]
+    assert torch.isfinite(form).all()
+    assert float(torch.linalg.eigvalsh(form)[0]) > 0

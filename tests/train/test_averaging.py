@@ -1,0 +1,135 @@
+"""The mean of the weights over the last steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import torch
+
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.train import averaging
+from sundae_ns.train.averaging import Averaging
+from sundae_ns.train.build import check
+from sundae_ns.train.state import TrainingRun
+
+LAST = 99
+
+
+def run_of(state: Any, *, images: int = 1, last: int = LAST) -> TrainingRun:
+    return cast(
+        TrainingRun, SimpleNamespace(state=state, last_step=last, schedule_length=LAST + 1, images_per_step=images)
+    )
+
+
+@pytest.fixture
+def state(build: Callable[..., Any]) -> Any:
+    return build(n=20).state
+
+
+def train(
+    state: Any, mean: Averaging, steps: range, *, seen: list[torch.Tensor] | None = None, last: int = LAST
+) -> None:
+    """Steps that change the weights at random."""
+    for step in steps:
+        state.step = step
+        torch.manual_seed(step)
+        for value in state.field.values():
+            value.data += torch.randn_like(value)
+        if seen is not None and step >= 90 and step % averaging.AVERAGED_EVERY == 0:
+            seen.append(state.field["means"].detach().clone())
+        mean.after_step(run_of(state, last=last))
+
+
+def test_the_last_weights_become_the_mean(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
+    seen: list[torch.Tensor] = []
+    train(state, Averaging(0.09, settled_at=0), range(LAST + 1), seen=seen)
+    assert len(seen) == 4
+    torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+
+
+def test_a_mean_that_an_interruption_has_cut_short_is_dropped(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that stops in its last part and is resumed for a longer one ends with weights of the end alone."""
+    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
+    first, longer = Averaging(0.3, settled_at=0), Averaging(0.09, settled_at=0)
+    train(state, first, range(90))
+    assert first.state_dict()["count"] > 0
+    longer.load_state_dict(state, first.state_dict())
+    seen: list[torch.Tensor] = []
+    train(state, longer, range(80, LAST + 1), seen=seen)
+    torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+
+
+def test_no_mean_of_fields_that_differ(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a prune, or a return to an earlier field, only the weights since then count."""
+    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
+    for change in ("prune", "return"):
+        seen: list[torch.Tensor] = []
+        mean = Averaging(0.3, settled_at=0)
+        train(state, mean, range(91))
+        if change == "prune":
+            for value in state.field.values():
+                value.data = value.data[:10].clone()
+        else:
+            state.restored += 1
+        train(state, mean, range(91, LAST + 1), seen=seen)
+        assert len(seen) == 3
+        torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+
+
+def test_unfinished_schedules_and_growing_fields_keep_their_weights(state: Any) -> None:
+    for mean, length in ((Averaging(0.1, settled_at=1000), LAST + 1), (Averaging(0.1, settled_at=0), 2 * LAST)):
+        state.step = LAST
+        before = state.field["means"].detach().clone()
+        mean.after_step(cast(TrainingRun, SimpleNamespace(state=state, last_step=LAST, schedule_length=length)))
+        assert torch.equal(state.field["means"], before)
+
+
+def test_a_longer_training_goes_on_from_the_last_weights(state: Any) -> None:
+    """Not from their mean, which does not belong to the state of the optimizers."""
+    mean, again = Averaging(0.5, settled_at=0), Averaging(0.5, settled_at=0)
+    train(state, mean, range(LAST))
+    state.step = LAST
+    last = {name: value.detach().clone() for name, value in state.field.items()}
+    mean.after_step(run_of(state))
+    assert not torch.equal(state.field["means"], last["means"])
+    shown = state.field["means"].detach().clone()
+    again.load_state_dict(state, mean.state_dict())
+    assert torch.equal(state.field["means"], shown)  # who only looks sees the mean
+    again.before_training(run_of(state))
+    assert all(torch.equal(value, last[name]) for name, value in state.field.items())
+    assert not again.state_dict()["replaced"]
+
+
+def test_a_first_part_ends_with_the_mean_of_its_last_steps(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As far as it reaches into the share: what is packed from there on begins at the mean."""
+    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 2)
+    seen: list[torch.Tensor] = []
+    mean = Averaging(0.09, settled_at=0)
+    train(state, mean, range(96), seen=seen, last=95)
+    assert len(seen) == 3
+    torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+    assert mean.state_dict()["replaced"]
+
+
+def test_a_rank_without_primitives(state: Any) -> None:
+    for value in state.field.values():
+        value.data = value.data[:0].clone()
+    train(state, Averaging(1.0, settled_at=0), range(LAST - 9, LAST))
+
+
+def test_ranks_do_not_save_the_mean_of_their_shard(state: Any) -> None:
+    mean = Averaging(1.0, settled_at=0)
+    mean.before_training(run_of(state, images=2))
+    train(state, mean, range(20))
+    assert not mean.state_dict()
+
+
+def test_a_share_that_cannot_be(build: Callable[..., Any]) -> None:
+    config = build(n=5).config
+    config.average_share = 1.5
+    with pytest.raises(ConfigError, match="average-share is 1.5"):
+        check(config)

@@ -1,0 +1,180 @@
+"""The field that a model starts with: sparse points, random ones, or a finished field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from foreign_files import FOREIGN, small_field
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from sundae_ns.core.errors import CheckpointError
+from sundae_ns.io.coordinates import similarity
+from sundae_ns.io.ply import write_ply
+from sundae_ns.plugin.datamanager import DATASET_FRAME
+from sundae_ns.plugin.model import SundaeModel
+from sundae_ns.train.initialize import FEWEST_POINTS
+
+Build = Callable[..., SundaeModel]
+Points = Callable[[], tuple[Tensor, Tensor]]
+MakeCamera = Callable[..., Cameras]
+TrainingOf = Callable[[SundaeModel], Any]
+
+N = 60
+"""Primitives of a model that is built without a count."""
+
+
+def colors_of(model: SundaeModel, camera: Cameras) -> Tensor:
+    """Colours of the primitives as the camera sees them ``[N, 3]``."""
+    settings = model.render_settings(training=False)
+    return model.source.primitives(model.view_of(camera), settings, features=False)["colors"].detach()
+
+
+@pytest.mark.parametrize("seed_points", [None, (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))])
+def test_without_a_sparse_cloud_points_are_random(
+    build: Build, training_of: TrainingOf, seed_points: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = build(seed_points=seed_points, num_random=40, random_scale=2.0)
+    assert model.num_points == 40
+    assert model.means.abs().max() <= 1
+    training_of(model)
+    assert "no sparse point cloud" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(("n", "warned"), [(FEWEST_POINTS - 1, True), (FEWEST_POINTS, False)])
+def test_who_has_hardly_any_points_hears_that_photos_do_not_overlap(
+    build: Build, training_of: TrainingOf, n: int, warned: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = build(seed_points=(torch.rand(n, 3), torch.full((n, 3), 99, dtype=torch.uint8)))
+    training_of(model)
+    said = " ".join(capsys.readouterr().out.split())
+    assert (f"only {n} sparse points" in said) == warned
+
+
+def test_a_finished_run_is_not_warned_of_what_it_did_not_start_from(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nor is training that goes on from a checkpoint: its field takes the place of the points."""
+    model = build(seed_points=None, num_random=40)
+    model.load_state_dict(build().state_dict())
+    training_of(model)
+    assert "Warning" not in capsys.readouterr().out
+
+
+def test_a_cloud_above_the_cap_is_cut_before_the_first_step(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = build(pruning={"mode": "continuous", "max_primitives": 25})
+    assert model.num_points == 25
+    training_of(model)
+    assert "starting from 25 of them" in " ".join(capsys.readouterr().out.split())
+
+
+def _ply(build: Build, path: Path, degree: int = 1, **options: Any) -> dict[str, Tensor]:
+    params = {name: value.detach() for name, value in build(sh_degree=degree).gauss_params.items()}
+    params["features_rest"] = torch.randn_like(params["features_rest"])
+    write_ply(path, params, **options)
+    return params
+
+
+def _frame() -> tuple[Tensor, float]:
+    turn = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return torch.cat([turn, torch.tensor([[0.1], [0.2], [0.3]])], dim=1), 0.5
+
+
+def test_a_ply_of_the_capture_is_moved_into_the_model(build: Build, tmp_path: Path) -> None:
+    params = _ply(build, tmp_path / "a.ply")
+    model = build(warm_start=tmp_path / "a.ply", metadata={DATASET_FRAME: _frame()})
+    expected = similarity(params, *_frame())
+    for name in ("means", "scales", "quats", "features_rest", "opacities"):
+        torch.testing.assert_close(model.gauss_params[name].detach(), expected[name])
+    assert model.gauss_params["features"].shape == (N, 5)
+    as_is = build(warm_start=tmp_path / "a.ply", warm_start_frame="model")
+    torch.testing.assert_close(as_is.means.detach(), params["means"])
+
+
+def test_a_ply_of_the_capture_needs_to_know_the_way(build: Build, training_of: TrainingOf, tmp_path: Path) -> None:
+    _ply(build, tmp_path / "a.ply")
+    with pytest.raises(CheckpointError, match="warm-start-frame model") as caught:
+        training_of(build(warm_start=tmp_path / "a.ply"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", [name for name in FOREIGN if name not in ("colors.ply", "a.ksplat")])
+def test_files_of_other_programs_start_a_model(
+    build: Build, training_of: TrainingOf, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """gsplat's trainer normalises a capture in a way of its own, which its file does not state."""
+    given = small_field(50)
+    given["scales"][3, 0] = -torch.inf  # a flat primitive
+    if name == "a.compressed.ply":  # its bounds are finite
+        given["scales"][3, 0] = -20.0
+    FOREIGN[name](tmp_path / name, given)
+    options = {"warm_start": tmp_path / name, "metadata": {DATASET_FRAME: _frame()}}
+    if name.endswith(".pt"):
+        with pytest.raises(CheckpointError, match=r"coordinates.*--pipeline.model.warm-start-frame capture"):
+            training_of(build(**options))
+        caplog.clear()
+        options["warm_start_frame"] = "capture"
+    model = build(**options)
+    expected = similarity(given, *_frame())["means"]
+    torch.testing.assert_close(model.means.detach(), expected, rtol=0, atol=0.001)
+    assert model.gauss_params["scales"].isfinite().all()
+    mended = [message for message in caplog.messages if "clamped" in message]
+    assert len(mended) == (name != "a.compressed.ply")
+
+
+def test_a_finished_run_opens_without_what_it_started_from(
+    build: Build, training_of: TrainingOf, tmp_path: Path
+) -> None:
+    """Training without the warm start is refused in one line; loading the run's checkpoint needs it no more."""
+    _ply(build, tmp_path / "a.ply")
+    state = build(warm_start=tmp_path / "a.ply", warm_start_frame="model").state_dict()
+    (tmp_path / "a.ply").unlink()
+    orphan = build(warm_start=tmp_path / "a.ply", warm_start_frame="model")
+    with pytest.raises(CheckpointError, match="does not exist"):
+        training_of(orphan)
+    orphan.load_state_dict(state)
+    assert torch.equal(orphan.means, state["gauss_params.means"])
+    training_of(orphan)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_colours_are_those_of_the_cloud_and_of_the_warm_start(
+    build: Build, points: Points, camera: MakeCamera, tmp_path: Path, degree: int
+) -> None:
+    xyz, rgb = points()
+    model = build(sh_degree=degree, seed_points=(xyz, rgb))
+    shown = colors_of(model, camera())
+    torch.testing.assert_close(shown, rgb / 255, rtol=0, atol=2e-3)
+    torch.save(
+        {"pipeline": {f"_model.{k}": v for k, v in model.state_dict().items()}}, tmp_path / "step-000000001.ckpt"
+    )
+    for wanted in (0, 1):
+        warm = build(sh_degree=wanted, warm_start=tmp_path / "step-000000001.ckpt")
+        torch.testing.assert_close(colors_of(warm, camera()), shown, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_a_warm_start_of_another_sh_degree(build: Build, tmp_path: Path, degree: int) -> None:
+    params = _ply(build, tmp_path / "a.ply", degree=degree)
+    model = build(warm_start=tmp_path / "a.ply", warm_start_frame="model", sh_degree=1)
+    rest = model.gauss_params["features_rest"].detach()
+    assert rest.shape == (N, 3, 3)
+    shared = min(3, params["features_rest"].shape[1])
+    assert torch.equal(rest[:, :shared], params["features_rest"][:, :shared])
+    assert not rest[:, shared:].any()
+
+
+def test_a_warm_start_prunes_at_its_first_step(build: Build, training_of: TrainingOf, tmp_path: Path) -> None:
+    _ply(build, tmp_path / "a.ply")
+    training = training_of(build(warm_start=tmp_path / "a.ply", warm_start_frame="model", pruning={"prune_at": 15000}))
+    training.step(0)
+    assert training.model.num_points == N // 2
+    assert training.live()
+    assert "base_loss" in training.step(1)
+    assert training.model.num_points == N // 2

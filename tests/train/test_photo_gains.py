@@ -1,0 +1,246 @@
+"""Gains of photos: what differs from the neighbours is found and taken out, what the place explains is not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from photographed import ANGLES, COUNT, batch_of, begin, image_of, measure, ring, run_of, update
+from torch import Tensor
+
+from sundae_ns.core.camera import View
+from sundae_ns.plugin.model import SundaeModel
+from sundae_ns.train import exposure
+from sundae_ns.train.exposure import LEAST_PHOTOS, PhotoGains, places
+from sundae_ns.train.state import FieldState, TrainingRun
+
+Build = Callable[..., SundaeModel]
+ON_CPU = cast(FieldState, SimpleNamespace(device=torch.device("cpu")))
+
+
+def found(gains: PhotoGains) -> Tensor:
+    """The gains that photos are divided by ``[COUNT, 3]``."""
+    white = torch.ones(48, 64, 3)
+    return torch.stack([(1 / gains.balanced(white, batch_of(index)))[0, 0] for index in range(COUNT)])
+
+
+def test_photos_that_differ_from_their_neighbours_are_evened_out() -> None:
+    true = torch.exp(0.2 * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0)))
+    gains, run = begin()
+    measure(gains, run, lambda index: image_of(index) * true[index])
+    left = true.log() - found(gains).log()
+    assert left.std() < 0.4 * true.log().std(), "what neighbours have in common stays in the photos"
+    assert float(found(gains).log().mean(dim=0).abs().max()) < 1e-3, "the light of the whole field stays"
+
+
+def test_light_that_changes_with_the_place_stays_in_the_photos() -> None:
+    true = torch.exp(0.2 * torch.sin(ANGLES))[:, None].expand(-1, 3)
+    gains, run = begin()
+    measure(gains, run, lambda index: image_of(index) * true[index])
+    assert found(gains).log().abs().max() < 0.02
+
+
+def test_differences_no_larger_than_a_fields_own_errors_stay_in_the_photos() -> None:
+    """So a capture whose light does not change is trained as without gains, to the bit."""
+    true = torch.exp(0.8 * exposure.NOISE * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0)))
+    gains, run = begin()
+    measure(gains, run, lambda index: image_of(index) * true[index])
+    assert torch.equal(found(gains), torch.ones(COUNT, 3))
+
+
+def test_gains_settle_whatever_they_were_at_first() -> None:
+    """They are measured against photos that were divided by them: an error must not feed itself."""
+    true = torch.exp(0.2 * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(1)))
+    ends = []
+    for first in (1.0, 1.5):
+        gains, run = begin()
+        measure(gains, run, lambda index, first=first: image_of(index) * first * true[index], rounds=1)  # type: ignore[misc]
+        measure(gains, run, lambda index: image_of(index) * true[index], rounds=30)
+        ends.append(found(gains))
+    torch.testing.assert_close(ends[0], ends[1], rtol=1e-3, atol=1e-3)
+
+
+def test_clipped_and_masked_pixels_do_not_count() -> None:
+    gains, run = begin()
+    one = batch_of(5)
+    photo, mask = image_of(5) * 1.3, torch.ones(48, 64, 1)
+    photo[:10], mask[20:30], photo[20:30] = 1.0, 0.0, 0.0
+    for index in range(COUNT):
+        if index != 5:
+            gains.observe(image_of(index), image_of(index), None, batch_of(index))
+    gains.observe(image_of(5), photo, mask, one)
+    update(gains, run)
+    measured = gains.state_dict()["measured"]
+    torch.testing.assert_close(measured[5], torch.full((3,), math.log(1.3), dtype=torch.float64), rtol=1e-4, atol=1e-4)
+    assert measured[6].abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("spoilt", [torch.zeros(48, 64, 3), torch.full((48, 64, 3), math.nan), torch.ones(48, 64, 3)])
+def test_a_photo_that_says_nothing_has_no_gain(spoilt: Tensor) -> None:
+    gains, run = begin()
+    measure(gains, run, lambda index: spoilt if index == 7 else image_of(index), rounds=3)
+    state = gains.state_dict()
+    assert state["counts"][7] == 0
+    assert state["counts"][8] == 3
+    torch.testing.assert_close(found(gains), torch.ones(COUNT, 3), rtol=1e-4, atol=1e-4)
+
+
+def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alone(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    photo = image_of(0)
+    gains, run = begin()
+    measure(gains, run, lambda index: image_of(index) * (1 + index % 2))
+    assert gains.balanced(photo, batch_of(0)) is not photo
+    assert gains.balanced(photo, batch_of(0, channels=4)) is photo
+    assert gains.balanced(photo, {"image": photo}) is photo
+    before = gains.state_dict()
+    gains.observe(photo, photo, None, batch_of(0, channels=4))
+    assert torch.equal(gains.state_dict()["sums"], before["sums"])
+    for few in (PhotoGains(LEAST_PHOTOS - 1, "on"), PhotoGains(LEAST_PHOTOS - 1, "auto"), PhotoGains(9, "off")):
+        few.before_training(run_of(ring(LEAST_PHOTOS - 1)))
+        few.observe(photo, few.balanced(photo * 2, batch_of(0)), None, batch_of(0))
+        update(few, run)
+        assert few.balanced(photo, batch_of(0)) is photo
+        few.finish(run)
+    # Once: nobody has asked for the others.
+    assert " ".join(capsys.readouterr().out.split()).count("31 training photos are too few") == 1
+
+
+def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
+    true = torch.exp(0.2 * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(2)))
+
+    def photos(index: int) -> Tensor:
+        return image_of(index) * true[index]
+
+    def half(gains: PhotoGains, run: TrainingRun) -> None:
+        measure(gains, run, photos, rounds=2)
+        gains.observe(image_of(3), gains.balanced(photos(3), batch_of(3)), None, batch_of(3))
+
+    gains, run = begin()
+    half(gains, run)
+    saved = gains.state_dict()
+    resumed = PhotoGains(COUNT, "on")
+    resumed.load_state_dict(ON_CPU, saved)
+    assert torch.equal(found(resumed), found(gains)), "a fine-tune has no run"
+    resumed.before_training(run)
+    half(gains, run)
+    half(resumed, run)
+    assert torch.equal(found(resumed), found(gains))
+    assert saved["counts"].max() < gains.state_dict()["counts"].max(), "a saved state does not change"
+    for other in ({}, PhotoGains(COUNT + 1, "on").state_dict()):
+        fresh = PhotoGains(COUNT, "on")
+        fresh.load_state_dict(ON_CPU, other)
+        assert torch.equal(found(fresh), torch.ones(COUNT, 3))
+
+
+def test_ranks_add_up_what_each_has_measured() -> None:
+    gains, run = begin()
+    gains.total = lambda sums: sums * 1.0 + elsewhere
+    elsewhere = torch.zeros(COUNT, 2, 3)
+    elsewhere[9] = torch.tensor([[2.0], [1.0]])
+    measure(gains, run, image_of, rounds=1)
+    assert gains.state_dict()["measured"][9].min() > 0
+    assert gains.state_dict()["measured"][8].abs().max() < 1e-6
+
+
+def test_cameras_at_one_place_are_apart_by_what_they_see() -> None:
+    eye = torch.zeros(3)
+    views = [View.look_at(eye, (math.cos(a), math.sin(a), 0.0)) for a in ANGLES]
+    views += [View.look_at((4.0, 0.0, 0.0), (9.0, 0.0, 0.0))]
+    points = places(views)[:-1]
+    apart = np.linalg.norm(points.diff(dim=0).numpy(), axis=1)
+    assert apart == pytest.approx(apart[0], rel=1e-3)
+    assert apart[0] > 0.01
+
+
+def test_training_compares_with_the_balanced_photo_and_evaluation_with_the_true_one(
+    build: Build, batch: Callable[..., dict[str, Any]], camera: Callable[..., Any]
+) -> None:
+    model, photo = build(photo_gains="on"), {**batch(), "image_idx": 2}
+    gains = model.photo_gains.state_dict()
+    gains["gains"][2] = torch.tensor([0.5, 1.0, 2.0])
+    model.photo_gains.load_state_dict(model.state, gains)
+    background = {"background": torch.zeros(3)}
+    true = photo["image"].float() / 255
+    model.train()
+    torch.testing.assert_close(model.target(photo, background), true / torch.tensor([0.5, 1.0, 2.0]))
+    torch.testing.assert_close(model.step_inputs(camera(), photo).target, true / torch.tensor([0.5, 1.0, 2.0]))
+    torch.testing.assert_close(model.truth(photo, background), true)
+    model.eval()
+    torch.testing.assert_close(model.target(photo, background), true)
+
+
+def test_auto_divides_photos_of_changing_light_from_the_decision_on() -> None:
+    true = torch.exp(0.15 * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(3)))
+
+    def photos(index: int) -> Tensor:
+        return image_of(index) * true[index]
+
+    gains, run = begin("auto")
+    photo = photos(5)
+    measure(gains, run, photos, late=False)
+    assert gains.balanced(photo, batch_of(5)) is photo, "a young field errs more than photos differ"
+    assert gains.state_dict()["divides"] is None
+    measure(gains, run, photos, rounds=1)
+    assert gains.state_dict()["divides"] is True
+    asked, run = begin("on")
+    measure(asked, run, photos, rounds=13)
+    torch.testing.assert_close(found(gains), found(asked), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("differences", ["even light", "three photos", "the place"])
+def test_auto_leaves_a_capture_of_even_light_alone_and_measures_no_more(differences: str) -> None:
+    """So it is trained as without gains, to the bit. A few photos in other light are no change of exposure."""
+    noise = 0.8 * exposure.NOISE * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0))
+    true = {
+        "even light": torch.exp(noise),
+        "three photos": torch.where(torch.arange(COUNT) < 3, 2.5, 1.0)[:, None].expand(-1, 3),
+        "the place": torch.exp(0.2 * torch.sin(ANGLES))[:, None].expand(-1, 3),
+    }[differences]
+    gains, run = begin("auto")
+    measure(gains, run, lambda index: 0.3 * image_of(index) * true[index])
+    photo, before = image_of(0), gains.state_dict()
+    assert before["divides"] is False
+    assert gains.balanced(photo, batch_of(0)) is photo
+    gains.observe(photo, photo * 2, None, batch_of(0))
+    update(gains, run)
+    assert all(torch.equal(gains.state_dict()[name], before[name]) for name in ("sums", "counts", "gains"))
+
+
+def test_auto_waits_until_photos_were_measured_often_enough() -> None:
+    gains, run = begin("auto")
+    measure(gains, run, lambda index: image_of(index) * (1 + index % 2), rounds=1)
+    assert gains.state_dict()["divides"] is None
+    measure(gains, run, lambda index: image_of(index) * (1 + index % 2), rounds=1)
+    assert gains.state_dict()["divides"] is True
+
+
+def test_a_decision_is_resumed_and_an_option_replaces_it() -> None:
+    gains, run = begin("auto")
+    measure(gains, run, lambda index: image_of(index) * (1 + index % 2))
+    saved = gains.state_dict()
+    for mode, divides in (("auto", True), ("on", True), ("off", False)):
+        other, _ = begin(mode)  # type: ignore[arg-type]
+        other.load_state_dict(ON_CPU, saved)
+        assert other.state_dict()["divides"] is divides
+        photo = image_of(1)
+        assert (other.balanced(photo, batch_of(1)) is not photo) is divides
+
+
+def test_the_end_says_what_was_taken_out(capsys: pytest.CaptureFixture[str]) -> None:
+    gains, run = begin()
+    gains.finish(run)
+    assert "as bright as those beside them" in " ".join(capsys.readouterr().out.split())
+    measure(gains, run, lambda index: image_of(index) * (1.3 if index % 2 else 1.0))
+    gains.finish(run)
+    assert "up to 12% brighter or darker" in " ".join(capsys.readouterr().out.split())
+    quiet, run = begin("auto")
+    measure(quiet, run, image_of)
+    quiet.finish(run)
+    assert capsys.readouterr().out == ""

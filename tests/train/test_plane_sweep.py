@@ -1,0 +1,142 @@
+"""The plane sweep on images of a painted wall, the plane y = 0."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from sundae_ns.core.camera import View
+from sundae_ns.train import plane_sweep
+from sundae_ns.train.plane_sweep import Sweep
+from sundae_ns.train.state import Photo
+
+SIDE, FOCAL = 72, 77.0
+
+
+def paint(points: Tensor) -> Tensor:
+    """Colours ``[N, 3]`` of points of the wall: sums of waves of many lengths."""
+    generator = torch.Generator().manual_seed(0)
+    waves = torch.randn(2, 40, generator=generator) * torch.logspace(0, 1, 40)
+    phases = 6.3 * torch.rand(40, 3, generator=generator)
+    values = torch.sin((points[:, [0, 2]].float() @ waves)[:, :, None] + phases).mean(dim=1)
+    return (0.5 + 1.6 * values).clamp(0, 1)
+
+
+def photo(eye: tuple[float, float, float]) -> Photo:
+    view = View.look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), width=SIDE, height=SIDE)
+    view = view._replace(K=torch.tensor([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1.0]]))
+    y, x = torch.meshgrid(torch.arange(SIDE) + 0.5, torch.arange(SIDE) + 0.5, indexing="ij")
+    rays = torch.stack([(x - SIDE / 2) / FOCAL, (y - SIDE / 2) / FOCAL, torch.ones_like(x)], dim=2).reshape(-1, 3)
+    rays = rays @ view.viewmat[:3, :3]
+    hits = view.center - rays * (view.center[1] / rays[:, 1])[:, None]
+    return Photo(view, paint(hits).reshape(SIDE, SIDE, 3), None)
+
+
+@pytest.fixture(scope="module")
+def capture() -> tuple[list[Photo], Tensor]:
+    """Three neighbouring photos of the wall, from the side and from above, and sparse points."""
+    photos = [photo(eye) for eye in ((-1.2, -3.4, 0.8), (-0.3, -3.6, 1.3), (0.6, -3.3, 0.4))]
+    across = 2 * torch.rand(200, 2, generator=torch.Generator().manual_seed(1)) - 1
+    return photos, torch.stack([across[:, 0], torch.zeros(200), across[:, 1]], dim=1)
+
+
+def points_of(photos: list[Photo], sparse: Tensor, longest: int = SIDE, wanted: int = SIDE**2) -> tuple[Tensor, Tensor]:
+    sweep = Sweep(photos, sparse, longest)
+    for index in range(len(photos)):
+        sweep.add(index)
+    return sweep.points(wanted)
+
+
+def gaps(photos: list[Photo], points: Tensor) -> Tensor:
+    """Distance of points to the wall along the rays from the three cameras, over their distance ``[N]``."""
+    eyes = torch.stack([photo.view.center for photo in photos])
+    return (points[:, 1] / (points[None, :, 1] - eyes[:, None, 1])).abs().amin(dim=0)
+
+
+@pytest.fixture(scope="module")
+def swept(capture: tuple[list[Photo], Tensor]) -> tuple[Tensor, Tensor]:
+    return points_of(*capture)
+
+
+def test_points_lie_on_the_surfaces(capture: tuple[list[Photo], Tensor], swept: tuple[Tensor, Tensor]) -> None:
+    """Measured: 5,700 points (37% of the pixels), 1.0% off in the median; three quarters are within 2.2%."""
+    points, colours = swept
+    assert len(points) == len(colours) > 4000
+    errors = gaps(capture[0], points)
+    assert float(errors.median()) < 0.015
+    assert float(errors.quantile(0.75)) < 0.04
+
+
+def test_colours_are_those_of_the_images(capture: tuple[list[Photo], Tensor], swept: tuple[Tensor, Tensor]) -> None:
+    """Measured: in one of the photos the point is that colour, 0.011 off in the median (channels swapped: 0.05)."""
+    points, colours = swept
+    errors = torch.full((len(points),), torch.inf)
+    for photo in capture[0]:
+        x, y, z = plane_sweep._project(photo.view, points)
+        inside = (z > 0) & (x > 0) & (y > 0) & (x < SIDE) & (y < SIDE)
+        shown = photo.target[y[inside].long(), x[inside].long()]
+        errors[inside] = torch.minimum(errors[inside], (shown - colours[inside]).abs().mean(dim=1))
+    assert float(errors.median()) < 0.025
+
+
+def test_of_more_points_than_wanted_an_even_part_is_found(
+    capture: tuple[list[Photo], Tensor], swept: tuple[Tensor, Tensor]
+) -> None:
+    points, colours = points_of(*capture, wanted=100)
+    assert 100 < len(points) == len(colours) < 100 * plane_sweep._LOOKED_AT
+    found, whole = torch.cat([points, colours], dim=1), torch.cat(swept, dim=1)
+    assert torch.allclose(
+        found, whole[torch.cdist(found, whole, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)], atol=1e-6
+    )
+    assert torch.allclose(points.mean(dim=0), swept[0].mean(dim=0), atol=0.05 * float(swept[0].std()))
+
+
+def test_masked_pixels_give_no_points(capture: tuple[list[Photo], Tensor]) -> None:
+    photos, sparse = capture
+    left = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+    left[:, : SIDE // 2] = True
+    sweep = Sweep([photos[0]._replace(mask=left), *photos[1:]], sparse, SIDE)
+    depth = sweep.add(0)
+    assert (depth[:, : SIDE // 2] > 0).any()
+    assert not (depth[:, SIDE // 2 :] > 0).any()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda photos, sparse: (
+            [photo._replace(target=torch.full_like(photo.target, 0.4)) for photo in photos],
+            sparse,
+        ),
+        lambda photos, sparse: (photos[:1], sparse),
+        lambda photos, sparse: ([], sparse),
+        lambda photos, sparse: (photos, sparse[:0]),
+        lambda photos, sparse: (photos, sparse + 1000),
+        # Noise of its own in each image: what is alike by chance does not come back to its pixel.
+        lambda photos, sparse: (
+            [
+                photo._replace(target=torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(i)))
+                for i, photo in enumerate(photos)
+            ],
+            sparse,
+        ),
+    ],
+    ids=["flat", "one photo", "none", "no sparse points", "sparse points elsewhere", "noise"],
+)
+def test_what_says_nothing_gives_no_points(
+    capture: tuple[list[Photo], Tensor], change: Callable[..., tuple[list[Photo], Tensor]]
+) -> None:
+    points, colours = points_of(*change(*capture))
+    assert points.shape == colours.shape
+    assert len(points) <= 0.03 * 3 * SIDE * SIDE
+    assert torch.isfinite(points).all()
+
+
+def test_sums_of_patches_are_those_of_pooling() -> None:
+    image = torch.rand(2, 1, 11, 9)
+    window = plane_sweep.WINDOW
+    pooled = torch.nn.functional.avg_pool2d(image, window, stride=1, padding=window // 2) * window**2
+    assert torch.allclose(plane_sweep._box(image), pooled, atol=1e-5)

@@ -1,0 +1,99 @@
+"""Lines of progress: share and time left of the whole run, quality and size."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from nerfstudio.utils import writer
+
+from sundae_ns.cli.process import percent_of
+from sundae_ns.plugin import optimizer_configs as nerfstudio_configs
+from sundae_ns.plugin.optimizer_configs import METRICS_EVENT, ProgressWriter
+from sundae_ns.train.progress import TimeLeft, duration, long_on_cpu
+
+
+def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.setattr(writer, "GLOBAL_BUFFER", {})
+    monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": 400})
+    events: list[dict[str, Any]] = [
+        # A resumed run writes its configuration first.
+        {"name": "config", "event": {}, "step": 0},
+        {"name": "Train Iter (time)", "event": 0.25, "step": 159},
+        {"name": METRICS_EVENT, "event": {"psnr": 21.456, "gaussian_count": 12345}},
+    ]
+    monkeypatch.setattr(nerfstudio_configs, "EVENT_STORAGE", events)
+    made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10), ["Viewer at: somewhere"])
+    clock = [100.0]
+    monkeypatch.setattr(nerfstudio_configs.time, "monotonic", lambda: clock[0])
+    made.write_stats_log(0)
+    made.write_stats_log(0)
+    clock[0] += 10
+    events[1]["step"] = 199
+    made.write_stats_log(0)
+    banner, first, line = capsys.readouterr().out.splitlines()
+    assert banner == "Viewer at: somewhere"
+    assert first == "160 (40.00%)  PSNR 21.46 dB  12,345 primitives", "the first step compiles"
+    assert line == "200 (50.00%)  50 s left at 250 ms a step  PSNR 21.46 dB  12,345 primitives"
+    assert percent_of(line) == 50, "sundae demo reads it"
+
+
+def test_the_time_left_does_not_jump() -> None:
+    """Intervals of ten seconds in which a step takes 16 or 124 ms, which would be 8 and 62 minutes of 30,000 steps."""
+    watch, total, done, now = TimeLeft(), 30000, 0, 0.0
+    found: list[tuple[float, float]] = []
+    while done < total:
+        steps = round(10 / (0.016 if len(found) % 2 else 0.124))
+        done, now = min(done + steps, total), now + 10
+        left = watch.update(done, total, now)
+        if left is not None:
+            found.append((left, now))
+        else:
+            found.append((float("nan"), now))
+    later = [left for left, _ in found[10:-6]]
+    assert all(1 / 1.5 < after / before < 1.5 for before, after in zip(later, later[1:]))
+    half = len(found) // 2
+    assert 0.6 < found[half][0] / (now - found[half][1]) < 1.5, "and it is right"
+
+
+def test_a_lasting_change_is_followed() -> None:
+    watch, now = TimeLeft(), 0.0
+    for done in range(0, 3001, 10):
+        now += 10 * (0.1 if done < 500 else 1.0)
+        watch.update(done, 3000, now)
+    assert watch.step_s == pytest.approx(1.0, rel=0.05)
+
+
+def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.setattr(nerfstudio_configs, "LINE_EVERY", 0.0)
+    monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": 4})
+    events: list[dict[str, Any]] = [{"name": "Train Iter (time)", "event": 2.0, "step": 0}]
+    monkeypatch.setattr(nerfstudio_configs, "EVENT_STORAGE", events)
+    made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10))
+    made.write_stats_log(0)
+    assert capsys.readouterr().out == "", "nothing is measured yet"
+    events.append({"name": METRICS_EVENT, "event": {"psnr": 20.0, "gaussian_count": 7}})
+    events[0]["step"] = 1
+    made.write_stats_log(1)
+    del events[1]
+    events[0]["step"] = 2
+    made.write_stats_log(2)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["2", "3"]
+    assert lines[1].endswith("PSNR 20.00 dB  7 primitives")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (59.6, "1 min 0 s"), (185, "3 min 5 s"), (7261, "2 h 1 min")]
+)
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_a_training_of_hours_on_a_cpu_is_foretold() -> None:
+    assert long_on_cpu(0.05, 30000) is None
+    text = long_on_cpu(1.7, 30000)
+    assert text is not None
+    for part in ("at least 14 h 10 min", "1700 ms", "sundae-tiny", "--downscale-factor"):
+        assert part in text

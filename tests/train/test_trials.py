@@ -1,0 +1,256 @@
+"""Trials without a trainer: the engine, states of checkpoints, and estimated sizes."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import asdict
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from models import Training
+from torch.optim import SGD, Adam
+from torch.optim.lr_scheduler import LambdaLR
+
+from sundae_ns.core.errors import CheckpointError
+from sundae_ns.core.gaussians import FEATURES
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
+from sundae_ns.plugin.model import SundaeModel
+from sundae_ns.train import trials as trials_module
+from sundae_ns.train.choice import HeldOutQuality, Tried
+from sundae_ns.train.schedules import Decay
+from sundae_ns.train.trials import Progress, Trial, TrialEngine, Trials, packed_size
+
+Build = Callable[..., SundaeModel]
+VIEW = HeldOutQuality(10, 20.0, 0.5)
+
+
+class FakeRun:
+    """A run whose steps add 1 to every centre."""
+
+    def __init__(self, state: Any) -> None:
+        self.state = state
+        self.held_out: list[int] = []
+        self.source = SimpleNamespace(total=20)
+
+    def hold_out(self, indices: Any) -> None:
+        self.held_out = list(indices)
+
+    def train(self, trials: TrialEngine, most: int = 100) -> int:
+        """Train to the end of the trial, or ``most`` steps; returns their number."""
+        for number in range(1, most + 1):
+            self.state.step += 1
+            self.state.field["means"].data += 1
+            if trials.after_step(self):  # type: ignore[arg-type]
+                return number
+        return most
+
+
+@pytest.fixture
+def run(build: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> FakeRun:
+    monkeypatch.setattr(trials_module, "AVERAGED_EVERY", 1)
+    state = build(n=20).state
+    state.head_starts_at = math.inf
+    state.field["means"].data.zero_()
+    state.optimizers = {name: Adam([value]) for name, value in state.field.items()}
+    state.optimizers["compensation"] = Adam(state.head.parameters())
+    return FakeRun(state)
+
+
+def height(run: FakeRun) -> float:
+    return float(run.state.field["means"].detach()[0, 0])
+
+
+def test_trials_of_several_lengths_go_back_to_any_kept_field(run: FakeRun) -> None:
+    decay = Decay(0.1, 1000, 1.0, False, 0)
+    decay.pruned_at = 0
+    run.state.schedulers = {"means": LambdaLR(SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0), lr_lambda=decay)}
+    trials, state = TrialEngine(), run.state
+
+    def age() -> int:
+        """Steps since the rate has restarted, as far as they count."""
+        return state.step - (decay.pruned_at or 0)
+
+    trials.keep("first", state, head=False)
+    trials.start(run, Trial(5, held_out=[2]))  # type: ignore[arg-type]
+    assert run.held_out == [2]
+    assert run.train(trials) == 5
+    trials.keep("second", state, head=False)
+    trials.start(run, Trial(3, held_out=[4]))  # type: ignore[arg-type]
+    assert (run.train(trials), run.held_out, height(run)) == (3, [4], 8.0)
+    trials.go_back("second", state)
+    assert (height(run), trials.taken_back, age()) == (5.0, 3, 5)
+    trials.start(run, Trial(4))  # type: ignore[arg-type]
+    run.train(trials, most=2)
+    trials.go_back("first", state)
+    assert (height(run), trials.taken_back, age()) == (0.0, 3 + 2 + 5, 0)
+    trials.go_back("second", state)  # its five steps count again
+    assert (height(run), trials.taken_back, age()) == (5.0, 5, 5)
+    trials.end(run, "count")  # type: ignore[arg-type]
+    assert (run.held_out, trials.trial, trials.kept) == ([], None, {})
+
+
+@pytest.mark.parametrize(("averaged", "shown", "own"), [(3, 4.0, 5.0), (0, 5.0, 5.0)])
+def test_the_mean_of_the_last_weights_is_measured(
+    run: FakeRun, monkeypatch: pytest.MonkeyPatch, averaged: int, shown: float, own: float
+) -> None:
+    seen: list[float] = []
+
+    def measured(run: FakeRun, **_: bool) -> list[HeldOutQuality]:
+        seen.append(height(run))
+        return [VIEW]
+
+    monkeypatch.setattr(trials_module, "measure_heldout", measured)
+    trials = TrialEngine()
+    trials.start(run, Trial(5, averaged=averaged))  # type: ignore[arg-type]
+    run.train(trials)
+    assert trials.measure(run) == [VIEW]  # type: ignore[arg-type]
+    assert (seen, height(run)) == ([shown], own)
+
+
+def test_a_field_is_provisional_until_the_trials_end(run: FakeRun) -> None:
+    state, trials = run.state, TrialEngine(head_starts_at=2)
+    trials.start(run, Trial(5, num_features=5, counts=False))  # type: ignore[arg-type]
+    run.train(trials)
+    assert state.head_enabled
+    assert state.provisional
+    trials.end(run, "count")  # type: ignore[arg-type]
+    assert not state.provisional
+    assert state.schedule_step - state.head_starts_at - trials.taken_back == 3
+
+
+def test_another_width_begins_with_a_fresh_head_and_a_kept_one_comes_back(run: FakeRun) -> None:
+    state, trials = run.state, TrialEngine()
+    weights = {name: value.clone() for name, value in state.head.named_parameters()}
+    trials.keep("start", state, head=True)
+    trials.start(run, Trial(2, num_features=29))  # type: ignore[arg-type]
+    assert (state.head.config.num_features, state.field["features"].shape) == (29, (20, 29))
+    trials.go_back("start", state)
+    trials.start(run, Trial(2, num_features=0))  # type: ignore[arg-type]
+    assert not state.head_enabled
+    assert (state.head.config.num_features, state.field["features"].shape) == (5, (20, 5))
+    assert all(torch.equal(value, weights[name]) for name, value in state.head.named_parameters())
+
+
+def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun) -> None:
+    trials, other, state = TrialEngine(), TrialEngine(), run.state
+    trials.keep("first", state, head=False)
+    trials.start(run, Trial(6, held_out=[1, 3], averaged=5, counts=False))  # type: ignore[arg-type]
+    run.train(trials, most=4)
+    saved = copy.deepcopy(trials.state_dict())
+    state.provisional = False
+    other.load_state_dict(state, saved)
+    assert state.provisional
+    run.held_out = []
+    other.hold_out(run)  # type: ignore[arg-type]
+    assert run.held_out == [1, 3]
+    assert run.train(other) == 2
+    other.take_mean(state)
+    assert height(run) == 4.0  # of the steps 2 to 6
+    other.go_back("first", state)
+    assert (height(run), other.taken_back) == (0.0, 6)
+
+
+def test_the_mode_auto_adds_a_trial_and_the_others_do_not(build: Build) -> None:
+    assert "trials" in {extension.name for extension in build(head={"mode": "auto"}).extensions}
+    for mode in ("residual", "features", "off"):
+        assert "trials" not in {extension.name for extension in build(head={"mode": mode}).extensions}
+    names = [extension.name for extension in build(head={"mode": "off"}, pruning={"keep_ratio": None}).extensions]
+    assert names.index("trials") < names.index("pruning") < names.index("after-prune")
+
+
+def test_an_undecided_head_is_residual_and_disabled(build: Build) -> None:
+    model = build(head={"mode": "auto"})
+    model.step = 10**6
+    assert model.head is not None
+    assert model.head.config.mode == "residual"
+    assert not model.state.head_enabled
+
+
+def test_a_head_is_undecided_by_default_and_then_residual() -> None:
+    assert HeadConfig().mode == "auto"
+    assert CompensationHead(HeadConfig()).config.mode == "residual"
+
+
+def test_a_removed_head_leaves_no_values_and_no_moments(build: Build) -> None:
+    model = build(head={"mode": "residual"})
+    training = Training(model)
+    for step in range(3, 6):
+        training.step(step)
+    training.step(6)
+    assert model.state.head_enabled
+    assert training.optimizers.optimizers["compensation"].state
+    features = model.gauss_params["features"]
+    model.state.remove_head()
+    assert model.head is None
+    assert model.gauss_params["features"] is features
+    assert features.numel() == 0
+    assert not training.optimizers.optimizers["compensation"].state
+    assert not training.optimizers.optimizers["features"].state
+    before = model.gauss_params["means"].detach().clone()
+    training.step(7)
+    assert not model.gauss_params["means"].detach().equal(before)
+
+
+@pytest.fixture
+def undecided(build: Build) -> tuple[SundaeModel, Trials]:
+    """A model whose head is to be decided about, and its trials."""
+    model = build(head={"mode": "auto"})
+    return model, next(one for one in model.extensions if isinstance(one, Trials))
+
+
+def saved(stage: str = "", kept: tuple[str, ...] = (), **progress: Any) -> dict[str, Any]:
+    """A state of trials."""
+    engine = TrialEngine()
+    engine.kept = {name: {} for name in kept}
+    engine.trial = Trial(10, num_features=5, counts=False) if stage else None
+    return {"progress": asdict(Progress(stage, **progress)), "engine": engine.state_dict(), "head": True}
+
+
+def test_a_checkpoint_without_a_decision_names_the_option(undecided: tuple[SundaeModel, Trials]) -> None:
+    model, trials = undecided
+    with pytest.raises(CheckpointError, match=r"--pipeline.model.head.mode"):
+        trials.prepare_loading(model.state, {})
+
+
+@pytest.mark.parametrize(("stage", "kept"), [("head", ("start",)), ("count", ()), ("length", ("plain",))])
+def test_a_state_without_a_field_to_go_back_to_is_refused(
+    undecided: tuple[SundaeModel, Trials], stage: str, kept: tuple[str, ...]
+) -> None:
+    model, trials = undecided
+    tried = [Tried("head", 9, "plain", 9)]
+    with pytest.raises(CheckpointError, match="lacks a field") as raised:
+        trials.load_state_dict(model.state, saved(stage, kept, tried=tried))
+    assert "\n" not in str(raised.value)
+
+
+def test_only_trials_do_without_mirrored_images(undecided: tuple[SundaeModel, Trials]) -> None:
+    """They are too short to see what these bring; a run that resumes in a trial goes on with it."""
+    model, trials = undecided
+    for state, mirrored in ((saved("head", ("start",)), False), (saved(chosen={"head": "head"}), True)):
+        trials.load_state_dict(model.state, state)
+        model.step = 10**6
+        assert model.state.head_enabled
+        assert model.resolution(model.step).mirror == mirrored
+
+
+@pytest.mark.parametrize("with_head", [False, True])
+def test_a_part_of_a_field_tells_the_size_of_all_of_it(with_head: bool) -> None:
+    n, generator = 20_000, torch.Generator().manual_seed(0)
+    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}
+    shapes |= {"features_rest": (3, 3), FEATURES: (5,)}
+    field = {name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()}
+    head = CompensationHead(HeadConfig(mode="residual", size="tiny", num_features=5)) if with_head else None
+    found = packed_size(field, head)
+    assert found is not None
+    packed = {name: value for name, value in field.items() if with_head or name != FEATURES}
+    data, sections = pack_bytes(*fit_scene(PackedScene(packed, {} if head is None else dict(head.state_dict()))))
+    of_head = sum(size for name, size in sections.items() if name.startswith("head/"))
+    assert found[1] == pytest.approx(of_head, rel=0.01)
+    assert (found[1] > 0) == with_head
+    assert found[0] == pytest.approx(len(data) - of_head, rel=0.1)
+    assert packed_size({**field, "means": torch.full((n, 3), torch.nan)}) is None
