@@ -7,8 +7,8 @@
 The formats are fp32 (the run itself), .ply, .spz and .sog by ``sundae export``, .sundae by ``sundae pack`` with the
 head if there is one, and .sog by PlayCanvas's ``splat-transform`` where it is in PATH (``npm install -g
 @playcanvas/splat-transform``, node 22; it needs a GPU by Vulkan: with ``--splat-transform "splat-transform --gpu cpu"``
-100,000 primitives took more than eight minutes). Each file is loaded again by ``sundae_ns.load`` and rendered over the
-background of the run. Bytes are those of the whole file; fp32 counts primitives, features and head. With ``-o``, rows
+100,000 Gaussians took more than eight minutes). Each file is loaded again by ``sundae_ns.load`` and rendered over the
+background of the run. Bytes are those of the whole file; fp32 counts Gaussians, features and head. With ``-o``, rows
 take the place of those of the same capture, method, format, program and seed. ``benchmarks/tables.py`` shows
 results/formats.csv.
 """
@@ -31,7 +31,7 @@ from typing import Any, NamedTuple, TextIO
 import sundae_ns as sn
 from sundae_ns.core.files import replacing
 from sundae_ns.io.accounting import bytes_of, bytes_of_module
-from sundae_ns.plugin.camera_models import view_of
+from sundae_ns.plugin.camera_models import camera_of
 from sundae_ns.plugin.finished_runs import Opened, load_model, load_run
 from sundae_ns.scene.packing import packed_bytes
 
@@ -80,12 +80,12 @@ def packed_files(run: Path, scene: sn.Scene, folder: Path, data: Path | None, pr
 
 def rows_of(opened: Opened, method: str, files: Iterator[Packed], scene: sn.Scene) -> Iterator[dict[str, Any]]:
     """A row for the run in fp32, then one for each file."""
-    views = [view_of(camera, scene.device) for camera in opened.cameras]
+    cameras = [camera_of(camera, scene.device) for camera in opened.cameras]
 
     def row(measured: sn.Scene, kind: str, program: str, count: int, command: str) -> dict[str, Any]:
         # Files for viewers state no background.
         shown = dataclasses.replace(measured, background_color=scene.background_color)
-        quality = sn.measure(shown, opened.truths, views)
+        quality = sn.measure(shown, opened.truths, cameras)
         return {
             "capture": opened.scene,
             "method": method,
@@ -94,12 +94,12 @@ def rows_of(opened: Opened, method: str, files: Iterator[Packed], scene: sn.Scen
             "bytes": count,
             "psnr": round(quality.psnr, 4),
             "ssim": round(quality.ssim, 4),
-            "primitives": measured.num_primitives,
+            "primitives": measured.num_gaussians,
             "seed": "" if opened.seed is None else opened.seed,
             "command": command,
         }
 
-    stored = bytes_of(scene.field) + (0 if scene.head is None else bytes_of_module(scene.head))
+    stored = bytes_of(scene.gaussians) + (0 if scene.head is None else bytes_of_module(scene.head))
     yield row(scene, "fp32", "", stored, f"ns-train {opened.method}")
     for packed in files:
         loaded = sn.load(packed.file, device=scene.device)

@@ -37,7 +37,7 @@ from torch import Tensor
 from sundae_ns.core.timing import now
 from sundae_ns.graph.filters import high_pass
 from sundae_ns.graph.graph import NeighborGraph, build_graph
-from sundae_ns.io.formats import read_field
+from sundae_ns.io.formats import read_gaussians
 
 NEIGHBORS = 16
 TIE = 1e-12
@@ -190,8 +190,8 @@ def tiled(path: Path, count: int) -> Tensor:
     """Centres of a field, copied side by side up to a count."""
     from multi_gpu import tile
 
-    field = read_field(path)[0]
-    return tile({"means": field["means"][field["means"].isfinite().all(dim=1)]}, count)["means"]
+    gaussians = read_gaussians(path)[0]
+    return tile({"means": gaussians["means"][gaussians["means"].isfinite().all(dim=1)]}, count)["means"]
 
 
 def main() -> None:

@@ -1,12 +1,12 @@
-"""Measure packed scenes: bytes, bits a primitive, quality and seconds; print one JSON line.
+"""Measure packed scenes: bytes, bits a Gaussian, quality and seconds; print one JSON line.
 
-    python benchmarks/bench_pack.py                              # 1,000,000 random primitives
+    python benchmarks/bench_pack.py                              # 1,000,000 random Gaussians
     python benchmarks/bench_pack.py --run RUN --views 6          # a finished run, at its training resolution
     python benchmarks/bench_pack.py --run RUN --set harmonics_step=0.04 feature_step=0.3
     python benchmarks/bench_pack.py --run RUN --views 99 --finetune 1000                # as sundae pack --finetune 1000
     python benchmarks/bench_pack.py --packed scene.sundae --repeats 10                  # only opens it
 
-Random primitives have no structure for an entropy coder; they measure time. A run is rendered before and after packing:
+Random Gaussians have no structure for an entropy coder; they measure time. A run is rendered before and after packing:
 ``psnr``, ``ssim`` and ``psnr_packed``, ``ssim_packed`` are against the test images, with the head and without
 (``_base``); ``psnr_between`` compares the two renderings. With ``--finetune`` the packed model trains with rounding and
 the rate in the loop, from the coarser options of ``FINETUNED``, which ``--set`` changes. ``--keep`` keeps the packed
@@ -47,7 +47,7 @@ FIRST_IMAGE = """
 import sys
 import sundae_ns as sn
 scene = sn.load(sys.argv[1])
-views = scene.views or sn.virtual_views(scene, 1, size=640)
+views = scene.views or sn.virtual_cameras(scene, 1, size=640)
 sn.render(scene, views[0])
 """
 
@@ -55,7 +55,7 @@ sn.render(scene, views[0])
 def random_scene(n: int) -> PackedScene:
     g = torch.Generator().manual_seed(0)
     features = 13
-    field = {
+    gaussians = {
         "means": torch.randn(n, 3, generator=g),
         "scales": 0.8 * torch.randn(n, 3, generator=g) - 5,
         "quats": torch.randn(n, 4, generator=g),
@@ -65,11 +65,11 @@ def random_scene(n: int) -> PackedScene:
         "features": torch.randn(n, features, generator=g),
     }
     torch.manual_seed(0)
-    return PackedScene(field, dict(CompensationHead(HeadConfig(num_features=features)).state_dict()))
+    return PackedScene(gaussians, dict(CompensationHead(HeadConfig(num_features=features)).state_dict()))
 
 
 def config_of(settings: list[str], finetuned: bool) -> PackConfig:
-    kinds: dict[str, Any] = {field.name: type(field.default) for field in fields(PackConfig)}
+    kinds: dict[str, Any] = {gaussians.name: type(gaussians.default) for gaussians in fields(PackConfig)}
     values: dict[str, Any] = dict(FINETUNED) if finetuned else {}
     for setting in settings:
         name, _, value = setting.partition("=")
@@ -132,10 +132,10 @@ def sizes(report: PackReport) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
+def quality(run: Path, file: Path, cameras: int) -> dict[str, Any]:
     before = load_model(run / "config.yml")
     after = load_model(file, data=before.capture).model
-    chosen = torch.linspace(0, len(before.cameras) - 1, min(views, len(before.cameras))).round().long().tolist()
+    chosen = torch.linspace(0, len(before.cameras) - 1, min(cameras, len(before.cameras))).round().long().tolist()
     names = ("psnr", "psnr_packed", "psnr_between", "ssim", "ssim_packed")
     sums = {name + suffix: 0.0 for name in names for suffix in ("", "_base")}
     for i in track(chosen, description="Rendering", transient=True):

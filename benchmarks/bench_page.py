@@ -35,7 +35,7 @@ from sundae_ns.io.pack import container
 from sundae_ns.io.pack.packed_scene import CAMERAS as STORED
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene
 from sundae_ns.plugin.finished_runs import model_of
-from sundae_ns.scene.packing import arrays_of_views, scene_of
+from sundae_ns.scene.packing import arrays_of_cameras, scene_of
 from sundae_ns.scene.page import write_page
 
 SECONDS = 400.0
@@ -48,7 +48,7 @@ WEB = Path(__file__).parents[1] / "web"
 
 def sized(scene: PackedScene, intrinsics: Tensor, sizes: Tensor, picks: Tensor, share: float) -> PackedScene:
     """The scene with some of its cameras, with other lenses, and its head at ``share`` of the scale of its training."""
-    cameras = {name: value[picks].clone() for name, value in arrays_of_views(scene_of(scene).views).items()}
+    cameras = {name: value[picks].clone() for name, value in arrays_of_cameras(scene_of(scene).cameras).items()}
     cameras["intrinsics"] = intrinsics.to(cameras["intrinsics"])
     cameras["sizes"] = sizes.to(cameras["sizes"])
     meta = copy.deepcopy(scene.meta)
@@ -60,7 +60,7 @@ def sized(scene: PackedScene, intrinsics: Tensor, sizes: Tensor, picks: Tensor, 
 
 def picked(scene: PackedScene) -> tuple[Tensor, Tensor, Tensor]:
     """Six cameras, fewer if it has fewer: their indices, intrinsics ``[N, 4]`` and sizes ``[N, 2]`` in pixels."""
-    cameras = arrays_of_views(scene_of(scene).views)
+    cameras = arrays_of_cameras(scene_of(scene).cameras)
     picks = torch.linspace(0, len(cameras["poses"]) - 1, CAMERAS).round().long().unique()
     return picks, cameras["intrinsics"][picks].double(), cameras["sizes"][picks].double()
 
@@ -81,7 +81,7 @@ def write_changed(out: Path, scene: Path, small: PackedScene) -> PackedScene:
     assert small.cameras is not None
     dtypes = {name: section["dtype"] for name, section in STORED.items()}
     cameras = {f"cameras/{name}": small.cameras[name].numpy().astype(dtype) for name, dtype in dtypes.items()}
-    unpacked = 4 * sum(value.numel() for value in (*small.field.values(), *small.head.values()))
+    unpacked = 4 * sum(value.numel() for value in (*small.gaussians.values(), *small.head.values()))
     sections = {**container.read_sections(scene, header), **cameras}
     out.write_bytes(container.encode(meta, sections, unpacked=unpacked)[0])
     return read_scene(out)
@@ -90,7 +90,7 @@ def write_changed(out: Path, scene: Path, small: PackedScene) -> PackedScene:
 def truths(scene: PackedScene) -> list[dict[str, NDArray[np.float32]]]:
     """``rgb`` and ``base_rgb`` of each camera by Python."""
     model = model_of(scene_of(scene))
-    cameras = arrays_of_views(scene_of(scene).views)
+    cameras = arrays_of_cameras(scene_of(scene).cameras)
     images = []
     for pose, lens, size in zip(*(cameras[name] for name in ("poses", "intrinsics", "sizes")), strict=True):
         fx, fy, cx, cy = lens.float().reshape(4, 1, 1)
@@ -129,9 +129,9 @@ def compared(scene: Path, side: int = SIDE, *, half: bool = False) -> dict[str, 
         small = write_changed(packed, scene, scaled(read_scene(scene), side))
         write_page(html, scene_of(small), packed.read_bytes(), title=scene.stem)
         images = truths(small)
-        width, height = (int(length) for length in arrays_of_views(scene_of(small).views)["sizes"][0])
+        width, height = (int(length) for length in arrays_of_cameras(scene_of(small).cameras)["sizes"][0])
         row: dict[str, Any] = {"scene": scene.name, "bytes": scene.stat().st_size, "size": f"{width}x{height}"}
-        row |= {"primitives": len(small.field["means"]), "head": bool(small.head)}
+        row |= {"primitives": len(small.gaussians["means"]), "head": bool(small.head)}
         with Browser(chromium, width, height, WEBGPU) as page:
             began = time.perf_counter()
             page.open(html.as_uri())
@@ -185,7 +185,7 @@ def half_images(packed: Path) -> tuple[str, list[NDArray[np.float64]]] | None:
         adapter = json.loads(found.stdout.splitlines()[-1])
         if adapter is None:
             return None
-        sizes = arrays_of_views(scene_of(read_scene(packed)).views)["sizes"].tolist()
+        sizes = arrays_of_cameras(scene_of(read_scene(packed)).cameras)["sizes"].tolist()
         files = [np.fromfile(f"{copy}.{i}", np.uint8) for i in range(len(sizes))]
         pixels = [file.reshape(height, width, 4) for file, (width, height) in zip(files, sizes, strict=True)]
         return adapter, [each[..., :3] / 255 for each in pixels]

@@ -1,6 +1,6 @@
 """Time training steps, or a part alone: loss, heads, rasterisers; print one JSON line for each row.
 
-    python benchmarks/bench_step.py                            # sundae-tiny on a CPU, 128 x 128, 5,000 primitives
+    python benchmarks/bench_step.py                            # sundae-tiny on a CPU, 128 x 128, 5,000 Gaussians
     python benchmarks/bench_step.py --primitives 20000 --size 256 --device cuda
     python benchmarks/bench_step.py loss --device cuda         # fused kernels and convolutions, with their errors
     python benchmarks/bench_step.py heads                      # on CUDA, each head as one CUDA graph
@@ -164,7 +164,7 @@ def _head_ms(config: HeadConfig, height: int, width: int) -> dict[str, float]:
 
 
 def rasterizers(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """The rasterisers of the device on a random view of 16 channels, primitives of one to three pixels."""
+    """The rasterisers of the device on a random view of 16 channels, Gaussians of one to three pixels."""
     n, size, g = options.primitives, options.size, torch.Generator().manual_seed(0)
     depth = 2 + 2 * torch.rand(n, 1, generator=g)
     screen = size * (torch.rand(n, 2, generator=g) - 0.5)
@@ -183,10 +183,10 @@ def rasterizers(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         viewmat, K = (value.to(device, dtype) for value in camera)
         means, quats, scales, opacities, colors = leaves
         backend = select_backend(name, device)
-        view = rasterize(means, quats, scales, opacities, colors, viewmat, K, size, size, backend=backend)
+        drawn = rasterize(means, quats, scales, opacities, colors, viewmat, K, size, size, backend=backend)
         if not gradients:
-            return [view.colors]
-        return [view.colors.detach(), *torch.autograd.grad(view.colors, leaves, weights.to(device, dtype))]
+            return [drawn.colors]
+        return [drawn.colors.detach(), *torch.autograd.grad(drawn.colors, leaves, weights.to(device, dtype))]
 
     oracle = draw("reference", "cpu", torch.float64)
     names: tuple[BackendName, ...] = ("gsplat", "reference") if options.device == "cuda" else ("cpu", "reference")

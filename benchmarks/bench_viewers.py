@@ -1,13 +1,13 @@
 """Show an export of a packed scene in other viewers and compare with Python's images; print one JSON line per setting.
 
-    python benchmarks/bench_viewers.py scene.sundae                     # a .ply of all primitives
+    python benchmarks/bench_viewers.py scene.sundae                     # a .ply of all Gaussians
     python benchmarks/bench_viewers.py scene.sundae --kind spz --central
     python benchmarks/bench_viewers.py scene.sundae --kind glb --central --viewer three
 
 The viewers are Spark, GaussianSplats3D, three.js, PlayCanvas and Babylon.js, each with the files that it reads, in a
 Chromium that renders in software; ``make browser`` installs them. Six cameras, a black background, base colours. Each
-setting of a viewer adds to the one before. ``--central`` keeps the primitives whose centres lie in all six images:
-beside the image the viewers project and drop primitives differently. Lines belong in results/viewers.jsonl.
+setting of a viewer adds to the one before. ``--central`` keeps the Gaussians whose centres lie in all six images:
+beside the image the viewers project and drop Gaussians differently. Lines belong in results/viewers.jsonl.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from harness.chromium import Browser, find_chromium, wait_for
 from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene
 from sundae_ns.scene.load_save import save_for_viewers
-from sundae_ns.scene.packing import arrays_of_views, scene_of
+from sundae_ns.scene.packing import arrays_of_cameras, scene_of
 
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <script type="module" src="viewers.js"></script>"""
 REACH = math.sqrt(2 * math.log(255))
-"""Sigmas to where the alpha of an opaque primitive falls below 1/255."""
+"""Sigmas to where the alpha of an opaque Gaussian falls below 1/255."""
 Options = dict[str, dict[str, Any]]
 READS = {
     "spark": ("ply", "spz"),
@@ -89,19 +89,19 @@ def settings(kind: str, antialiased: bool) -> dict[str, dict[str, Options]]:
 def base_colors(scene: PackedScene) -> PackedScene:
     """The scene without its head, on a black background."""
     model = {**scene.meta["model"], "head": None, "trained_focal": None, "background_color": "black"}
-    field = {name: value for name, value in scene.field.items() if name != FEATURES}
-    return replace(scene, field=field, head={}, meta={**scene.meta, "model": model})
+    gaussians = {name: value for name, value in scene.gaussians.items() if name != FEATURES}
+    return replace(scene, gaussians=gaussians, head={}, meta={**scene.meta, "model": model})
 
 
 def central(scene: PackedScene) -> PackedScene:
-    """The scene with the primitives whose centres lie in the images of all cameras."""
-    keep = torch.ones(len(scene.field["means"]), dtype=torch.bool)
-    cameras = arrays_of_views(scene_of(scene).views)
+    """The scene with the Gaussians whose centres lie in the images of all cameras."""
+    keep = torch.ones(len(scene.gaussians["means"]), dtype=torch.bool)
+    cameras = arrays_of_cameras(scene_of(scene).cameras)
     for pose, lens, size in zip(*(cameras[name].float() for name in ("poses", "intrinsics", "sizes")), strict=True):
-        x, y, z = ((scene.field["means"] - pose[:, 3]) @ pose[:, :3]).T
+        x, y, z = ((scene.gaussians["means"] - pose[:, 3]) @ pose[:, :3]).T
         u, v = lens[0] * x / -z + lens[2], lens[3] - lens[1] * y / -z
         keep &= (z < 0) & (u > 0) & (u < size[0]) & (v > 0) & (v < size[1])
-    return replace(scene, field={name: value[keep] for name, value in scene.field.items()})
+    return replace(scene, gaussians={name: value[keep] for name, value in scene.gaussians.items()})
 
 
 class _Quiet(SimpleHTTPRequestHandler):
@@ -114,7 +114,7 @@ class Viewers:
 
     def __init__(self, page: Browser, address: str, scene: PackedScene, file: str) -> None:
         self._page, self._address, self._file = page, address, file
-        cameras = arrays_of_views(scene_of(scene).views)
+        cameras = arrays_of_cameras(scene_of(scene).cameras)
         names = ("fx", "fy", "cx", "cy", "width", "height")
         self._sizes = cameras["sizes"].tolist()
         self._cameras = [
@@ -146,7 +146,7 @@ def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
     chromium = find_chromium()
     if chromium is None or not has_packages():
         sys.exit("no Chromium or no viewers here: apt-get install chromium, then make browser")
-    width, height = (int(side) for side in arrays_of_views(scene_of(scene).views)["sizes"][0])
+    width, height = (int(side) for side in arrays_of_cameras(scene_of(scene).cameras)["sizes"][0])
     with TemporaryDirectory() as folder:
         site = Path(folder)
         (site / "index.html").write_text(PAGE)
@@ -170,7 +170,7 @@ def rows(
         shown = central(shown)
     images = [truth["base_rgb"] for truth in truths(shown)]
     height, width, _ = images[0].shape
-    about = {"scene": scene.name, "file": kind, "primitives": len(shown.field["means"]), "central": center}
+    about = {"scene": scene.name, "file": kind, "primitives": len(shown.gaussians["means"]), "central": center}
     with opened(shown, kind) as viewers:
         for viewer, ladder in settings(kind, shown.meta["model"]["rasterize_mode"] == "antialiased").items():
             if only not in (None, viewer):
@@ -188,7 +188,7 @@ def main() -> None:
     parser.add_argument("--kind", choices=("ply", "spz", "sog", "glb"), default="ply", help="of the export")
     parser.add_argument("--side", type=int, default=SIDE, help="longest side of the images, pixels")
     parser.add_argument("--viewer", choices=READS, help="one viewer instead of all")
-    parser.add_argument("--central", action="store_true", help="only primitives whose centres lie in all images")
+    parser.add_argument("--central", action="store_true", help="only Gaussians whose centres lie in all images")
     options = parser.parse_args()
     for row in rows(options.scene, kind=options.kind, side=options.side, center=options.central, only=options.viewer):
         print(json.dumps(row), flush=True)

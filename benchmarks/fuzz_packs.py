@@ -61,17 +61,17 @@ def _scene(path: Path, degree: int, kind: tuple[Any, int, int] | None) -> bytes:
     torch.manual_seed(degree)
     points = torch.rand(POINTS, 3) - 0.5
     width = kind[2] if kind else 1
-    field = {
+    gaussians = {
         k: v.detach()
         for k, v in from_points(points, torch.rand(POINTS, 3), sh_degree=degree, num_features=width).items()
     }
-    field["features_rest"] = 0.2 * torch.randn(POINTS, (degree + 1) ** 2 - 1, 3)
-    field["quats"] = torch.randn(POINTS, 4)
+    gaussians["features_rest"] = 0.2 * torch.randn(POINTS, (degree + 1) ** 2 - 1, 3)
+    gaussians["quats"] = torch.randn(POINTS, 4)
     head, stated = {}, None
     if kind is None:
-        field.pop("features")
+        gaussians.pop("features")
     else:
-        field["features"] = torch.randn(POINTS, width)
+        gaussians["features"] = torch.randn(POINTS, width)
         config = HeadConfig(mode=kind[0], size="tiny", pixel_unshuffle=kind[1], num_features=width)
         # Few weights that are not zero: zeros decode fast.
         head = {
@@ -100,7 +100,7 @@ def _scene(path: Path, degree: int, kind: tuple[Any, int, int] | None) -> bytes:
     if degree % 2:
         meta["up"] = [0.6, 0.0, -0.8]
         meta["start"] = {"pose": poses[1].tolist(), "intrinsics": lens[1].tolist(), "size": [24, 18]}
-    write_scene(path, PackedScene(field, head, cameras, meta))
+    write_scene(path, PackedScene(gaussians, head, cameras, meta))
     return path.read_bytes()
 
 
@@ -128,7 +128,7 @@ def python_verdict(path: Path) -> Verdict:
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
-    digest = hashlib.sha256(packed.field["means"].numpy().tobytes())
+    digest = hashlib.sha256(packed.gaussians["means"].numpy().tobytes())
     for name in sorted(packed.head):
         digest.update(packed.head[name].contiguous().numpy().tobytes())
     cameras = packed.cameras or {
@@ -138,11 +138,11 @@ def python_verdict(path: Path) -> Verdict:
     }
     for pose, lens, size in zip(cameras["poses"], cameras["intrinsics"], cameras["sizes"], strict=True):
         digest.update(torch.cat([pose.reshape(-1).double(), lens, size.double()]).numpy().tobytes())
-    rest, start = packed.field["features_rest"].shape[1], packed.meta.get("start")
+    rest, start = packed.gaussians["features_rest"].shape[1], packed.meta.get("start")
     content = {
         "digest": digest.hexdigest(),
         "degree": round((rest + 1) ** 0.5) - 1,
-        "logits": scene.field.encoding == "logits",
+        "logits": scene.gaussians.encoding == "logits",
         "antialiased": scene.antialiased,
         "background": [round(float(value), 4) for value in scene.background],
         "trainedFocal": list(scene.trained_focal) if scene.trained_focal else None,

@@ -47,7 +47,7 @@ from harness.processes import Bench, command_here, train_here
 from harness.still_life import write_still_life
 from sundae_ns.core.errors import CheckpointError
 from sundae_ns.io import checkpoint
-from sundae_ns.plugin.camera_models import view_of
+from sundae_ns.plugin.camera_models import camera_of
 from sundae_ns.plugin.finished_runs import load_model
 
 SPREAD = 3.0
@@ -116,8 +116,8 @@ def same_tensors(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool
 def quality(run: Path) -> float:
     """PSNR of the test views, dB."""
     opened = load_model(run)
-    views = [view_of(camera, opened.model.device) for camera in opened.cameras]
-    return sn.measure(sn.load(run, device=opened.model.device), opened.truths, views).psnr
+    cameras = [camera_of(camera, opened.model.device) for camera in opened.cameras]
+    return sn.measure(sn.load(run, device=opened.model.device), opened.truths, cameras).psnr
 
 
 def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: Path, kills: int) -> dict[str, Any]:
@@ -243,7 +243,7 @@ def is_whole(path: Path) -> bool:
     if path.suffix == ".html":
         return path.read_bytes().rstrip().endswith(b"</html>")
     try:
-        return sn.load(path).num_primitives > 0
+        return sn.load(path).num_gaussians > 0
     except sn.SundaeError:
         return False
 

@@ -27,7 +27,7 @@ from nerfstudio.scripts.train import _set_random_seed
 
 from harness.plan import parser_of
 from sundae_ns.io import checkpoint
-from sundae_ns.io.formats import read_field
+from sundae_ns.io.formats import read_gaussians
 from sundae_ns.train.schedules import set_schedule
 
 WARM = 100
@@ -35,20 +35,20 @@ WARM = 100
 COLUMNS = ("field", "gpus", "device", "primitives", "images", "seconds", "images_per_s", "psnr", "ssim", "peak_mib")
 
 
-def tile(field: dict[str, torch.Tensor], count: int) -> dict[str, torch.Tensor]:
+def tile(gaussians: dict[str, torch.Tensor], count: int) -> dict[str, torch.Tensor]:
     """Copies of a field side by side on the ground, cut to an exact count, in random order.
 
     A trained field is mixed too: with an order by position, one camera would see a whole shard and none of the others.
     """
-    n = len(field["means"])
+    n = len(gaussians["means"])
     copies = -(-count // n)
     side = next(s for s in range(1, copies + 1) if s * s >= copies)
-    low, high = torch.quantile(field["means"][:: max(n // 10**5, 1)], torch.tensor([0.02, 0.98]), dim=0)
+    low, high = torch.quantile(gaussians["means"][:: max(n // 10**5, 1)], torch.tensor([0.02, 0.98]), dim=0)
     # From the middle outwards, so that the cameras stand in the first copy.
     cells = sorted(((x, y) for x in range(side) for y in range(side)), key=max)[:copies]
     chosen = torch.randperm(copies * n, generator=torch.Generator().manual_seed(0))[:count]
     offsets = torch.tensor([[*cell, 0] for cell in cells]) * (high - low)
-    tiled = {name: value[chosen % n] for name, value in field.items()}
+    tiled = {name: value[chosen % n] for name, value in gaussians.items()}
     tiled["means"] = tiled["means"] + offsets[chosen // n]
     return tiled
 
@@ -160,10 +160,13 @@ def main() -> None:
             if options.only == ("whole" if tiled else "tiled"):
                 continue
             if tiled:
-                field = tile(read_field(options.field or folder / "warm.ckpt")[0], options.primitives)
-                state = {"step": 0, "pipeline": {f"_model.gauss_params.{key}": value for key, value in field.items()}}
+                gaussians = tile(read_gaussians(options.field or folder / "warm.ckpt")[0], options.primitives)
+                state = {
+                    "step": 0,
+                    "pipeline": {f"_model.gauss_params.{key}": value for key, value in gaussians.items()},
+                }
                 checkpoint.write(state, folder / "tiled.ckpt")
-                del field, state
+                del gaussians, state
             for ranks in options.gpus:
                 torch.multiprocessing.spawn(measure, (ranks, folder, options, extra, tiled), nprocs=ranks)
         rows = (folder / "rows.csv").read_text()

@@ -152,8 +152,8 @@ def change(tree: ast.AST, index: int, kind: str) -> str:
             (not value) if isinstance(value, bool) else value + 1 if isinstance(value, int) else value * 2 + 1e-3
         )
     elif kind == "name":
-        field = "id" if isinstance(node, ast.Name) else "attr"
-        setattr(node, field, _NAMES[getattr(node, field)])
+        gaussians = "id" if isinstance(node, ast.Name) else "attr"
+        setattr(node, gaussians, _NAMES[getattr(node, gaussians)])
     else:
         node.value = ast.Constant(None)
     return f"line {node.lineno}: {before}  ->  {ast.unparse(node)}"

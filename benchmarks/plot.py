@@ -91,7 +91,7 @@ def plot_curve() -> Any:
 
 
 def plot_rules() -> Any:
-    """PSNR of pruning rules against the share they keep, over random primitives, a panel for each capture."""
+    """PSNR of pruning rules against the share they keep, over random Gaussians, a panel for each capture."""
     figure, panels = plt.subplots(1, len(PRUNED), figsize=(5.5 * len(PRUNED), 4), layout="constrained")
     for panel, scene in zip(panels, PRUNED, strict=True):
         psnr = {
@@ -110,8 +110,8 @@ def plot_rules() -> Any:
                 linewidth=width,
             )
         panel.set_title(f"{scene}, 15,000 steps after the prune, no head", fontsize=9)
-        panel.set_xlabel("primitives kept")
-        panel.set_ylabel("test PSNR over random primitives, dB")
+        panel.set_xlabel("Gaussians kept")
+        panel.set_ylabel("test PSNR over random Gaussians, dB")
         panel.grid(alpha=0.3)
     figure.legend(*panels[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
     return figure

@@ -33,7 +33,7 @@ from torch import Tensor
 import sundae_ns as sn
 from sundae_ns.core.errors import SundaeError
 from sundae_ns.core.files import replacing
-from sundae_ns.plugin.camera_models import view_of
+from sundae_ns.plugin.camera_models import camera_of
 from sundae_ns.plugin.finished_runs import load_model
 
 COLUMNS = (
@@ -54,10 +54,10 @@ class Full(NamedTuple):
 
     capture: str
     scene: sn.Scene
-    views: list[sn.View]
+    cameras: list[sn.Camera]
     photos: list[Tensor]
     images: list[Tensor]
-    virtual: list[sn.View]
+    virtual: list[sn.Camera]
 
 
 def full_field(run: Path, data: Path | None) -> Full:
@@ -65,10 +65,10 @@ def full_field(run: Path, data: Path | None) -> Full:
     opened = load_model(run, data=data)
     device = opened.model.device
     scene = dataclasses.replace(sn.load(run, device=device), head=None)
-    views = [view_of(camera, device) for camera in opened.cameras]
-    images = [sn.render(scene, view).rgb for view in views]
-    virtual = sn.virtual_views(scene, HELD_OUT, seed=10_000, size=256)
-    return Full(opened.scene, scene, views, opened.truths, images, virtual)
+    cameras = [camera_of(ns_camera, device) for ns_camera in opened.cameras]
+    images = [sn.render(scene, camera).rgb for camera in cameras]
+    virtual = sn.virtual_cameras(scene, HELD_OUT, seed=10_000, size=256)
+    return Full(opened.scene, scene, cameras, opened.truths, images, virtual)
 
 
 def device_of(scene: sn.Scene) -> str:
@@ -104,10 +104,10 @@ def made(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: P
         subprocess.run(words, check=True, stdout=sys.stderr)
         seconds = time.monotonic() - began
         found = sn.load(out, device=scene.device)
-        return dataclasses.replace(scene, field=found.field), seconds
+        return dataclasses.replace(scene, gaussians=found.gaussians), seconds
     if job["training"] == "none":
         rule = dataclasses.replace(RULE, seed=options.seed)
-        small = sn.prune(scene, keep=share, views=sn.virtual_views(scene, seed=options.seed), rule=rule)
+        small = sn.prune(scene, keep=share, cameras=sn.virtual_cameras(scene, seed=options.seed), rule=rule)
     else:
         head = job["training"] == "distill"
         small = sn.distill(scene, keep=share, steps=options.steps, seed=options.seed, head=head)
@@ -124,14 +124,14 @@ def row_of(full: Full, job: dict[str, Any], options: argparse.Namespace, folder:
         file = folder / f"small{suffix}"
         sn.save(small, file)
         sizes[suffix] = file.stat().st_size
-    photos = sn.measure(small, full.photos, full.views)
+    photos = sn.measure(small, full.photos, full.cameras)
     return {
         **job,
         "capture": full.capture,
-        "primitives": small.num_primitives,
+        "primitives": small.num_gaussians,
         "bytes": sizes[".sundae"],
         "bytes_sog": sizes[".sog"],
-        "psnr_to_field": f"{sn.measure(small, full.images, full.views).psnr:.3f}",
+        "psnr_to_field": f"{sn.measure(small, full.images, full.cameras).psnr:.3f}",
         "psnr": f"{photos.psnr:.3f}",
         "ssim": f"{photos.ssim:.4f}",
         "psnr_virtual": f"{sn.measure(small, full.scene, full.virtual).psnr:.3f}",

@@ -95,7 +95,7 @@ def quality() -> list[str]:
 
 
 def cells_of(row: dict[str, Any]) -> list[str]:
-    """Capture, method, number of primitives, metrics and size of a row of runs.csv."""
+    """Capture, method, number of Gaussians, metrics and size of a row of runs.csv."""
     return [
         f"{row['scene']}, {row['resolution'].replace('x', ' x ')}",
         METHODS[row["variant"]],

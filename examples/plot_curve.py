@@ -1,4 +1,4 @@
-"""Plot how the quality of a scene falls with its number of primitives, before any training.
+"""Plot how the quality of a scene falls with its number of Gaussians, before any training.
 
     python examples/plot_curve.py garden.ply curve.png
 
@@ -25,19 +25,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help=".ply, .spz, .sog, .sundae, or a run of ns-train")
     parser.add_argument("out", type=Path, help="image to write")
-    parser.add_argument("--views", type=int, default=64, help="number of virtual cameras")
+    parser.add_argument("--cameras", type=int, default=64, help="number of virtual cameras")
     options = parser.parse_args()
 
     scene = sn.load(options.scene, device="cuda" if torch.cuda.is_available() else "cpu")
-    views, others = sn.virtual_views(scene, options.views), sn.virtual_views(scene, 16, seed=1)
+    cameras, others = sn.virtual_cameras(scene, options.cameras), sn.virtual_cameras(scene, 16, seed=1)
     rules = {"merged": sn.PruneRule(), "not merged": sn.PruneRule(redistribution="none")}
     figure, axes = plt.subplots(figsize=(5, 3.5), layout="constrained")
     for name, rule in rules.items():
-        small = [sn.prune(scene, keep=share, views=views, rule=rule) for share in SHARES]
+        small = [sn.prune(scene, keep=share, cameras=cameras, rule=rule) for share in SHARES]
         found = [sn.measure(each, scene, others, head=False) for each in small]
         for each, quality in zip(small, found, strict=True):
-            print(f"{name}: {each.num_primitives:,} primitives, {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
-        axes.plot([each.num_primitives for each in small], [quality.psnr for quality in found], "o-", label=name)
+            print(f"{name}: {each.num_gaussians:,} Gaussians, {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
+        axes.plot([each.num_gaussians for each in small], [quality.psnr for quality in found], "o-", label=name)
     axes.set(xscale="log", xlabel="primitives", ylabel="PSNR against the whole scene, dB")
     axes.legend()
     axes.grid(alpha=0.3)

@@ -22,7 +22,7 @@ from sundae_ns.train.pruning import PruningConfig
 def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
     """Optimizers for a run: splatfacto's rates, and rates of features and head.
 
-    Right after the prune the rate of the centres restarts, so that kept primitives can fill the gaps.
+    Right after the prune the rate of the centres restarts, so that kept Gaussians can fill the gaps.
 
     Args:
         steps: length of the run, at which decaying rates reach their final value.
@@ -97,7 +97,7 @@ def method(
 
 
 def _keep(percent: int) -> MethodSpecification:
-    description = f"SUNDAE that keeps {percent}% of the primitives, with a head where it pays."
+    description = f"SUNDAE that keeps {percent}% of the Gaussians, with a head where it pays."
     return method(f"sundae-{percent}", description, PruningConfig(keep_ratio=percent / 100))
 
 
@@ -154,7 +154,7 @@ sundae_paper = method(
     average_share=0.0,
     loss_after_prune="l1",
     prior_after_prune=0.0,
-    photo_gains="off",
+    exposure_compensation="off",
     dense_start_views=0,
     ssim_lambda=0.25,
 )

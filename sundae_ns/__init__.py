@@ -5,8 +5,8 @@ The library needs no nerfstudio:
     import sundae_ns as sn
 
     scene = sn.load("garden.ply")                          # .ply, .spz, .sog, .glb, .sundae, or a run of ns-train
-    views = sn.virtual_views(scene)                        # or sn.views_of("transforms.json")
-    small = sn.prune(scene, keep=0.1, views=views)         # a new scene; dropped primitives are merged into kept ones
+    views = sn.virtual_cameras(scene)                        # or sn.cameras_of("transforms.json")
+    small = sn.prune(scene, keep=0.1, views=views)         # a new scene; dropped Gaussians are merged into kept ones
     image = sn.render(small, views[0]).rgb                 # [H, W, 3], on a CPU or a GPU
     sn.save(small, "small.sundae")
 
@@ -22,11 +22,11 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sundae_ns.core.camera import View as View
+    from sundae_ns.core.camera import Camera as Camera
     from sundae_ns.core.errors import SundaeError as SundaeError
     from sundae_ns.plugin.distill import distill as distill
     from sundae_ns.pruning.rule import PruneRule as PruneRule
-    from sundae_ns.scene.cameras import views_of as views_of
+    from sundae_ns.scene.cameras import cameras_of as cameras_of
     from sundae_ns.scene.cleaning import crop as crop
     from sundae_ns.scene.cleaning import remove_floaters as remove_floaters
     from sundae_ns.scene.load_save import load as load
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sundae_ns.scene.scene import Scene as Scene
     from sundae_ns.scene.scene import measure as measure
     from sundae_ns.scene.scene import render as render
-    from sundae_ns.scene.virtual_cameras import virtual_views as virtual_views
+    from sundae_ns.scene.virtual_cameras import virtual_cameras as virtual_cameras
 
 __version__ = "0.1.0"
 

@@ -38,7 +38,7 @@ def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
     generator = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(600, 3, generator=generator), dim=1)
     scene = sn.Scene.from_points(points, 0.5 + 0.4 * points)
-    scene.field["opacities"] += 4
+    scene.gaussians["opacities"] += 4
     path = tmp_path_factory.mktemp("examples") / "cloud.ply"
     sn.save(scene, path)
     return path
@@ -51,9 +51,9 @@ def test_every_example_is_tested() -> None:
 
 def test_prune_ply(run: Run, cloud: Path, tmp_path: Path) -> None:
     text = run("prune_ply.py", cloud, tmp_path / "a.spz", "--keep", 0.5, "--views", 8)
-    assert "300 of 600 primitives" in text
+    assert "300 of 600 Gaussians" in text
     assert float(re.findall(r"PSNR ([\d.]+) dB", text)[0]) > 20
-    assert sn.load(tmp_path / "a.spz").num_primitives == 300
+    assert sn.load(tmp_path / "a.spz").num_gaussians == 300
 
 
 def test_render_packed(run: Run, tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_render_packed(run: Run, tmp_path: Path) -> None:
 
 def test_plot_curve(run: Run, cloud: Path, tmp_path: Path) -> None:
     text = run("plot_curve.py", cloud, tmp_path / "a.png", "--views", 4)
-    quality = [float(value) for value in re.findall(r"merged: [\d,]+ primitives, ([\d.]+) dB", text)]
+    quality = [float(value) for value in re.findall(r"merged: [\d,]+ Gaussians, ([\d.]+) dB", text)]
     assert len(quality) == 10
     assert quality[4] > quality[0]
     assert Image.open(tmp_path / "a.png").size == (750, 525)

@@ -208,8 +208,8 @@ def _config_of(entry: Entry, method: str) -> Any:
                 validate()
     except SystemExit as error:
         meant = re.search(r"Perhaps you meant:\s+--(\S+)", said.getvalue())
-        mend = f"did you mean {meant[1]}?" if meant else f"`ns-train {method} --help` lists its options"
-        raise ConfigError(f"arm {entry.name}: {_message_of(said.getvalue())}; {mend}") from error
+        sanitise = f"did you mean {meant[1]}?" if meant else f"`ns-train {method} --help` lists its options"
+        raise ConfigError(f"arm {entry.name}: {_message_of(said.getvalue())}; {sanitise}") from error
     except (ConfigError, ValueError) as error:
         raise ConfigError(f"arm {entry.name}: {error}") from error
     return config

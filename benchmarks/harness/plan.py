@@ -36,7 +36,7 @@ class Arm:
     total: int = 0
     """Length of its method's warm-up and fine-tuning together; 0 for an arm that trains whole."""
     keep_ratio: float | None = None
-    """Its own share of the warm-up's primitives, in place of the plan's."""
+    """Its own share of the warm-up's Gaussians, in place of the plan's."""
     at_every_ratio: bool = False
     """Whether an arm that trains whole runs at every share of the plan, because it prunes once."""
 
@@ -57,7 +57,7 @@ class Job:
     steps: int
     seed: int
     keep_ratio: float | None = None
-    """Share of the primitives to keep; None for an arm that has no share, or decides it."""
+    """Share of the Gaussians to keep; None for an arm that has no share, or decides it."""
     needs: str | None = None
     """Key of the warm-up that it starts from."""
     options: Words = ()
@@ -113,7 +113,7 @@ def plan_scene(
         data: folder of the capture; its name is the scene's name in tables.
         parser: from :func:`parser_of`.
         arms: the sides of the comparison; their names differ.
-        keep_ratios: shares of the primitives to keep.
+        keep_ratios: shares of the Gaussians to keep.
         seeds: the first is for everything; the others repeat the shares of ``repeat_at``, from warm-ups of their own.
         repeat_at: shares for which all seeds are run.
 

@@ -54,7 +54,7 @@ class Options:
     also with -no-head; sundae-with-head, sundae-no-head-bytes; sundae-fast,
     sundae-auto, splatfacto, splatfacto-7k."""
     keep_ratios: tuple[float, ...] = (0.1,)
-    """shares of the warm-up's primitives to keep."""
+    """shares of the warm-up's Gaussians to keep."""
     seeds: tuple[int, ...] = (42,)
     """the first for every job, the others for the shares of --repeat-at."""
     repeat_at: tuple[float, ...] = (0.1,)
@@ -71,11 +71,11 @@ class Options:
     def command(self) -> str:
         """The command of the whole comparison, without the shard."""
         words = ["python", f"benchmarks/{self.script}", str(self.folder), "-o", str(self.out)]
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for gaussians in fields(self):
+            value = getattr(self, gaussians.name)
             values = value if isinstance(value, tuple) else (value,)
-            if values and field.name not in ("folder", "out", "shard", "jobs"):
-                words += [f"--{field.name.replace('_', '-')}", *map(str, values)]
+            if values and gaussians.name not in ("folder", "out", "shard", "jobs"):
+                words += [f"--{gaussians.name.replace('_', '-')}", *map(str, values)]
         return shlex.join(words)
 
 

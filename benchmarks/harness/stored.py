@@ -18,11 +18,11 @@ METHODS = {
     "sundae-fast": "sundae-fast",
     "sundae": "sundae, fixed share",
     "sundae-with-head": "sundae, with a head in any case",
-    "sundae-no-head": "the same primitives, no head",
-    "sundae-no-head-bytes": "more primitives in place of a head",
+    "sundae-no-head": "the same Gaussians, no head",
+    "sundae-no-head-bytes": "more Gaussians in place of a head",
     "mcmc": "3DGS-MCMC",
     "band": "the paper's band rule",
-    "random-no-head": "random primitives",
+    "random-no-head": "random Gaussians",
     "contribution-no-head": "highest contribution, as LightGaussian",
 }
 """Arms of runs.csv in the order of a table, by the names that readers see."""

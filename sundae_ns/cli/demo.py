@@ -83,7 +83,7 @@ def demo(
     title = f"{measured.resolution} px, {device}, {len(measured.full.views)} test views"
     lines = [title, *table(["stage", "primitives", "PSNR, dB", "SSIM", "LPIPS"], rows, words=1)]
     lines.append(
-        f"Kept: {prune['after'] / max(prune['before'], 1):.1%} of the primitives. "
+        f"Kept: {prune['after'] / max(prune['before'], 1):.1%} of the Gaussians. "
         f"Size: {measured.bytes_total / 1e6:.2f} MB, the head {measured.bytes_head / 1e6:.2f} MB of it; packed "
         f"{len(packed) / 1e6:.2f} MB. A frame: "
         f"{number(measured.full.ms, 2)} ms, without the head {number(measured.base.ms, 2)}."

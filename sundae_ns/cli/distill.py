@@ -9,12 +9,12 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sundae_ns.cli.inputs import cameras_of
+from sundae_ns.cli.inputs import chosen_cameras
 from sundae_ns.cli.options import Out, Overwrite, Scene, check_exclusive, check_file, check_suffix
 from sundae_ns.core.errors import ConfigError, writing
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.load_save import SUFFIXES, load, save
-from sundae_ns.scene.virtual_cameras import virtual_views
+from sundae_ns.scene.virtual_cameras import virtual_cameras
 
 
 def distill(
@@ -35,8 +35,8 @@ def distill(
 
     Args:
         out: file to write, in the format of its suffix: .sundae, or without a head .ply, .spz or .sog.
-        keep: share of the primitives to keep, in (0, 1]; by default 0.1.
-        count: number of primitives to keep, in place of a share.
+        keep: share of the Gaussians to keep, in (0, 1]; by default 0.1.
+        count: number of Gaussians to keep, in place of a share.
         steps: number of training steps; by default 8,000 on a GPU, 3,000 on a CPU.
         head: whether a head may be added; without one the scene is complete in other viewers.
         seed: random seed.
@@ -53,8 +53,8 @@ def distill(
 
     partial = out.with_name(f"{out.name}.partial")
     console = Console(stderr=True)
-    views = None if cameras is None else cameras_of(scene, cameras, None) or virtual_views(scene, None, seed=seed)
-    made = Distillation(scene, keep=keep, count=count, views=views, steps=steps, seed=seed, head=head, progress=True)
+    given = None if cameras is None else chosen_cameras(scene, cameras, None) or virtual_cameras(scene, None, seed=seed)
+    made = Distillation(scene, keep=keep, count=count, cameras=given, steps=steps, seed=seed, head=head, progress=True)
     if partial.exists():
         made.load(partial)
         console.print(f"going on from step {made.step:,} of {made.steps:,}, with {partial}", highlight=False)
@@ -81,7 +81,7 @@ def distill(
     save(result, out)
     partial.unlink(missing_ok=True)
     head_text = "with" if result.head else "without"
-    print(f"{out}: {result.num_primitives:,} of {scene.num_primitives:,} primitives, {head_text} a head")
+    print(f"{out}: {result.num_gaussians:,} of {scene.num_gaussians:,} Gaussians, {head_text} a head")
     if made.gain is not None:
         print(f"a head gained {made.gain:.2f} dB in its trial, on cameras that no step sees")
     psnr = made.quality()

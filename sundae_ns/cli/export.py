@@ -75,19 +75,19 @@ def export(
         found, usable = load_with_mask(scene)
         rows = within(usable, cleaning.mask(found, ()))
         keep_vertices(scene, out, rows)
-        print(f"{out}: {int(rows.sum()):,} of {len(rows):,} primitives")
+        print(f"{out}: {int(rows.sum()):,} of {len(rows):,} Gaussians")
         return 0
     # A run's cameras, which tell floaters, are in its capture.
     found = open_packed(scene, data)[0] if cleaning.remove_floaters else load(scene)
     found = cleaning.cleaned(found)
     if upright and not found.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
-    with Console(stderr=True).status(f"Writing {found.num_primitives:,} primitives"):  # minutes for a .sog of a million
+    with Console(stderr=True).status(f"Writing {found.num_gaussians:,} Gaussians"):  # minutes for a .sog of a million
         written = save_for_viewers(found, out, upright=upright)
     mode = ", antialiased" if found.antialiased else ""
-    print(f"{out}: {written.primitives:,} primitives, degree {written.degree}{mode}, {written.bytes:,} bytes")
+    print(f"{out}: {written.primitives:,} Gaussians, degree {written.degree}{mode}, {written.bytes:,} bytes")
     if written.clamped:
-        print(f"clamped scales or colours of {written.clamped:,} primitives to the range of a .spz; a .sog has none")
+        print(f"clamped scales or colours of {written.clamped:,} Gaussians to the range of a .spz; a .sog has none")
     if written.cut:
         print(f"left out harmonics above SH degree {written.degree}, which {out.suffix} cannot store; .ply can")
     return 0

@@ -14,12 +14,12 @@ from rich.console import Console
 from torch import Tensor
 
 from sundae_ns.cli.options import Flag
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import DataError
 from sundae_ns.io.config_file import check_run, find_config
-from sundae_ns.io.formats import kind_of, kind_of_primitives
+from sundae_ns.io.formats import kind_of, kind_of_gaussians
 from sundae_ns.io.ply import has_own_columns
-from sundae_ns.scene.cameras import views_of
+from sundae_ns.scene.cameras import cameras_of
 from sundae_ns.scene.cleaning import crop_mask, floater_mask, kept
 from sundae_ns.scene.load_save import load, packed_file
 from sundae_ns.scene.scene import Scene
@@ -31,10 +31,10 @@ class Cleaning:
     """What to cut, before anything else."""
 
     crop: tuple[float, float, float, float, float, float] | None = None
-    """keep the primitives whose centres are in this box: its lowest x y z, then its highest, in the coordinates of the
+    """keep the Gaussians whose centres are in this box: its lowest x y z, then its highest, in the coordinates of the
     scene."""
     remove_floaters: Flag = False
-    """remove small groups of primitives that touch no other, and what none of the cameras of the photographs sees."""
+    """remove small groups of Gaussians that touch no other, and what none of the cameras of the photographs sees."""
 
     @property
     def chosen(self) -> list[str]:
@@ -42,40 +42,40 @@ class Cleaning:
         given = {"--crop": self.crop is not None, "--remove-floaters": self.remove_floaters}
         return [name for name, is_given in given.items() if is_given]
 
-    def mask(self, scene: Scene, views: Sequence[View], *, progress: bool = True) -> Tensor:
-        """True for primitives that stay, bool ``[N]``; prints their numbers to stderr.
+    def mask(self, scene: Scene, cameras: Sequence[Camera], *, progress: bool = True) -> Tensor:
+        """True for Gaussians that stay, bool ``[N]``; prints their numbers to stderr.
 
         Args:
             scene: to clean.
-            views: cameras of the photographs; none if they are not known.
+            cameras: cameras of the photographs; none if they are not known.
             progress: show a progress bar on stderr.
 
         Raises:
             ConfigError: the box is empty.
             DataError: nothing is left.
         """
-        mask = torch.ones(scene.num_primitives, dtype=torch.bool, device=scene.device)
+        mask = torch.ones(scene.num_gaussians, dtype=torch.bool, device=scene.device)
         if self.crop is not None:
             mask = crop_mask(scene, self.crop[:3], self.crop[3:])
-            print(f"{int(mask.sum()):,} of {len(mask):,} primitives are in the box", file=sys.stderr)
+            print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
         if self.remove_floaters:
             left = int(mask.sum())
-            floats = floater_mask(kept(scene, mask), views, console=Console(stderr=True) if progress else None)
+            floats = floater_mask(kept(scene, mask), cameras, console=Console(stderr=True) if progress else None)
             mask[mask.clone()] = ~floats
-            rule = "" if views else ", by their neighbours alone: no camera of the photographs is known"
-            print(f"removed {int(floats.sum()):,} floaters of {left:,} primitives{rule}", file=sys.stderr)
+            rule = "" if cameras else ", by their neighbours alone: no camera of the photographs is known"
+            print(f"removed {int(floats.sum()):,} floaters of {left:,} Gaussians{rule}", file=sys.stderr)
             if not bool(mask.any()):
-                raise DataError("all primitives float; leave out --remove-floaters")
+                raise DataError("all Gaussians float; leave out --remove-floaters")
         return mask
 
     def cleaned(self, scene: Scene, *, progress: bool = True) -> Scene:
         """The scene without what :meth:`mask` cuts, by the views that are stored with it."""
-        return kept(scene, self.mask(scene, scene.views, progress=progress)) if self.chosen else scene
+        return kept(scene, self.mask(scene, scene.cameras, progress=progress)) if self.chosen else scene
 
 
 def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     """A scene, and the packed file that holds it; a run, whose capture may have moved, is packed in memory."""
-    if kind_of(path) == "packed" or kind_of_primitives(path) is not None or path.suffix == ".sundae":
+    if kind_of(path) == "packed" or kind_of_gaussians(path) is not None or path.suffix == ".sundae":
         return packed_file(path)
     check_run(path)  # before nerfstudio is imported, which takes seconds
     from sundae_ns.plugin.finished_runs import load_run
@@ -86,7 +86,7 @@ def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     return scene, packed_bytes(scene)
 
 
-def cameras_of(scene: Scene, cameras: Path | None, most: int | None) -> Sequence[View]:
+def chosen_cameras(scene: Scene, cameras: Path | None, most: int | None) -> Sequence[Camera]:
     """Cameras of a file or a run, else those stored with the scene; none if there are none.
 
     Args:
@@ -95,16 +95,16 @@ def cameras_of(scene: Scene, cameras: Path | None, most: int | None) -> Sequence
         most: largest number of cameras that are taken from a run.
     """
     if cameras is None:
-        return scene.views
+        return scene.cameras
     if kind_of(cameras) == "packed":
-        return load(cameras).views
+        return load(cameras).cameras
     if not ((cameras.is_dir() or cameras.name == "config.yml") and find_config(cameras) is not None):
-        return views_of(cameras, scene)
+        return cameras_of(cameras, scene)
     check_run(cameras)
     from sundae_ns.plugin.finished_runs import load_run
 
     with redirect_stdout(StringIO()):
-        return load_run(cameras, max_cameras=most or VIEWS["cpu"]).views
+        return load_run(cameras, max_cameras=most or VIEWS["cpu"]).cameras
 
 
 def copies_rows(source: Path, out: Path) -> bool:

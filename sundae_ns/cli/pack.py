@@ -22,7 +22,7 @@ from sundae_ns.cli.options import Direction, Out, Overwrite, check_exclusive, ch
 from sundae_ns.cli.train import has_gpu
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.io.config_file import check_run
-from sundae_ns.io.formats import PRIMITIVES, kind_of_primitives
+from sundae_ns.io.formats import PRIMITIVES, kind_of_gaussians
 from sundae_ns.io.pack.codecs import Codecs
 from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED, PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes, write_fitted
@@ -81,7 +81,7 @@ def pack(
     config = replace(precision, **{**FINETUNED, **given}) if finetune else precision
     config.validate()
     check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
-    kind = kind_of_primitives(run)
+    kind = kind_of_gaussians(run)
     for name, value in (("--finetune", finetune), ("--target-drop", target_drop), ("--data", data)):
         if kind is not None and value:
             raise ConfigError(f"{run} is a {PRIMITIVES[kind]} without photos; leave out {name}, or give a run")
@@ -133,7 +133,7 @@ def pack(
     if json:
         print(dumps({"file": str(out), **report.summary(), **figures}))
         return 0
-    print(f"{out}: {report.primitives:,} primitives in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
+    print(f"{out}: {report.primitives:,} Gaussians in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
     print(f"{'':14}{'bytes':>12}{'bits per primitive':>20}")
     for name, bits in report.bits.items():
         print(f"{name:14}{round(bits * report.primitives / 8):12,}{bits:20.2f}")
@@ -169,7 +169,7 @@ def _measured(
     except SundaeError as error:
         notes.append(f"the quality is not measured: {error}")
         return "", {}
-    figures: dict[str, Any] = {"psnr": [before.psnr, after.psnr], "views": opened.views}
+    figures: dict[str, Any] = {"psnr": [before.psnr, after.psnr], "views": opened.cameras}
     line = f"PSNR {before.psnr:.2f} -> {after.psnr:.2f} dB"
     if math.isfinite(before.ssim + after.ssim):  # not for images smaller than its window
         figures["ssim"] = [before.ssim, after.ssim]
@@ -183,4 +183,4 @@ def _measured(
                 f"{plain_size:,} bytes and loses {before.psnr - without:.2f} dB, which is worth more: give more steps, "
                 "or leave out --finetune"
             )
-    return f"{line}, before and after, on {opened.views} of {opened.all_views} test views", figures
+    return f"{line}, before and after, on {opened.cameras} of {opened.all_cameras} test views", figures

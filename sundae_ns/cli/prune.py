@@ -1,4 +1,4 @@
-"""``sundae prune``: a scene of any program with fewer primitives, without its photos."""
+"""``sundae prune``: a scene of any program with fewer Gaussians, without its photos."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.inputs import Cleaning, cameras_of, copies_rows
+from sundae_ns.cli.inputs import Cleaning, chosen_cameras, copies_rows
 from sundae_ns.cli.options import Out, Overwrite, Scene, check_exclusive, check_file, check_suffix
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.ply import keep_vertices
@@ -16,7 +16,7 @@ from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene import prune_scene as pruning
 from sundae_ns.scene.cleaning import kept, within
 from sundae_ns.scene.load_save import SUFFIXES, load_with_mask, save
-from sundae_ns.scene.virtual_cameras import virtual_views
+from sundae_ns.scene.virtual_cameras import virtual_cameras
 
 
 def prune(
@@ -25,7 +25,7 @@ def prune(
     keep: float | None = None,
     count: int | None = None,
     target_drop: float | None = None,
-    views: int | None = None,
+    num_cameras: int | None = None,
     cameras: Path | None = None,
     overwrite: Overwrite = False,
     rule: Annotated[PruneRule, tyro.conf.arg(name="")] = pruning.DEFAULT_RULE,
@@ -33,17 +33,17 @@ def prune(
 ) -> int:
     """Prune a scene of any program, without its photos.
 
-    Kept are the primitives that virtual cameras see most of; the others are merged into them, and some steps fit pairs
-    to the scene's own images. On a CPU a million primitives with three bands of harmonics take about 1.7 GB.
+    Kept are the Gaussians that virtual cameras see most of; the others are merged into them, and some steps fit pairs
+    to the scene's own images. On a CPU a million Gaussians with three bands of harmonics take about 1.7 GB.
 
     Args:
         out: file to write, in the format of its suffix: .ply, .spz, .sog, .glb or .sundae. A .ply of a .ply keeps all
             properties and comments.
-        keep: share of the primitives to keep, of those that a box and the floaters leave, in (0, 1]; by default 0.1.
-        count: number of primitives to keep, in place of a share.
+        keep: share of the Gaussians to keep, of those that a box and the floaters leave, in (0, 1]; by default 0.1.
+        count: number of Gaussians to keep, in place of a share.
         target_drop: keep as few as lose at most this PSNR, in dB, of a full field that shows its photos at 30 dB; by
             the images of held-out cameras.
-        views: number of virtual cameras, for scenes that come without cameras; by default 128, on a GPU 256.
+        num_cameras: number of virtual cameras, for scenes that come without cameras; by default 128, on a GPU 256.
         cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, in place of the
             scene's own or virtual cameras.
     """
@@ -55,28 +55,28 @@ def prune(
     check_file(out, reads=[source, cameras], overwrite=overwrite)
     rule.validate()
     scene, usable = load_with_mask(source)
-    total = scene.num_primitives if usable is None else len(usable)
+    total = scene.num_gaussians if usable is None else len(usable)
     with naming_full_memory(lambda: total):
         scene, seen, clean = scene.to(fastest_device()), None, None
         looks_around = rule.uses_contribution or target_drop is not None
-        given = cameras_of(scene, cameras, views) if looks_around or cleaning.remove_floaters else ()
+        given = chosen_cameras(scene, cameras, num_cameras) if looks_around or cleaning.remove_floaters else ()
         if cleaning.chosen:
             clean = cleaning.mask(scene, given)
             scene = kept(scene, clean)
         if looks_around:
-            seen = given or virtual_views(scene, views, seed=rule.seed)
+            seen = given or virtual_cameras(scene, num_cameras, seed=rule.seed)
         if target_drop is not None and seen is not None:
             count, curve = pruning.count_for_drop(scene, target_drop, seen, rule, progress=True)
             for number, psnr in curve:
-                print(f"{number:12,} primitives: {psnr:.2f} dB against the full field, on held-out cameras")
+                print(f"{number:12,} Gaussians: {psnr:.2f} dB against the full field, on held-out cameras")
         pruned = pruning.prune_with_mask(scene, keep, count, seen, rule, progress=True)
     small = pruned.scene.to("cpu")
     if copies_rows(source, out):
         rows = within(usable, within(clean, pruned.mask).cpu())
-        keep_vertices(source, out, rows, small.field if rule.redistribution == "merge" else None)
+        keep_vertices(source, out, rows, small.gaussians if rule.redistribution == "merge" else None)
     else:
         save(small, out)
-    print(f"{out}: {small.num_primitives:,} of {total:,} primitives")
+    print(f"{out}: {small.num_gaussians:,} of {total:,} Gaussians")
     if pruned.seen is not None and seen:
-        print(f"{len(seen)} cameras see {pruned.seen:.1%} of the primitives")
+        print(f"{len(seen)} cameras see {pruned.seen:.1%} of the Gaussians")
     return 0

@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.progress import track
 
 from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.files import replacing, write_image
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.report.video import write_video
 from sundae_ns.scene.camera_path import film_views
-from sundae_ns.scene.cameras import CameraFile, read_cameras, view_in_front, with_start
+from sundae_ns.scene.cameras import CameraFile, camera_in_front, read_cameras, with_start
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.scene import render as render_view
@@ -73,11 +73,11 @@ def render(
     elif view is None and opened.start is not None:
         cameras = CameraFile([opened.start], None)
     else:
-        cameras = CameraFile(list(opened.views) or [view_in_front(opened)], None)
-    views = [_resized(each, width, even=video) for each in cameras.views]
+        cameras = CameraFile(list(opened.cameras) or [camera_in_front(opened)], None)
+    views = [_resized(each, width, even=video) for each in cameras.cameras]
     opened = opened.to(fastest_device())
 
-    def rendered(view: View) -> Image.Image:
+    def rendered(view: Camera) -> Image.Image:
         return image_of(render_view(opened, view, head=head).rgb)
 
     if video:
@@ -99,7 +99,7 @@ def render(
     return 0
 
 
-def _resized(view: View, width: int | None, *, even: bool) -> View:
+def _resized(view: Camera, width: int | None, *, even: bool) -> Camera:
     """The camera with images of another width, and with even sides for a video, whose colours have half the size."""
     view = view if width is None else view.zoomed(width / view.width)
     return view._replace(width=view.width // 2 * 2, height=view.height // 2 * 2) if even else view

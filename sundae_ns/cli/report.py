@@ -53,7 +53,7 @@ def report(
     check_least(warmup=(warmup, 0), repeats=(repeats, 0))
     from sundae_ns.plugin.finished_runs import load_model
     from sundae_ns.report.measure import measure_scene
-    from sundae_ns.report.report_page import ShownRun, report_page, views_for_each
+    from sundae_ns.report.report_page import ShownRun, cameras_for_each, report_page
 
     words = ["sundae", "report", *map(str, runs), "-o", str(out), "--lpips-net", lpips_net]
     words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
@@ -87,7 +87,7 @@ def report(
                 with writing(f"cannot write to {out}"):
                     out.mkdir(parents=True, exist_ok=True)
                 progress.update(task, description=f"Encoding views of {escape(label)}")
-                views = _views(opened, measured, views_for_each(len(runs)))
+                views = _views(opened, measured, cameras_for_each(len(runs)))
                 curve = read_count_curve(opened.source) if opened.packed_bytes is None else None
                 done.append(ShownRun(measured, views, curve, capture=str(opened.capture.resolve())))
             except SundaeError as error:  # keep the measurements of the other runs
@@ -133,12 +133,12 @@ def _label(opened: Opened, taken: Collection[str]) -> str:
 @torch.no_grad()
 def _views(opened: Opened, measured: Measured, most: int) -> list[ShownView]:
     """The views of a run that the page shows, ``most`` or fewer; memory holds one at a time at its full size."""
-    from sundae_ns.report.report_page import choose_views, shown_view
+    from sundae_ns.report.report_page import choose_cameras, shown_view
 
     full, base = measured.full.views, measured.base.views if measured.has_head else None
     names = [path.name for path in opened.datamanager.eval_dataset.image_filenames]
     shown = []
-    for index in choose_views([view.psnr for view in full], most):
+    for index in choose_cameras([view.psnr for view in full], most):
         outputs, photo = opened.model.get_outputs_for_camera(opened.cameras[index]), opened.truths[index]
         quality = full[index], None if base is None else base[index]
         shown.append(shown_view(index, names[index], photo, outputs["rgb"], outputs["base_rgb"], *quality))

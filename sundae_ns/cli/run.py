@@ -86,7 +86,7 @@ class Project:
         self.train.check(self.photos)
         mb, draft, steps = self.max_mb, self.quality == "draft", self.train.steps
         fixed = self.train.keep is not None or self.train.method != "sundae"
-        decides = "needs a method that decides the number of primitives; leave out --keep and --method"
+        decides = "needs a method that decides the number of Gaussians; leave out --keep and --method"
         for wrong, words in (
             (mb is not None and not 0.01 <= mb <= 1e6, f"max-mb is {mb or 0:g}; give at least 0.01"),
             (
@@ -226,7 +226,7 @@ def run(
         photos: folder of photos, a video, or a capture, which has poses already.
         out: folder for the capture, the run, scene.sundae, scene.html and the report; created if missing.
         quality: draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03).
-        max_mb: most megabytes of the packed scene; fewer primitives and coarser steps keep to it.
+        max_mb: most megabytes of the packed scene; fewer Gaussians and coarser steps keep to it.
     """
     _check_input(photos)
     project = Project(photos, out, train, poses, quality, max_mb)

@@ -29,7 +29,7 @@ class TrainOptions:
     method: str = "sundae"
     """one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU."""
     keep: float | None = None
-    """share of the primitives to keep, in (0, 1]; by default as many as the scene needs, or that of the method."""
+    """share of the Gaussians to keep, in (0, 1]; by default as many as the scene needs, or that of the method."""
     steps: int | None = None
     """number of training steps; by default that of the method."""
 

@@ -38,7 +38,7 @@ def world_to_camera_floats(pose: Sequence[float]) -> list[float]:
     return [*matrix, 0.0, 0.0, 0.0, 1.0]
 
 
-class Window(NamedTuple):
+class Crop(NamedTuple):
     """A rectangle of an image, in pixels."""
 
     left: int
@@ -54,7 +54,7 @@ def camera_center(viewmat: Tensor) -> Tensor:
     return -viewmat[:3, :3].T @ viewmat[:3, 3]
 
 
-class View(NamedTuple):
+class Camera(NamedTuple):
     """One camera in the rasteriser's form."""
 
     viewmat: Tensor
@@ -68,7 +68,7 @@ class View(NamedTuple):
     """Focal length in pixels, the mean of both axes. Kept beside K, because reading K back waits for the GPU."""
 
     @classmethod
-    def from_pose(cls, pose: Tensor, intrinsics: Sequence[float], width: int, height: int) -> View:
+    def from_pose(cls, pose: Tensor, intrinsics: Sequence[float], width: int, height: int) -> Camera:
         """A pinhole camera from a pose as nerfstudio and Blender write it.
 
         Args:
@@ -78,7 +78,7 @@ class View(NamedTuple):
             height: of the image, pixels.
 
         >>> import torch, sundae_ns as sn
-        >>> sn.View.from_pose(torch.eye(4), (50.0, 50.0, 32.0, 24.0), 64, 48).center
+        >>> sn.Camera.from_pose(torch.eye(4), (50.0, 50.0, 32.0, 24.0), 64, 48).center
         tensor([0., 0., 0.])
         """
         fx, fy, cx, cy = (float(value) for value in intrinsics)
@@ -86,7 +86,7 @@ class View(NamedTuple):
         return cls(world_to_camera(pose[:3].float()), K, int(width), int(height), (fx + fy) / 2)
 
     @classmethod
-    def from_fov(cls, pose: Tensor, fov: float, width: int, height: int) -> View:
+    def from_fov(cls, pose: Tensor, fov: float, width: int, height: int) -> Camera:
         """As :meth:`from_pose`, with the vertical field of view in degrees and the principal point in the middle."""
         focal = height / 2 / math.tan(math.radians(fov) / 2)
         return cls.from_pose(pose, (focal, focal, width / 2, height / 2), width, height)
@@ -101,7 +101,7 @@ class View(NamedTuple):
         fov: float = 60.0,
         width: int = 640,
         height: int = 480,
-    ) -> View:
+    ) -> Camera:
         """A camera at one place that looks at another, on the CPU.
 
         Args:
@@ -113,7 +113,7 @@ class View(NamedTuple):
             height: of the image, pixels.
 
         >>> import sundae_ns as sn
-        >>> sn.View.look_at((0, -2, 0), (0, 0, 0)).center
+        >>> sn.Camera.look_at((0, -2, 0), (0, 0, 0)).center
         tensor([ 0., -2.,  0.])
         """
         eye, target, up = (torch.as_tensor(v, dtype=torch.float64, device="cpu") for v in (eye, target, up))
@@ -130,32 +130,32 @@ class View(NamedTuple):
         rotation = self.viewmat[:3, :3].T * self.viewmat.new_tensor(OPENGL_TO_OPENCV)
         return torch.cat([rotation, self.center[:, None]], dim=1)
 
-    def to(self, device: torch.device | str) -> View:
+    def to(self, device: torch.device | str) -> Camera:
         """The camera on another device."""
         return self._replace(viewmat=self.viewmat.to(device), K=self.K.to(device))
 
-    def zoomed(self, factor: float) -> View:
+    def zoomed(self, factor: float) -> Camera:
         """The camera with the same field of view and sides ``factor`` times as long."""
         width, height = (max(round(side * factor), 1) for side in (self.width, self.height))
         # Scale by the rounded sizes, so that the edges of both images agree. Row by row, because a tensor of numbers
         # would be copied to the device.
         K = torch.stack([self.K[0] * (width / self.width), self.K[1] * (height / self.height), self.K[2]])
-        return View(self.viewmat, K, width, height, self.focal * factor)
+        return Camera(self.viewmat, K, width, height, self.focal * factor)
 
-    def cut(self, window: Window) -> View:
+    def cut(self, crop: Crop) -> Camera:
         """The camera of a window of the image. Of a mirrored one it sees what a mirror would show."""
         viewmat, K = self.viewmat, self.K.clone()
-        K[0, 2] -= window.left
-        K[1, 2] -= window.top
-        if window.mirrored:
+        K[0, 2] -= crop.left
+        K[1, 2] -= crop.top
+        if crop.mirrored:
             viewmat = viewmat.clone()
             viewmat[0].neg_()
-            K[0, 2].neg_().add_(window.width)
-        return View(viewmat, K, window.width, window.height, self.focal)
+            K[0, 2].neg_().add_(crop.width)
+        return Camera(viewmat, K, crop.width, crop.height, self.focal)
 
 
 def poses_looking_at(eyes: Tensor, targets: Tensor, up: Tensor) -> Tensor:
-    """Poses of cameras that look at points, camera-to-world with OpenGL axes; arguments as for :meth:`View.look_at`.
+    """Poses of cameras that look at points, camera-to-world with OpenGL axes; arguments as for :meth:`Camera.look_at`.
 
     Args:
         eyes: centres of the cameras ``[..., 3]``.
@@ -173,9 +173,9 @@ def poses_looking_at(eyes: Tensor, targets: Tensor, up: Tensor) -> Tensor:
     return torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)
 
 
-def crop_image(image: Tensor, window: Window | None) -> Tensor:
+def crop_image(image: Tensor, crop: Crop | None) -> Tensor:
     """A window of an image ``[H, W, C]``; None for the whole image."""
-    if window is None:
+    if crop is None:
         return image
-    part = image[window.top : window.top + window.height, window.left : window.left + window.width]
-    return part.flip(1) if window.mirrored else part
+    part = image[crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
+    return part.flip(1) if crop.mirrored else part

@@ -1,4 +1,4 @@
-"""Rotations and covariances of primitives, their overlap and their projected area."""
+"""Rotations and covariances of Gaussians, their overlap and their projected area."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch.nn.functional import normalize
 SURFACE_EXPONENT = 1.6075
 """Exponent of Thomsen's formula for the surface area of an ellipsoid, which is exact to 1.1% for any axes."""
 
-PAIRS = 1 << 18  # pairs of primitives whose overlap is computed at once; they take about 50 MiB
-ROWS = 1 << 16  # primitives whose matrices are computed at once; the steps between take some 600 bytes a primitive
+PAIRS = 1 << 18  # pairs of Gaussians whose overlap is computed at once; they take about 50 MiB
+ROWS = 1 << 16  # Gaussians whose matrices are computed at once; the steps between take some 600 bytes a Gaussian
 _SWEEPS = 6  # rotations of each pair of axes; the error squares with each sweep, and five reach the rounding of float64
 _LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])
 """Rows and columns of the six entries of a symmetric matrix, diagonal first."""
@@ -38,7 +38,7 @@ def covariances(scales: Tensor, quats: Tensor) -> Tensor:
 
 
 def covariances_of(params: Mapping[str, Tensor]) -> Tensor:
-    """Covariances of the primitives of a field, float64 on its device ``[N, 3, 3]``."""
+    """Covariances of the Gaussians of a field, float64 on its device ``[N, 3, 3]``."""
     scales, quats = params["scales"].detach(), params["quats"].detach()
     result = torch.empty(len(scales), 3, 3, dtype=torch.float64, device=scales.device)
     for rows in chunks(len(scales)):
@@ -107,14 +107,14 @@ def mean_projected_area(scales: Tensor) -> Tensor:
     """Mean projected area of ellipsoids with half axes ``[N, 3]`` over all directions, divided by pi ``[N]``.
 
     The mean projected area is a quarter of the surface area (Cauchy), which Thomsen's formula gives. It measures how
-    much of an image a primitive covers; the volume does not, because most primitives are flat.
+    much of an image a Gaussian covers; the volume does not, because most Gaussians are flat.
     """
     a, b, c = (scales / scales.amax(dim=1, keepdim=True)).pow(SURFACE_EXPONENT).unbind(dim=1)
     return scales.amax(dim=1).square() * ((a * b + a * c + b * c) / 3).pow(1 / SURFACE_EXPONENT)
 
 
 def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: float) -> Tensor:
-    """Bhattacharyya coefficient of each primitive with its neighbours, in [0, 1]; 1 for equal primitives.
+    """Bhattacharyya coefficient of each Gaussian with its neighbours, in [0, 1]; 1 for equal Gaussians.
 
     ``exp(-(d^T S^-1 d) / 8) (|A| |B|)^(1/4) / |S|^(1/2)`` with ``S = (A + B) / 2`` (Bhattacharyya, 1943).
 
@@ -122,7 +122,7 @@ def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: 
         means: world units ``[N, 3]``.
         covariance: squared world units ``[N, 3, 3]``.
         indices: neighbours ``[N, K]``.
-        least_width: standard deviation added to all axes, world units; without it, two parallel flat primitives would
+        least_width: standard deviation added to all axes, world units; without it, two parallel flat Gaussians would
             count as separate however close they are.
 
     Returns:
@@ -156,7 +156,7 @@ def outer_entries(vectors: Tensor) -> Tensor:
 
 
 def pair_overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """Bhattacharyya coefficient of pairs of primitives, as :func:`overlap`; 0 for one that overflows.
+    """Bhattacharyya coefficient of pairs of Gaussians, as :func:`overlap`; 0 for one that overflows.
 
     Args:
         means: world units ``[N, 3]``.

@@ -44,7 +44,7 @@ class ConfigError(SundaeError, ValueError):
 
 
 class DataError(SundaeError, ValueError):
-    """Input data (images, cameras, point clouds, primitives) is unusable."""
+    """Input data (images, cameras, point clouds, Gaussians) is unusable."""
 
 
 class BackendError(SundaeError, RuntimeError):
@@ -60,7 +60,7 @@ class PackError(SundaeError, ValueError):
 
 
 class MemoryExhaustedError(SundaeError, RuntimeError):
-    """The device lacks memory for the field or the image, or a view has more primitives than any real scene."""
+    """The device lacks memory for the field or the image, or a view has more Gaussians than any real scene."""
 
 
 class CheckpointError(SundaeError, ValueError):
@@ -97,12 +97,12 @@ def reading(
     kind: str,
     failure: type[SundaeError] = DataError,
     *,
-    mend: str = "export it again",
+    sanitise: str = "export it again",
     missing: str = "check the path",
 ) -> Iterator[None]:
     """Turn every error of reading an untrusted file into a ``failure``; decoders raise errors of many kinds.
 
-    ``kind`` names what the file should be, ``"a complete .spz"``. ``mend`` says what to do if it is damaged,
+    ``kind`` names what the file should be, ``"a complete .spz"``. ``sanitise`` says what to do if it is damaged,
     ``missing`` if it cannot be opened.
     """
     try:
@@ -112,7 +112,7 @@ def reading(
     except OSError as error:
         raise failure(f"{path} cannot be read ({error.strerror or one_line(error)}); {missing}") from error
     except Exception as error:
-        raise failure(f"{path} is not {kind} ({one_line(error)}); {mend}") from error
+        raise failure(f"{path} is not {kind} ({one_line(error)}); {sanitise}") from error
 
 
 def _reason(error: Exception) -> str | None:
@@ -155,15 +155,15 @@ def rank_ended(error: BaseException) -> RankError:
 
 
 def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError:
-    """The error for a full CUDA device: the number of primitives, the allocation that failed, what to try."""
+    """The error for a full CUDA device: the number of Gaussians, the allocation that failed, what to try."""
     found = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", str(error))
     asked = f"cannot allocate {found[1]} more" if found else "cannot allocate more"
     return MemoryExhaustedError(
-        f"the GPU's memory is full: {asked} with {primitives:,} primitives; "
+        f"the GPU's memory is full: {asked} with {primitives:,} Gaussians; "
         "try --pipeline.datamanager.cache-images cpu (images in host memory), "
         "--pipeline.datamanager.camera-res-scale-factor 0.5 (smaller images), or "
         "--pipeline.model.pruning.mode continuous --pipeline.model.pruning.keep-ratio 0.5 "
-        f"--pipeline.model.pruning.max-primitives {max(primitives // 2, 1)} (a lower peak); "
+        f"--pipeline.model.pruning.max-gaussians {max(primitives // 2, 1)} (a lower peak); "
         "--load-dir resumes from the last checkpoint"
     )
 

@@ -1,6 +1,6 @@
-"""A field: the parameters of its primitives, their shapes and activations, and the mending of values not finite.
+"""A field: the parameters of its Gaussians, their shapes and activations, and the mending of values not finite.
 
-A field is a mapping from the names below to tensors that share their first dimension, the number of primitives N.
+A field is a mapping from the names below to tensors that share their first dimension, the number of Gaussians N.
 Values are stored before activation, as 3DGS and splatfacto do:
 
 =================  ==============  ===============================================================
@@ -37,7 +37,7 @@ SPLAT_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opac
 _COLUMNS = {"means": 3, "scales": 3, "quats": 4, "features_dc": 3, "opacities": 1}
 
 MAX_SH_DEGREE = 4  # highest SH degree of a field
-FEATURES = "features"  # name of the parameter that SUNDAE adds to each primitive
+FEATURES = "features"  # name of the parameter that SUNDAE adds to each Gaussian
 LARGEST_LOGIT = 16.0
 """Logit for opacities of 0 and 1. Its float32 opacity is the last below 1, so that its logarithms stay finite."""
 
@@ -48,8 +48,8 @@ float32, unless a tiny scene needs less."""
 _QUATERNION_RANGE = 1e-6, 1e18  # largest components of quaternions that can be normalised in float32
 
 
-def num_primitives(params: Mapping[str, Tensor]) -> int:
-    """Number of primitives N in a field."""
+def num_gaussians(params: Mapping[str, Tensor]) -> int:
+    """Number of Gaussians N in a field."""
     return params["means"].shape[0]
 
 
@@ -97,19 +97,19 @@ def rgb_to_logit(rgb: Tensor) -> Tensor:
 
 
 def finite_mask(params: Mapping[str, Tensor]) -> Tensor:
-    """True where every parameter of a primitive is finite: bool ``[N]``."""
-    n = num_primitives(params)
+    """True where every parameter of a Gaussian is finite: bool ``[N]``."""
+    n = num_gaussians(params)
     mask = torch.ones(n, dtype=torch.bool, device=params["means"].device)
     for value in params.values():
         mask &= torch.isfinite(value.detach().flatten(1)).all(dim=1)
     return mask
 
 
-class Field(UserDict[str, Any]):
+class Gaussians(UserDict[str, Any]):
     """Named parameters ``[N, ...]`` (see :mod:`sundae_ns.core.gaussians`) and the encoding of their colours.
 
     A view of the mapping that it is given: surgery that replaces a parameter here replaces it there too. ``len`` counts
-    parameters, :attr:`num_primitives` counts primitives.
+    parameters, :attr:`num_gaussians` counts Gaussians.
 
     Args:
         params: tensors, or ``Parameter``s of a field in training.
@@ -122,54 +122,54 @@ class Field(UserDict[str, Any]):
         self.encoding: Encoding = encoding
 
     @property
-    def num_primitives(self) -> int:
-        """Number of primitives N."""
-        return num_primitives(self)
+    def num_gaussians(self) -> int:
+        """Number of Gaussians N."""
+        return num_gaussians(self)
 
     @property
     def sh_degree(self) -> int:
         """SH degree of the stored colours."""
         return sh_degree(self["features_rest"])
 
-    def rows(self, mask: Tensor) -> Field:
-        """The primitives under a mask, bool ``[N]``, as a field of its own."""
-        return Field({name: value[mask] for name, value in self.items()}, self.encoding)
+    def rows(self, mask: Tensor) -> Gaussians:
+        """The Gaussians under a mask, bool ``[N]``, as a field of its own."""
+        return Gaussians({name: value[mask] for name, value in self.items()}, self.encoding)
 
-    def replaced(self, values: Mapping[str, Tensor]) -> Field:
+    def replaced(self, values: Mapping[str, Tensor]) -> Gaussians:
         """A field of the same tensors but for these values, in a mapping of its own that surgery does not change."""
-        return Field({**self, **values}, self.encoding)
+        return Gaussians({**self, **values}, self.encoding)
 
-    def as_harmonics(self) -> Field:
+    def as_harmonics(self) -> Gaussians:
         """The field with colours as spherical harmonics; itself if it stores them so."""
         if self.encoding == "harmonics":
             return self
         colors = rgb_to_sh(self["features_dc"].detach().sigmoid())
-        return Field({**self, "features_dc": colors}, "harmonics")
+        return Gaussians({**self, "features_dc": colors}, "harmonics")
 
 
-def as_field(params: Mapping[str, Any]) -> Field:
+def as_gaussians(params: Mapping[str, Any]) -> Gaussians:
     """A mapping of parameters as a field; a plain mapping stores colours as harmonics."""
-    return params if isinstance(params, Field) else Field(dict(params))
+    return params if isinstance(params, Gaussians) else Gaussians(dict(params))
 
 
-class Mended(NamedTuple):
+class Sanitised(NamedTuple):
     """A field whose values are finite, and what that took."""
 
-    field: Field
-    """The primitives that have a meaning ``[M, ...]``; the tensors of the source if nothing changed."""
+    gaussians: Gaussians
+    """The Gaussians that have a meaning ``[M, ...]``; the tensors of the source if nothing changed."""
     mask: Tensor
-    """True for these primitives of the source, bool ``[N]``."""
+    """True for these Gaussians of the source, bool ``[N]``."""
     limits: int
-    """Number of these primitives with an opacity of exactly 0 or 1, which was clamped."""
+    """Number of these Gaussians with an opacity of exactly 0 or 1, which was clamped."""
     flat: int
-    """Number of these primitives with a width of 0, which was clamped."""
+    """Number of these Gaussians with a width of 0, which was clamped."""
     unrotated: int
-    """Number of these primitives with an all-zero quaternion, which became the identity."""
+    """Number of these Gaussians with an all-zero quaternion, which became the identity."""
 
     @property
     def dropped(self) -> int:
-        """Number of primitives that were left out: NaN, or infinite where that has no meaning."""
-        return len(self.mask) - self.field.num_primitives
+        """Number of Gaussians that were left out: NaN, or infinite where that has no meaning."""
+        return len(self.mask) - self.gaussians.num_gaussians
 
     @property
     def clamped(self) -> bool:
@@ -183,26 +183,26 @@ class Mended(NamedTuple):
         parts = [f"clamped {named} to finite values"] if named else []
         if self.dropped:
             parts.append(f"dropped {self.dropped:,} that were not finite (NaN or infinite)")
-        return f"{len(self.mask):,} primitives: {', '.join(parts)}" if parts else ""
+        return f"{len(self.mask):,} Gaussians: {', '.join(parts)}" if parts else ""
 
 
 @torch.no_grad()
-def mend(params: Mapping[str, Any]) -> Mended:
-    """The primitives of a field that have a meaning, with finite values.
+def sanitise(params: Mapping[str, Any]) -> Sanitised:
+    """The Gaussians of a field that have a meaning, with finite values.
 
     - A logit of plus or minus infinity is an opacity of 1 or 0, and becomes plus or minus :data:`LARGEST_LOGIT`.
     - A log-scale of minus infinity is a width of 0, and becomes the least of the field within :data:`LEAST_SCALES`.
     - An all-zero quaternion does not rotate, as in the renderers of 3DGS, and becomes the identity. One that is too
       short or too long to be normalised in float32 is rescaled.
-    - A primitive with any other value that is NaN or infinite is left out.
+    - A Gaussian with any other value that is NaN or infinite is left out.
 
     Args:
-        params: the field, N primitives; it does not change.
+        params: the field, N Gaussians; it does not change.
     """
-    field = as_field(params)
+    gaussians = as_gaussians(params)
     values: dict[str, Tensor] = {}
-    opacities, scales, quats = (field[name].detach() for name in ("opacities", "scales", "quats"))
-    n, device = field.num_primitives, field["means"].device
+    opacities, scales, quats = (gaussians[name].detach() for name in ("opacities", "scales", "quats"))
+    n, device = gaussians.num_gaussians, gaussians["means"].device
     nothing = torch.zeros(n, dtype=torch.bool, device=device)
     limits, flat, unrotated = nothing, nothing, nothing
     infinite = opacities.isinf()
@@ -224,8 +224,8 @@ def mend(params: Mapping[str, Any]) -> Mended:
             # The identity: w is 1, the others stay 0.
             rescaled[:, 0] += unrotated.to(rescaled)
             values["quats"] = torch.where(odd[:, None], rescaled, quats)
-    mended = field.replaced(values) if values else field
-    mask = finite_mask(mended)
+    sanitised = gaussians.replaced(values) if values else gaussians
+    mask = finite_mask(sanitised)
     whole = bool(mask.all())
     counts = (int((kind & mask).sum()) for kind in (limits, flat, unrotated))
-    return Mended(mended if whole else mended.rows(mask), mask, *counts)
+    return Sanitised(sanitised if whole else sanitised.rows(mask), mask, *counts)

@@ -1,4 +1,4 @@
-"""Merging: replace groups of primitives by one primitive with the same moments."""
+"""Merging: replace groups of Gaussians by one Gaussian with the same moments."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ MAX_OPACITY = 0.99  # upper limit of merged opacities, at which the logit still 
 
 @torch.no_grad()
 def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[str, Tensor]:
-    """Replace each group of primitives by one with the same moments.
+    """Replace each group of Gaussians by one with the same moments.
 
     With weights w normalised within a group:
 
     - centre and covariance are those of the mixture: ``m = sum w_i m_i``, ``S = sum w_i (S_i + (m_i - m)(m_i - m)^T)``;
     - SH coefficients and features are ``sum w_i c_i``;
     - opacity follows from ``t A = sum t_i A_i``, with optical depth ``t = -log(1 - alpha)`` and mean projected area A:
-      a wall of many small primitives absorbs as much light from afar as before. Limited to ``MAX_OPACITY``. Volumes in
-      place of areas would suit fog, but primitives are flat.
+      a wall of many small Gaussians absorbs as much light from afar as before. Limited to ``MAX_OPACITY``. Volumes in
+      place of areas would suit fog, but Gaussians are flat.
 
     Args:
-        params: the field, all finite, N primitives.
-        label: index of the primitive that each one is merged into, int64 ``[N]``: its own index for a primitive that
+        params: the field, all finite, N Gaussians.
+        label: index of the Gaussian that each one is merged into, int64 ``[N]``: its own index for a Gaussian that
             stays, -1 for one that is dropped, else the index of one that stays.
-        weight: weight of each primitive in its group, not negative ``[N]``.
+        weight: weight of each Gaussian in its group, not negative ``[N]``.
 
     Returns:
-        Parameters ``[M, ...]`` of the primitives that stay, in order, with dtype and device of ``params``; computed in
-        float64 there, in the same order each time. A primitive whose group is itself alone, has no weight or overflows
+        Parameters ``[M, ...]`` of the Gaussians that stay, in order, with dtype and device of ``params``; computed in
+        float64 there, in the same order each time. A Gaussian whose group is itself alone, has no weight or overflows
         is unchanged, bit for bit.
     """
     source = {name: value.detach() for name, value in params.items()}
@@ -84,7 +84,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
         return normalized[some, None, None] * own
 
     covariance = total(moments, 3, 3)
-    # A covariance that overflows has no axes; its primitive stays unchanged.
+    # A covariance that overflows has no axes; its Gaussian stays unchanged.
     bounded = covariance.isfinite().all(dim=2).all(dim=1)
     deviations, quats = scales_and_quaternions(torch.where(bounded[:, None, None], covariance, 0.0))
     # A width of zero has no logarithm; limit each axis to the thinnest axis of the members.

@@ -11,7 +11,7 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.gaussians import num_primitives
+from sundae_ns.core.gaussians import num_gaussians
 
 Snapshot = dict[str, dict[str, Tensor]]
 """By parameter: its ``value`` and the tensors of its optimizer state, all on the CPU."""
@@ -25,10 +25,10 @@ def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimize
     Raises:
         DataError: a parameter has another length, or an optimizer holds another tensor or more than one.
     """
-    n = num_primitives(params)
+    n = num_gaussians(params)
     for name, value in params.items():
         if value.ndim == 0 or value.shape[0] != n:
-            raise DataError(f"parameter {name!r} has shape {list(value.shape)} in a field of {n} primitives: resize it")
+            raise DataError(f"parameter {name!r} has shape {list(value.shape)} in a field of {n} Gaussians: resize it")
         if name not in optimizers:
             continue
         held = [p for group in optimizers[name].param_groups for p in group["params"]]
@@ -38,8 +38,8 @@ def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimize
             )
 
 
-def per_primitive(value: Any, n: int) -> bool:
-    """Return whether a value is a tensor with a row for each of ``n`` primitives."""
+def per_gaussian(value: Any, n: int) -> bool:
+    """Return whether a value is a tensor with a row for each of ``n`` Gaussians."""
     return isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] == n
 
 
@@ -98,7 +98,7 @@ def keep(
     states: Iterable[MutableMapping[str, Any]],
     mask: Tensor,
 ) -> None:
-    """Keep the primitives under a mask and remove all others, in place on the mappings.
+    """Keep the Gaussians under a mask and remove all others, in place on the mappings.
 
     Replaces every parameter by a new, shorter ``Parameter`` with the same ``requires_grad`` and without a gradient. The
     optimizer of the same name holds the new one, with its per-primitive state (Adam's moments) sliced and its step
@@ -109,17 +109,17 @@ def keep(
         params: the field, name to parameter ``[N, ...]``.
         optimizers: optimizers with one parameter each; names that are not in ``params`` are ignored.
         states: running states; their tensors with first dimension N are sliced, all else stays.
-        mask: True for primitives to keep, bool, any device ``[N]``.
+        mask: True for Gaussians to keep, bool, any device ``[N]``.
 
     Raises:
         DataError: the mask has a wrong shape or dtype or keeps nothing, or the optimizers do not hold the parameters.
             All arguments are unchanged then.
     """
-    n = num_primitives(params)
+    n = num_gaussians(params)
     if mask.dtype != torch.bool or mask.shape != (n,):
-        raise DataError(f"mask is {mask.dtype} {list(mask.shape)} for {n} primitives: pass torch.bool [{n}]")
+        raise DataError(f"mask is {mask.dtype} {list(mask.shape)} for {n} Gaussians: pass torch.bool [{n}]")
     if not mask.any():
-        raise DataError(f"the mask removes all {n} primitives: keep at least one")
+        raise DataError(f"the mask removes all {n} Gaussians: keep at least one")
     check_wiring(params, optimizers)
 
     def kept(value: Tensor) -> Tensor:
@@ -128,7 +128,7 @@ def keep(
     for name in list(params):
         change_parameter(params, optimizers, name, kept)
     for state in states:
-        state.update({key: kept(value) for key, value in state.items() if per_primitive(value, n)})
+        state.update({key: kept(value) for key, value in state.items() if per_gaussian(value, n)})
 
 
 @torch.no_grad()
@@ -152,7 +152,7 @@ def rewrite(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], v
     for name, value in values.items():
         if name not in params or params[name].shape != value.shape:
             shape = list(params[name].shape) if name in params else "no such parameter"
-            raise DataError(f"cannot write {list(value.shape)} to {name!r} ({shape}): pass one row per primitive")
+            raise DataError(f"cannot write {list(value.shape)} to {name!r} ({shape}): pass one row per Gaussian")
     for name, value in values.items():
         parameter = params[name]
         value = value.to(parameter)
@@ -175,7 +175,7 @@ def snapshot(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) 
 def restore(
     params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], saved: Mapping[str, dict[str, Tensor]]
 ) -> None:
-    """Restore a snapshot with any number of primitives, in place on the mappings.
+    """Restore a snapshot with any number of Gaussians, in place on the mappings.
 
     Replaces the parameter objects, as :func:`keep` does.
     """
@@ -223,7 +223,7 @@ def _state(entries: Mapping[str, Tensor], value: Tensor, optimizer: Optimizer) -
 def grow(
     params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], count: int, min_opacity: float
 ) -> None:
-    """Add ``count`` primitives: the most opaque ones become two at one place, which render alike.
+    """Add ``count`` Gaussians: the most opaque ones become two at one place, which render alike.
 
     Opacities ``o' = 1 - sqrt(1 - o)`` preserve the opacity at the centre, scales ``s' = s o / (2 o' - o'^2 / sqrt(2))``
     the integral along a ray (3DGS-MCMC, Kheradmand et al., 2024, equation 9 for two copies). Replaces the parameter

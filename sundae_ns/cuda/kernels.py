@@ -181,10 +181,10 @@ def _library(name: str) -> ctypes.CDLL:
 
 
 @contextmanager
-def naming_full_memory(num_primitives: Callable[[], int]) -> Iterator[None]:
+def naming_full_memory(num_gaussians: Callable[[], int]) -> Iterator[None]:
     """Turn CUDA's error of full memory inside the block into one that names the number of Gaussians and a remedy.
 
-    ``num_primitives`` counts the Gaussians; it is called on an error only.
+    ``num_gaussians`` counts the Gaussians; it is called on an error only.
 
     Raises:
         MemoryExhaustedError: the memory of the GPU is full.
@@ -192,4 +192,4 @@ def naming_full_memory(num_primitives: Callable[[], int]) -> Iterator[None]:
     try:
         yield
     except torch.cuda.OutOfMemoryError as error:
-        raise out_of_memory(error, num_primitives()) from error
+        raise out_of_memory(error, num_gaussians()) from error

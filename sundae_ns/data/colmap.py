@@ -104,8 +104,8 @@ def read_points(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
                 end += _POINT.itemsize
                 end += 8 * _COUNT.unpack_from(content, end - _COUNT.size)[0]
             _check_end(content, end)
-            windows = sliding_window_view(np.frombuffer(content + bytes(_POINT.itemsize), np.uint8), _POINT.itemsize)
-            points = windows[starts].view(_POINT)[:, 0]
+            crops = sliding_window_view(np.frombuffer(content + bytes(_POINT.itemsize), np.uint8), _POINT.itemsize)
+            points = crops[starts].view(_POINT)[:, 0]
             return points["xyz"].copy(), points["rgb"].copy()
     if (model / "points3D.txt").exists():
         with _content(model / "points3D.txt") as content:
@@ -144,7 +144,7 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
 @contextmanager
 def _content(path: Path) -> Iterator[bytes]:
     """The bytes of a file; whatever fails while they are parsed becomes one line."""
-    with reading(path, f"a complete {path.name} of COLMAP", mend="copy or export it again"):
+    with reading(path, f"a complete {path.name} of COLMAP", sanitise="copy or export it again"):
         yield regular(path).read_bytes()
 
 

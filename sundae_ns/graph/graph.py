@@ -14,7 +14,7 @@ SAMPLED = 2**22  # most distances of which the median is taken
 
 @dataclass(frozen=True, eq=False)
 class NeighborGraph:
-    """Rows of the weight matrix W, one per primitive, each with at most K entries.
+    """Rows of the weight matrix W, one per Gaussian, each with at most K entries.
 
     The graph is directed: ``i`` may be among the K nearest of ``j`` without ``j`` being among those of ``i``.
     """
@@ -48,7 +48,7 @@ def build_graph(
 
     By default ``sigma`` is the median of the positive distances to neighbours, and ``tau = (3 sigma)^2``. The median
     scales with the scene. Clones (distance 0, left out) and far floaters do not move it. Half of all neighbours lie
-    within one sigma, so weights spread over (0, 1); only primitives beyond three times the typical spacing have no
+    within one sigma, so weights spread over (0, 1); only Gaussians beyond three times the typical spacing have no
     edge. The paper's rule (``tau`` ten times the smallest distance, ``sigma`` the variance of distances) mixes units,
     and leaves the graph empty if the field has a pair of clones.
 
@@ -78,7 +78,7 @@ def build_graph(
 
 def _typical_distance(distances: Tensor) -> float:
     """Median of the positive finite distances ``[N, K]``, the lower of the two middle values; 1 without any."""
-    # Of a large field every n-th primitive: on a GPU one block of threads finds the median, too slow for gigabytes.
+    # Of a large field every n-th Gaussian: on a GPU one block of threads finds the median, too slow for gigabytes.
     values = distances[:: max(1, distances.numel() // SAMPLED)]
     values = values[(values > 0) & values.isfinite()]
     return float(values.median()) if len(values) else 1.0

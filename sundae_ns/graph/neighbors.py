@@ -65,8 +65,8 @@ def knn(points: Tensor, k: int) -> Neighbors:
     n = len(points)
     if n <= k:
         raise DataError(
-            f"{n} primitives cannot have {k} neighbours each: use at most {max(n - 1, 0)} neighbours, "
-            "or a field with more primitives"
+            f"{n} Gaussians cannot have {k} neighbours each: use at most {max(n - 1, 0)} neighbours, "
+            "or a field with more Gaussians"
         )
     # Supported by the kernel, and exact for the points.
     dtype = torch.float64 if points.dtype == torch.float64 else torch.float32

@@ -1,6 +1,6 @@
 """The compensation head: from splatted colours, features and accumulation to the final image.
 
-Training sees random crops of large images (:func:`training_window`), so the cost of a step does not grow with the image
+Training sees random crops of large images (:func:`training_crop`), so the cost of a step does not grow with the image
 size. A screen-space network learns one size of a pixel in the scene, and on an image of half or twice the focal length
 it may do harm. Such images are compensated at the trained scale, and the correction is resized (:func:`plan`).
 """
@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from sundae_ns.core.camera import Window
+from sundae_ns.core.camera import Crop
 from sundae_ns.core.errors import BackendError, ConfigError
 from sundae_ns.head import fused
 from sundae_ns.head.unet import UNet
@@ -58,7 +58,7 @@ class HeadConfig:
     pixel_unshuffle: int = 2
     """Fold blocks of this many pixels per side into channels before the U-Net: 1 is the paper's, 2 is faster."""
     num_features: int = 13
-    """Length F of each primitive's feature vector. 1, 5, 13 and 29 splat without padding."""
+    """Length F of each Gaussian's feature vector. 1, 5, 13 and 29 splat without padding."""
     start_at: int | None = None
     """Training step after which the head is enabled; by default the last prune. If it is enabled for the last few
     thousand steps only, base colours stay those of a field without a head: less flicker and less overfitting to few
@@ -192,7 +192,7 @@ class CompensationHead(nn.Module):
         return base + alpha * out.float() if residual else out.float()
 
 
-def training_window(width: int, height: int, max_pixels: int, seed: int, *, mirror: bool = False) -> Window | None:
+def training_crop(width: int, height: int, max_pixels: int, seed: int, *, mirror: bool = False) -> Crop | None:
     """A random window with the image's aspect ratio, or None to train on the whole image, not mirrored.
 
     Positions are drawn from beyond the edges too and moved back inside, because uniform ones would rarely include the
@@ -211,11 +211,11 @@ def training_window(width: int, height: int, max_pixels: int, seed: int, *, mirr
     u, v, side = torch.rand(3, generator=torch.Generator().manual_seed(seed)).tolist()
     mirrored = mirror and side < 0.5
     if whole:
-        return Window(0, 0, width, height, mirrored) if mirrored else None
+        return Crop(0, 0, width, height, mirrored) if mirrored else None
     share = (max_pixels / (width * height)) ** 0.5
     columns, rows = (min(max(int(length * share) // GRID * GRID, GRID), length) for length in (width, height))
     left, top = int(width * u - columns / 2), int(height * v - rows / 2)
-    return Window(min(max(left, 0), width - columns), min(max(top, 0), height - rows), columns, rows, mirrored)
+    return Crop(min(max(left, 0), width - columns), min(max(top, 0), height - rows), columns, rows, mirrored)
 
 
 class ScalePlan(NamedTuple):

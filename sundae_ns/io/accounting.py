@@ -1,4 +1,4 @@
-"""Stored bytes of the primitives and of the head. MB means 1e6 bytes."""
+"""Stored bytes of the Gaussians and of the head. MB means 1e6 bytes."""
 
 from __future__ import annotations
 

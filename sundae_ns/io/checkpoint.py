@@ -28,7 +28,7 @@ from torch import Tensor
 
 from sundae_ns.core.errors import CheckpointError, StorageError, one_line, regular
 from sundae_ns.core.files import replacing
-from sundae_ns.core.gaussians import SPLAT_NAMES, Encoding, Field, odd_shapes
+from sundae_ns.core.gaussians import SPLAT_NAMES, Encoding, Gaussians, odd_shapes
 
 EXTRA_STATE = "_extra_state"
 FORMAT = 2
@@ -180,7 +180,7 @@ def extra_state(
     num_features: int,
     encoding: Encoding,
     running: Mapping[str, Mapping[str, Any]],
-    extensions: Mapping[str, Mapping[str, Any]],
+    train_callbacks: Mapping[str, Mapping[str, Any]],
     trained_focal: tuple[float, float] | None,
     head_enabled: bool,
 ) -> dict[str, Any]:
@@ -191,7 +191,7 @@ def extra_state(
         num_features: configured length of the feature vectors; 0 without a head.
         encoding: how the field stores colours.
         running: running states of ``densification`` and ``pruning``.
-        extensions: states of the extensions, by name.
+        train_callbacks: states of the extensions, by name.
         trained_focal: shortest and longest focal length that the head was trained at, pixels.
         head_enabled: whether images get the head's correction at this step; readers of finished scenes need it.
     """
@@ -202,7 +202,7 @@ def extra_state(
         "num_features": num_features,
         "encoding": encoding,
         "running": {name: dict(value) for name, value in running.items()},
-        "extensions": {name: dict(value) for name, value in extensions.items()},
+        "extensions": {name: dict(value) for name, value in train_callbacks.items()},
         "trained_focal": None if trained_focal is None else list(trained_focal),
         "head_enabled": head_enabled,
     }
@@ -252,22 +252,22 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
     Raises:
         CheckpointError: a tensor is missing or has another shape, or the running states do not fit.
     """
-    mend = "load it with the options that it was trained with"
+    sanitise = "load it with the options that it was trained with"
     for name, value in expected.items():
         if not isinstance(value, Tensor) or name == EXTRA_STATE:
             continue
         if not isinstance(state.get(name), Tensor):
-            raise CheckpointError(f"the checkpoint has no {name}; {mend}")
-        per_primitive = name.startswith(_PREFIX)
+            raise CheckpointError(f"the checkpoint has no {name}; {sanitise}")
+        per_gaussian = name.startswith(_PREFIX)
         theirs, ours = state[name].shape, value.shape
-        if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_primitive else (theirs != ours):
+        if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_gaussian else (theirs != ours):
             hint = ", such as its --pipeline.model.head.size" if name.startswith("networks.head.") else ""
             raise CheckpointError(
-                f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {mend}{hint}"
+                f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {sanitise}{hint}"
             )
     rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
     if len(rows) != 1 or rows[0] == 0:
-        raise CheckpointError(f"the checkpoint has parameters of {rows} primitives; give another")
+        raise CheckpointError(f"the checkpoint has parameters of {rows} Gaussians; give another")
     extra, n = state[EXTRA_STATE], rows[0]
     pruning, strategy = extra["running"].get("pruning"), extra["running"].get("densification")
     numbers = [extra.get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
@@ -275,10 +275,10 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
         raise CheckpointError("the checkpoint does not say where training stopped; give another")
     for name, value in strategy.items():
         if isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] != n:
-            raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} primitives; give another")
+            raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} Gaussians; give another")
 
 
-def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
+def gaussians_of(loaded: Mapping[str, Any], path: Path) -> Gaussians:
     """The stored field of a checkpoint from :func:`read`, without features, float32 on the CPU.
 
     Raises:
@@ -286,12 +286,12 @@ def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
     """
     state = model_state(loaded)
     stored = {name: state.get(_PREFIX + name) for name in SPLAT_NAMES}
-    field = {name: value.float() for name, value in stored.items() if isinstance(value, Tensor)}
-    if len(field) < len(stored):
+    gaussians = {name: value.float() for name, value in stored.items() if isinstance(value, Tensor)}
+    if len(gaussians) < len(stored):
         raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
-    for odd in odd_shapes(field):
+    for odd in odd_shapes(gaussians):
         raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")
-    return Field(field, _encoding(field, state.get(EXTRA_STATE)))
+    return Gaussians(gaussians, _encoding(gaussians, state.get(EXTRA_STATE)))
 
 
 def model_state(loaded: Mapping[str, Any]) -> dict[str, Any]:
@@ -303,10 +303,10 @@ def model_state(loaded: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _encoding(field: Mapping[str, Tensor], extra: Any) -> Encoding:
+def _encoding(gaussians: Mapping[str, Tensor], extra: Any) -> Encoding:
     """How the field of a checkpoint stores colours; splatfacto, which does not say, stores logits at SH degree 0."""
     if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
-        return "logits" if field["features_rest"].shape[1] == 0 else "harmonics"
+        return "logits" if gaussians["features_rest"].shape[1] == 0 else "harmonics"
     _check_format(extra)
     for encoding in get_args(Encoding):
         if extra.get("encoding") == encoding:

@@ -59,9 +59,9 @@ def _make_object(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Iterato
     # Setting a configuration up calls its target.
     if not isinstance(state.get("_target", type), type):
         raise ConstructorError(None, None, f"the target of {suffix} is no class", node.start_mark)
-    for field in dataclasses.fields(kind):  # options newer than the run
-        if field.name not in state and field.default_factory is not dataclasses.MISSING:
-            state[field.name] = field.default_factory()
+    for gaussians in dataclasses.fields(kind):  # options newer than the run
+        if gaussians.name not in state and gaussians.default_factory is not dataclasses.MISSING:
+            state[gaussians.name] = gaussians.default_factory()
     vars(made).update(state)
 
 
@@ -129,7 +129,7 @@ def load_config(path: Path) -> Any:
 
 def _load(path: Path, loader: type[yaml.SafeLoader]) -> Any:
     kind = "a run's config.yml, or of another version"
-    with reading(path, kind, CheckpointError, mend=_REMEDY, missing=_REMEDY):
+    with reading(path, kind, CheckpointError, sanitise=_REMEDY, missing=_REMEDY):
         return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
 
 

@@ -97,7 +97,7 @@ def separate(codes: NDArray[np.uint64], axis: int) -> NDArray[np.uint64]:
 def scene_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     """Permutation ``[N]`` that sorts finite centres ``[N, 3]`` along a space-filling curve.
 
-    Coordinates are centred on their medians and compressed by an inverse hyperbolic sine, so that a few far primitives
+    Coordinates are centred on their medians and compressed by an inverse hyperbolic sine, so that a few far Gaussians
     do not push all others into one cell.
     """
     centred = means.astype(np.float64) - np.median(means, axis=0)

@@ -1,4 +1,4 @@
-"""Kinds of files, and one reader and one writer for files of primitives of all formats."""
+"""Kinds of files, and one reader and one writer for files of Gaussians of all formats."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, SundaeError, regular
-from sundae_ns.core.gaussians import SPLAT_NAMES, Field, Mended, mend, sh_degree_of
+from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, Sanitised, sanitise, sh_degree_of
 from sundae_ns.io import checkpoint
 from sundae_ns.io.coordinates import similarity
 from sundae_ns.io.gltf import read_glb, write_glb
 from sundae_ns.io.ply import (
     MAX_SH_DEGREE,
     MODEL_FRAME,
-    check_field,
+    check_gaussians,
     is_nerfstudio_ply,
     ply_comments,
     read_ply,
@@ -38,7 +38,7 @@ PRIMITIVES: dict[Kind, str] = {
     "ksplat": ".ksplat file",
     "gsplat": "checkpoint of gsplat",
 }
-"""Kinds of files that hold primitives alone, and their names."""
+"""Kinds of files that hold Gaussians alone, and their names."""
 FORMATS = (".ply", ".spz", ".sog", ".glb")  # that write_for_viewers writes
 ANTIALIASED = "SplatRenderMode: mip"
 """Header comment of a .ply whose scene was trained with antialiasing."""
@@ -81,8 +81,8 @@ def kind_of(path: Path) -> Kind | None:
     return _HEADERLESS.get(path.suffix.lower()) if kind is None else kind
 
 
-def kind_of_primitives(path: Path) -> Kind | None:
-    """Kind of a file of primitives, of a missing or damaged one by its suffix; None for all others.
+def kind_of_gaussians(path: Path) -> Kind | None:
+    """Kind of a file of Gaussians, of a missing or damaged one by its suffix; None for all others.
 
     A .sog may be a folder of images, or the ``meta.json`` in it.
     """
@@ -108,7 +108,7 @@ def unread(path: Path) -> str | None:
 
 
 def refuse(path: Path, *, packed: str | None = None, primitives: str | None = None) -> None:
-    """Raise ``CheckpointError`` for a packed scene or a file of primitives, with the advice for it; None accepts it."""
+    """Raise ``CheckpointError`` for a packed scene or a file of Gaussians, with the advice for it; None accepts it."""
     kind = kind_of(path)
     if kind == "packed" and packed is not None:
         raise CheckpointError(f"{path} is a packed scene; {packed}")
@@ -121,10 +121,10 @@ def refuse(path: Path, *, packed: str | None = None, primitives: str | None = No
 # ------------------------------------------------------------------------------------------------------------- reading
 
 
-class StoredPrimitives(NamedTuple):
-    """The primitives of a file."""
+class StoredGaussians(NamedTuple):
+    """The Gaussians of a file."""
 
-    mended: Mended
+    sanitised: Sanitised
     """Those that have a meaning, with finite values, float32 on the CPU; and what was clamped or dropped."""
     antialiased: bool
     """Whether the file is marked as trained with antialiasing."""
@@ -132,13 +132,13 @@ class StoredPrimitives(NamedTuple):
     """Whether coordinates are those of nerfstudio's model."""
 
 
-def read_primitives(path: Path) -> StoredPrimitives:
-    """Read a file of primitives of any program. Nothing in it is executed.
+def read_gaussian_file(path: Path) -> StoredGaussians:
+    """Read a file of Gaussians of any program. Nothing in it is executed.
 
     Raises:
-        DataError: the file is missing, damaged, of another kind, or has no finite primitive.
+        DataError: the file is missing, damaged, of another kind, or has no finite Gaussian.
     """
-    kind, antialiased, in_model_frame = kind_of_primitives(path), False, False
+    kind, antialiased, in_model_frame = kind_of_gaussians(path), False, False
     if kind == "glb":
         params, antialiased, in_model_frame = read_glb(path)
     elif kind in ("spz", "sog"):
@@ -148,7 +148,7 @@ def read_primitives(path: Path) -> StoredPrimitives:
     else:
         params, antialiased = read_ply(path), ANTIALIASED in ply_comments(path)
         in_model_frame = is_nerfstudio_ply(path)
-    return StoredPrimitives(usable(params, path, DataError, "export it again"), antialiased, in_model_frame)
+    return StoredGaussians(usable(params, path, DataError, "export it again"), antialiased, in_model_frame)
 
 
 def usable(
@@ -156,21 +156,21 @@ def usable(
     path: Path,
     failure: type[SundaeError] = CheckpointError,
     remedy: str = "give another file",
-) -> Mended:
-    """The primitives of a file that have a meaning, with finite values; logs what was changed.
+) -> Sanitised:
+    """The Gaussians of a file that have a meaning, with finite values; logs what was changed.
 
     Raises:
-        failure: no primitive has a meaning.
+        failure: no Gaussian has a meaning.
     """
-    mended = mend(params)
-    if not mended.field.num_primitives:
-        raise failure(f"{path} has {len(mended.mask):,} primitives, and none is finite; {remedy}")
-    if summary := mended.summary():
+    sanitised = sanitise(params)
+    if not sanitised.gaussians.num_gaussians:
+        raise failure(f"{path} has {len(sanitised.mask):,} Gaussians, and none is finite; {remedy}")
+    if summary := sanitised.summary():
         _log.warning("%s: %s", path, summary)
-    return mended
+    return sanitised
 
 
-class FinishedField(NamedTuple):
+class FinishedGaussians(NamedTuple):
     """A field to start from or to look at."""
 
     params: dict[str, Tensor]
@@ -178,14 +178,14 @@ class FinishedField(NamedTuple):
     in_model_frame: bool
     """Whether coordinates are those of nerfstudio's model (checkpoints, ``ns-export``), not the capture's (others)."""
     dropped: int
-    """Number of primitives left out because they have no meaning (``gaussians.mend``)."""
+    """Number of Gaussians left out because they have no meaning (``gaussians.sanitise``)."""
 
 
-def read_field(path: Path) -> FinishedField:
-    """Read a finished field: a splatfacto or SUNDAE checkpoint, a packed scene without its head, or primitives.
+def read_gaussians(path: Path) -> FinishedGaussians:
+    """Read a finished field: a splatfacto or SUNDAE checkpoint, a packed scene without its head, or Gaussians.
 
     Args:
-        path: ``.ckpt`` file, a folder of them (the newest counts), or a file of primitives or packed scene.
+        path: ``.ckpt`` file, a folder of them (the newest counts), or a file of Gaussians or packed scene.
 
     Raises:
         CheckpointError: there is no such file, it holds no Gaussian field, or has another format.
@@ -194,14 +194,14 @@ def read_field(path: Path) -> FinishedField:
     wanted = "give a .ckpt file, the folder of them, or a .ply"
     if not path.exists():
         raise CheckpointError(f"{path} does not exist; {wanted}")
-    if kind_of_primitives(path) is not None:
+    if kind_of_gaussians(path) is not None:
         try:
-            mended, _, in_model_frame = read_primitives(path)
+            sanitised, _, in_model_frame = read_gaussian_file(path)
         except DataError as error:
             raise CheckpointError(str(error)) from error
-        return FinishedField(dict(mended.field), in_model_frame, mended.dropped)
+        return FinishedGaussians(dict(sanitised.gaussians), in_model_frame, sanitised.dropped)
     if kind_of(path) == "packed":
-        return _packed_field(path)
+        return _packed_gaussians(path)
     refuse(path)
     if not path.is_dir():
         loaded = checkpoint.read(path)
@@ -209,19 +209,19 @@ def read_field(path: Path) -> FinishedField:
         path, loaded = checkpoint.read_newest(path)
     else:
         raise CheckpointError(f"{path} holds no checkpoint; {wanted}")
-    mended = usable(checkpoint.field_of(loaded, path), path)
-    return FinishedField(dict(mended.field.as_harmonics()), True, mended.dropped)
+    sanitised = usable(checkpoint.gaussians_of(loaded, path), path)
+    return FinishedGaussians(dict(sanitised.gaussians.as_harmonics()), True, sanitised.dropped)
 
 
-def _packed_field(path: Path) -> FinishedField:
+def _packed_gaussians(path: Path) -> FinishedGaussians:
     from sundae_ns.io.pack.packed_scene import read_scene  # its decoder needs a compiler, which other files do not
 
     packed = read_scene(path)
     model, source = packed.meta.get("model"), packed.meta.get("source")
     logits = isinstance(model, dict) and model.get("sh_degree") == 0
-    field = Field({name: packed.field[name] for name in SPLAT_NAMES}, "logits" if logits else "harmonics")
+    gaussians = Gaussians({name: packed.gaussians[name] for name in SPLAT_NAMES}, "logits" if logits else "harmonics")
     in_model_frame = not isinstance(source, dict) or source.get("model_frame") is not False
-    return FinishedField(dict(field.as_harmonics()), in_model_frame, 0)
+    return FinishedGaussians(dict(gaussians.as_harmonics()), in_model_frame, 0)
 
 
 # ------------------------------------------------------------------------------------------------------------- writing
@@ -232,11 +232,11 @@ class ViewerFile(NamedTuple):
 
     primitives: int
     dropped: int
-    """Primitives left out because they are not finite."""
+    """Gaussians left out because they are not finite."""
     degree: int
     """SH degree of the file."""
     clamped: int
-    """Primitives with values beyond the range of a .spz, which stores the nearest value."""
+    """Gaussians with values beyond the range of a .spz, which stores the nearest value."""
     cut: bool
     """Whether the field has a higher SH degree than the file."""
     bytes: int
@@ -258,11 +258,11 @@ def write_for_viewers(
 ) -> ViewerFile:
     """Write a field in the format of the file's suffix, atomically.
 
-    Drops primitives without a meaning (``gaussians.mend``), and SH coefficients above the format's degree.
+    Drops Gaussians without a meaning (``gaussians.sanitise``), and SH coefficients above the format's degree.
 
     Args:
         path: its folder must exist.
-        params: the field; see :mod:`sundae_ns.core.gaussians`. A :class:`Field` says how it stores colours.
+        params: the field; see :mod:`sundae_ns.core.gaussians`. A :class:`Gaussians` says how it stores colours.
         antialiased: mark the scene as trained with antialiasing.
         upright: rotate the scene from nerfstudio's axes to those of a 3DGS .ply, so that viewers show it upright;
             a .glb is in any case.
@@ -274,28 +274,28 @@ def write_for_viewers(
         StorageError: the disk is full or not writable.
     """
     check_format(path)
-    check_field(params)
-    mended = mend(params)
-    field = {name: value.detach().cpu() for name, value in mended.field.as_harmonics().items()}
+    check_gaussians(params)
+    sanitised = sanitise(params)
+    gaussians = {name: value.detach().cpu() for name, value in sanitised.gaussians.as_harmonics().items()}
     kind = path.suffix.lower()
     if upright and kind != ".glb":
-        field = similarity(field, _UPRIGHT, 1.0)
-    coefficients = field["features_rest"].shape[1]
+        gaussians = similarity(gaussians, _UPRIGHT, 1.0)
+    coefficients = gaussians["features_rest"].shape[1]
     if kind != ".ply":
-        field["features_rest"] = field["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
+        gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
     if kind == ".ply":
         comments = [MODEL_FRAME] if in_model_frame and not upright else []
-        write_ply(path, field, comments=comments + ([ANTIALIASED] if antialiased else []))
+        write_ply(path, gaussians, comments=comments + ([ANTIALIASED] if antialiased else []))
     elif kind == ".glb":
-        write_glb(path, field, antialiased=antialiased, in_model_frame=in_model_frame)
+        write_glb(path, gaussians, antialiased=antialiased, in_model_frame=in_model_frame)
     else:
-        (write_spz if kind == ".spz" else write_sog)(path, field, antialiased=antialiased)
-    kept = field["features_rest"].shape[1]
+        (write_spz if kind == ".spz" else write_sog)(path, gaussians, antialiased=antialiased)
+    kept = gaussians["features_rest"].shape[1]
     return ViewerFile(
-        primitives=len(field["means"]),
-        dropped=mended.dropped,
+        primitives=len(gaussians["means"]),
+        dropped=sanitised.dropped,
         degree=sh_degree_of(kept) or 0,
-        clamped=clamped(field) if kind == ".spz" else 0,
+        clamped=clamped(gaussians) if kind == ".spz" else 0,
         cut=kept < coefficients,
         bytes=path.stat().st_size,
     )

@@ -1,10 +1,10 @@
-"""Primitives in glTF: binary files (.glb) with Khronos' extension ``KHR_gaussian_splatting``.
+"""Gaussians in glTF: binary files (.glb) with Khronos' extension ``KHR_gaussian_splatting``.
 
     12 bytes   "glTF", u4 2, u4 length of the file
     8 + J      u4 J, "JSON", the document, padded with spaces
     8 + B      u4 B, "BIN\0", the buffer
 
-The document has a node, a mesh and a primitive of points. Its attributes are float32 accessors of the buffer: POSITION,
+The document has a node, a mesh and a Gaussian of points. Its attributes are float32 accessors of the buffer: POSITION,
 and after the extension's name ROTATION (unit quaternions xyzw), SCALE (widths), OPACITY, and SH_DEGREE_l_COEF_n; and
 COLOR_0 in bytes, for programs without the extension. Values are exact. three.js, PlayCanvas and Babylon.js read them.
 
@@ -32,7 +32,7 @@ from sundae_ns.core.errors import reading, regular
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SH_C0, sh_degree
 from sundae_ns.io.coordinates import similarity
-from sundae_ns.io.ply import LEAST_OPACITY, MAX_SH_DEGREE, check_field, checked
+from sundae_ns.io.ply import LEAST_OPACITY, MAX_SH_DEGREE, check_gaussians, checked
 
 EXTENSION = "KHR_gaussian_splatting"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
@@ -49,7 +49,7 @@ _OURS, _MODEL_FRAME, _ANTIALIASED = "sundae_ns", "modelFrame", "antialiased"
 
 
 class GltfScene(NamedTuple):
-    """The primitives of a .glb: a field, float32 on the CPU, and the marks of :func:`write_glb`."""
+    """The Gaussians of a .glb: a field, float32 on the CPU, and the marks of :func:`write_glb`."""
 
     params: dict[str, Tensor]
     antialiased: bool
@@ -69,22 +69,22 @@ def write_glb(
     ``in_model_frame`` says that it is in the coordinates of nerfstudio's model.
 
     Raises:
-        DataError: the field has no primitives, an SH degree above 3, or wrong shapes.
+        DataError: the field has no Gaussians, an SH degree above 3, or wrong shapes.
         StorageError: the disk is full or not writable.
     """
-    field = similarity(checked(path, params), _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0)
-    opacities = field["opacities"].sigmoid()
-    colors = torch.cat([SH_C0 * field["features_dc"] + 0.5, opacities], dim=1).clamp(0, 1)
+    gaussians = similarity(checked(path, params), _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0)
+    opacities = gaussians["opacities"].sigmoid()
+    colors = torch.cat([SH_C0 * gaussians["features_dc"] + 0.5, opacities], dim=1).clamp(0, 1)
     attributes = {
-        "POSITION": field["means"],
+        "POSITION": gaussians["means"],
         "COLOR_0": (255 * colors).round().to(torch.uint8),
-        f"{EXTENSION}:ROTATION": field["quats"].roll(-1, dims=1),
-        f"{EXTENSION}:SCALE": field["scales"].exp(),
+        f"{EXTENSION}:ROTATION": gaussians["quats"].roll(-1, dims=1),
+        f"{EXTENSION}:SCALE": gaussians["scales"].exp(),
         f"{EXTENSION}:OPACITY": opacities,
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": field["features_dc"],
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": gaussians["features_dc"],
     }
-    rest = field["features_rest"].unbind(dim=1)
-    attributes |= dict(zip(semantics(sh_degree(field["features_rest"])), rest, strict=True))
+    rest = gaussians["features_rest"].unbind(dim=1)
+    attributes |= dict(zip(semantics(sh_degree(gaussians["features_rest"])), rest, strict=True))
     marks = {_MODEL_FRAME: in_model_frame, _ANTIALIASED: antialiased}
     document, binary = _document(attributes, {name: True for name, true in marks.items() if true})
     with replacing(path) as partial, partial.open("wb") as file:
@@ -95,7 +95,7 @@ def write_glb(
 
 
 def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tuple[bytes, bytearray]:
-    """The JSON and the buffer of a file with one primitive of these attributes."""
+    """The JSON and the buffer of a file with one Gaussian of these attributes."""
     accessors: list[dict[str, Any]] = []
     buffer_views: list[dict[str, int]] = []
     buffer = bytearray()
@@ -112,7 +112,7 @@ def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tu
         accessors.append(accessor)
         buffer_views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": _VERTICES})
         buffer += data
-    extension = {
+    callback = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
         "projection": "perspective",
@@ -121,7 +121,7 @@ def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tu
     primitive = {
         "attributes": {name: i for i, name in enumerate(attributes)},
         "mode": _POINTS,
-        "extensions": {EXTENSION: extension},
+        "extensions": {EXTENSION: callback},
     }
     document = {
         "asset": {"version": "2.0", "generator": "sundae_ns", **({"extras": {_OURS: marks}} if marks else {})},
@@ -144,7 +144,7 @@ def read_glb(path: Path) -> GltfScene:
     Raises:
         DataError: the file is missing, damaged, no .glb, or holds no Gaussians in a form that this module reads.
     """
-    with reading(path, "a complete .glb with Gaussians", mend="export it again, or as .ply"):
+    with reading(path, "a complete .glb with Gaussians", sanitise="export it again, or as .ply"):
         document, binary = _chunks(path)
         try:
             return _scene_of(document, binary)
@@ -153,7 +153,7 @@ def read_glb(path: Path) -> GltfScene:
 
 
 def _scene_of(document: Mapping[str, Any], binary: memoryview) -> GltfScene:
-    parts = [_read_primitive(document, binary, *placed) for placed in _placed(document)]
+    parts = [_read_gaussian(document, binary, *placed) for placed in _placed(document)]
     if not parts:
         raise ValueError(f"no mesh of its scene has {EXTENSION}")
     if len({part["features_rest"].shape[1] for part in parts}) > 1:
@@ -188,7 +188,7 @@ def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
 
 
 def _placed(document: Mapping[str, Any]) -> Iterator[tuple[Mapping[str, Any], NDArray[np.float64]]]:
-    """Primitives of the scene with Gaussians, and the transform ``[4, 4]`` of the nodes above them."""
+    """Gaussians of the scene with Gaussians, and the transform ``[4, 4]`` of the nodes above them."""
     nodes = document.get("nodes", [])
     scene = document["scenes"][document.get("scene", 0)]
     waiting = [(index, np.eye(4)) for index in scene.get("nodes", [])]
@@ -232,10 +232,10 @@ def _matrix(node: Mapping[str, Any]) -> NDArray[np.float64]:
     return matrix
 
 
-def _read_primitive(
+def _read_gaussian(
     document: Mapping[str, Any], binary: memoryview, primitive: Mapping[str, Any], transform: NDArray[np.float64]
 ) -> dict[str, Tensor]:
-    """The field of one primitive of the document, where its nodes put it."""
+    """The field of one Gaussian of the document, where its nodes put it."""
     stated = primitive["extensions"][EXTENSION]
     if stated.get("extensions") or stated.get("kernel", "ellipse") != "ellipse":
         raise ValueError("its Gaussians are compressed, or of another kernel")
@@ -259,7 +259,7 @@ def _read_primitive(
         "features_rest": torch.stack(rest, dim=1) if rest else torch.zeros(len(means), 0, 3),
         "opacities": torch.logit(values(f"{EXTENSION}:OPACITY"), eps=LEAST_OPACITY),
     }
-    check_field(params)
+    check_gaussians(params)
     if np.array_equal(transform, np.eye(4)):
         return params
     linear = transform[:3, :3]
@@ -276,15 +276,15 @@ def _values(document: Mapping[str, Any], binary: memoryview, index: object) -> N
     accessor = document["accessors"][_index(index)]
     if "sparse" in accessor or "bufferView" not in accessor:
         raise ValueError("it has sparse or empty accessors")
-    view = document["bufferViews"][_index(accessor["bufferView"])]
-    if _index(view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
+    camera = document["bufferViews"][_index(accessor["bufferView"])]
+    if _index(camera.get("buffer", 0)) != 0 or "uri" in document["buffers"][0] or camera.get("extensions"):
         raise ValueError("its data are compressed, or in another file")
     kind, columns = np.dtype(_COMPONENTS[accessor["componentType"]]), _NUMBERS[accessor["type"]]
-    rows, start = _index(accessor["count"]), _index(view.get("byteOffset", 0))
-    stride = _index(view.get("byteStride", kind.itemsize * columns))
+    rows, start = _index(accessor["count"]), _index(camera.get("byteOffset", 0))
+    stride = _index(camera.get("byteStride", kind.itemsize * columns))
     inside = _index(accessor.get("byteOffset", 0))
     used = inside + (rows - 1) * stride + kind.itemsize * columns if rows else 0
-    beyond = used > _index(view["byteLength"]) or start + view["byteLength"] > len(binary)
+    beyond = used > _index(camera["byteLength"]) or start + camera["byteLength"] > len(binary)
     if beyond or stride < kind.itemsize * columns:
         raise ValueError("its accessors reach beyond its data")
     table: NDArray[Any] = np.ndarray((rows, columns), kind, binary, start + inside, (stride, kind.itemsize))

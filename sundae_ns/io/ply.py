@@ -1,6 +1,6 @@
 """The .ply of 3D Gaussian splatting, the compressed .ply of PlayCanvas, and the .ply of points.
 
-3DGS: one binary vertex per primitive, all properties float32, values before activation:
+3DGS: one binary vertex per Gaussian, all properties float32, values before activation:
 
     x y z  nx ny nz  f_dc_0..2  f_rest_0..3K-1  opacity  scale_0..2  rot_0..3 (wxyz)
 
@@ -33,7 +33,7 @@ from torch import Tensor
 
 from sundae_ns.core.errors import DataError, SundaeError, reading, regular
 from sundae_ns.core.files import replacing
-from sundae_ns.core.gaussians import SPLAT_NAMES, num_primitives, odd_shapes, rgb_to_sh, sh_degree_of, sh_to_rgb
+from sundae_ns.core.gaussians import SPLAT_NAMES, num_gaussians, odd_shapes, rgb_to_sh, sh_degree_of, sh_to_rgb
 
 MODEL_FRAME = "Coordinates: nerfstudio model"
 """Header comment of files in the coordinates of nerfstudio's model, not of the capture."""
@@ -63,7 +63,7 @@ _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32":
 _MAX_HEADER = 1 << 16  # bytes
 
 
-def check_field(params: Mapping[str, Tensor], failure: type[SundaeError] = DataError) -> None:
+def check_gaussians(params: Mapping[str, Tensor], failure: type[SundaeError] = DataError) -> None:
     """Raise a ``failure`` unless a field has all of ``SPLAT_NAMES``, in their shapes."""
     missing = [name for name in SPLAT_NAMES if name not in params]
     if missing:
@@ -76,24 +76,26 @@ def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The parameters that .spz, .sog and .glb store, float32 on the CPU; quaternions become unit ones.
 
     Raises:
-        DataError: the field has no primitives, values that are not finite, an SH degree above 3, or wrong shapes.
+        DataError: the field has no Gaussians, values that are not finite, an SH degree above 3, or wrong shapes.
     """
-    check_field(params)
-    field = {name: params[name].detach().to("cpu", torch.float32).contiguous() for name in SPLAT_NAMES}
-    if not len(field["means"]):
-        raise DataError(f"the field has no primitives, which a {path.suffix} cannot store; check the run")
-    if not all(bool(value.isfinite().all()) for value in field.values()):
-        raise DataError("some values are NaN or infinite; drop those primitives first (finite_mask)")
-    if field["features_rest"].shape[1] > (MAX_SH_DEGREE + 1) ** 2 - 1:
+    check_gaussians(params)
+    gaussians = {name: params[name].detach().to("cpu", torch.float32).contiguous() for name in SPLAT_NAMES}
+    if not len(gaussians["means"]):
+        raise DataError(f"the field has no Gaussians, which a {path.suffix} cannot store; check the run")
+    if not all(bool(value.isfinite().all()) for value in gaussians.values()):
+        raise DataError("some values are NaN or infinite; drop those Gaussians first (finite_mask)")
+    if gaussians["features_rest"].shape[1] > (MAX_SH_DEGREE + 1) ** 2 - 1:
         raise DataError(f"a {path.suffix} stores SH degrees up to {MAX_SH_DEGREE}; cut features_rest, or write a .ply")
     # Opacities beyond these logits are 0 and 1 in every format, and would overflow before they are.
-    field["opacities"] = field["opacities"].clamp(-30.0, 30.0)
+    gaussians["opacities"] = gaussians["opacities"].clamp(-30.0, 30.0)
     # Normalise in float64: the square of 1e-30 is 0 in float32.
-    quats = field["quats"].double()
+    quats = gaussians["quats"].double()
     norms = quats.norm(dim=1, keepdim=True)
     identity = torch.tensor(np.eye(1, 4)[0])
-    field["quats"] = torch.where(norms > 0, quats / norms.clamp_min(torch.finfo(torch.float64).tiny), identity).float()
-    return field
+    gaussians["quats"] = torch.where(
+        norms > 0, quats / norms.clamp_min(torch.finfo(torch.float64).tiny), identity
+    ).float()
+    return gaussians
 
 
 # ------------------------------------------------------------------------------------------------------------- writing
@@ -118,7 +120,7 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
     Args:
         path: the file; its folder must exist.
         params: a field; see :mod:`sundae_ns.core.gaussians`. ``features`` are not written. Values that are not
-            finite are written unchanged: drop such primitives first (``finite_mask``), because viewers do not.
+            finite are written unchanged: drop such Gaussians first (``finite_mask``), because viewers do not.
         comments: lines for the header: :data:`MODEL_FRAME` for the field of a nerfstudio model, ``SplatRenderMode:
             mip`` for an antialiased scene.
 
@@ -126,8 +128,8 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
         DataError: a parameter is missing or has the wrong shape.
         StorageError: the disk is full or not writable.
     """
-    check_field(params)
-    n = num_primitives(params)
+    check_gaussians(params)
+    n = num_gaussians(params)
     means, *others = _table(params)
     blocks = [means, (_NORMALS, np.zeros((n, 3), np.float32)), *others]
     names = [name for block, _ in blocks for name in block]
@@ -145,7 +147,7 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
         source: a .ply that has its values as :func:`has_own_columns` says.
         out: the file to write atomically.
         mask: True for vertices to keep, bool ``[N]``.
-        params: new parameters of the kept primitives ``[M, ...]``; None to keep their values.
+        params: new parameters of the kept Gaussians ``[M, ...]``; None to keep their values.
 
     Raises:
         DataError: the file cannot be read, or has another number of vertices.
@@ -184,7 +186,7 @@ def _header(path: Path) -> bytes:
 def _check_header(path: Path, primitives: bool) -> bytes:
     """Check the header alone, and return it: plyfile allocates by it, and reads lists and text row by row, in minutes.
 
-    ``primitives`` refuses what no binary .ply of Gaussian primitives has: text and lists.
+    ``primitives`` refuses what no binary .ply of Gaussian Gaussians has: text and lists.
     """
     header = _header(path)
     lines = [line.split() for line in header.decode("latin-1").splitlines()]
@@ -228,7 +230,7 @@ def _load(path: Path, *, primitives: bool = False) -> PlyData:
         with _AsciiHeader(FileIO(path), len(header)) as file:
             data = PlyData.read(file)
     if "vertex" not in data:
-        raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussian primitives.")
+        raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussian Gaussians.")
     return data
 
 
@@ -298,10 +300,10 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     Returns:
         A field by the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU. The SH degree
         follows from the number of ``f_rest_*``; without any, ``features_rest`` is ``[N, 0, 3]``. Values may be
-        infinite, where that is how the file states an opacity of 1; see ``gaussians.mend``.
+        infinite, where that is how the file states an opacity of 1; see ``gaussians.sanitise``.
 
     Raises:
-        DataError: the file is missing, not a binary .ply, truncated, or does not hold Gaussian primitives.
+        DataError: the file is missing, not a binary .ply, truncated, or does not hold Gaussian Gaussians.
     """
     data = _load(path, primitives=True)
     rows = data["vertex"].data
@@ -314,7 +316,7 @@ def read_ply(path: Path) -> dict[str, Tensor]:
         columns["features_dc"] = _RGB
     missing = [name for names in columns.values() for name in names if name not in present]
     if missing:
-        raise DataError(f"{path} lacks {', '.join(missing)}; give a .ply of 3D Gaussian primitives with SH colours.")
+        raise DataError(f"{path} lacks {', '.join(missing)}; give a .ply of 3D Gaussian Gaussians with SH colours.")
     rest = sum(name.startswith("f_rest_") for name in present)
     degree = sh_degree_of(rest // 3) if rest % 3 == 0 else None
     if degree is None or not present.issuperset(_rest_columns(rest)):
@@ -336,7 +338,7 @@ def _decompressed(chunks: NDArray[Any], vertices: NDArray[Any], harmonics: NDArr
     """A field of the elements of a compressed .ply; ``ValueError`` if they do not fit together."""
     n = len(vertices)
     if len(chunks) < -(-n // _CHUNK):
-        raise ValueError(f"{len(chunks)} chunks are too few for {n:,} primitives")
+        raise ValueError(f"{len(chunks)} chunks are too few for {n:,} Gaussians")
     chunk = np.arange(n) // _CHUNK
 
     def between(ratios: NDArray[np.float32], kind: str, axes: str) -> NDArray[np.float32]:
@@ -354,9 +356,9 @@ def _decompressed(chunks: NDArray[Any], vertices: NDArray[Any], harmonics: NDArr
         "quats": from_smallest_three(rotation, vertices["packed_rotation"].astype(np.uint32) >> np.uint32(30)),
         "features_rest": _decompressed_harmonics(harmonics, n),
     }
-    field = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in values.items()}
-    field["features_dc"] = rgb_to_sh(torch.from_numpy(np.ascontiguousarray(rgb)))
-    return {**field, "opacities": torch.logit(torch.from_numpy(color[:, 3:].copy()), eps=LEAST_OPACITY)}
+    gaussians = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in values.items()}
+    gaussians["features_dc"] = rgb_to_sh(torch.from_numpy(np.ascontiguousarray(rgb)))
+    return {**gaussians, "opacities": torch.logit(torch.from_numpy(color[:, 3:].copy()), eps=LEAST_OPACITY)}
 
 
 def _ratios(words: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float32]:
@@ -381,7 +383,7 @@ def _decompressed_harmonics(rows: NDArray[Any] | None, n: int) -> NDArray[np.flo
     if rows is None or not names:
         return np.zeros((n, 0, 3), np.float32)
     if len(rows) != n or len(names) % 3 or sh_degree_of(len(names) // 3) is None:
-        raise ValueError(f"{len(names)} coefficients of {len(rows):,} primitives fit no SH degree")
+        raise ValueError(f"{len(names)} coefficients of {len(rows):,} Gaussians fit no SH degree")
     levels = np.stack([rows[f"f_rest_{i}"] for i in range(len(names))], axis=1)
     ratios = np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + np.float32(0.5)) / 256))
     return (8 * (ratios - 0.5)).reshape(n, 3, -1).transpose(0, 2, 1).astype(np.float32)

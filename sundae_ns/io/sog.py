@@ -1,4 +1,4 @@
-"""The .sog of PlayCanvas, version 2: a zip of lossless WebP images with one pixel per primitive, and ``meta.json``.
+"""The .sog of PlayCanvas, version 2: a zip of lossless WebP images with one pixel per Gaussian, and ``meta.json``.
 
 Written from the format's public description, because no maintained Python package writes it:
 
@@ -10,7 +10,7 @@ Written from the format's public description, because no maintained Python packa
     shN_labels.webp            index in a palette of at most 65,536 rows, in red and green
     shN_centroids.webp         the palette: 64 rows of SH coefficients of degrees 1 to 3 in a row of pixels
 
-Codebooks are k-means in one dimension. With more primitives than palette rows, these are centres of a two-level
+Codebooks are k-means in one dimension. With more Gaussians than palette rows, these are centres of a two-level
 k-means. Coordinates are those of a .ply, as in files of ``splat-transform``.
 """
 
@@ -54,12 +54,12 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
     """Write the base colours of a finite field of SH degree at most 3 as a bundled .sog, atomically, in another order.
 
     Raises:
-        DataError: the field has no primitives, an SH degree above 3, or wrong shapes.
+        DataError: the field has no Gaussians, an SH degree above 3, or wrong shapes.
         StorageError: the disk is full or not writable.
     """
-    field = checked(path, params)
-    order = scene_order(field["means"].numpy())
-    arrays = {name: value.numpy()[order] for name, value in field.items()}
+    gaussians = checked(path, params)
+    order = scene_order(gaussians["means"].numpy())
+    arrays = {name: value.numpy()[order] for name, value in gaussians.items()}
     n = len(order)
 
     bent = np.sign(arrays["means"]) * np.log1p(np.abs(arrays["means"].astype(np.float64)))
@@ -127,8 +127,8 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
         if (version := meta.get("version", 1)) != 2:
             raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
         arrays = _decoded(entry, meta)
-    field = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
-    return field, bool(meta.get("antialias")) or meta.get("model") == "antialiased"
+    gaussians = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
+    return gaussians, bool(meta.get("antialias")) or meta.get("model") == "antialiased"
 
 
 def _file_entry(folder: Path, name: str) -> bytes:
@@ -170,7 +170,7 @@ def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str,
         centres = _pixels(file(entry["files"][0]))[..., :3].reshape(-1, coefficients, 3)
         label = pixels(entry, 1, 2).astype(np.int64)
         rest = np.asarray(entry["codebook"], np.float32)[centres[label[:, 0] + 256 * label[:, 1]]]
-    field = {
+    gaussians = {
         "means": np.sign(bent) * np.expm1(np.abs(bent)),
         "scales": np.asarray(meta["scales"]["codebook"], np.float32)[pixels(meta["scales"], 0, 3)],
         "quats": from_smallest_three((turns[:, :3] / 255.0 - 0.5) * math.sqrt(2.0), largest),
@@ -178,10 +178,10 @@ def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str,
         "features_rest": rest,
         "opacities": np.log(opacity / (1 - opacity)),
     }
-    short = [name for name, value in field.items() if len(value) != n]
+    short = [name for name, value in gaussians.items() if len(value) != n]
     if n < 1 or short:
-        raise ValueError(f"{', '.join(short) or 'the field'} has fewer than {n:,} primitives")
-    return field
+        raise ValueError(f"{', '.join(short) or 'the gaussians'} has fewer than {n:,} Gaussians")
+    return gaussians
 
 
 def _pixels(file: bytes) -> NDArray[np.uint8]:

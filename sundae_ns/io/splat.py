@@ -1,19 +1,19 @@
 """Scenes of other viewers and trainers, which are read only: .splat, .ksplat, and the checkpoints of gsplat.
 
-.splat, of the first web viewers, 32 bytes a primitive without a header:
+.splat, of the first web viewers, 32 bytes a Gaussian without a header:
 
     means 3 f4 | widths 3 f4 | red green blue opacity u1 | quaternion wxyz, 128 + 128 q, u1
 
 .ksplat, of GaussianSplats3D, version 0.1, little-endian; read from files of its own converter:
 
-    0     header of 4,096 bytes: u1 major, u1 minor, 2 x, u4 sections stored and used, u4 primitives stored and used,
+    0     header of 4,096 bytes: u1 major, u1 minor, 2 x, u4 sections stored and used, u4 Gaussians stored and used,
           u2 level, 2 x, 12 x, f4 bounds of SH coefficients
-    4096  1,024 bytes a section: u4 primitives used and stored, u4 bucket size, u4 buckets, f4 bucket width,
+    4096  1,024 bytes a section: u4 Gaussians used and stored, u4 bucket size, u4 buckets, f4 bucket width,
           u2 bytes of a centre, 2 x, u4 range of a coordinate, u4 bytes, u4 full and partial buckets, u2 SH degree
-    ...   the sections: u4 lengths of the partial buckets, 3 f4 centres of all buckets, primitives bucket after bucket
+    ...   the sections: u4 lengths of the partial buckets, 3 f4 centres of all buckets, Gaussians bucket after bucket
 
     level 0: float32, no buckets; 1: positions u2 around the centre of their bucket, all else f2; 2: as 1, SH in u1.
-    A primitive: means 3, widths 3, quaternion wxyz 4, rgba u1, SH by degree and channel; degrees end at 2.
+    A Gaussian: means 3, widths 3, quaternion wxyz 4, rgba u1, SH by degree and channel; degrees end at 2.
 
 .pt of gsplat's ``simple_trainer.py``: an archive of ``torch.save`` with ``splats``, one for each rank.
 """
@@ -48,7 +48,7 @@ _GSPLAT_NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 _RANK = re.compile(r"(.*_rank)\d+")
 
 
-def _field(rows: NDArray[Any], means: NDArray[Any], quats: NDArray[Any], rest: NDArray[Any]) -> dict[str, Tensor]:
+def _gaussians(rows: NDArray[Any], means: NDArray[Any], quats: NDArray[Any], rest: NDArray[Any]) -> dict[str, Tensor]:
     """A field of rows with ``widths`` and ``rgba``."""
 
     def tensor(values: NDArray[Any]) -> Tensor:
@@ -70,18 +70,18 @@ def read_splat(path: Path) -> dict[str, Tensor]:
 
     Returns:
         A field by the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
-        coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.mend``.
+        coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.sanitise``.
 
     Raises:
-        DataError: the file is missing or empty, or has no whole number of primitives.
+        DataError: the file is missing or empty, or has no whole number of Gaussians.
     """
     with reading(path, "a complete .splat"):
         size = regular(path).stat().st_size
         if size == 0 or size % _SPLAT.itemsize:
-            raise ValueError(f"{size:,} bytes are no whole number of primitives of {_SPLAT.itemsize} bytes")
+            raise ValueError(f"{size:,} bytes are no whole number of Gaussians of {_SPLAT.itemsize} bytes")
         rows = np.fromfile(path, _SPLAT)
     quats = (rows["quats"].astype(np.float32) - 128) / 128
-    return _field(rows, rows["means"], quats, np.zeros((len(rows), 0, 3)))
+    return _gaussians(rows, rows["means"], quats, np.zeros((len(rows), 0, 3)))
 
 
 def read_ksplat(path: Path) -> dict[str, Tensor]:
@@ -90,7 +90,7 @@ def read_ksplat(path: Path) -> dict[str, Tensor]:
     Raises:
         DataError: the file is missing, cut or damaged, of another version, or its sections have different SH degrees.
     """
-    with reading(path, "a complete .ksplat", mend="export it again, or convert it to .ply with splat-transform"):
+    with reading(path, "a complete .ksplat", sanitise="export it again, or convert it to .ply with splat-transform"):
         data = memoryview(regular(path).read_bytes())
         if len(data) < _HEADER_BYTES:
             raise ValueError(f"{len(data):,} bytes are shorter than its header")
@@ -108,7 +108,7 @@ def read_ksplat(path: Path) -> dict[str, Tensor]:
             part, start = _section(data, _HEADER_BYTES + i * _SECTION_BYTES, start, level, bounds)
             parts += [part] if len(part["means"]) else []
         if not parts:
-            raise ValueError("it has no primitives")
+            raise ValueError("it has no Gaussians")
         if len({part["features_rest"].shape[1] for part in parts}) > 1:
             raise ValueError("its sections have different SH degrees")
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
@@ -130,7 +130,7 @@ def _section(
     first = centers + center_bytes * buckets
     end = first + stored * kind.itemsize
     if used > stored or end > len(data):
-        raise ValueError(f"its {len(data):,} bytes cannot hold a section of {max(used, stored):,} primitives")
+        raise ValueError(f"its {len(data):,} bytes cannot hold a section of {max(used, stored):,} Gaussians")
     rows = np.frombuffer(data, kind, used, first)
     means, harmonics = rows["means"], rows["harmonics"].astype(np.float32)
     if level:
@@ -139,7 +139,7 @@ def _section(
         lengths = np.frombuffer(data, "<u4", partial, start)
         # Sums before arrays: a number of rows may be absurd.
         if full * size + int(lengths.sum(dtype=np.uint64)) != stored:
-            raise ValueError(f"its buckets do not hold {stored:,} primitives")
+            raise ValueError(f"its buckets do not hold {stored:,} Gaussians")
         bucket = np.repeat(np.arange(buckets), np.concatenate([np.full(full, size, np.int64), lengths]))[:used]
         limit = limit or _RANGE
         middle = np.frombuffer(data, "<f4", 3 * buckets, centers).reshape(-1, 3)[bucket]
@@ -150,21 +150,21 @@ def _section(
     degrees = range(1, math.isqrt(coefficients + 1))
     groups = [harmonics[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)].reshape(-1, 3, 2 * d + 1) for d in degrees]
     rest = np.concatenate([np.zeros((len(rows), 3, 0), np.float32), *groups], axis=2).transpose(0, 2, 1)
-    return _field(rows, means, rows["quats"], rest), end
+    return _gaussians(rows, means, rows["quats"], rest), end
 
 
 def read_gsplat(path: Path) -> dict[str, Tensor]:
     """Read a checkpoint of gsplat's trainer, with those of the other ranks beside it. No code in it runs.
 
     Args:
-        path: ``ckpt_29999_rank0.pt``; the primitives of a training on several GPUs are spread over ``_rank0``,
+        path: ``ckpt_29999_rank0.pt``; the Gaussians of a training on several GPUs are spread over ``_rank0``,
             ``_rank1`` and so on.
 
     Returns:
         A field as that of :func:`read_splat`, in the coordinates of gsplat's training.
 
     Raises:
-        DataError: a file is missing or damaged, or holds no primitives with SH colours.
+        DataError: a file is missing or damaged, or holds no Gaussians with SH colours.
     """
 
     def step_of(file: Path) -> str | None:
@@ -180,8 +180,8 @@ def read_gsplat(path: Path) -> dict[str, Tensor]:
 
 
 def _rank(path: Path) -> dict[str, Tensor]:
-    """The primitives of one file."""
-    with reading(path, "a checkpoint of gsplat", mend="give another file"), regular(path).open("rb") as file:
+    """The Gaussians of one file."""
+    with reading(path, "a checkpoint of gsplat", sanitise="give another file"), regular(path).open("rb") as file:
         damage = damage_of(file)
         if damage is not None:
             raise ValueError(damage)
@@ -198,9 +198,9 @@ def _rank(path: Path) -> dict[str, Tensor]:
         if missing:
             raise ValueError(f"its splats lack {', '.join(missing)}")
         values: dict[str, Any] = {name: splats[name].detach().float() for name in _GSPLAT_NAMES}
-        field = {name: values[name] for name in ("means", "scales", "quats")}
-        field |= {"features_dc": values["sh0"].flatten(1), "features_rest": values["shN"]}
-        field["opacities"] = values["opacities"].reshape(-1, 1)
-        for odd in odd_shapes(field):
+        gaussians = {name: values[name] for name in ("means", "scales", "quats")}
+        gaussians |= {"features_dc": values["sh0"].flatten(1), "features_rest": values["shN"]}
+        gaussians["opacities"] = values["opacities"].reshape(-1, 1)
+        for odd in odd_shapes(gaussians):
             raise ValueError(odd)
-    return field
+    return gaussians

@@ -1,4 +1,4 @@
-"""The .spz of Niantic: quantised, deflated primitives, which most web viewers read; coded by ``gsply``.
+"""The .spz of Niantic: quantised, deflated Gaussians, which most web viewers read; coded by ``gsply``.
 
 One gzip stream (versions 1 to 3), little-endian; version 4 starts with the header itself:
 
@@ -35,7 +35,7 @@ _VERSION = 3  # one gzip stream; more programs read it than version 4
 _HEADER_FLAGS = 14  # offset of the flags in the header
 _ANTIALIASED = 0x1  # flag
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
-_LEAST_BYTES = 19  # of a primitive of SH degree 0
+_LEAST_BYTES = 19  # of a Gaussian of SH degree 0
 _CHUNK = 1 << 20
 _LARGEST = (1 << 23) - 1  # largest coordinate in steps, 24 bits with a sign
 _MOST_BITS = 24  # fractional bits of a coordinate
@@ -45,19 +45,19 @@ _COLOR, _HARMONIC = 0.5 / 0.15, 1.0  # largest SH coefficients of degree 0, and 
 
 
 def fractional_bits(means: Tensor) -> int:
-    """Most fractional bits, at most 24, of positions ``[N, 3]`` with which the farthest primitive fits.
+    """Most fractional bits, at most 24, of positions ``[N, 3]`` with which the farthest Gaussian fits.
 
     The error of a coordinate is at most ``2^-(bits + 1)``, plus the rounding of float32.
 
     Raises:
-        DataError: a primitive is so far away that fewer than 8 bits are left.
+        DataError: a Gaussian is so far away that fewer than 8 bits are left.
     """
     farthest = float(means.abs().max())
     for bits in range(_MOST_BITS, _FEWEST_BITS - 1, -1):
         if round(farthest * 2**bits) <= _LARGEST:
             return bits
     raise DataError(
-        f"a primitive is {farthest:.3g} from the origin, too far for the fixed point of a .spz; write a .sog or .ply"
+        f"a Gaussian is {farthest:.3g} from the origin, too far for the fixed point of a .spz; write a .sog or .ply"
     )
 
 
@@ -65,17 +65,17 @@ def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
     """Write the base colours of a finite field of SH degree at most 3 as a .spz, atomically.
 
     Raises:
-        DataError: the field has no primitives, an SH degree above 3, a primitive too far away, or wrong shapes.
+        DataError: the field has no Gaussians, an SH degree above 3, a Gaussian too far away, or wrong shapes.
         StorageError: the disk is full or not writable.
     """
     from gsply import GSData
     from gsply.spz import write_spz as write
 
-    field = checked(path, params)
-    bits = fractional_bits(field["means"])
-    field["features_rest"] = (field["features_rest"] / _HARMONICS_STEP).round() * _HARMONICS_STEP
-    opacities, colors, rest = (field[name].numpy() for name in ("opacities", "features_dc", "features_rest"))
-    means, scales, quats = (field[name].numpy() for name in ("means", "scales", "quats"))
+    gaussians = checked(path, params)
+    bits = fractional_bits(gaussians["means"])
+    gaussians["features_rest"] = (gaussians["features_rest"] / _HARMONICS_STEP).round() * _HARMONICS_STEP
+    opacities, colors, rest = (gaussians[name].numpy() for name in ("opacities", "features_dc", "features_rest"))
+    means, scales, quats = (gaussians[name].numpy() for name in ("means", "scales", "quats"))
     harmonics = rest if rest.size else None
     data = GSData.from_arrays(means, scales, quats, opacities[:, 0], colors, harmonics, format="ply")
     with replacing(path) as partial:
@@ -107,8 +107,8 @@ def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
         "features_rest": rest.reshape(n, -1, 3),
         "opacities": data.opacities.reshape(n, 1),
     }
-    field = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in columns.items()}
-    return field, bool(flags & _ANTIALIASED)
+    gaussians = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in columns.items()}
+    return gaussians, bool(flags & _ANTIALIASED)
 
 
 def _checked_flags(path: Path) -> int:
@@ -121,9 +121,7 @@ def _checked_flags(path: Path) -> int:
         raise DataError(f"{path} is no .spz; give a .ply, .spz, .sog, .sundae, or a run")
     _, _, count, _, _, flags, _ = _HEADER.unpack(header)
     if count == 0 or count * _LEAST_BYTES > most:
-        raise DataError(
-            f"{path} states {count:,} primitives, which its {len(raw):,} bytes cannot hold; export it again"
-        )
+        raise DataError(f"{path} states {count:,} Gaussians, which its {len(raw):,} bytes cannot hold; export it again")
     if packed:
         stream, rest, size = zlib.decompressobj(wbits=31), raw, 0
         while rest and not stream.eof:
@@ -134,10 +132,10 @@ def _checked_flags(path: Path) -> int:
     return int(flags)
 
 
-def clamped(field: Mapping[str, Tensor]) -> int:
-    """Number of primitives with a scale or an SH coefficient beyond what a .spz stores; it stores the nearest value."""
+def clamped(gaussians: Mapping[str, Tensor]) -> int:
+    """Number of Gaussians with a scale or an SH coefficient beyond what a .spz stores; it stores the nearest value."""
     low, high = _SCALES
-    beyond = ((field["scales"] < low) | (field["scales"] > high)).any(dim=1)
-    beyond |= (field["features_dc"].abs() > _COLOR).any(dim=1)
-    beyond |= (field["features_rest"].flatten(1).abs() > _HARMONIC).any(dim=1)
+    beyond = ((gaussians["scales"] < low) | (gaussians["scales"] > high)).any(dim=1)
+    beyond |= (gaussians["features_dc"].abs() > _COLOR).any(dim=1)
+    beyond |= (gaussians["features_rest"].flatten(1).abs() > _HARMONIC).any(dim=1)
     return int(beyond.sum())

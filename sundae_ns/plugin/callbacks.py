@@ -19,8 +19,8 @@ from sundae_ns.io.config_file import find_config
 from sundae_ns.io.run_folder import take_records
 from sundae_ns.plugin.datamanager import SundaeDatamanager
 from sundae_ns.plugin.distributed import Ranks
-from sundae_ns.scene.render import LocalField, RenderSettings, TrainingView
-from sundae_ns.train.state import Extension, FieldState, Photo
+from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamera
+from sundae_ns.train.state import Callback, Photo, TrainingState
 
 
 class NerfstudioRun:
@@ -33,16 +33,16 @@ class NerfstudioRun:
 
     def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
         self.model = model
-        self.state: FieldState = model.state
+        self.state: TrainingState = model.state
         self.background: Tensor = model.background_color.to(model.device)
         self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
         self._trainer = cast(Any, attributes.trainer)
         self._ranks: Ranks = getattr(self._trainer, "ranks", None) or Ranks()
 
     @property
-    def source(self) -> LocalField:
-        """Where views get their primitives from."""
-        return cast(LocalField, self.model.source)
+    def source(self) -> GaussianSource:
+        """Where views get their Gaussians from."""
+        return cast(GaussianSource, self.model.source)
 
     @property
     def settings(self) -> RenderSettings:
@@ -82,7 +82,7 @@ class NerfstudioRun:
         """Indices of the training views."""
         return self._datamanager.train_indices
 
-    def training_views(self) -> list[TrainingView]:
+    def training_views(self) -> list[TrainingCamera]:
         """All training views."""
         return training_views(self.model, self._datamanager)
 
@@ -92,12 +92,12 @@ class NerfstudioRun:
 
     def heldout_views(self) -> Iterator[Photo]:
         """The held-out training views, loaded one at a time."""
-        for camera, batch in self._datamanager.views(self._datamanager.holdout_indices):
+        for camera, batch in self._datamanager.cameras(self._datamanager.holdout_indices):
             yield self._photo(camera, batch)
 
     def photos(self) -> Iterator[Photo]:
         """All training views; transparent pixels are masked."""
-        for camera, batch in self._datamanager.views(self.view_indices()):
+        for camera, batch in self._datamanager.cameras(self.view_indices()):
             photo, image = self._photo(camera, batch), batch["image"]
             if image.shape[-1] == 4:
                 opaque = (image[..., 3] > (127 if image.dtype == torch.uint8 else 0.5)).to(photo.target.device)
@@ -108,7 +108,7 @@ class NerfstudioRun:
     def _photo(self, camera: Cameras, batch: dict[str, Any]) -> Photo:
         target = self.model.truth(batch, {"background": self.background}, downscale=1)
         mask = batch["mask"].to(target.device).squeeze(-1) > 0 if "mask" in batch else None
-        return Photo(self.model.view_of(camera), target, mask)
+        return Photo(self.model.camera_of(camera), target, mask)
 
     def evaluate(self) -> dict[str, float]:
         """Mean ``psnr`` and ``ssim`` over all test views."""
@@ -133,7 +133,7 @@ class NerfstudioRun:
         places = TrainingCallbackLocation
         return [
             TrainingCallback([places.BEFORE_TRAIN_ITERATION], self._begin_step),
-            TrainingCallback([places.AFTER_TRAIN_ITERATION], lambda step: self.act(self.model.extensions)),
+            TrainingCallback([places.AFTER_TRAIN_ITERATION], lambda step: self.act(self.model.train_callbacks)),
             TrainingCallback([places.AFTER_TRAIN], self._finish),
         ]
 
@@ -145,30 +145,30 @@ class NerfstudioRun:
             resumed = self._trainer.config.load_dir or self._trainer.config.load_checkpoint
             if resumed and (config := find_config(resumed)) and config.parent.resolve() != self.folder.resolve():
                 take_records(config.parent, self.folder, self.state.schedule_step)
-        for extension in self.model.extensions:
-            extension.before_training(self)
+        for callback in self.model.train_callbacks:
+            callback.before_training(self)
         self._hand_over()
 
     def _begin_step(self, step: int) -> None:
         self.state.step = step
 
-    def act(self, extensions: Sequence[Extension]) -> None:
+    def act(self, train_callbacks: Sequence[Callback]) -> None:
         """Let extensions act after a step, in their order."""
-        for extension in extensions:
-            self._ranks.after_step(extension, self)
+        for callback in train_callbacks:
+            self._ranks.after_step(callback, self)
         self._hand_over()
 
     def _hand_over(self) -> None:
         """Give nerfstudio's own list the parameters of the field: surgery makes new ones."""
         assert self._optimizers is not None
-        for name, value in self.state.field.items():
+        for name, value in self.state.gaussians.items():
             self._optimizers.parameters[name] = [value]
 
     def _finish(self, step: int) -> None:
         with self._ranks.whole() as first:
             if first:
-                for extension in self.model.extensions:
-                    extension.finish(self)
+                for callback in self.model.train_callbacks:
+                    callback.finish(self)
                 self._summarize()
         writer.write_out_storage()
 
@@ -181,10 +181,10 @@ class NerfstudioRun:
             quality = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
             _say(f"trained: {quality} on {len(self._datamanager.eval_dataset)} test views")
         head = self.state.head if self.state.head_enabled else None
-        numbers = sum(value.numel() for value in self.state.field.values())
+        numbers = sum(value.numel() for value in self.state.gaussians.values())
         size = BYTES_PER_FLOAT * numbers + (0 if head is None else bytes_of_module(head))
         with_head = f"{'without' if head is None else 'with'} a head"
-        _say(f"{self.source.total:,} primitives, {with_head}: {megabytes(size)} before packing")
+        _say(f"{self.source.total:,} Gaussians, {with_head}: {megabytes(size)} before packing")
         _say(f"next: {shlex.join(['sundae', 'pack', str(self.folder), '-o', 'scene.sundae'])}")
 
 
@@ -192,7 +192,7 @@ def _say(line: str) -> None:
     CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def training_views(model: Any, datamanager: SundaeDatamanager) -> list[TrainingView]:
+def training_views(model: Any, datamanager: SundaeDatamanager) -> list[TrainingCamera]:
     """All training views of a datamanager."""
     with torch.no_grad():  # a camera optimizer moves them
-        return [TrainingView(model.view_of(camera), mask) for camera, mask in datamanager.training_views()]
+        return [TrainingCamera(model.camera_of(camera), mask) for camera, mask in datamanager.training_views()]

@@ -9,7 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from sundae_ns.core.camera import View, world_to_camera, world_to_camera_floats
+from sundae_ns.core.camera import Camera, world_to_camera, world_to_camera_floats
 from sundae_ns.core.errors import DataError
 from sundae_ns.data.capture import read_json
 from sundae_ns.plugin.placing import STRAY, TYPES, stray_cameras
@@ -104,7 +104,7 @@ def check_projection(camera: Cameras) -> None:
 
 
 @torch.no_grad()
-def views_of_points(points: Tensor, cameras: Cameras) -> Tensor:
+def cameras_of_points(points: Tensor, cameras: Cameras) -> Tensor:
     """For cameras ``[M]``, whether each sees one of points ``[N, 3]`` or more, bool ``[M]``.
 
     2,000 of the points are looked for. Distortion is left out; images count with a margin of a tenth of their size on
@@ -126,7 +126,7 @@ def views_of_points(points: Tensor, cameras: Cameras) -> Tensor:
 
 def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
     """Warn of a cloud ``[N, 3]`` that most views do not show: it and the cameras are in different coordinates."""
-    seen = views_of_points(points, cameras)
+    seen = cameras_of_points(points, cameras)
     if seen.float().mean() < 0.5:
         warn(
             f"{int((~seen).sum())} of {len(seen)} views show no point of the sparse cloud, so cloud and cameras are "
@@ -156,7 +156,7 @@ def other_frame(run: Path, transform: Tensor, scale: float) -> str | None:
     )
 
 
-def view_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None = None, downscale: int = 1) -> View:
+def camera_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None = None, downscale: int = 1) -> Camera:
     """The rasteriser's form of a camera of shape ``(1,)``; ``camera`` does not change.
 
     Args:
@@ -178,4 +178,4 @@ def view_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None 
     else:
         viewmat = world_to_camera(pose.reshape(-1, 3, 4)[0]).to(device)
         intrinsics = torch.tensor(K, dtype=dtype).to(device).view(3, 3)
-    return View(viewmat, intrinsics, *size, (fx + fy) / 2 / downscale)
+    return Camera(viewmat, intrinsics, *size, (fx + fy) / 2 / downscale)

@@ -247,11 +247,11 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             mask = self.cached_train[index].get("mask") if masked else None
             yield self.train_dataset.cameras[index : index + 1], mask
 
-    def views(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, torch.Tensor]]]:
+    def cameras(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, torch.Tensor]]]:
         """Training views as camera and batch, as nerfstudio's evaluation takes them; loaded one at a time."""
-        return map(self._view, indices)
+        return map(self._camera, indices)
 
-    def _view(self, index: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
+    def _camera(self, index: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         batch = dict(self.cached_train[index])  # first: undistortion, which comes with it, changes the camera
         batch["image"] = batch["image"].to(self.device, non_blocking=True)  # pinned in host memory
         if index not in self._cameras:  # nerfstudio's slicing is slow
@@ -262,7 +262,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         """Camera (on the CPU) and batch of ``step``."""
-        return self._view(self.view_of_step(step + self.rank))
+        return self._camera(self.view_of_step(step + self.rank))
 
     def _fill_the_gpu(self, cameras: Cameras) -> bool:
         """Whether images, three bytes a pixel, leave less than half of a GPU's free memory for the training."""

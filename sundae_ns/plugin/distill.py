@@ -17,10 +17,10 @@ import torch
 from pytorch_msssim import SSIM
 from torch.nn import Parameter
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, CheckpointError, ConfigError, reading
 from sundae_ns.core.files import replacing
-from sundae_ns.core.gaussians import FEATURES, Field, mend
+from sundae_ns.core.gaussians import FEATURES, Gaussians, sanitise
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.accounting import stored_bytes
@@ -28,14 +28,14 @@ from sundae_ns.plugin.model import SundaeModelConfig
 from sundae_ns.scene.initialization import initial_features
 from sundae_ns.scene.optimise import optimise, rate_factor
 from sundae_ns.scene.prune_scene import prune_with_mask
-from sundae_ns.scene.render import LocalField
+from sundae_ns.scene.render import GaussianSource
 from sundae_ns.scene.scene import Scene, measure, render
-from sundae_ns.scene.virtual_cameras import VIEWS, by_device, of_unit_size, resized, size_of, split, virtual_views
+from sundae_ns.scene.virtual_cameras import VIEWS, by_device, of_unit_size, resized, size_of, split, virtual_cameras
 from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.train.choice import least_gain
 from sundae_ns.train.graphed_step import RecordedStep
 from sundae_ns.train.schedules import NETWORK_BETAS, fused_adam, network_groups, sparse_factor
-from sundae_ns.train.state import FieldState
+from sundae_ns.train.state import TrainingState
 from sundae_ns.train.step import StepInputs, StepLosses, TrainingStep
 
 _log = logging.getLogger(__name__)
@@ -69,7 +69,7 @@ class Distillation:
 
     Args:
         teacher: the full scene; its own head, if it has one, corrects its images.
-        keep, count, views, steps, seed, head, size: as in :func:`distill`.
+        keep, count, cameras, steps, seed, head, size: as in :func:`distill`.
         progress: whether the prune shows a progress bar.
 
     Raises:
@@ -83,7 +83,7 @@ class Distillation:
         *,
         keep: float | None = None,
         count: int | None = None,
-        views: Sequence[View] | None = None,
+        cameras: Sequence[Camera] | None = None,
         steps: int | None = None,
         seed: int = 0,
         head: bool = True,
@@ -95,18 +95,18 @@ class Distillation:
             raise ConfigError(f"steps is {steps}; give 1 or more")
         if keep is None and count is None:
             keep = 0.1
-        teacher = dataclasses.replace(teacher, field=mend(teacher.field).field)
+        teacher = dataclasses.replace(teacher, gaussians=sanitise(teacher.gaussians).gaussians)
         side = size or by_device(SIDES, teacher.device)
-        if views:
-            shown, held_out = split(views)
-            given = shown or views
+        if cameras:
+            shown, held_out = split(cameras)
+            given = shown or cameras
         else:
-            given = virtual_views(teacher, CAMERAS, seed=seed, size=side)
-            held_out = virtual_views(teacher, HELD_OUT, seed=seed + 1, size=side)
+            given = virtual_cameras(teacher, CAMERAS, seed=seed, size=side)
+            held_out = virtual_cameras(teacher, HELD_OUT, seed=seed + 1, size=side)
         self._size = size_of(teacher)
         self._teacher, seen = of_unit_size(teacher, [*given, *held_out])
-        self.cameras = [view.to(teacher.device) for view in seen[: len(given)]]
-        self.held_out = [view.to(teacher.device) for view in seen[len(given) :]][:HELD_OUT]
+        self.cameras = [camera.to(teacher.device) for camera in seen[: len(given)]]
+        self.held_out = [camera.to(teacher.device) for camera in seen[len(given) :]][:HELD_OUT]
         self.steps, self._seed = steps, seed
         """Number of steps to train."""
         seen = self.cameras[: by_device(VIEWS, teacher.device)]
@@ -117,7 +117,7 @@ class Distillation:
             on_cpu = teacher.device.type == "cpu"
             tiny = {"size": "tiny", "pixel_unshuffle": 1, "num_features": 5} if on_cpu else {}
             self._head_config = HeadConfig(mode="residual", **tiny)  # type: ignore[arg-type]
-        self.state = self._start(cut.scene.field)
+        self.state = self._start(cut.scene.gaussians)
         self.step = 0
         """Number of steps that were trained."""
         self.gain: float | None = None
@@ -127,8 +127,8 @@ class Distillation:
         self._settings = self._teacher.settings(head=False)
         self._recorded = RecordedStep(self._losses) if self._settings.backend.name == "gsplat" else None
 
-    def _start(self, field: Field) -> FieldState:
-        params = {name: value.detach().clone() for name, value in field.items() if name != FEATURES}
+    def _start(self, gaussians: Gaussians) -> TrainingState:
+        params = {name: value.detach().clone() for name, value in gaussians.items() if name != FEATURES}
         networks = torch.nn.ModuleDict()
         if self._head_config is not None:
             generator = torch.Generator().manual_seed(self._seed)
@@ -144,8 +144,8 @@ class Distillation:
         if self._head_config is not None:
             groups = network_groups(networks["head"].parameters(), 1e-3, weight_decay=0.15)
             optimizers["compensation"] = fused_adam(groups, eps=1e-8, betas=NETWORK_BETAS, decoupled_weight_decay=True)
-        state = FieldState(Field(trained, field.encoding), networks, optimizers, pruning={"num_prunes": 1})
-        focals = [view.focal for view in self.cameras]
+        state = TrainingState(Gaussians(trained, gaussians.encoding), networks, optimizers, pruning={"num_prunes": 1})
+        focals = [camera.focal for camera in self.cameras]
         state.trained_focal = (min(focals), max(focals))
         return state
 
@@ -170,7 +170,7 @@ class Distillation:
                 self._mean.count_in(weights_of(self.state))
             return after_step(2 * trial + done, total) or done == self.steps
 
-        with naming_full_memory(lambda: self.state.field.num_primitives):
+        with naming_full_memory(lambda: self.state.gaussians.num_gaussians):
             if trial and not self._try_head(trial, lambda done: after_step(done, total)):
                 return False
             if not self._optimise(self.steps, self.step, on_step):
@@ -180,7 +180,7 @@ class Distillation:
 
     def _optimise(self, steps: int, first: int, on_step: Callable[[int], bool]) -> bool:
         """Train; step ``i`` of ``steps`` is a function of both, so that a resumed training repeats it."""
-        sparse = sparse_factor(self.state.field.num_primitives)
+        sparse = sparse_factor(self.state.gaussians.num_gaussians)
 
         def factor(name: str, i: int) -> float:
             if name == "means":
@@ -205,8 +205,8 @@ class Distillation:
             quality.append(self.quality())
             state.restore(start)
         self.gain = quality[1] - quality[0]
-        plain = {name: value for name, value in state.field.items() if name != FEATURES}
-        ratio = stored_bytes(state.field, self._head_config) / stored_bytes(plain, None)
+        plain = {name: value for name, value in state.gaussians.items() if name != FEATURES}
+        ratio = stored_bytes(state.gaussians, self._head_config) / stored_bytes(plain, None)
         if not self.gain >= least_gain(math.log2(ratio)):
             self._remove_head()
         return True
@@ -217,11 +217,11 @@ class Distillation:
 
     def _train_step(self, i: int) -> None:
         state = self.state
-        view = self._camera(i)
+        camera = self._camera(i)
         # A teacher of nerfstudio's model may have been trained over random backgrounds; the student sees the shown one.
-        target = render(self._teacher, view).rgb
+        target = render(self._teacher, camera).rgb
         state.step = i + 1  # a head is enabled in the steps after its start
-        inputs = StepInputs(view, target, None, self._teacher.background)
+        inputs = StepInputs(camera, target, None, self._teacher.background)
         settings = state.render_settings(self._settings.backend, antialiased=self._teacher.antialiased, training=True)
         if self._recorded is not None:
             try:
@@ -230,32 +230,36 @@ class Distillation:
             except BackendError as error:
                 _log.warning("the distillation runs kernel by kernel, slower: %s", error)
                 self._recorded = None
-        loss, _, _ = TrainingStep(LocalField(state.field), state, self._losses, state.field)(inputs, settings)
+        loss, _, _ = TrainingStep(GaussianSource(state.gaussians), state, self._losses, state.gaussians)(
+            inputs, settings
+        )
         loss.backward()
         for optimizer in state.optimizers.values():
             optimizer.step()
             optimizer.zero_grad()
 
-    def _camera(self, i: int) -> View:
+    def _camera(self, i: int) -> Camera:
         """A camera near one of those to begin from."""
         generator = torch.Generator().manual_seed((self._seed + 1) * 1_000_003 + i)
-        view = self.cameras[int(torch.randint(len(self.cameras), (1,), generator=generator))]
-        shift = SHIFT * torch.randn(3, generator=generator) * float(view.viewmat[:3, 3].norm())
+        camera = self.cameras[int(torch.randint(len(self.cameras), (1,), generator=generator))]
+        shift = SHIFT * torch.randn(3, generator=generator) * float(camera.viewmat[:3, 3].norm())
         x, y, z = (TURN * torch.randn(3, generator=generator) / 3).tolist()
         turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
-        viewmat = view.viewmat.clone()
+        viewmat = camera.viewmat.clone()
         viewmat[:3] = turn.to(viewmat) @ viewmat[:3]
         viewmat[:3, 3] += shift.to(viewmat) / math.sqrt(3)
-        return view._replace(viewmat=viewmat)
+        return camera._replace(viewmat=viewmat)
 
     def scene(self) -> Scene:
         """The scene as it is now, at unit size if its source is no nerfstudio model."""
         state = self.state
         head = state.head if state.head_enabled else None
-        field = {name: value.detach() for name, value in state.field.items() if name != FEATURES or head is not None}
+        gaussians = {
+            name: value.detach() for name, value in state.gaussians.items() if name != FEATURES or head is not None
+        }
         return dataclasses.replace(
             self._teacher,
-            field=Field(field, state.field.encoding),
+            gaussians=Gaussians(gaussians, state.gaussians.encoding),
             head=head,
             trained_focal=None if head is None else state.trained_focal,
         )
@@ -276,7 +280,7 @@ class Distillation:
             "step": self.step,
             "gain": self.gain,
             "head": None if state.head is None else dict(state.head.state_dict()),
-            "field": {name: value.detach() for name, value in state.field.items()},
+            "field": {name: value.detach() for name, value in state.gaussians.items()},
             "optimizers": {name: optimizer.state_dict() for name, optimizer in state.optimizers.items()},
             "mean": self._mean.state_dict(),
         }
@@ -300,7 +304,7 @@ class Distillation:
                 self._remove_head()
             elif state.head is not None:
                 state.head.load_state_dict(saved["head"])
-            for name, value in state.field.items():
+            for name, value in state.gaussians.items():
                 if value.shape != saved["field"][name].shape:
                     raise ValueError("another scene")
                 value.data.copy_(saved["field"][name])
@@ -316,7 +320,7 @@ class Distillation:
 
     def _options(self) -> Mapping[str, Any]:
         """What a resumed training must share."""
-        counts = [self._teacher.num_primitives, self.state.field.num_primitives, len(self.cameras)]
+        counts = [self._teacher.num_gaussians, self.state.gaussians.num_gaussians, len(self.cameras)]
         return {"steps": self.steps, "seed": self._seed, "counts": counts}
 
 
@@ -325,7 +329,7 @@ def distill(
     *,
     keep: float | None = None,
     count: int | None = None,
-    views: Sequence[View] | None = None,
+    cameras: Sequence[Camera] | None = None,
     steps: int | None = None,
     seed: int = 0,
     head: bool = True,
@@ -335,9 +339,9 @@ def distill(
 
     Args:
         scene: of any program; it does not change.
-        keep: share of the finite primitives to keep, in (0, 1]; by default 0.1.
-        count: number of primitives to keep, in place of a share.
-        views: cameras that the steps begin from. Every eighth is held out. By default they are virtual ones.
+        keep: share of the finite Gaussians to keep, in (0, 1]; by default 0.1.
+        count: number of Gaussians to keep, in place of a share.
+        cameras: cameras that the steps begin from. Every eighth is held out. By default they are virtual ones.
         steps: number of training steps, by default 8,000 on a GPU, 3,000 on a CPU; the trials of the head come before
             them.
         seed: of all random draws.
@@ -354,9 +358,9 @@ def distill(
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
-    >>> sn.distill(scene, keep=0.5, views=sn.virtual_views(scene, 4, size=32), steps=4, head=False).num_primitives
+    >>> sn.distill(scene, keep=0.5, cameras=sn.virtual_cameras(scene, 4, size=32), steps=4, head=False).num_gaussians
     100
     """
-    made = Distillation(scene, keep=keep, count=count, views=views, steps=steps, seed=seed, head=head, size=size)
+    made = Distillation(scene, keep=keep, count=count, cameras=cameras, steps=steps, seed=seed, head=head, size=size)
     made.train(lambda *_: True)
     return made.result()

@@ -36,15 +36,15 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.distributed.nn.functional import all_to_all_single
 
-from sundae_ns.core.camera import View, camera_center
+from sundae_ns.core.camera import Camera, camera_center
 from sundae_ns.core.errors import NOTHING_SAVED, ConfigError, passed_on
-from sundae_ns.core.gaussians import FEATURES, Field
-from sundae_ns.core.surgery import change_parameter, per_primitive
+from sundae_ns.core.gaussians import FEATURES, Gaussians
+from sundae_ns.core.surgery import change_parameter, per_gaussian
 from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN
-from sundae_ns.scene.render import NEAR_PLANE, ColorSettings, LocalField, colors_from
+from sundae_ns.scene.render import NEAR_PLANE, ColorSettings, GaussianSource, colors_from
 from sundae_ns.train.densification import COUNTED, start_counting
-from sundae_ns.train.exposure import PhotoGains
-from sundae_ns.train.state import Extension, FieldState
+from sundae_ns.train.exposure import ExposureCompensation
+from sundae_ns.train.state import Callback, TrainingState
 
 HEAD = "compensation"
 """Name of the head's optimizer: every rank holds a copy of the head."""
@@ -61,7 +61,7 @@ def check_options(config: Any) -> None:
     """
     model = config.pipeline.model
     pruning = model.pruning
-    counted = pruning.max_primitives is not None or pruning.target_primitives is not None
+    counted = pruning.max_gaussians is not None or pruning.target_gaussians is not None
     refused = {
         "continuous pruning to a count or under a cap": pruning.mode == "continuous" and counted,
         "a camera optimizer": model.camera_optimizer.mode != "off",
@@ -143,11 +143,11 @@ def may_be_seen(means: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, siz
     return ((depths >= NEAR_PLANE) & ~outside).T
 
 
-class ShardedField(LocalField):
+class ShardedSource(GaussianSource):
     """The shard of this rank. A render, of a training step only, is collective."""
 
-    def __init__(self, field: Field) -> None:
-        super().__init__(field, whole=False)
+    def __init__(self, gaussians: Gaussians) -> None:
+        super().__init__(gaussians, whole=False)
         self.sizes: list[int] = []
         """Gaussians of each rank."""
         self._rows = torch.empty(0)
@@ -162,42 +162,42 @@ class ShardedField(LocalField):
         return sum(self.sizes)
 
     def primitives(
-        self, view: View, settings: ColorSettings, *, features: bool, colors: bool = True
+        self, camera: Camera, settings: ColorSettings, *, features: bool, colors: bool = True
     ) -> dict[str, Tensor]:
         """The Gaussians of all ranks that the camera of this rank may see; differentiable. Collective."""
-        field, names = self.field, ["means", "quats", "scales", "opacities", *([FEATURES] if features else [])]
-        centers, ranks = self._route(view)
+        gaussians, names = self.gaussians, ["means", "quats", "scales", "opacities", *([FEATURES] if features else [])]
+        centers, ranks = self._route(camera)
         # For all cameras at once: the backward pass fills one gradient for each parameter, not for each camera.
-        going = {name: field[name].index_select(0, self._rows) for name in [*names, "features_dc", "features_rest"]}
+        going = {name: gaussians[name].index_select(0, self._rows) for name in [*names, "features_dc", "features_rest"]}
         seen_from = centers.index_select(0, ranks)
-        rows = torch.cat([*(going[name] for name in names), colors_from(going, field, seen_from, settings)], dim=1)
+        rows = torch.cat([*(going[name] for name in names), colors_from(going, gaussians, seen_from, settings)], dim=1)
         arrived = rows.new_empty(sum(self._received), rows.shape[1])
         arrived = all_to_all_single(arrived, rows, self._received, self._sent)
         if arrived.requires_grad:  # the gradient of the mean loss of all images
             arrived.register_hook(lambda gradient: gradient / len(self._sent))
-        return dict(zip([*names, "colors"], arrived.split([*(field[name].shape[1] for name in names), 3], dim=1)))
+        return dict(zip([*names, "colors"], arrived.split([*(gaussians[name].shape[1] for name in names), 3], dim=1)))
 
     @torch.no_grad()
-    def _route(self, view: View) -> tuple[Tensor, Tensor]:
+    def _route(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Find the rows to send; centres of all cameras ``[R, 3]``, and the camera of each row ``[S]``."""
-        means, ranks = self.field["means"], dist.get_world_size()
-        size = means.new_tensor([view.width, view.height, len(means)])
-        own = torch.cat([view.viewmat.flatten(), view.K.flatten(), size])
+        means, ranks = self.gaussians["means"], dist.get_world_size()
+        size = means.new_tensor([camera.width, camera.height, len(means)])
+        own = torch.cat([camera.viewmat.flatten(), camera.K.flatten(), size])
         cameras = own.new_empty(ranks * len(own))
         dist.all_gather_into_tensor(cameras, own)
         viewmats, Ks, sizes = cameras.view(ranks, -1).split([16, 9, 3], dim=1)
         viewmats = viewmats.reshape(-1, 4, 4)
-        seen = may_be_seen(means, self.field["scales"], viewmats, Ks.reshape(-1, 3, 3), sizes[:, :2])
+        seen = may_be_seen(means, self.gaussians["scales"], viewmats, Ks.reshape(-1, 3, 3), sizes[:, :2])
         sent = seen.sum(dim=1)
         received = torch.empty_like(sent)
         dist.all_to_all_single(received, sent)
         numbers = torch.stack([sent, received, sizes[:, 2].long()])
         self._sent, self._received, self.sizes = numbers.tolist()  # waits for the GPU, once a step
-        camera, self._rows = torch.nonzero_static(seen, size=sum(self._sent)).unbind(dim=1)
-        return torch.stack([camera_center(viewmat) for viewmat in viewmats]), camera
+        receiver, self._rows = torch.nonzero_static(seen, size=sum(self._sent)).unbind(dim=1)
+        return torch.stack([camera_center(viewmat) for viewmat in viewmats]), receiver
 
     @torch.no_grad()
-    def count_views(self, state: FieldState, *, absgrad: bool) -> None:
+    def count_views(self, state: TrainingState, *, absgrad: bool) -> None:
         """Return the statistics of a batch to the owners of the Gaussians, for densification. Collective."""
         info, running = state.info, state.densification
         if not state.densifying or info.get(COUNTED):
@@ -208,7 +208,7 @@ class ShardedField(LocalField):
         shares = (radii if radii.ndim == 1 else radii.amax(dim=-1)).to(norms) / max(width, height)
         returned = norms.new_empty(sum(self._sent), 2)
         dist.all_to_all_single(returned, torch.stack([norms, shares], dim=1), self._sent, self._received)
-        start_counting(running, self.field["means"])
+        start_counting(running, self.gaussians["means"])
         norms, shares = returned.to(running["grad2d"]).unbind(dim=1)
         running["grad2d"].index_add_(0, self._rows, norms)
         running["count"].index_add_(0, self._rows, (shares > 0).to(norms))
@@ -280,11 +280,11 @@ class Ranks:
         """Keep the shard of this rank of the model that the first rank has built or loaded. Collective."""
         if self.count == 1:
             return
-        self._model, self._optimizers, self.sharded = model, optimizers, ShardedField(model.state.field)
+        self._model, self._optimizers, self.sharded = model, optimizers, ShardedSource(model.state.gaussians)
         datamanager.rank = self.rank
-        for extension in model.extensions:
-            if isinstance(extension, PhotoGains):
-                extension.total = _summed
+        for callback in model.train_callbacks:
+            if isinstance(callback, ExposureCompensation):
+                callback.total = _summed
         self._scatter()
 
     def agreed(self, number: int, batch: int) -> int:
@@ -300,18 +300,18 @@ class Ranks:
             return 0
         return int(_summed(torch.tensor(number, device=self._model.device), dist.ReduceOp.MAX))
 
-    def after_step(self, extension: Extension, run: Any) -> None:
+    def after_step(self, callback: Callback, run: Any) -> None:
         """Let an extension act after a step, on the first rank alone if it needs all Gaussians. Collective."""
-        if self._whole or not extension.needs_all(run):
-            extension.after_step(run)
+        if self._whole or not callback.needs_all(run):
+            callback.after_step(run)
             return
         with self.whole() as first:
             if first:
-                extension.after_step(run)
-        saved = self._announced(extension.state_dict())
+                callback.after_step(run)
+        saved = self._announced(callback.state_dict())
         if not first:
-            extension.load_state_dict(run.state, saved)
-            extension.after_step(run)  # it is done; the rest, such as learning rates, follows on all ranks
+            callback.load_state_dict(run.state, saved)
+            callback.after_step(run)  # it is done; the rest, such as learning rates, follows on all ranks
 
     @contextlib.contextmanager
     def whole(self) -> Iterator[bool]:
@@ -330,9 +330,9 @@ class Ranks:
         self._scatter()
 
     def _gather(self) -> None:
-        state: FieldState = self._model.state
+        state: TrainingState = self._model.state
         notes: list[Any] = [None] * self.count
-        own = (state.field.num_primitives, state.densification.get("peak", 0), state.trained_focal)
+        own = (state.gaussians.num_gaussians, state.densification.get("peak", 0), state.trained_focal)
         dist.all_gather_object(notes, own)
         self.sharded.sizes, peaks, spans = map(list, zip(*notes))
         state.pruning["peak"] = max(state.pruning["peak"], sum(peaks))
@@ -348,12 +348,12 @@ class Ranks:
             return rows
 
         self._change_rows(gathered)
-        self._model.source = LocalField(state.field)
+        self._model.source = GaussianSource(state.gaussians)
 
     def _scatter(self) -> None:
         """Give each rank its rows of the first rank's field, and that rank's head and notes."""
-        state: FieldState = self._model.state
-        total, pruning = self._announced((state.field.num_primitives, dict(state.pruning)))
+        state: TrainingState = self._model.state
+        total, pruning = self._announced((state.gaussians.num_gaussians, dict(state.pruning)))
         state.pruning.update(pruning)
         bounds = [total * rank // self.count for rank in range(self.count + 1)]
         self.sharded.sizes = [end - start for start, end in pairwise(bounds)]
@@ -372,12 +372,12 @@ class Ranks:
 
     def _change_rows(self, change: Callable[[Tensor], Tensor]) -> None:
         """Replace the tensors with a row a Gaussian (parameters, moments, statistics), in an order that ranks share."""
-        state: FieldState = self._model.state
-        n, running = state.field.num_primitives, state.densification
-        for name in list(state.field):
-            change_parameter(state.field.data, state.optimizers, name, change)
-            self._optimizers.parameters[name] = [state.field[name]]
-        running.update({key: change(value) for key, value in running.items() if per_primitive(value, n)})
+        state: TrainingState = self._model.state
+        n, running = state.gaussians.num_gaussians, state.densification
+        for name in list(state.gaussians):
+            change_parameter(state.gaussians.data, state.optimizers, name, change)
+            self._optimizers.parameters[name] = [state.gaussians[name]]
+        running.update({key: change(value) for key, value in running.items() if per_gaussian(value, n)})
 
     def _announced(self, value: Any) -> Any:
         """A plain value of the first rank, on every rank."""

@@ -87,19 +87,19 @@ def finetune(
         raise CheckpointError(
             f"{run} was saved during densification; train it to its end, or pack it without a fine-tune"
         )
-    place(model, scene.field)
+    place(model, scene.gaussians)
     # Rounded quaternions have length 1, and gradients refer to them.
     model.gauss_params["quats"].data = torch.nn.functional.normalize(model.gauss_params["quats"].data)
     for name, value in model.gauss_params.items():
-        value.requires_grad_(name in codecs.field)
+        value.requires_grad_(name in codecs.gaussians)
     codecs = codecs.to(model.device)
     pipeline.train()
     weights = dict(model.head.named_parameters()) if model.head is not None and scene.head else {}
-    field = Through.of({name: model.gauss_params[name] for name in codecs.field}, codecs.rounded)
+    gaussians = Through.of({name: model.gauss_params[name] for name in codecs.gaussians}, codecs.rounded)
     head = Through.of(weights, codecs.rounded_head)
-    numbers = sum(value.numel() for value in (*field.exact.values(), *head.exact.values()))
-    optimizer = _optimizer(field.exact, head.exact)
-    tuned = TunedStep(model, codecs, (field, head), optimizer, rate / numbers)
+    numbers = sum(value.numel() for value in (*gaussians.exact.values(), *head.exact.values()))
+    optimizer = _optimizer(gaussians.exact, head.exact)
+    tuned = TunedStep(model, codecs, (gaussians, head), optimizer, rate / numbers)
 
     def step(i: int) -> None:
         at = opened.steps + i
@@ -117,20 +117,20 @@ def finetune(
     source = {**scene.meta.get("source", {}), "finetuned": steps}
     trained = replace(
         scene,
-        field={name: field.exact.get(name, value).detach().cpu() for name, value in scene.field.items()},
+        gaussians={name: gaussians.exact.get(name, value).detach().cpu() for name, value in scene.gaussians.items()},
         head={name: value.detach().cpu() for name, value in head.exact.items()},
         meta={**scene.meta, "source": source},
     )
     return trained, codecs.to(torch.device("cpu"))
 
 
-def _optimizer(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Optimizer:
+def _optimizer(gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Optimizer:
     groups: list[dict[str, Any]] = [
-        {"params": [value], "lr": RATES[name], "eps": 1e-15} for name, value in field.items()
+        {"params": [value], "lr": RATES[name], "eps": 1e-15} for name, value in gaussians.items()
     ]
     if head:
         groups.append({"params": list(head.values()), "lr": RATES["head"], "eps": 1e-8, "betas": NETWORK_BETAS})
-    on_cuda = next(iter(field.values())).is_cuda
+    on_cuda = next(iter(gaussians.values())).is_cuda
     if on_cuda:
         for group in groups:
             group["lr"] = torch.tensor(group["lr"], device=group["params"][0].device)
@@ -188,7 +188,7 @@ class TunedStep:
     def __call__(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train on one image; ``torch.cuda.OutOfMemoryError`` if the GPU's memory is full."""
         if self._can_record:
-            kind = (inputs.view.width, inputs.view.height, inputs.mask is not None)
+            kind = (inputs.camera.width, inputs.camera.height, inputs.mask is not None)
             try:
                 return self._recordings.run(self._run, inputs, settings, kind=kind)
             except BackendError as error:
@@ -208,12 +208,12 @@ class TunedStep:
         return result
 
     def _set_gradients(self, loss: Tensor) -> None:
-        field, head = self._parts
+        gaussians, head = self._parts
         at_rounded = _gradients(loss, [part.shown for part in self._parts])
         of_rate: list[dict[str, Tensor | None]] = [{}, {}]
         if self._rate > 0:
             with torch.enable_grad():
-                bits = estimated_bits(self._codecs, field.exact, head.exact)
+                bits = estimated_bits(self._codecs, gaussians.exact, head.exact)
                 total = self._rate * torch.stack(list(bits.values())).sum()
             of_rate = _gradients(total, [part.exact for part in self._parts])
         for part, gradients, others in zip(self._parts, at_rounded, of_rate, strict=True):

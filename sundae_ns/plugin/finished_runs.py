@@ -29,7 +29,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, PackError
 from sundae_ns.head.head import HeadConfig
 from sundae_ns.io import checkpoint
@@ -78,7 +78,7 @@ class Opened:
     steps: int
     """Number of training steps."""
     kept: float | None = None
-    """Share of the primitives that the prunes kept: the product over all prunes."""
+    """Share of the Gaussians that the prunes kept: the product over all prunes."""
     seed: int | None = None
     prune_s: float | None = None
     """Seconds of its prunes."""
@@ -220,7 +220,7 @@ def _shared(config: Any, kind: type[Any]) -> dict[str, Any]:
 
 
 def _kept(prunes: list[dict[str, Any]]) -> float | None:
-    """Share of the primitives that these prunes kept; None without a whole record."""
+    """Share of the Gaussians that these prunes kept; None without a whole record."""
     try:
         return math.prod(prune["after"] / prune["before"] for prune in prunes) if prunes else None
     except (KeyError, TypeError, ZeroDivisionError):
@@ -237,7 +237,7 @@ def _seconds(prunes: list[dict[str, Any]]) -> float | None:
 
 def model_of(scene: Scene) -> SundaeModel:
     """The model of a scene in evaluation mode, on the CPU, with all SH degrees and the head enabled."""
-    degree = 0 if scene.field.encoding == "logits" else max(scene.field.sh_degree, 1)
+    degree = 0 if scene.gaussians.encoding == "logits" else max(scene.gaussians.sh_degree, 1)
     head = HeadConfig(mode="off") if scene.head is None else dataclasses.replace(scene.head.config, start_at=0)
     config = SundaeModelConfig(
         sh_degree=degree,
@@ -258,18 +258,18 @@ def model_of(scene: Scene) -> SundaeModel:
 
 def put_scene(model: SundaeModel, scene: Scene) -> None:
     """Put a scene in place of a model's field and head; the model has its SH degree or more, and a head of its kind."""
-    place(model, scene.field)
+    place(model, scene.gaussians)
     if model.head is not None and scene.head is not None:
         model.head.load_state_dict(scene.head.state_dict())
     model.state.trained_focal = scene.trained_focal
 
 
-def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
+def place(model: SundaeModel, gaussians: Mapping[str, Tensor]) -> None:
     """Load a field into a model in place; parameters and coefficients that the field lacks become 0."""
     for name, value in model.gauss_params.items():
-        new = value.data.new_zeros(len(field["means"]), *value.shape[1:])
-        if name in field:
-            new[:, : field[name].shape[1]] = field[name].detach().to(new)
+        new = value.data.new_zeros(len(gaussians["means"]), *value.shape[1:])
+        if name in gaussians:
+            new[:, : gaussians[name].shape[1]] = gaussians[name].detach().to(new)
         value.data = new
 
 
@@ -293,20 +293,20 @@ def load_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> 
     manager.data = data or manager.data or config.data
     source = {"method": config.method_name, **scene.meta["source"]}
     meta = {**scene.meta, "source": source, "capture": describe_capture(manager)}
-    views, up = _training_views(manager, max_cameras) if max_cameras > 0 else (), scene.up
-    if up is None and views:
+    cameras, up = _training_views(manager, max_cameras) if max_cameras > 0 else (), scene.up
+    if up is None and cameras:
         with suppress(ConfigError):  # cameras that look all around have none
-            up = unit(torch.stack([view.pose[:, 1] for view in views]).double().mean(dim=0).tolist())
-    return dataclasses.replace(scene, views=views, up=up, meta=meta)
+            up = unit(torch.stack([camera.pose[:, 1] for camera in cameras]).double().mean(dim=0).tolist())
+    return dataclasses.replace(scene, cameras=cameras, up=up, meta=meta)
 
 
-def _training_views(manager: SundaeDatamanagerConfig, most: int) -> tuple[View, ...]:
+def _training_views(manager: SundaeDatamanagerConfig, most: int) -> tuple[Camera, ...]:
     cameras: Cameras = manager.setup(device="cpu", test_mode="test").train_dataset.cameras
     chosen = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long()
     intrinsics = torch.cat([cameras.fx, cameras.fy, cameras.cx, cameras.cy], dim=-1)[chosen].tolist()
     sizes = torch.cat([cameras.width, cameras.height], dim=-1)[chosen].tolist()
     rows = zip(cameras.camera_to_worlds[chosen], intrinsics, sizes, strict=True)
-    return tuple(View.from_pose(pose, lens, *size) for pose, lens, size in rows)
+    return tuple(Camera.from_pose(pose, lens, *size) for pose, lens, size in rows)
 
 
 def describe_capture(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
@@ -332,7 +332,9 @@ def describe_capture(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
 def _parser_options(kind: type[DataParserConfig]) -> dict[str, Any]:
     """Options of a parser that a finished run needs, with their defaults."""
     left_out = {"_target", "data", "masks_path", "depths_path", "mask_color", "load_3D_points", "ply_path"}
-    return {field.name: getattr(kind(), field.name) for field in fields(kind) if field.name not in left_out}
+    return {
+        gaussians.name: getattr(kind(), gaussians.name) for gaussians in fields(kind) if gaussians.name not in left_out
+    }
 
 
 def datamanager_of(scene: Scene, data: Path) -> SundaeDatamanagerConfig:

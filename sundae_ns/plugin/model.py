@@ -20,25 +20,25 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-from sundae_ns.core.camera import View, Window, crop_image
+from sundae_ns.core.camera import Camera, Crop, crop_image
 from sundae_ns.core.metrics import Lpips, psnr, quality_of
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io import checkpoint
 from sundae_ns.plugin.callbacks import NerfstudioRun, training_views
-from sundae_ns.plugin.camera_models import check_projection, view_of
+from sundae_ns.plugin.camera_models import camera_of, check_projection
 from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanager, view_index
 from sundae_ns.plugin.viewer import ViewerControls, in_viewer
 from sundae_ns.rasterize.interface import select_backend
 from sundae_ns.rasterize.types import Backend
 from sundae_ns.scene.frames import FrameReplay, Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs
-from sundae_ns.scene.render import SHOWN_BACKGROUNDS, LocalField, RenderSettings, StepResolution, contribution
+from sundae_ns.scene.render import SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, StepResolution, contribution
 from sundae_ns.train.build import build
 from sundae_ns.train.curve import CurvePoint
-from sundae_ns.train.exposure import PhotoGains
+from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.initialize import Start
 from sundae_ns.train.pruning import PruningConfig
-from sundae_ns.train.state import Extension, FieldState
+from sundae_ns.train.state import Callback, TrainingState
 from sundae_ns.train.step import StepInputs, StepLosses, TrainingStep, training_part
 from sundae_ns.train.trials import Trials
 
@@ -49,7 +49,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
 
     _target: type = field(default_factory=lambda: SundaeModel)
     pruning: PruningConfig = field(default_factory=PruningConfig)
-    """When to prune, how many primitives to keep, and which."""
+    """When to prune, how many Gaussians to keep, and which."""
     head: HeadConfig = field(default_factory=HeadConfig)
     """The compensation head."""
     rasterizer: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
@@ -62,7 +62,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Weight of opacities and scales in the loss of the pruned field, over the number of training images."""
     average_share: float = 0.1
     """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
-    photo_gains: Literal["auto", "on", "off"] = "auto"
+    exposure_compensation: Literal["auto", "on", "off"] = "auto"
     """Even out photos of changing exposure or white balance with their neighbours; auto does if half of them differ."""
     dense_start_views: int = 300
     """With at most this many training images, a plane sweep fills a sparse cloud to start from; 0 turns it off."""
@@ -93,21 +93,21 @@ class SundaeModel(SplatfactoModel):
     """
 
     config: SundaeModelConfig
-    state: FieldState
+    state: TrainingState
     """Field, head, optimizers, running states, and the clock."""
-    source: LocalField
-    """Where views get their primitives from."""
-    extensions: list[Extension]
+    source: GaussianSource
+    """Where views get their Gaussians from."""
+    train_callbacks: list[Callback]
     """Parts of training beside the step, in the order in which they act."""
 
     def populate_modules(self) -> None:
         """Build field, head and extensions. The device of the model is not known yet."""
         config = self.config
         frame = (self.kwargs.get("metadata") or {}).get(DATASET_FRAME)
-        self.state, self.extensions, self._start = build(config, self.num_train_data, self.seed_points, frame)
-        self.gauss_params, self.networks = cast(Any, self.state.field.data), self.state.networks
-        self.source = LocalField(self.state.field)
-        self.photo_gains = next(one for one in self.extensions if isinstance(one, PhotoGains))
+        self.state, self.train_callbacks, self._start = build(config, self.num_train_data, self.seed_points, frame)
+        self.gauss_params, self.networks = cast(Any, self.state.gaussians.data), self.state.networks
+        self.source = GaussianSource(self.state.gaussians)
+        self.exposure_compensation = next(one for one in self.train_callbacks if isinstance(one, ExposureCompensation))
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self.losses = StepLosses(config, self.ssim, self.num_train_data)
@@ -118,7 +118,7 @@ class SundaeModel(SplatfactoModel):
         self.compensated = True
         """Whether images outside of a viewer get the head's correction."""
         self._response, self._replay = ShownResponse(), FrameReplay()
-        self._views: dict[tuple[int | None, int], View] = {}
+        self._cameras: dict[tuple[int | None, int], Camera] = {}
         """Views of training cameras that do not move, by index and divisor of their sides."""
 
     # ---------------------------------------------------------------------------------------------------- the field
@@ -169,9 +169,9 @@ class SundaeModel(SplatfactoModel):
         return checkpoint.extra_state(
             step=state.step,
             num_features=self.config.num_features,
-            encoding=state.field.encoding,
+            encoding=state.gaussians.encoding,
             running=state.running_states(),
-            extensions={extension.name: extension.state_dict() for extension in self.extensions},
+            train_callbacks={callback.name: callback.state_dict() for callback in self.train_callbacks},
             trained_focal=state.trained_focal,
             head_enabled=state.head_enabled,
         )
@@ -182,20 +182,20 @@ class SundaeModel(SplatfactoModel):
         focal = state["trained_focal"]
         self.state.trained_focal = None if focal is None else (float(focal[0]), float(focal[1]))
         self.state.load_running_states(state["running"])
-        for extension in self.extensions:
-            extension.load_state_dict(self.state, state["extensions"].get(extension.name, {}))
+        for callback in self.train_callbacks:
+            callback.load_state_dict(self.state, state["extensions"].get(callback.name, {}))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
-        """Load a SUNDAE checkpoint with any number of primitives.
+        """Load a SUNDAE checkpoint with any number of Gaussians.
 
         Parameters are resized in place, because optimizers may hold them already.
 
         Raises:
             CheckpointError: a checkpoint of another method or format, or of another feature width or head.
         """
-        extra = checkpoint.check_extra_state(state_dict, self.config.num_features, self.state.field.encoding)
-        for extension in self.extensions:
-            extension.prepare_loading(self.state, extra["extensions"].get(extension.name, {}))
+        extra = checkpoint.check_extra_state(state_dict, self.config.num_features, self.state.gaussians.encoding)
+        for callback in self.train_callbacks:
+            callback.prepare_loading(self.state, extra["extensions"].get(callback.name, {}))
         checkpoint.check_model_state(state_dict, self.state_dict())
         n = state_dict["gauss_params.means"].shape[0]
         for value in self.gauss_params.values():
@@ -206,11 +206,11 @@ class SundaeModel(SplatfactoModel):
 
     # ---------------------------------------------------------------------------------------------------- rendering
 
-    def view_of(self, camera: Cameras, downscale: int = 1) -> View:
+    def camera_of(self, camera: Cameras, downscale: int = 1) -> Camera:
         """The rasteriser's form of a camera of shape ``(1,)``, moved by the camera optimizer while it trains."""
         optimizer = self.camera_optimizer
         pose = optimizer.apply_to_camera(camera) if self.training and optimizer.config.mode != "off" else None
-        return view_of(camera, self.device, pose=pose, downscale=downscale)
+        return camera_of(camera, self.device, pose=pose, downscale=downscale)
 
     def render_settings(self, *, training: bool) -> RenderSettings:
         """Settings of images at this step."""
@@ -223,7 +223,7 @@ class SundaeModel(SplatfactoModel):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]
-        """Render a camera, or the primitives in a box; unlike splatfacto's, this leaves the camera on its device."""
+        """Render a camera, or the Gaussians in a box; unlike splatfacto's, this leaves the camera on its device."""
         if not in_viewer():  # an error would end the viewer
             check_projection(camera)
         self.set_crop(obb_box)
@@ -236,70 +236,70 @@ class SundaeModel(SplatfactoModel):
             camera: of shape ``(1,)``.
 
         Returns:
-            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``window``, the
+            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``crop``, the
             part that the images show, or None. See ``rendering.frames.late_outputs`` for those outside of training.
         """
         with naming_full_memory(lambda: self.num_points):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
 
-    def _training_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
-        background, (view, window) = self._get_background_color(), self._training_view(camera)
+    def _training_outputs(self, ns_camera: Cameras) -> MutableMapping[str, Any]:
+        background, (camera, crop) = self._get_background_color(), self._training_camera(ns_camera)
         settings, depth = self.render_settings(training=True), self.config.output_depth_during_training
-        images, splatted = self.training_step.images(view, background, settings, depth=depth)
+        images, splatted = self.training_step.images(camera, background, settings, depth=depth)
         self.state.info = splatted.info
-        for extension in self.extensions:
-            extension.before_backward(self.state)
+        for callback in self.train_callbacks:
+            callback.before_backward(self.state)
         del images["feature_image"]
-        return {**images, "background": background, "window": window}
+        return {**images, "background": background, "window": crop}
 
-    def _shown_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
-        background, view = self._get_background_color(), self.view_of(camera)
+    def _shown_outputs(self, ns_camera: Cameras) -> MutableMapping[str, Any]:
+        background, camera = self._get_background_color(), self.camera_of(ns_camera)
         crop = None if self.crop_box is None else self.crop_box.within(self.means).squeeze(-1)
         visible = self.viewer_controls.visible(self.source, crop, compensate=self.compensated)
         if visible is None:
-            return empty_outputs(view.width, view.height, background)
+            return empty_outputs(camera.width, camera.height, background)
         settings = self.render_settings(training=False)
         splattable = settings.head is not None
         if not visible.compensate:
             settings = settings.without_head()
-        images = self._replay.render(visible.source, view, background, settings)
-        whole = self.state.field.replaced({})
-        drawn = whole if visible.mask is None else visible.source.field
-        values = partial(self._response.values, whole, self.viewer_controls.field_key, self.config.pruning)
-        late = late_outputs(images, drawn, whole, visible.mask, view, settings, values, splattable=splattable)
-        late["background"] = background.expand(view.height, view.width, 3)
+        images = self._replay.render(visible.source, camera, background, settings)
+        whole = self.state.gaussians.replaced({})
+        drawn = whole if visible.mask is None else visible.source.gaussians
+        values = partial(self._response.values, whole, self.viewer_controls.gaussians_key, self.config.pruning)
+        late = late_outputs(images, drawn, whole, visible.mask, camera, settings, values, splattable=splattable)
+        late["background"] = background.expand(camera.height, camera.width, 3)
         return late
 
     def contribution(self, datamanager: SundaeDatamanager, count: int | None = None) -> Tensor:
-        """Summed blending weight of each primitive ``[N]``; see :func:`sundae_ns.scene.render.contribution`."""
-        views, settings = training_views(self, datamanager), self.render_settings(training=False)
-        return contribution(self.source, views, self.background_color, settings, count, console=CONSOLE)
+        """Summed blending weight of each Gaussian ``[N]``; see :func:`sundae_ns.scene.render.contribution`."""
+        cameras, settings = training_views(self, datamanager), self.render_settings(training=False)
+        return contribution(self.source, cameras, self.background_color, settings, count, console=CONSOLE)
 
     def count_curve(self) -> list[CurvePoint]:
-        """The curve by which trials have chosen the number of primitives; empty without them."""
-        return [point for one in self.extensions if isinstance(one, Trials) for point in one.progress.curve()]
+        """The curve by which trials have chosen the number of Gaussians; empty without them."""
+        return [point for one in self.train_callbacks if isinstance(one, Trials) for point in one.progress.curve()]
 
     # ----------------------------------------------------------------------------------------------------- training
 
     @property
     def training_step(self) -> TrainingStep:
         """The training step, which nerfstudio's loop runs in two halves."""
-        return TrainingStep(self.source, self.state, self.losses, self.state.field)
+        return TrainingStep(self.source, self.state, self.losses, self.state.gaussians)
 
-    def _training_view(self, camera: Cameras) -> tuple[View, Window | None]:
+    def _training_camera(self, ns_camera: Cameras) -> tuple[Camera, Crop | None]:
         """The part of a training camera that a step shows. Views are kept: copying one to a GPU waits for it."""
         at = self.resolution(self.step)
-        key = view_index(camera), at.downscale
-        view = self._views.get(key) or self.view_of(camera, at.downscale)
+        key = view_index(ns_camera), at.downscale
+        camera = self._cameras.get(key) or self.camera_of(ns_camera, at.downscale)
         if key[0] is not None and self.camera_optimizer.config.mode == "off":
-            self._views[key] = view
-        return training_part(self.state, view, at)
+            self._cameras[key] = camera
+        return training_part(self.state, camera, at)
 
-    def step_inputs(self, camera: Cameras, batch: dict[str, Any]) -> StepInputs:
+    def step_inputs(self, ns_camera: Cameras, batch: dict[str, Any]) -> StepInputs:
         """What a step outside of nerfstudio's loop trains on, from a camera of shape ``(1,)`` and its batch."""
-        background, (view, window) = self._get_background_color(), self._training_view(camera)
-        target = self.target(batch, {"background": background, "window": window})
-        return StepInputs(view, target, self.mask(batch, window), background, window)
+        background, (camera, crop) = self._get_background_color(), self._training_camera(ns_camera)
+        target = self.target(batch, {"background": background, "window": crop})
+        return StepInputs(camera, target, self.mask(batch, crop), background, crop)
 
     def _get_downscale_factor(self) -> int:
         return self.resolution(self.step).downscale if self.training else 1
@@ -321,7 +321,7 @@ class SundaeModel(SplatfactoModel):
         """Callbacks that call the extensions."""
         self._start.announce()
         CONSOLE.log(f"rasteriser: {self.backend.name} on {self.device}")  # or an error, before the first step
-        self.viewer_controls.training_field = True
+        self.viewer_controls.training_gaussians = True
         run = NerfstudioRun(self, training_callback_attributes)
         run.start()
         return run.callbacks()
@@ -343,15 +343,15 @@ class SundaeModel(SplatfactoModel):
     def target(self, batch: dict[str, Any], outputs: Mapping[str, Any]) -> Tensor:
         """What outputs are compared with: the truth, in training divided by the gain of its photo ``[H, W, 3]``."""
         truth = self.truth(batch, outputs)
-        return self.photo_gains.balanced(truth, batch) if self.training else truth
+        return self.exposure_compensation.balanced(truth, batch) if self.training else truth
 
-    def mask(self, batch: dict[str, Any], window: Window | None) -> Tensor | None:
+    def mask(self, batch: dict[str, Any], crop: Crop | None) -> Tensor | None:
         """Pixels of a batch that count, at the resolution of this step ``[H, W, 1]``; None for all."""
         mask = None if "mask" not in batch else self._downscale_if_required(batch["mask"]).to(self.device)
-        return None if mask is None else crop_image(mask, window).float()
+        return None if mask is None else crop_image(mask, crop).float()
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> LazyOutputs:  # type: ignore[override]
-        """PSNR with and without the head, and the number of primitives; computed on access, which few steps need."""
+        """PSNR with and without the head, and the number of Gaussians; computed on access, which few steps need."""
         # They may be read during the next step. Bind the resolution now, and do not keep the autograd graph alive.
         rgb, base, downscale = outputs["rgb"].detach(), outputs["base_rgb"].detach(), self._get_downscale_factor()
         target = partial(self.truth, batch, {name: outputs.get(name) for name in ("window", "background")}, downscale)
@@ -369,7 +369,7 @@ class SundaeModel(SplatfactoModel):
         losses = self.training_step.terms(outputs, target, mask)
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
-            self.photo_gains.observe(outputs["rgb"], target, mask, batch)
+            self.exposure_compensation.observe(outputs["rgb"], target, mask, batch)
         return losses
 
     def get_image_metrics_and_images(

@@ -120,6 +120,6 @@ class ProgressWriter(LocalWriter):
             pace = "" if left is None else f"{duration(left)} left at {speed:.0f} ms a step  "
             print(
                 f"{done} ({100 * done / max(total, 1):.2f}%)  {pace}PSNR {float(self._metrics['psnr']):.2f} dB  "
-                f"{self._metrics['gaussian_count']:,} primitives",
+                f"{self._metrics['gaussian_count']:,} Gaussians",
                 flush=True,
             )

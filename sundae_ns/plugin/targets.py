@@ -31,17 +31,17 @@ class Judge:
 
     def __init__(self, run: Path, data: Path | None) -> None:
         opened = load_model(run, data)
-        self._model, self.all_views = opened.model, len(opened.cameras)
-        chosen = torch.linspace(0, self.all_views - 1, min(8, self.all_views)).round().long().unique().tolist()
-        self.views = len(chosen)
-        """Number of test views that are measured, of :attr:`all_views`."""
+        self._model, self.all_cameras = opened.model, len(opened.cameras)
+        chosen = torch.linspace(0, self.all_cameras - 1, min(8, self.all_cameras)).round().long().unique().tolist()
+        self.cameras = len(chosen)
+        """Number of test views that are measured, of :attr:`all_cameras`."""
         self._cameras, self._truths = ([each[i] for i in chosen] for each in (opened.cameras, opened.truths))
         self.before = self._quality()
         """Of the run itself."""
 
     def quality(self, scene: PackedScene, codecs: Codecs) -> Quality:
         """Quality of a pack."""
-        place(self._model, codecs.rounded(scene.field))
+        place(self._model, codecs.rounded(scene.gaussians))
         if self._model.head is not None and scene.head:
             self._model.head.load_state_dict(codecs.rounded_head(scene.head))
         return self._quality()
@@ -98,7 +98,7 @@ class Search:
             scene, codecs = self.scene, self._fit
             if power:
                 config = scaled(codecs.config, power, with_positions=False)
-                codecs = codecs.with_steps(config, scene.field, scene.head)
+                codecs = codecs.with_steps(config, scene.gaussians, scene.head)
         return Try(scene, codecs, len(pack_bytes(scene, codecs)[0]))
 
     def drop(self, tried: Try) -> float:

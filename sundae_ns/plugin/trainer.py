@@ -201,7 +201,7 @@ class SundaeTrainer(Trainer):
             self._step_schedulers()
         else:
             self._batch_ends = step + self.ranks.count
-            if all(extension.trains(model.state) for extension in model.extensions):
+            if all(callback.trains(model.state) for callback in model.train_callbacks):
                 self._result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
                 if self.ranks.count > 1:
                     self.ranks.sharded.count_views(model.state, absgrad=model.config.use_absgrad)
@@ -257,12 +257,12 @@ class SundaeTrainer(Trainer):
             self._recorded = None
             torch.cuda.empty_cache()
             return None
-        model.photo_gains.observe(result.images["rgb"], inputs.target, inputs.mask, batch)
+        model.exposure_compensation.observe(result.images["rgb"], inputs.target, inputs.mask, batch)
         self._step_schedulers()
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
             for name, scheduler in self.optimizers.schedulers.items():
                 writer.put_scalar(f"learning_rate/{name}", scheduler.get_last_lr()[0], step)
-        outputs = {**result.images, "background": inputs.background, "window": inputs.window}
+        outputs = {**result.images, "background": inputs.background, "window": inputs.crop}
         return result.loss, result.losses, model.get_metrics_dict(outputs, batch)
 
     def _step_schedulers(self) -> None:

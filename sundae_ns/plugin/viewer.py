@@ -2,7 +2,7 @@
 
 The preview never touches the field, nor the images of training and evaluation. It shows what the prune itself leaves,
 by the same decision; under a rule that merges, with the merged values. The head is disabled in a preview, because it
-was trained on all primitives of the field.
+was trained on all Gaussians of the field.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from nerfstudio.viewer.viewer_elements import (
 from torch import Tensor
 
 from sundae_ns.core.errors import ConfigError, SundaeError, one_line
-from sundae_ns.core.gaussians import mend
+from sundae_ns.core.gaussians import sanitise
 from sundae_ns.graph.graph import NeighborGraph
-from sundae_ns.pruning.decision import Pruned, prune_field
-from sundae_ns.pruning.merge import field_graph
+from sundae_ns.pruning.decision import Pruned, prune_gaussians
+from sundae_ns.pruning.merge import gaussian_graph
 from sundae_ns.pruning.rule import PruneRule, band_rule, kept_count
-from sundae_ns.scene.frames import FieldKey
-from sundae_ns.scene.render import LocalField
+from sundae_ns.scene.frames import GaussiansKey
+from sundae_ns.scene.render import GaussianSource
 from sundae_ns.train.curve import CurvePoint, expected_change
-from sundae_ns.train.state import FieldState
+from sundae_ns.train.state import TrainingState
 
 RuleName = Literal["as configured", "band: high", "band: low", "band: both"]
 
 ContributionOf = Callable[[Any, int | None], Tensor]
-"""Contribution of the primitives ``[N]``, given nerfstudio's datamanager and the number that a prune will keep."""
+"""Contribution of the Gaussians ``[N]``, given nerfstudio's datamanager and the number that a prune will keep."""
 
 
 def in_viewer() -> bool:
@@ -78,24 +78,24 @@ def previewed_rule(configured: PruneRule, name: RuleName) -> PruneRule:
 class Visible(NamedTuple):
     """What an image shows."""
 
-    source: LocalField
+    source: GaussianSource
     mask: Tensor | None
-    """Primitives of the field in it, bool ``[N]``; None for all."""
+    """Gaussians of the field in it, bool ``[N]``; None for all."""
     compensate: bool
     """Whether the head may correct the image."""
 
 
-class _FieldVersion:
+class _GaussiansVersion:
     """Identifies a field without keeping it alive: exactly, or to within a hundred steps while it is trained."""
 
-    def __init__(self, state: FieldState, training: bool) -> None:
-        values = list(state.field.values())
+    def __init__(self, state: TrainingState, training: bool) -> None:
+        values = list(state.gaussians.values())
         self._parameters = [weakref.ref(value) for value in values]  # surgery makes new parameters
         # Each change in place raises a tensor's version, in training at every step; there, count steps instead.
         steps = [state.step // 100] if training else [value._version for value in values]
-        self._version = [state.field.num_primitives, *steps]
+        self._version = [state.gaussians.num_gaussians, *steps]
 
-    def matches(self, other: _FieldVersion) -> bool:
+    def matches(self, other: _GaussiansVersion) -> bool:
         """Whether both are of one field, which is still alive."""
         pairs = zip(self._parameters, other._parameters)
         return self._version == other._version and all(mine() is not None and mine() is its() for mine, its in pairs)
@@ -110,12 +110,12 @@ class ViewerControls(torch.nn.Module):
         state: the field.
         configured: the rule of the run's prune.
         contribute: computes contributions.
-        curve: the curve by which trials have chosen the number of primitives; empty without them.
+        curve: the curve by which trials have chosen the number of Gaussians; empty without them.
     """
 
     def __init__(
         self,
-        state: FieldState,
+        state: TrainingState,
         configured: PruneRule,
         contribute: ContributionOf,
         curve: Callable[[], Sequence[CurvePoint]] = list,
@@ -124,53 +124,55 @@ class ViewerControls(torch.nn.Module):
         self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
         hint = "Show only what a prune to this share would keep; 1 shows everything"
         self.keep_ratio = ViewerSlider("Keep ratio", 1.0, 0.01, 1.0, 0.01, cb_hook=self._show_expected, hint=hint)
-        hint = "Number of primitives and, where trials have found it, what so few lose if they are trained on"
+        hint = "Number of Gaussians and, where trials have found it, what so few lose if they are trained on"
         self.expected = ViewerText("Expected", "", disabled=True, hint=hint)
         rules, hint = list(get_args(RuleName)), "Rule of the previewed prune; the head is disabled in a preview"
         self.rule = ViewerDropdown("Rule", rules[0], rules, hint=hint)
         self.control = ViewerControl()  # gives access to the viewer, and so to the training views
-        self.training_field = False
+        self.training_gaussians = False
         """Whether a trainer changes the field."""
         self._state, self._configured, self._contribute, self._curve = state, configured, contribute, curve
         self._lock = threading.Lock()
-        self._seen: _FieldVersion | None = None
+        self._seen: _GaussiansVersion | None = None
         self._graphs: dict[str, NeighborGraph] = {}
         self._contributions: dict[int | None, Tensor] = {}
         self._previews: dict[tuple[str, float], Pruned | None] = {}
 
     @property
-    def field_key(self) -> FieldKey | None:
+    def gaussians_key(self) -> GaussiansKey | None:
         """Identifies the present field; None while it is densified."""
-        if self.training_field and self._state.densifying:
+        if self.training_gaussians and self._state.densifying:
             return None
-        return self._state.field.num_primitives, self._state.pruning["num_prunes"]
+        return self._state.gaussians.num_gaussians, self._state.pruning["num_prunes"]
 
     def _show_expected(self, slider: ViewerSlider) -> None:
-        n = self._state.field.num_primitives
+        n = self._state.gaussians.num_gaussians
         count = kept_count(float(slider.value), n)
         change = expected_change(self._curve(), n, count)
         figures = "" if change is None else f": {change[0]:+.2f} dB, SSIM {change[1]:+.4f}"
-        self.expected.value = f"{count:,} primitives{figures}"
+        self.expected.value = f"{count:,} Gaussians{figures}"
 
-    def visible(self, source: LocalField, crop: Tensor | None, *, compensate: bool) -> Visible | None:
-        """What the next image shows; None if it shows no primitive.
+    def visible(self, source: GaussianSource, crop: Tensor | None, *, compensate: bool) -> Visible | None:
+        """What the next image shows; None if it shows no Gaussian.
 
         Args:
-            source: of all primitives.
-            crop: primitives in the crop box, bool ``[N]``; None for no box.
+            source: of all Gaussians.
+            crop: Gaussians in the crop box, bool ``[N]``; None for no box.
             compensate: whether images outside of a viewer get the head's correction.
         """
         preview = self.preview()
         if preview is not None:
-            field, mask = preview.field, preview.decision.mask
+            gaussians, mask = preview.gaussians, preview.decision.mask
             if crop is not None:
-                field, mask = field.rows(crop[mask]), mask & crop
-            return Visible(LocalField(field, whole=False), mask, compensate=False) if mask.any() else None
+                gaussians, mask = gaussians.rows(crop[mask]), mask & crop
+            return Visible(GaussianSource(gaussians, whole=False), mask, compensate=False) if mask.any() else None
         if in_viewer():
             compensate = self.compensate.value
         if crop is None:
             return Visible(source, None, compensate)
-        return Visible(LocalField(source.field.rows(crop), whole=False), crop, compensate) if crop.any() else None
+        return (
+            Visible(GaussianSource(source.gaussians.rows(crop), whole=False), crop, compensate) if crop.any() else None
+        )
 
     def preview(self) -> Pruned | None:
         """The previewed prune; None outside of the viewer, with the slider at 1, or if the rule cannot be applied.
@@ -182,7 +184,7 @@ class ViewerControls(torch.nn.Module):
         if share >= 1 or not in_viewer():
             return None
         with self._lock:
-            version = _FieldVersion(self._state, self.training_field)
+            version = _GaussiansVersion(self._state, self.training_gaussians)
             if self._seen is None or not self._seen.matches(version):
                 self._seen = version
                 self._graphs, self._contributions, self._previews = {}, {}, {}
@@ -198,12 +200,12 @@ class ViewerControls(torch.nn.Module):
 
     @torch.no_grad()
     def _prune(self, rule: PruneRule, share: float) -> Pruned:
-        field = self._state.field
-        usable = mend(field).field
-        n = usable.num_primitives
+        gaussians = self._state.gaussians
+        usable = sanitise(gaussians).gaussians
+        n = usable.num_gaussians
         count = kept_count(share, n)
         if rule.uses_graph and rule.edges not in self._graphs:
-            self._graphs[rule.edges] = field_graph(usable, rule)
+            self._graphs[rule.edges] = gaussian_graph(usable, rule)
         weights = None
         if rule.uses_contribution and count < n:
             detail = count if rule.uses_detail else None
@@ -215,4 +217,4 @@ class ViewerControls(torch.nn.Module):
                     )
                 self._contributions = {detail: self._contribute(viewer.pipeline.datamanager, detail)}
             weights = self._contributions[detail]
-        return prune_field(field, rule, count, weights, self._graphs.get(rule.edges))
+        return prune_gaussians(gaussians, rule, count, weights, self._graphs.get(rule.edges))

@@ -1,4 +1,4 @@
-"""The decision which primitives of a field to keep, and its two uses: a new field, and a field in training."""
+"""The decision which Gaussians of a field to keep, and its two uses: a new field, and a field in training."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.core.gaussians import Field, as_field, mend, num_primitives
-from sundae_ns.core.surgery import grow, keep, per_primitive, rewrite
+from sundae_ns.core.gaussians import Gaussians, as_gaussians, num_gaussians, sanitise
+from sundae_ns.core.surgery import grow, keep, per_gaussian, rewrite
 from sundae_ns.graph.graph import NeighborGraph
-from sundae_ns.pruning.merge import field_graph, merged, pair_labels
+from sundae_ns.pruning.merge import gaussian_graph, merged, pair_labels
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import score
 from sundae_ns.pruning.selection import neighbor_order, select_band, select_systematic
@@ -23,44 +23,44 @@ from sundae_ns.pruning.selection import neighbor_order, select_band, select_syst
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """Which primitives to keep, and the figures behind the choice."""
+    """Which Gaussians to keep, and the figures behind the choice."""
 
     mask: Tensor
-    """True for primitives to keep, bool ``[N]``."""
+    """True for Gaussians to keep, bool ``[N]``."""
     kept: int
-    """Number of primitives that the mask keeps."""
+    """Number of Gaussians that the mask keeps."""
     dropped_nonfinite: int
-    """Number of primitives dropped because a parameter is NaN or infinite."""
+    """Number of Gaussians dropped because a parameter is NaN or infinite."""
     tau: float | None = None
     """Threshold of the graph on squared distances, squared scene units; None if no graph was needed."""
     sigma: float | None = None
     """Width of the graph's weights, scene units; None if no graph was needed."""
     isolated: int | None = None
-    """Number of primitives without a neighbour within the threshold; None if no graph was needed."""
+    """Number of Gaussians without a neighbour within the threshold; None if no graph was needed."""
     values: Mapping[str, Tensor] | None = None
-    """New parameters of the kept primitives, in order ``[kept, ...]``; None if they are unchanged."""
+    """New parameters of the kept Gaussians, in order ``[kept, ...]``; None if they are unchanged."""
 
 
 class Pruned(NamedTuple):
     """A pruned field, and the decision behind it."""
 
-    field: Field
-    """The kept primitives, merged with the dropped ones if the rule merges; tensors of its own."""
+    gaussians: Gaussians
+    """The kept Gaussians, merged with the dropped ones if the rule merges; tensors of its own."""
     decision: Decision
     """Mask over the field before the prune, and figures."""
 
 
 @torch.no_grad()
-def prune_field(
-    field: Mapping[str, Tensor],
+def prune_gaussians(
+    gaussians: Mapping[str, Tensor],
     rule: PruneRule,
     count: int,
     contribution: Tensor | None = None,
     graph: NeighborGraph | None = None,
 ) -> Pruned:
-    """Prune a field to ``count`` primitives; arguments and errors are those of :func:`decide`."""
-    decision = decide(field, rule, count, contribution, graph)
-    return Pruned(as_field(field).rows(decision.mask).replaced(decision.values or {}), decision)
+    """Prune a field to ``count`` Gaussians; arguments and errors are those of :func:`decide`."""
+    decision = decide(gaussians, rule, count, contribution, graph)
+    return Pruned(as_gaussians(gaussians).rows(decision.mask).replaced(decision.values or {}), decision)
 
 
 @torch.no_grad()
@@ -71,42 +71,42 @@ def decide(
     contribution: Tensor | None = None,
     graph: NeighborGraph | None = None,
 ) -> Decision:
-    """Decide which primitives of a field to keep.
+    """Decide which Gaussians of a field to keep.
 
-    Primitives with a NaN, or an infinite parameter without a meaning, are dropped first (``gaussians.mend``); of the
+    Gaussians with a NaN, or an infinite parameter without a meaning, are dropped first (``gaussians.sanitise``); of the
     others exactly ``count`` stay. If that is all of them, nothing is scored. In a field of at most ``num_neighbors``
-    primitives each is a neighbour of all others within reach.
+    Gaussians each is a neighbour of all others within reach.
 
     Args:
-        params: the field, N primitives.
+        params: the field, N Gaussians.
         rule: how to score, select and merge.
-        count: number of primitives to keep, at least 1; all finite primitives are kept if they are fewer.
+        count: number of Gaussians to keep, at least 1; all finite Gaussians are kept if they are fewer.
         contribution: blending weights, summed over the training views, any device ``[N]``; see
             :func:`sundae_ns.scene.render.contribution`. Needed if ``rule.uses_contribution``.
-        graph: :func:`field_graph` of the finite primitives by the same rule; built if not given and needed.
+        graph: :func:`gaussian_graph` of the finite Gaussians by the same rule; built if not given and needed.
 
     Raises:
         ConfigError: an option is invalid, or a contribution is needed and not given.
-        DataError: no primitive is finite, or the contribution does not have one value per primitive.
+        DataError: no Gaussian is finite, or the contribution does not have one value per Gaussian.
     """
     rule.validate()
-    mended = mend(params)
-    usable, finite = mended.field, mended.mask
-    n, n_finite = len(finite), usable.num_primitives
+    sanitised = sanitise(params)
+    usable, finite = sanitised.gaussians, sanitised.mask
+    n, n_finite = len(finite), usable.num_gaussians
     if n_finite == 0:
         raise diverged(n)
     count = min(count, n_finite)
     if count == n_finite:
-        return Decision(finite, n_finite, n - n_finite, values=dict(usable) if mended.clamped else None)
+        return Decision(finite, n_finite, n - n_finite, values=dict(usable) if sanitised.clamped else None)
 
     if contribution is not None:
         if contribution.shape != finite.shape:
-            raise DataError(f"contribution has shape {list(contribution.shape)} for {n} primitives: return [{n}]")
+            raise DataError(f"contribution has shape {list(contribution.shape)} for {n} Gaussians: return [{n}]")
         contribution = contribution.detach()[finite.to(contribution.device)].to(finite.device)
     if not rule.uses_graph:
         graph = None
     elif graph is None:
-        graph = field_graph(usable, rule)
+        graph = gaussian_graph(usable, rule)
     scores, labels = score(usable, rule, graph, contribution), None
     if rule.selection == "pairs":
         assert graph is not None
@@ -118,7 +118,7 @@ def decide(
         selected = select_systematic(scores, count, neighbor_order(usable["means"]), rule.seed)
     mask = finite.clone()
     mask[finite] = selected.to(mask.device)
-    values = dict(usable.rows(selected.to(finite.device))) if mended.clamped else None
+    values = dict(usable.rows(selected.to(finite.device))) if sanitised.clamped else None
     if rule.redistribution == "merge":
         assert graph is not None
         if contribution is None:
@@ -138,17 +138,17 @@ def decide(
 
 
 def diverged(n: int) -> DataError:
-    """The error for a field of ``n`` primitives without a finite one."""
+    """The error for a field of ``n`` Gaussians without a finite one."""
     if n == 0:
         return DataError(
-            "no primitive is left: all became transparent and were removed, as where images show only their "
+            "no Gaussian is left: all became transparent and were removed, as where images show only their "
             "background; check the images, their masks and --pipeline.model.background-color"
         )
-    return DataError(f"none of {n} primitives is finite: the training has diverged, go back to an earlier checkpoint")
+    return DataError(f"none of {n} Gaussians is finite: the training has diverged, go back to an earlier checkpoint")
 
 
 @dataclass(eq=False)
-class FieldPruner:
+class Pruner:
     """Prunes a field in place, with its optimizers and running states."""
 
     params: MutableMapping[str, Parameter]
@@ -156,42 +156,42 @@ class FieldPruner:
     optimizers: Mapping[str, Optimizer]
     """By parameter name, one parameter each; others are left alone."""
     states: Sequence[MutableMapping[str, Any]] = ()
-    """Running states on the same primitives; their tensors of N rows are sliced along."""
+    """Running states on the same Gaussians; their tensors of N rows are sliced along."""
 
     @property
     def total(self) -> int:
-        """Number of primitives."""
-        return num_primitives(self.params)
+        """Number of Gaussians."""
+        return num_gaussians(self.params)
 
     def drop_nonfinite(self) -> int:
-        """Remove the primitives with a NaN, or an infinite parameter without a meaning; clamp the others (``mend``).
+        """Remove the Gaussians with a NaN, or an infinite parameter without a meaning; clamp the others (``sanitise``).
 
         Call it before the contribution, which renders the field: one NaN spreads over the image.
 
         Returns:
-            Number of removed primitives.
+            Number of removed Gaussians.
 
         Raises:
-            DataError: no primitive is finite; the field is unchanged.
+            DataError: no Gaussian is finite; the field is unchanged.
         """
-        mended = mend(self.params)
-        if not mended.field.num_primitives:
-            raise diverged(mended.dropped)
-        if mended.dropped:
-            keep(self.params, self.optimizers, self.states, mended.mask)
-        if mended.clamped:
-            rewrite(self.params, self.optimizers, mended.field)
-        return mended.dropped
+        sanitised = sanitise(self.params)
+        if not sanitised.gaussians.num_gaussians:
+            raise diverged(sanitised.dropped)
+        if sanitised.dropped:
+            keep(self.params, self.optimizers, self.states, sanitised.mask)
+        if sanitised.clamped:
+            rewrite(self.params, self.optimizers, sanitised.gaussians)
+        return sanitised.dropped
 
     def drop(self, mask: Tensor, *, at_most: float) -> int:
-        """Remove the primitives under a mask, unless they are too many.
+        """Remove the Gaussians under a mask, unless they are too many.
 
         Args:
             mask: bool ``[N]``.
             at_most: largest share of the field that is removed, below 1.
 
         Returns:
-            Number of removed primitives.
+            Number of removed Gaussians.
         """
         count = int(mask.sum())
         if not 0 < count <= at_most * self.total:
@@ -209,11 +209,11 @@ class FieldPruner:
         return decision
 
     def add(self, count: int, least_opacity: float) -> None:
-        """Add ``count`` primitives on top of others, which share their opacity, so that no image changes.
+        """Add ``count`` Gaussians on top of others, which share their opacity, so that no image changes.
 
         Per-primitive statistics are dropped: call it once densification has ended.
         """
-        n = num_primitives(self.params)
+        n = num_gaussians(self.params)
         grow(self.params, self.optimizers, count, least_opacity)
         for state in self.states:
-            state.update(dict.fromkeys(name for name, value in state.items() if per_primitive(value, n)))
+            state.update(dict.fromkeys(name for name, value in state.items() if per_gaussian(value, n)))

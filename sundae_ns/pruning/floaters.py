@@ -1,6 +1,6 @@
-"""Primitives right in front of a camera, where the scene has nothing.
+"""Gaussians right in front of a camera, where the scene has nothing.
 
-A primitive that is near enough to one camera can explain what differs between its photo and the others, and covers much
+A Gaussian that is near enough to one camera can explain what differs between its photo and the others, and covers much
 of the images of cameras beside it (such floaters are described by Philip and Deschaintre, "Floaters No More", 2023).
 The sparse points of structure from motion say how near the scene comes to the cameras, and where it comes nearer.
 """
@@ -14,10 +14,10 @@ NEAREST = 0.01
 """Share of the sparse points that may be nearer to a camera than the scene is taken to be: some of them are wrong."""
 FREE = 2 / 3  # share of that distance which is taken to be empty
 SUPPORT, REACH = 3, 0.5
-"""A primitive is no floater if this many sparse points are within this share of the empty distance from it: a few
+"""A Gaussian is no floater if this many sparse points are within this share of the empty distance from it: a few
 photos may be of something near. Wrong points lie alone."""
 MOST = 0.05
-"""Largest share of the primitives that can be floaters; with more of them the points do not say where the scene is."""
+"""Largest share of the Gaussians that can be floaters; with more of them the points do not say where the scene is."""
 _ROWS = 1 << 14
 
 
@@ -31,7 +31,7 @@ def _distances(points: Tensor, others: Tensor, nth: int = 1) -> Tensor:
 
 @torch.no_grad()
 def near_cameras(means: Tensor, eyes: Tensor, points: Tensor) -> Tensor:
-    """True for primitives that float in front of a camera, bool ``[N]``.
+    """True for Gaussians that float in front of a camera, bool ``[N]``.
 
     Args:
         means: centres ``[N, 3]``, world units.

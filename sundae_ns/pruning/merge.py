@@ -1,7 +1,7 @@
-"""The graph of a field, and the groups of primitives that one primitive replaces: pairs, or Voronoi cells.
+"""The graph of a field, and the groups of Gaussians that one Gaussian replaces: pairs, or Voronoi cells.
 
-Edges weigh distance, or distance, overlap and colour. Pairs: the two primitives that differ least become one, again and
-again, until few enough are left. Cells: each dropped primitive joins the kept one that is nearest along the edges.
+Edges weigh distance, or distance, overlap and colour. Pairs: the two Gaussians that differ least become one, again and
+again, until few enough are left. Cells: each dropped Gaussian joins the kept one that is nearest along the edges.
 """
 
 from __future__ import annotations
@@ -13,46 +13,46 @@ import torch
 from torch import Tensor
 
 from sundae_ns.core.covariance import chunks, covariances_of, lower_entries, outer_entries, overlap, pair_overlap
-from sundae_ns.core.gaussians import as_field, rgb_to_logit, sh_to_rgb
+from sundae_ns.core.gaussians import as_gaussians, rgb_to_logit, sh_to_rgb
 from sundae_ns.core.merging import merge
 from sundae_ns.graph.graph import NeighborGraph, build_graph
 from sundae_ns.pruning.rule import PruneRule
 
 LEAST_WIDTH = 0.25
-"""Width added to primitives when their overlap is measured, as a share of the graph's sigma: some are flat."""
+"""Width added to Gaussians when their overlap is measured, as a share of the graph's sigma: some are flat."""
 
 MOST_UNLIKE = 8.0
 """Largest difference of colours that counts, in typical differences. Weights fall to e^-32 and stay positive; otherwise
-a primitive of an extreme colour would have no neighbour and could not be merged."""
-UNSEEN = 0.001  # share of all weight that is dropped, not merged: the lightest primitives
-FLOOR = 1e-4  # least weight in a merge, as a share of the mean: primitives that nothing sees merge by their likeness
+a Gaussian of an extreme colour would have no neighbour and could not be merged."""
+UNSEEN = 0.001  # share of all weight that is dropped, not merged: the lightest Gaussians
+FLOOR = 1e-4  # least weight in a merge, as a share of the mean: Gaussians that nothing sees merge by their likeness
 WIDTH = 0.01
-"""Variance added to each axis, as a share of the sum of all three: two parallel flat primitives are alike too."""
+"""Variance added to each axis, as a share of the sum of all three: two parallel flat Gaussians are alike too."""
 PART = 0.5  # share of the possible merges of a round that happen; the others wait for what the better ones leave
 MOST_ROUNDS = 256
 """Most rounds; a field needs about 60. Thousands of clones that share their neighbours would need many more."""
-ROWS = 1 << 17  # primitives whose edges are followed at once; they take about 100 MiB
-MOST_HOPS = 64  # most edges between a dropped primitive and its kept one; keep ratios from 0.001 on need about a dozen
+ROWS = 1 << 17  # Gaussians whose edges are followed at once; they take about 100 MiB
+MOST_HOPS = 64  # most edges between a dropped Gaussian and its kept one; keep ratios from 0.001 on need about a dozen
 
 
 @torch.no_grad()
-def field_graph(params: Mapping[str, Tensor], rule: PruneRule) -> NeighborGraph:
+def gaussian_graph(params: Mapping[str, Tensor], rule: PruneRule) -> NeighborGraph:
     """Neighbour graph of a field, with the weights that the rule asks for.
 
     With ``centres``, as in the paper, weights fall with distance. ``appearance`` multiplies them by the overlap of the
-    two primitives (Bhattacharyya) and by ``exp(-|c_i - c_j|^2 / (2 s^2))`` for their colours, s being the root mean
-    square difference over all edges. As in a bilateral filter, primitives on two sides of an image edge are hardly
+    two Gaussians (Bhattacharyya) and by ``exp(-|c_i - c_j|^2 / (2 s^2))`` for their colours, s being the root mean
+    square difference over all edges. As in a bilateral filter, Gaussians on two sides of an image edge are hardly
     neighbours.
 
-    A field of at most ``num_neighbors`` primitives has the graph of all pairs within reach.
+    A field of at most ``num_neighbors`` Gaussians has the graph of all pairs within reach.
 
     Args:
-        params: the field, all finite, N primitives.
+        params: the field, all finite, N Gaussians.
 
     Raises:
-        DataError: only one primitive, or positions that are not finite.
+        DataError: only one Gaussian, or positions that are not finite.
     """
-    params = as_field(params).as_harmonics()
+    params = as_gaussians(params).as_harmonics()
     means = params["means"].detach()
     graph = build_graph(means, num_neighbors=min(rule.num_neighbors, max(len(means) - 1, 1)))
     if rule.edges == "centres" or not rule.uses_edge_weights:
@@ -77,24 +77,24 @@ def _color_affinity(colors: Tensor, graph: NeighborGraph) -> Tensor:
 
 @torch.no_grad()
 def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tensor, count: int) -> Tensor:
-    """Label of each primitive after pairs along the edges of the graph have merged until ``count`` groups are left.
+    """Label of each Gaussian after pairs along the edges of the graph have merged until ``count`` groups are left.
 
     Two groups of weights w and w' cost ``w w' / (w + w') (1 - overlap + |c - c'|^2)``: with the Bhattacharyya
     coefficient of their Gaussians as overlap, how much their images change if one of the same moments replaces both
     (Ward, 1963). A round merges pairs that cost less than any other pair of either group, the cheapest half of these.
 
     Args:
-        params: the field, all finite, N primitives.
+        params: the field, all finite, N Gaussians.
         graph: its edges are the pairs, whatever their weights.
-        weight: of each primitive, such as its summed blending weight, not negative ``[N]``.
+        weight: of each Gaussian, such as its summed blending weight, not negative ``[N]``.
         count: number of groups, 1 to N.
 
     Returns:
         Labels as :func:`sundae_ns.core.merging.merge` takes them, int64, on the graph's device ``[N]``: the index
-        of a member, in each merge that of the heavier group; -1 for primitives that are dropped.
+        of a member, in each merge that of the heavier group; -1 for Gaussians that are dropped.
     """
     device, n = graph.indices.device, graph.N
-    values = as_field(params).as_harmonics()
+    values = as_gaussians(params).as_harmonics()
     w = weight.to(device).double().nan_to_num(0.0).clamp_min(0)
     label = torch.arange(n, device=device)
     order = torch.sort(w, stable=True).indices
@@ -138,14 +138,14 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
 class _Groups:
     """Moments of the groups, each in the row that its label names, float64."""
 
-    def __init__(self, field: Mapping[str, Tensor], weight: Tensor, device: torch.device) -> None:
-        means = field["means"].detach().to(device).double()
+    def __init__(self, gaussians: Mapping[str, Tensor], weight: Tensor, device: torch.device) -> None:
+        means = gaussians["means"].detach().to(device).double()
         self.weight = weight
         self.mean = means - means.median(dim=0).values
-        scales, quats = (field[name].detach().to(device).double() for name in ("scales", "quats"))
+        scales, quats = (gaussians[name].detach().to(device).double() for name in ("scales", "quats"))
         self.entries = lower_entries(scales.exp(), quats)
         self.entries[:, :3] += WIDTH * self.entries[:, :3].sum(dim=1, keepdim=True)
-        self.color = sh_to_rgb(field["features_dc"].detach().to(device).double()).clamp(0, 1)
+        self.color = sh_to_rgb(gaussians["features_dc"].detach().to(device).double()).clamp(0, 1)
 
     def cost(self, first: Tensor, second: Tensor) -> Tensor:
         """Cost of the merge of each pair ``[P]``."""
@@ -195,20 +195,20 @@ def _cheapest_of_both(pairs: tuple[Tensor, Tensor], cost: Tensor, n: int) -> Ten
 
 @torch.no_grad()
 def voronoi_labels(graph: NeighborGraph, mask: Tensor) -> Tensor:
-    """Voronoi label of each primitive: the index of the nearest kept primitive along the edges of the graph.
+    """Voronoi label of each Gaussian: the index of the nearest kept Gaussian along the edges of the graph.
 
-    The length of an edge is ``-log W_ij``, so edges between primitives of different appearance are long if the graph
+    The length of an edge is ``-log W_ij``, so edges between Gaussians of different appearance are long if the graph
     weights by appearance. All edges are relaxed at once, hop by hop (Bellman and Ford). Among equally near kept
-    primitives the one found in fewer hops wins, then the one over the earlier neighbour.
+    Gaussians the one found in fewer hops wins, then the one over the earlier neighbour.
 
-    Edges are followed from a primitive to its neighbours. Primitives that reach no kept one so follow edges in both
+    Edges are followed from a Gaussian to its neighbours. Gaussians that reach no kept one so follow edges in both
     directions: a thousand clones share the same few neighbours, and all of these may be dropped.
 
     Args:
-        mask: True for primitives to keep, bool, any device ``[N]``.
+        mask: True for Gaussians to keep, bool, any device ``[N]``.
 
     Returns:
-        Labels, int64, on the graph's device ``[N]``: its own index for a kept primitive; -1 for primitives that are
+        Labels, int64, on the graph's device ``[N]``: its own index for a kept Gaussian; -1 for Gaussians that are
         connected to no kept one.
     """
     device = graph.weights.device
@@ -230,7 +230,7 @@ def voronoi_labels(graph: NeighborGraph, mask: Tensor) -> Tensor:
 
 
 def _nearer(graph: NeighborGraph, among: slice, changed: Tensor, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Primitives that one hop brings nearer to a kept one, the neighbours that lead there, and the new distances."""
+    """Gaussians that one hop brings nearer to a kept one, the neighbours that lead there, and the new distances."""
     # A distance can only shrink if that of a neighbour has shrunk.
     rows = changed[graph.indices[among]].any(dim=1).nonzero().squeeze(1).add_(among.start)
     near = graph.indices[rows]
@@ -245,7 +245,7 @@ def _lengths(weights: Tensor) -> Tensor:
 
 
 def _label_either_way(graph: NeighborGraph, label: Tensor, distance: Tensor) -> Tensor:
-    """Label the primitives without a label, along edges in both directions."""
+    """Label the Gaussians without a label, along edges in both directions."""
     unlabelled = label < 0
     rows, slots = ((unlabelled[:, None] | unlabelled[graph.indices]) & (graph.weights > 0)).nonzero(as_tuple=True)
     ends, length = graph.indices[rows, slots], _lengths(graph.weights[rows, slots])
@@ -271,22 +271,22 @@ def _label_either_way(graph: NeighborGraph, label: Tensor, distance: Tensor) -> 
 def merged(
     params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, weight: Tensor, labels: Tensor | None = None
 ) -> dict[str, Tensor]:
-    """Merge the primitives of each Voronoi cell of the graph into its kept one; see :func:`voronoi_labels`, and
+    """Merge the Gaussians of each Voronoi cell of the graph into its kept one; see :func:`voronoi_labels`, and
     :func:`sundae_ns.core.merging.merge` for the result.
 
     A field that stores logits averages colours, not logits.
 
     Args:
-        params: the field, all finite, N primitives.
-        mask: True for primitives to keep, bool ``[N]``.
-        weight: weight of each primitive in the merge, its summed blending weight over the training views ``[N]``.
-        labels: of groups that take the place of the Voronoi cells, int64 ``[N]``; -1 for primitives that are dropped.
+        params: the field, all finite, N Gaussians.
+        mask: True for Gaussians to keep, bool ``[N]``.
+        weight: weight of each Gaussian in the merge, its summed blending weight over the training views ``[N]``.
+        labels: of groups that take the place of the Voronoi cells, int64 ``[N]``; -1 for Gaussians that are dropped.
 
     Returns:
-        Parameters of the kept primitives ``[M, ...]``.
+        Parameters of the kept Gaussians ``[M, ...]``.
     """
     labels = voronoi_labels(graph, mask) if labels is None else labels
-    if as_field(params).encoding == "harmonics":
+    if as_gaussians(params).encoding == "harmonics":
         return merge(params, labels, weight)
     own = params["features_dc"].detach()
     colors = own.sigmoid()

@@ -1,4 +1,4 @@
-"""The rule of a prune: which primitives stay, and what becomes of the others. It knows no count and no schedule."""
+"""The rule of a prune: which Gaussians stay, and what becomes of the others. It knows no count and no schedule."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ ScoreName = Literal["detail-contribution", "response"]
 
 @dataclass
 class PruneRule:
-    """How a prune ranks, selects and merges primitives.
+    """How a prune ranks, selects and merges Gaussians.
 
     The defaults are those of ``sundae``: systematic draws in proportion to the contribution to pixels with detail, and
-    each dropped primitive merged into a kept one. :func:`band_rule` is the paper's.
+    each dropped Gaussian merged into a kept one. :func:`band_rule` is the paper's.
     """
 
     selection: Literal["systematic", "pairs", "band"] = "systematic"
-    """How scores select primitives: one draw in each stretch of space (systematic), one for each group of the pairs
+    """How scores select Gaussians: one draw in each stretch of space (systematic), one for each group of the pairs
     that differ least (pairs), or both ends of the ranking as in the paper (band)."""
     score: ScoreName | Callable[[Mapping[str, Tensor]], Tensor] = "detail-contribution"
-    """Importance of a primitive: its blending weight over the training views, with pixels weighted by the detail that
-    the kept primitives cannot show (detail-contribution), or its high-pass response (response). Any other score is a
-    function of the parameters of N finite primitives that returns numbers ``[N]``, not negative."""
+    """Importance of a Gaussian: its blending weight over the training views, with pixels weighted by the detail that
+    the kept Gaussians cannot show (detail-contribution), or its high-pass response (response). Any other score is a
+    function of the parameters of N finite Gaussians that returns numbers ``[N]``, not negative."""
     signal: Literal["attributes", "positions"] = "attributes"
     """Signal of the response: position, colour, opacity and size (attributes), or positions alone as in the paper."""
     edges: Literal["centres", "appearance"] = "appearance"
     """Weights of the graph: by distance, overlap and colour (appearance), or as in the paper by distance (centres)."""
     redistribution: Literal["none", "merge"] = "merge"
-    """Whether each dropped primitive is merged into the kept one that is nearest along the graph, or of its group
+    """Whether each dropped Gaussian is merged into the kept one that is nearest along the graph, or of its group
     (merge), or discarded as in the paper (none). A merge needs a pass over the training views."""
     gamma: float = 0.5
-    """Share of the kept primitives that the band selection takes from the high end, in [0, 1]."""
+    """Share of the kept Gaussians that the band selection takes from the high end, in [0, 1]."""
     num_neighbors: int = 16
-    """Most neighbours of a primitive in the graph."""
+    """Most neighbours of a Gaussian in the graph."""
     seed: int = 0
     """Seed of random draws, which are the same on every device."""
 
@@ -59,7 +59,7 @@ class PruneRule:
 
     @property
     def uses_detail(self) -> bool:
-        """Whether the contribution weights pixels by the detail that the kept primitives cannot show."""
+        """Whether the contribution weights pixels by the detail that the kept Gaussians cannot show."""
         return self.score == "detail-contribution"
 
     @property
@@ -105,7 +105,7 @@ def check_share(share: float) -> None:
 
 
 def kept_count(share: float, n: int) -> int:
-    """Number of ``n`` primitives that a prune to a share keeps: ``round(share * n)``, at least 1.
+    """Number of ``n`` Gaussians that a prune to a share keeps: ``round(share * n)``, at least 1.
 
     The one place that turns a share into a count.
 

@@ -1,4 +1,4 @@
-"""Scores: what a primitive contributes to the detail of images, or the response of a graph filter to its attributes."""
+"""Scores: what a Gaussian contributes to the detail of images, or the response of a graph filter to its attributes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.core.gaussians import as_field, sh_to_rgb
+from sundae_ns.core.gaussians import as_gaussians, sh_to_rgb
 from sundae_ns.graph.filters import high_pass, response_magnitude
 from sundae_ns.graph.graph import NeighborGraph
-from sundae_ns.pruning.merge import field_graph
+from sundae_ns.pruning.merge import gaussian_graph
 from sundae_ns.pruning.rule import PruneRule
 
 
@@ -20,14 +20,14 @@ from sundae_ns.pruning.rule import PruneRule
 def score(
     params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph | None, contribution: Tensor | None
 ) -> Tensor:
-    """Score of each primitive by the rule, float64 ``[N]``.
+    """Score of each Gaussian by the rule, float64 ``[N]``.
 
     The response enters as the norm ``|f_i| = sqrt(pi_i)``. Its ranking is that of ``pi_i``, and sampling in proportion
     to the norm gives the least expected error (Chen et al., "Fast Resampling of Three-Dimensional Point Clouds via
     Graphs", 2018). Without neighbours it is NaN, which every selection ranks last.
 
     Args:
-        params: the field, all finite, N primitives.
+        params: the field, all finite, N Gaussians.
         graph: graph of the field, for the response; built if not given.
         contribution: blending weights ``[N]``, for the score of that name.
 
@@ -38,7 +38,7 @@ def score(
     if callable(rule.score):
         values = rule.score(params)
         if values.shape != (len(params["means"]),):
-            raise DataError(f"a score has shape {list(values.shape)} for {len(params['means'])} primitives: return [N]")
+            raise DataError(f"a score has shape {list(values.shape)} for {len(params['means'])} Gaussians: return [N]")
         return values.double()
     if rule.score == "response":
         return response(params, rule, graph).sqrt()
@@ -54,16 +54,16 @@ def response(params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph
     """Squared norm of the high-pass response of the rule's signal, pi of the paper.
 
     Args:
-        params: the field, all finite, N primitives.
+        params: the field, all finite, N Gaussians.
         graph: graph of the field; built if not given.
 
     Returns:
-        float64 on the field's device ``[N]``; NaN for primitives without neighbours.
+        float64 on the field's device ``[N]``; NaN for Gaussians without neighbours.
 
     Raises:
-        DataError: only one primitive, or positions that are not finite.
+        DataError: only one Gaussian, or positions that are not finite.
     """
-    graph = field_graph(params, rule) if graph is None else graph
+    graph = gaussian_graph(params, rule) if graph is None else graph
     signal = attribute_signal(params) if rule.signal == "attributes" else params["means"].detach()
     return response_magnitude(high_pass(graph, signal))
 
@@ -74,7 +74,7 @@ def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
     Each group is divided by its own spread, so that no group dominates the response. The channels of a group share one
     spread: in a flat field, the flat axis must not be scaled up to the others.
     """
-    params = as_field(params).as_harmonics()
+    params = as_gaussians(params).as_harmonics()
     groups = (
         params["means"],
         sh_to_rgb(params["features_dc"]),
@@ -102,7 +102,7 @@ def _standardise(values: Tensor) -> Tensor:
 def pixel_detail(image: Tensor, cells: float) -> Tensor:
     """Local deviation of an image from its mean over a cell, as weights of the pixels.
 
-    A primitive covers a cell of about ``H W / cells`` pixels, and the deviation within a window of that size is the
+    A Gaussian covers a cell of about ``H W / cells`` pixels, and the deviation within a window of that size is the
     detail that it cannot show. The squared error of n cells is least if their density is proportional to the gradient
     (minimise ``int |grad f|^2 / density``), and in a smooth image the deviation is proportional to the gradient.
 
@@ -121,14 +121,14 @@ def pixel_detail(image: Tensor, cells: float) -> Tensor:
 
     def local_mean(values: Tensor) -> Tensor:
         # Rows, then columns: a square window of many pixels would take long.
-        for window, padding in (((2 * half + 1, 1), (half, 0)), ((1, 2 * half + 1), (0, half))):
-            values = avg_pool2d(values, window, stride=1, padding=padding, count_include_pad=False)
+        for crop, padding in (((2 * half + 1, 1), (half, 0)), ((1, 2 * half + 1), (0, half))):
+            values = avg_pool2d(values, crop, stride=1, padding=padding, count_include_pad=False)
         return values
 
     variance = (local_mean(planes.square()) - local_mean(planes).square()).clamp_min(0).sum(dim=1)[0]
     mean = variance.mean()
     if not mean > 0:
         return torch.ones_like(variance).to(image.dtype)
-    # A flat pixel has a weight too, a quarter of the root mean square: flat areas need some primitives.
+    # A flat pixel has a weight too, a quarter of the root mean square: flat areas need some Gaussians.
     weights = (variance + 0.25**2 * mean).sqrt()
     return (weights / weights.mean()).to(image.dtype)

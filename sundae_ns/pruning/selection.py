@@ -1,12 +1,12 @@
-"""Exact selection: turn scores into a mask that keeps exactly a given number of primitives.
+"""Exact selection: turn scores into a mask that keeps exactly a given number of Gaussians.
 
 Both functions take scores ``[N]`` of any floating dtype on any device, and return a bool mask ``[N]`` on that device
 with exactly ``count`` True entries. Among equal scores the lower index is selected first. NaN means "unknown" and is
 selected last; ``+inf`` is the highest score. All work is done on the CPU in float64, so the same scores give the same
 mask on every device.
 
-Independent draws leave holes and clumps by chance. Systematic sampling draws one primitive in each stretch of an order
-in which neighbours follow each other. It covers a field evenly, and keeps the probability of each primitive.
+Independent draws leave holes and clumps by chance. Systematic sampling draws one Gaussian in each stretch of an order
+in which neighbours follow each other. It covers a field evenly, and keeps the probability of each Gaussian.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
     """Select the ``round(gamma * count)`` highest magnitudes, and the lowest for the rest.
 
     The paper's rule (paragraph "Controlling bandwidth with gamma"). The two ends never overlap. NaN magnitudes, those
-    of isolated primitives, belong to neither end.
+    of isolated Gaussians, belong to neither end.
 
     Args:
-        count: number of primitives to keep, 1 to N.
+        count: number of Gaussians to keep, 1 to N.
         gamma: share of the high end, in [0, 1].
 
     Raises:
@@ -46,7 +46,7 @@ def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
     """Inclusion probabilities ``p_i = min(1, c s_i)`` of positive finite scores ``[N]`` that sum to ``count``, 1 to N.
 
     Returns:
-        Probabilities, float64 on the CPU ``[N]``; exactly 1 for primitives that are always included.
+        Probabilities, float64 on the CPU ``[N]``; exactly 1 for Gaussians that are always included.
     """
     values = score.detach().to(device="cpu", dtype=torch.float64)
     # The largest is 1, so that sums do not overflow; none is 0, so that no sum is.
@@ -54,7 +54,7 @@ def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
     ordered = torch.sort(values, descending=True, stable=True).values
     rest = ordered.flip(0).cumsum(0).flip(0)
     left = count - torch.arange(count, dtype=torch.float64)
-    # The fewest certain primitives such that no other has a probability above 1.
+    # The fewest certain Gaussians such that no other has a probability above 1.
     certain = int((left * ordered[:count] <= rest[:count]).to(torch.uint8).argmax())
     probabilities = values * ((count - certain) / rest[certain])
     return probabilities.masked_fill(values > ordered[certain], 1.0).clamp_max(1.0)
@@ -69,10 +69,10 @@ def neighbor_order(points: Tensor) -> Tensor:
 
 
 def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Tensor:
-    """Draw one primitive in each stretch of an order over which the inclusion probabilities sum to one.
+    """Draw one Gaussian in each stretch of an order over which the inclusion probabilities sum to one.
 
     Systematic sampling with unequal probabilities (Madow, 1949): probabilities are summed along the order, and a
-    primitive is selected whenever the sum passes ``u + j``, with one random u for all j. Each primitive is selected
+    Gaussian is selected whenever the sum passes ``u + j``, with one random u for all j. Each Gaussian is selected
     with probability ``min(1, c s_i)``, and any stretch of the order keeps its expected number, rounded up or down.
 
     Infinite scores are selected first, then positive ones. Scores that are NaN or at most 0 are drawn uniformly, after
@@ -80,8 +80,8 @@ def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Te
 
     Args:
         score: scores ``[N]``.
-        count: number of primitives to keep, 1 to N.
-        order: permutation of the primitives, int64 ``[N]``.
+        count: number of Gaussians to keep, 1 to N.
+        order: permutation of the Gaussians, int64 ``[N]``.
 
     Returns:
         Mask with ``count`` True entries, bool, on the device of the scores ``[N]``.
@@ -134,9 +134,9 @@ def as_scores(score: Tensor, count: int) -> Tensor:
         DataError: they have another shape, or ``count`` is not in 1 to N.
     """
     if score.ndim != 1:
-        raise DataError(f"scores have shape {list(score.shape)}: pass one number per primitive, [N]")
+        raise DataError(f"scores have shape {list(score.shape)}: pass one number per Gaussian, [N]")
     if not 1 <= count <= len(score):
-        raise DataError(f"cannot keep {count} of {len(score)} primitives: ask for 1 to {len(score)}")
+        raise DataError(f"cannot keep {count} of {len(score)} Gaussians: ask for 1 to {len(score)}")
     return score.detach().to(device="cpu", dtype=torch.float64)
 
 

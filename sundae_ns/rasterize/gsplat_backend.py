@@ -43,7 +43,7 @@ class GsplatBackend:
         image = blended[0][0][0] if len(blended) == 1 else torch.cat([part[0] for part, _ in blended], dim=-1)
         return result_of(image, alpha, splats.means2d, splats.radii, inputs)
 
-    def rasterize_views(self, inputs: Inputs, viewmats: Tensor, Ks: Tensor, colors: Tensor) -> Tensor:
+    def rasterize_cameras(self, inputs: Inputs, viewmats: Tensor, Ks: Tensor, colors: Tensor) -> Tensor:
         """Render several views at once; one wait for the device in all.
 
         Raises:

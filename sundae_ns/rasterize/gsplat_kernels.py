@@ -90,7 +90,7 @@ def tile_lists(splats: Splats, width: int, height: int, *, capacity: Capacity) -
     dtype = torch.int16 if columns * (rows + 1) <= torch.iinfo(torch.int16).max else torch.int32
     kernels = load_kernels("tiles.cu", ("count_tiles", "list_tiles"), listing_options(dtype), device)
     n = means2d.shape[1]
-    lanes = lanes_per_primitive(n)
+    lanes = lanes_per_gaussian(n)
     order = depths[0].argsort(stable=True)
     geometry = (n, lanes, order, means2d, conics, opacities, radii, radii.ndim - 1, width, height, columns, rows)
     counts = torch.empty(n * lanes, dtype=torch.int32, device=device)
@@ -115,7 +115,7 @@ def tile_lists(splats: Splats, width: int, height: int, *, capacity: Capacity) -
     return GsplatLists(width, height, starts.view(shape), primitives.index_select(0, by_tile), drawn)
 
 
-def lanes_per_primitive(n: int) -> int:
+def lanes_per_gaussian(n: int) -> int:
     """Threads that share the rows of tiles of a Gaussian: a few Gaussians may each be as large as the image."""
     return 32 if n < 2**17 else 8
 
@@ -217,7 +217,7 @@ def _color_kernels(device: torch.device) -> dict[str, Launch]:
     return load_kernels("colors.cu", names, COLOR_OPTIONS, device, _PER_BLOCK)
 
 
-def _view(degree: int, means: Tensor, center: Tensor) -> list[Argument]:
+def _camera(degree: int, means: Tensor, center: Tensor) -> list[Argument]:
     return [len(means), degree, means, center, int(center.ndim > 1)]
 
 
@@ -228,7 +228,7 @@ class _Colors(torch.autograd.Function):
     ) -> Tensor:
         means, center, dc, rest = (value.contiguous() for value in (means, center, dc, rest))
         colors = torch.empty_like(means)
-        arguments = [*_view(degree, means, center), dc, rest, rest.shape[1], colors]
+        arguments = [*_camera(degree, means, center), dc, rest, rest.shape[1], colors]
         _color_kernels(means.device)["harmonic_colors"](colors.numel(), arguments)
         ctx.save_for_backward(means, center, dc, rest, colors)
         ctx.degree = degree
@@ -240,6 +240,6 @@ class _Colors(torch.autograd.Function):
         means, center, dc, rest, colors = ctx.saved_tensors
         grads = [torch.empty_like(value) for value in (means, dc, rest)]
         threads = -(-len(means) // _PER_BLOCK) * _PER_BLOCK
-        arguments = [*_view(ctx.degree, means, center), rest, rest.shape[1], colors, gradient.contiguous(), *grads]
+        arguments = [*_camera(ctx.degree, means, center), rest, rest.shape[1], colors, gradient.contiguous(), *grads]
         _color_kernels(means.device)["harmonic_colors_backward"](threads, arguments)
         return None, grads[0], None, grads[1], grads[2]

@@ -72,7 +72,7 @@ def rasterize(
     return backend.rasterize(inputs)
 
 
-def rasterize_views(
+def rasterize_cameras(
     means: Tensor,  # [N, 3]
     quats: Tensor,  # [N, 4]
     scales: Tensor,  # [N, 3]
@@ -104,14 +104,14 @@ def rasterize_views(
     _check_shapes((viewmats, "viewmats", (count, 4, 4)), (Ks, "Ks", (count, 3, 3)))
     if colors.dim() != 3 or colors.shape[0] != count:
         raise DataError(f"colors has shape {list(colors.shape)}; pass [{count}, {len(means)}, C]")
-    views = [
-        Inputs(means, quats, scales, opacities, *view, width, height, near_plane, far_plane, antialiased)
-        for view in zip(colors, viewmats, Ks, strict=True)
+    cameras = [
+        Inputs(means, quats, scales, opacities, *camera, width, height, near_plane, far_plane, antialiased)
+        for camera in zip(colors, viewmats, Ks, strict=True)
     ]
-    _check(views[0])
+    _check(cameras[0])
     if isinstance(backend, GsplatBackend) and len(means):
-        return backend.rasterize_views(views[0], viewmats, Ks, colors)
-    return torch.stack([backend.rasterize(view).colors for view in views])
+        return backend.rasterize_cameras(cameras[0], viewmats, Ks, colors)
+    return torch.stack([backend.rasterize(camera).colors for camera in cameras])
 
 
 def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, backend: Backend) -> Tensor:

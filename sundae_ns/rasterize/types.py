@@ -149,10 +149,10 @@ def check_pairs(pairs: int, gaussians: int, tiles: int, size: int, *, training: 
     """
     if not training and pairs > MOST_PER_TILE * tiles + PER_GAUSSIAN * gaussians + ALWAYS:
         raise MemoryExhaustedError(
-            f"the view has {pairs // tiles:,} primitives in each tile of its image, but a real scene has less than "
+            f"the view has {pairs // tiles:,} Gaussians in each tile of its image, but a real scene has less than "
             f"{MOST_PER_TILE:,}; choose another camera"
         )
-    check_memory(size * pairs, f"{pairs:,} pairs of a tile and a primitive")
+    check_memory(size * pairs, f"{pairs:,} pairs of a tile and a Gaussian")
 
 
 def check_memory(size: int, what: str) -> None:

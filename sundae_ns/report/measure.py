@@ -70,13 +70,13 @@ def frame_times(model: SundaeModel, cameras: Sequence[Any], *, warmup: int = 3, 
             with compensation(model, on):
                 times.append(milliseconds(partial(show, camera)))
         settings = model.render_settings(training=False)
-        zoom, weight = scale_plan(model.view_of(camera), settings.trained_focal)
+        zoom, weight = scale_plan(model.camera_of(camera), settings.trained_focal)
         if settings.head is None or weight == 0:
             heads.append(0.0)
             continue
-        view = model.view_of(camera).zoomed(zoom)
+        at_scale = model.camera_of(camera).zoomed(zoom)
         images, splatted = draw(
-            model.source.primitives(view, settings, features=True), view, background, settings, depth=False
+            model.source.primitives(at_scale, settings, features=True), at_scale, background, settings, depth=False
         )
         run_head = partial(compensate, settings.head, images["base_rgb"], splatted, background)
         heads.append(milliseconds(run_head))
@@ -84,7 +84,7 @@ def frame_times(model: SundaeModel, cameras: Sequence[Any], *, warmup: int = 3, 
 
 
 def sizes(model: SundaeModel) -> Sizes:
-    """Bytes of everything that a render needs: primitives in fp32 with features, and the head."""
+    """Bytes of everything that a render needs: Gaussians in fp32 with features, and the head."""
     return Sizes(bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head))
 
 

@@ -98,7 +98,7 @@ class Measured:
 
     @property
     def bytes_total(self) -> int:
-        """Bytes of primitives and head."""
+        """Bytes of Gaussians and head."""
         return self.bytes_primitives + self.bytes_head
 
     @property

@@ -76,12 +76,12 @@ class ShownRun:
     views: Sequence[ShownView]
     """Its views to show, in the order of the capture."""
     curve: CountCurve | None = None
-    """Expected quality over the number of primitives; None if no trials decided about it."""
+    """Expected quality over the number of Gaussians; None if no trials decided about it."""
     capture: str = ""
     """Stands for the capture: views of one index and name compare between runs of one capture."""
 
 
-def choose_views(qualities: Sequence[float], most: int) -> list[int]:
+def choose_cameras(qualities: Sequence[float], most: int) -> list[int]:
     """Indices of the views to show, ascending: the worst, the best, and others evenly spaced in the capture's order.
 
     Args:
@@ -98,7 +98,7 @@ def choose_views(qualities: Sequence[float], most: int) -> list[int]:
     return sorted(list(order)[:most])
 
 
-def views_for_each(runs: int) -> int:
+def cameras_for_each(runs: int) -> int:
     """Most views to show of each of a number of runs, so that a page keeps its size."""
     return min(MOST_VIEWS, max(MOST_ON_A_PAGE // max(runs, 1), 2))
 
@@ -175,7 +175,7 @@ def _address(content: bytes, kind: str) -> str:
 
 
 def curve_plot(curve: CountCurve) -> str:
-    """Expected PSNR and SSIM over the number of primitives, with errors and the choice, as the address of an SVG."""
+    """Expected PSNR and SSIM over the number of Gaussians, with errors and the choice, as the address of an SVG."""
     figure = Figure(figsize=(10.8, 4.2), layout="constrained")
     FigureCanvasSVG(figure)
     points = [point for point in curve.points if point.psnr_loss is not None and point.ssim_loss is not None]
@@ -185,7 +185,7 @@ def curve_plot(curve: CountCurve) -> str:
         errors = [getattr(point, f"{metric}_error") for point in points]
         panel.errorbar(counts, values, yerr=errors, color="#0072B2", marker="o", markersize=5, capsize=3, linewidth=1.3)
         panel.axvline(curve.chosen, color="#D55E00", linestyle="--", linewidth=1.3)
-        panel.set(xscale="log", xlabel="number of primitives", ylabel=f"{label} (higher is better)")
+        panel.set(xscale="log", xlabel="number of Gaussians", ylabel=f"{label} (higher is better)")
         panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         panel.xaxis.set_minor_formatter(NullFormatter())

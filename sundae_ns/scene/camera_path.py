@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.interpolate import CubicSpline
 
-from sundae_ns.core.camera import View, poses_looking_at
+from sundae_ns.core.camera import Camera, poses_looking_at
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.scene.cameras import unit
 from sundae_ns.scene.scene import Scene
-from sundae_ns.scene.virtual_cameras import FOV, middle_and_reach, virtual_views
+from sundae_ns.scene.virtual_cameras import FOV, middle_and_reach, virtual_cameras
 
 MOST_FRAMES = 36_000
 """Frames of 25 minutes."""
@@ -25,7 +25,7 @@ _STEEP = 0.95
 Array = NDArray[np.float64]
 
 
-def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float = 24.0) -> list[View]:
+def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float = 24.0) -> list[Camera]:
     """Cameras of a film of a scene, along a closed and smooth path at an even speed; upright, without roll.
 
     The path leads through up to eight of the views that are stored with the scene, from the start view, else the first,
@@ -42,7 +42,7 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
 
     Raises:
         ConfigError: there is not even one frame, or there are more than :data:`MOST_FRAMES`.
-        DataError: the scene has no finite primitive.
+        DataError: the scene has no finite Gaussian.
     """
     count = round(seconds * frames_per_second) if math.isfinite(seconds * frames_per_second) else 0
     if not (1 <= count <= MOST_FRAMES and seconds > 0):
@@ -51,9 +51,9 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
             f"give 1 to {MOST_FRAMES:,} frames"
         )
     up = _up_of(scene)
-    views = [view for view in (scene.start, *scene.views) if view is not None]
-    lens = views[0] if views else View.from_fov(torch.eye(4), FOV, 1280, 720)
-    poses = np.array([view.pose.double().tolist() for view in views]).reshape(-1, 3, 4)
+    cameras = [camera for camera in (scene.start, *scene.cameras) if camera is not None]
+    lens = cameras[0] if cameras else Camera.from_fov(torch.eye(4), FOV, 1280, 720)
+    poses = np.array([camera.pose.double().tolist() for camera in cameras]).reshape(-1, 3, 4)
     poses = poses[np.abs(poses[:, :, 2] @ up) < _STEEP]
     poses = poses[np.sort(np.unique(poses.round(5), axis=0, return_index=True)[1])]
     eyes, ahead = (poses[:, :, 3], -poses[:, :, 2]) if len(poses) >= 3 else _circle(scene, up)
@@ -65,13 +65,13 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     found = poses_looking_at(centers, centers + torch.from_numpy(path[:, 3:]), torch.from_numpy(up))
     lens = lens.zoomed(min(1280 / max(lens.width, lens.height), 1.0))
     intrinsics = [float(lens.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    return [View.from_pose(pose, intrinsics, lens.width, lens.height) for pose in found]
+    return [Camera.from_pose(pose, intrinsics, lens.width, lens.height) for pose in found]
 
 
 def _up_of(scene: Scene) -> Array:
     up = scene.up
-    if up is None and scene.views:
-        mean = torch.stack([view.pose[:, 1] for view in scene.views]).double().mean(dim=0)
+    if up is None and scene.cameras:
+        mean = torch.stack([camera.pose[:, 1] for camera in scene.cameras]).double().mean(dim=0)
         up = unit(mean.tolist()) if float(mean.norm()) > 1e-3 else None
     return np.array(up or (0.0, 0.0, 1.0))
 
@@ -80,7 +80,7 @@ def _circle(scene: Scene, up: Array) -> tuple[Array, Array]:
     """Eyes on a circle, at the median distance and height of the virtual views, and directions to its middle."""
     middle, reach = middle_and_reach(scene)
     center = middle.numpy()
-    arms = np.stack([view.center.double().numpy() for view in virtual_views(scene, 48)]) - center
+    arms = np.stack([camera.center.double().numpy() for camera in virtual_cameras(scene, 48)]) - center
     height = np.median(arms @ up).clip(-0.5 * reach, 0.5 * reach)
     side = np.cross(up, np.roll(up, 1) + [1e-3, 0.0, 0.0])
     side /= np.linalg.norm(side)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from sundae_ns.core.camera import OPENGL_TO_OPENCV, View
+from sundae_ns.core.camera import OPENGL_TO_OPENCV, Camera
 from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.data.capture import finite, matrix, read_json, rigid, side
@@ -25,25 +25,25 @@ Direction = tuple[float, float, float]
 class CameraFile(NamedTuple):
     """The cameras of a file."""
 
-    views: list[View]
+    cameras: list[Camera]
     frames_per_second: float | None
     """Speed of a camera path; None for the cameras of a capture."""
 
 
-def view_in_front(scene: Scene) -> View:
+def camera_in_front(scene: Scene) -> Camera:
     """A camera of 640 x 480 pixels for a scene without cameras: with z upwards it looks along y."""
-    means = scene.field["means"].detach().cpu()
+    means = scene.gaussians["means"].detach().cpu()
     center = means.median(dim=0).values
     away = 3 * float((means - center).norm(dim=1).median().clamp_min(1e-6))
     up = torch.tensor(scene.up or (0.0, 0.0, 1.0))
     side = torch.tensor([1.0, 0.0, 0.0] if abs(float(up[0])) < 0.9 else [0.0, 1.0, 0.0])
     back = torch.nn.functional.normalize(torch.linalg.cross(side, up), dim=0)
-    return View.look_at(
+    return Camera.look_at(
         center + away * back, center, up, fov=2 * math.degrees(math.atan(240 / 500))
     )  # that of the web page
 
 
-def views_of(path: Path | str, scene: Scene | None = None) -> list[View]:
+def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
     """The cameras of a file, as ideal pinhole cameras: distortion is left out.
 
     Args:
@@ -60,27 +60,30 @@ def views_of(path: Path | str, scene: Scene | None = None) -> list[View]:
     >>> camera = {"fl_x": 50, "fl_y": 50, "cx": 32, "cy": 24, "w": 64, "h": 48, "frames": [frame]}
     >>> path = pathlib.Path(tempfile.mkdtemp(), "camera.json")
     >>> _ = path.write_text(json.dumps(camera), encoding="utf-8")
-    >>> sn.views_of(path)[0].center
+    >>> sn.cameras_of(path)[0].center
     tensor([0., 0., 3.])
     """
-    return read_cameras(Path(path), scene).views
+    return read_cameras(Path(path), scene).cameras
 
 
 def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
-    """As :func:`views_of`, with the speed of a camera path."""
+    """As :func:`cameras_of`, with the speed of a camera path."""
     if path.is_dir() and any((path / name).exists() for name in ("cameras.bin", "cameras.txt")):
         return CameraFile(_of_colmap(path, scene), None)
     path = path / "transforms.json" if path.is_dir() else path
     content = read_json(path)
     if "camera_path" in content:
-        views, speed = _camera_path(content, path.name), finite(content.get("fps", 24), "fps", path.name, positive=True)
-        return CameraFile(views, speed)
+        cameras, speed = (
+            _camera_path(content, path.name),
+            finite(content.get("fps", 24), "fps", path.name, positive=True),
+        )
+        return CameraFile(cameras, speed)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
     content = with_focal_lengths(content, path.parent)
     transform, scale = _to_model(scene, content, path.name)
-    views = []
+    cameras = []
     for i, entry in enumerate(frames):
         where = f"{path.name}, frame {i}"
         stated = {**content, **entry} if isinstance(entry, dict) else {}
@@ -89,30 +92,30 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
         names = ("fl_x", "fl_y", "cx", "cy")
         intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in names]
         size = [side(stated.get(name), name, where) for name in ("w", "h")]
-        views.append(_moved(pose, transform, scale, intrinsics, *size))
-    return CameraFile(views, None)
+        cameras.append(_moved(pose, transform, scale, intrinsics, *size))
+    return CameraFile(cameras, None)
 
 
 def _moved(
     pose: np.ndarray, transform: np.ndarray, scale: float, intrinsics: Sequence[float], width: int, height: int
-) -> View:
+) -> Camera:
     """A camera, camera-to-world with OpenGL axes ``[3 or 4, 4]``, after a transform and then a scale."""
     moved = transform[:3, :3] @ pose[:3]
     moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
-    return View.from_pose(torch.from_numpy(moved), intrinsics, width, height)
+    return Camera.from_pose(torch.from_numpy(moved), intrinsics, width, height)
 
 
-def _of_colmap(model: Path, scene: Scene | None) -> list[View]:
+def _of_colmap(model: Path, scene: Scene | None) -> list[Camera]:
     """Views of a COLMAP model, in its own coordinates or in those of a run trained on it."""
     transform, scale = _to_model(scene, {}, model.name)
-    views = []
+    cameras = []
     for image in read_images(model).values():
         quaternion, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
         rotation = rotation_matrices(quaternion[None])[0].T
         pose = torch.cat([rotation * rotation.new_tensor(OPENGL_TO_OPENCV), -(rotation @ translation)[:, None]], dim=1)
         camera = image.camera
-        views.append(_moved(pose.numpy(), transform, scale, camera.intrinsics, camera.width, camera.height))
-    return views
+        cameras.append(_moved(pose.numpy(), transform, scale, camera.intrinsics, camera.width, camera.height))
+    return cameras
 
 
 def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple[np.ndarray, float]:
@@ -131,7 +134,7 @@ def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple
     return transform @ np.linalg.inv(applied), scale
 
 
-def _camera_path(content: dict[str, Any], where: str) -> list[View]:
+def _camera_path(content: dict[str, Any], where: str) -> list[Camera]:
     """Views of a camera path of nerfstudio's viewer, which is in the coordinates of the model."""
     entries = content["camera_path"]
     if not isinstance(entries, list) or not entries:
@@ -139,7 +142,7 @@ def _camera_path(content: dict[str, Any], where: str) -> list[View]:
     if content.get("camera_type", "perspective") != "perspective":
         raise DataError(f"{where} has cameras of type {content['camera_type']!r}; use perspective ones")
     width, height = (side(content.get(f"render_{name}"), f"render_{name}", where) for name in ("width", "height"))
-    views = []
+    cameras = []
     for i, entry in enumerate(entries):
         place = f"{where}, camera {i}"
         flat = entry.get("camera_to_world") if isinstance(entry, dict) else None
@@ -148,8 +151,8 @@ def _camera_path(content: dict[str, Any], where: str) -> list[View]:
         fov = finite(entry.get("fov", 60.0), "fov", place, positive=True)
         if not fov < 180:
             raise DataError(f"{place}: fov is {fov:g}; it must be below 180 degrees")
-        views.append(View.from_fov(torch.from_numpy(pose), fov, width, height))
-    return views
+        cameras.append(Camera.from_fov(torch.from_numpy(pose), fov, width, height))
+    return cameras
 
 
 def is_frame(stated: Any) -> bool:
@@ -184,8 +187,8 @@ def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None)
 
     Args:
         scene: whose stored views an index counts.
-        start_view: index of a stored view, or a file whose first camera it is (:func:`sundae_ns.views_of`); None keeps
-            that of the scene.
+        start_view: index of a stored camera, or a file whose first camera it is (:func:`sundae_ns.cameras_of`); None
+            keeps that of the scene.
         up: direction ``[3]`` of any length; None keeps that of the scene.
 
     Raises:
@@ -197,10 +200,10 @@ def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None)
     if start_view is None:
         return scene
     if not start_view.lstrip("-").isdigit():
-        return dataclasses.replace(scene, start=read_cameras(Path(start_view), scene).views[0])
-    count = len(scene.views)
+        return dataclasses.replace(scene, start=read_cameras(Path(start_view), scene).cameras[0])
+    count = len(scene.cameras)
     if not count:
         raise ConfigError("the scene has no stored cameras; give --start-view a camera file")
     if not 0 <= int(start_view) < count:
         raise ConfigError(f"there is no camera {start_view}; give --start-view 0 to {count - 1}, or a camera file")
-    return dataclasses.replace(scene, start=scene.views[int(start_view)])
+    return dataclasses.replace(scene, start=scene.cameras[int(start_view)])

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.core.gaussians import mend
+from sundae_ns.core.gaussians import sanitise
 from sundae_ns.graph.neighbors import knn
 from sundae_ns.scene.prune_scene import weights_in
 from sundae_ns.scene.scene import Scene
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 REACH = 3.0
-"""Two primitives touch if they are nearer than this many times the sum of their largest standard deviations."""
+"""Two Gaussians touch if they are nearer than this many times the sum of their largest standard deviations."""
 
 
 def crop(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Scene:
-    """The primitives whose centres are in a box, its faces included; everything else of the scene stays.
+    """The Gaussians whose centres are in a box, its faces included; everything else of the scene stays.
 
     Args:
         scene: to cut; it does not change.
@@ -35,42 +35,42 @@ def crop(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Scene:
 
     Raises:
         ConfigError: the box is empty or not finite.
-        DataError: no primitive is in the box.
+        DataError: no Gaussian is in the box.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
-    >>> sn.crop(scene, (0, 0, 0), (1, 1, 2)).num_primitives
+    >>> sn.crop(scene, (0, 0, 0), (1, 1, 2)).num_gaussians
     200
     """
     return kept(scene, crop_mask(scene, low, high))
 
 
-def remove_floaters(scene: Scene, *, views: Sequence[View] | None = None) -> Scene:
-    """The scene without primitives that no surface supports.
+def remove_floaters(scene: Scene, *, cameras: Sequence[Camera] | None = None) -> Scene:
+    """The scene without Gaussians that no surface supports.
 
-    These are small groups that touch no other primitive (:data:`REACH`), and what none of the views sees. Floaters that
+    These are small groups that touch no other Gaussian (:data:`REACH`), and what none of the views sees. Floaters that
     touch a surface stay.
 
     Args:
         scene: to clean; it does not change.
-        views: cameras of the photographs; by default those stored with the scene. Without any, groups alone count.
+        cameras: cameras of the photographs; by default those stored with the scene. Without any, groups alone count.
 
     Raises:
-        DataError: no primitive is finite, or the views see none.
+        DataError: no Gaussian is finite, or the views see none.
 
     >>> import torch, sundae_ns as sn
     >>> points = torch.cat([torch.rand(2000, 3), torch.tensor([[9.0, 9.0, 9.0]])])
     >>> scene = sn.Scene.from_points(points, torch.rand(2001, 3))
-    >>> field = scene.field.replaced({"scales": scene.field["scales"].clamp(max=-3)})
-    >>> sn.remove_floaters(sn.Scene(field)).num_primitives < 2001
+    >>> gaussians = scene.gaussians.replaced({"scales": scene.gaussians["scales"].clamp(max=-3)})
+    >>> sn.remove_floaters(sn.Scene(gaussians)).num_gaussians < 2001
     True
     """
-    return kept(scene, ~floater_mask(scene, scene.views if views is None else views))
+    return kept(scene, ~floater_mask(scene, scene.cameras if cameras is None else cameras))
 
 
 def kept(scene: Scene, mask: Tensor) -> Scene:
-    """The scene with the primitives under a mask, bool ``[N]``."""
-    return dataclasses.replace(scene, field=scene.field.rows(mask))
+    """The scene with the Gaussians under a mask, bool ``[N]``."""
+    return dataclasses.replace(scene, gaussians=scene.gaussians.rows(mask))
 
 
 def within(mask: Tensor | None, inner: Tensor) -> Tensor:
@@ -83,54 +83,54 @@ def within(mask: Tensor | None, inner: Tensor) -> Tensor:
 
 
 def crop_mask(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Tensor:
-    """True for the primitives in a box, bool ``[N]``; arguments and errors as for :func:`crop`."""
+    """True for the Gaussians in a box, bool ``[N]``; arguments and errors as for :func:`crop`."""
     if len(low) != 3 or len(high) != 3 or not all(math.isfinite(value) for value in (*low, *high)):
         raise ConfigError("the box is not six finite numbers; give its lowest x y z, then its highest")
     if not all(one < other for one, other in zip(low, high, strict=True)):
         raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
-    means = scene.field["means"].detach()
+    means = scene.gaussians["means"].detach()
     # In float64, where both numbers are exact.
     inside = (means.double() >= means.new_tensor(low, dtype=torch.float64)).all(dim=1)
     inside &= (means.double() <= means.new_tensor(high, dtype=torch.float64)).all(dim=1)
     if not bool(inside.any()):
         finite = means[means.isfinite().all(dim=1)].double().cpu().numpy()
         if not len(finite):
-            raise DataError("no primitive is in the box, because none is finite; export the scene again")
+            raise DataError("no Gaussian is in the box, because none is finite; export the scene again")
         lowest, highest = (" ".join(f"{value:.3g}" for value in np.quantile(finite, q, axis=0)) for q in (0.05, 0.95))
-        raise DataError(f"no primitive is in the box; most of them lie between {lowest} and {highest}")
+        raise DataError(f"no Gaussian is in the box; most of them lie between {lowest} and {highest}")
     return inside
 
 
 @torch.no_grad()
-def floater_mask(scene: Scene, views: Sequence[View], *, console: Console | None = None) -> Tensor:
+def floater_mask(scene: Scene, cameras: Sequence[Camera], *, console: Console | None = None) -> Tensor:
     """True for floaters, bool ``[N]``; arguments and errors as for :func:`remove_floaters`.
 
     Args:
         console: shows a progress bar; None for none.
     """
-    mended = mend(scene.field)
-    found = ~mended.mask
-    if not mended.field.num_primitives:
-        raise DataError("no primitive is finite; export the scene again")
-    usable = dataclasses.replace(scene, field=mended.field)
+    sanitised = sanitise(scene.gaussians)
+    found = ~sanitised.mask
+    if not sanitised.gaussians.num_gaussians:
+        raise DataError("no Gaussian is finite; export the scene again")
+    usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
     floats = _unsupported(usable)
-    if views:
-        small = [view.zoomed(min(512 / max(view.width, view.height), 1.0)) for view in views]
+    if cameras:
+        small = [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]
         floats |= weights_in(usable, small, console=console) <= 0
-    found[mended.mask] = floats
+    found[sanitised.mask] = floats
     return found
 
 
 def _unsupported(scene: Scene) -> Tensor:
-    """True for primitives of small groups that touch no other one, bool ``[N]``."""
+    """True for Gaussians of small groups that touch no other one, bool ``[N]``."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    n = scene.num_primitives
+    n = scene.num_gaussians
     if n <= 1:
         return torch.zeros(n, dtype=torch.bool, device=scene.device)
-    near = knn(scene.field["means"].detach(), min(16, n - 1))
-    reach = REACH * scene.field["scales"].detach().amax(dim=1).exp()
+    near = knn(scene.gaussians["means"].detach(), min(16, n - 1))
+    reach = REACH * scene.gaussians["scales"].detach().amax(dim=1).exp()
     touching = near.distances < reach[:, None] + reach[near.indices]
     rows = torch.arange(n, device=scene.device)[:, None].expand_as(touching)[touching].cpu().numpy()
     columns = near.indices[touching].cpu().numpy()

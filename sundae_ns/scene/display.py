@@ -37,7 +37,7 @@ def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Te
 
     Args:
         features: rendered features ``[H, W, F]``, already weighted by ``alpha``.
-        mean, basis, deviations: from :func:`principal_components` of the primitives' features.
+        mean, basis, deviations: from :func:`principal_components` of the Gaussians' features.
         alpha: accumulation ``[H, W, 1]``; colours are black where it is 0.
     """
     components = (features - alpha * mean) @ basis

@@ -18,24 +18,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, DataError
-from sundae_ns.core.gaussians import FEATURES, Field
+from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.cuda.cuda_graphs import GraphCache, record, warm_up
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import response
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.scene import display
-from sundae_ns.scene.render import LocalField, RenderSettings, degree_in_use, render_view, scale_plan, splat
+from sundae_ns.scene.render import GaussianSource, RenderSettings, degree_in_use, render_view, scale_plan, splat
 
 _log = logging.getLogger(__name__)
 
 OUTPUTS = ("rgb", "base_rgb", "depth", "accumulation", "features", "response")
 """Outputs beside the background, in the order in which viewers list them."""
 
-FieldKey = tuple[int, int]
-"""Identifies a state of a field: number of primitives, and number of prunes."""
+GaussiansKey = tuple[int, int]
+"""Identifies a state of a field: number of Gaussians, and number of prunes."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,13 @@ class ShownResponse:
 
     def __init__(self) -> None:
         # The field, and its values. One tuple, because the viewer reads it from its own thread.
-        self._last: tuple[FieldKey | None, Tensor | None] = (None, None)
+        self._last: tuple[GaussiansKey | None, Tensor | None] = (None, None)
 
-    def values(self, field: Field, key: FieldKey | None, rule: PruneRule) -> Tensor | None:
-        """Values in [0, 1] ``[N]``; None if there is no response, as for a single primitive without neighbours.
+    def values(self, gaussians: Gaussians, key: GaussiansKey | None, rule: PruneRule) -> Tensor | None:
+        """Values in [0, 1] ``[N]``; None if there is no response, as for a single Gaussian without neighbours.
 
         Args:
-            field: the primitives.
+            gaussians: the Gaussians.
             key: their state; None for a field that still grows, whose response is not shown.
             rule: signal and graph.
         """
@@ -82,7 +82,7 @@ class ShownResponse:
         of, values = self._last
         if of != key:
             try:
-                values = display.response_values(response(field, rule))
+                values = display.response_values(response(gaussians, rule))
             except DataError:
                 values = None
             self._last = (key, values)
@@ -91,10 +91,10 @@ class ShownResponse:
 
 def late_outputs(
     images: Mapping[str, Any],
-    drawn: Field,
-    field: Field,
+    drawn: Gaussians,
+    gaussians: Gaussians,
     mask: Tensor | None,
-    view: View,
+    camera: Camera,
     settings: RenderSettings,
     values: Callable[[], Tensor | None],
     *,
@@ -102,16 +102,16 @@ def late_outputs(
 ) -> LazyOutputs:
     """All outputs but the background; ``depth``, ``features`` and ``response`` are computed on access.
 
-    ``features`` shows principal components as colours, ``response`` the response of the visible primitives.
+    ``features`` shows principal components as colours, ``response`` the response of the visible Gaussians.
 
     Args:
         images: from a render. Depth and features that are missing are splatted on access.
-        drawn: the primitives of these images.
-        field: all primitives. Both fields are kept, so their mappings must not change.
-        mask: the primitives that were drawn, bool ``[N]``; None for all.
-        view: the camera.
+        drawn: the Gaussians of these images.
+        gaussians: all Gaussians. Both fields are kept, so their mappings must not change.
+        mask: the Gaussians that were drawn, bool ``[N]``; None for all.
+        camera: the camera.
         settings: of the render.
-        values: gives the response of all primitives, in [0, 1] ``[N]``, or None.
+        values: gives the response of all Gaussians, in [0, 1] ``[N]``, or None.
         splattable: whether there are features that this process can splat by itself; otherwise their image is black.
     """
     alpha, found_depth, found_features = (images.get(name) for name in ("accumulation", "depth", "feature_image"))
@@ -120,7 +120,7 @@ def late_outputs(
     def depth() -> Tensor:
         found = found_depth
         if found is None:
-            found = splat(drawn, view, drawn["opacities"], settings, render_depth=True).depth
+            found = splat(drawn, camera, drawn["opacities"], settings, render_depth=True).depth
             assert found is not None
         return display.fill_depth(found, alpha)
 
@@ -129,15 +129,15 @@ def late_outputs(
         if image is None or image.shape[-1] == 0:
             if not splattable:
                 return alpha.new_zeros(*alpha.shape[:2], 3)
-            image = splat(drawn, view, drawn[FEATURES], settings).colors
-        return display.feature_colors(image, *display.principal_components(field[FEATURES]), alpha)
+            image = splat(drawn, camera, drawn[FEATURES], settings).colors
+        return display.feature_colors(image, *display.principal_components(gaussians[FEATURES]), alpha)
 
     def response_image() -> Tensor:
         shown = values()
         if shown is None:
-            return field["means"].new_zeros(view.height, view.width, 1)
-        visible = field if mask is None else field.rows(mask)
-        return splat(visible, view, (shown if mask is None else shown[mask])[:, None], settings).colors
+            return gaussians["means"].new_zeros(camera.height, camera.width, 1)
+        visible = gaussians if mask is None else gaussians.rows(mask)
+        return splat(visible, camera, (shown if mask is None else shown[mask])[:, None], settings).colors
 
     late = {"depth": Later(depth), "features": Later(features), "response": Later(response_image)}
     outputs = {**images, **late}
@@ -145,7 +145,7 @@ def late_outputs(
 
 
 def empty_outputs(width: int, height: int, background: Tensor) -> dict[str, Any]:
-    """Outputs of a crop without primitives: the keys and shapes of any other image."""
+    """Outputs of a crop without Gaussians: the keys and shapes of any other image."""
     image = background.expand(height, width, 3)
     zeros = background.new_zeros(height, width, 1)
     return {
@@ -160,7 +160,7 @@ def empty_outputs(width: int, height: int, background: Tensor) -> dict[str, Any]
 
 
 SPARE_CAPACITY = 1.5
-"""Capacity for tile and primitive pairs, as a multiple of those of the recorded view. Another view may have more."""
+"""Capacity for tile and Gaussian pairs, as a multiple of those of the recorded view. Another view may have more."""
 
 REPLAYED = ("rgb", "base_rgb", "accumulation")
 """Images of a recorded frame."""
@@ -184,20 +184,22 @@ class FrameReplay:
 
     def __init__(self) -> None:
         self._frames: GraphCache[_Frame] = GraphCache()
-        self._field: object = None
+        self._gaussians: object = None
         self._can_record = True
         # A viewer renders in its own thread; a replay and its inputs belong together.
         self._lock = Lock()
 
-    def render(self, source: LocalField, view: View, background: Tensor, settings: RenderSettings) -> dict[str, Any]:
+    def render(
+        self, source: GaussianSource, camera: Camera, background: Tensor, settings: RenderSettings
+    ) -> dict[str, Any]:
         """The images of a view, as :func:`sundae_ns.scene.render.render_view` makes them.
 
         Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of a whole local field. Other
         frames, and the first of a size, are rendered kernel by kernel. Both agree up to the order in which kernels sum.
 
         Args:
-            source: of the primitives.
-            view: the camera.
+            source: of the Gaussians.
+            camera: the camera.
             background: colour ``[3]``.
             settings: everything else.
 
@@ -207,7 +209,7 @@ class FrameReplay:
         if self._can_record and _recordable(source, settings):
             with self._lock:
                 try:
-                    images = self._replayed(source, view, background, settings)
+                    images = self._replayed(source, camera, background, settings)
                 # No compiler, no memory, or any failure of a driver to record.
                 except (BackendError, RuntimeError) as error:
                     _log.warning("frames cannot be recorded and are rendered kernel by kernel: %s", error)
@@ -216,64 +218,64 @@ class FrameReplay:
                     self._can_record, images = False, None
             if images is not None:
                 return images
-        images = render_view(source, view, background, settings, depth=False)[0]
+        images = render_view(source, camera, background, settings, depth=False)[0]
         return {name: images[name] for name in REPLAYED}
 
     def _replayed(
-        self, source: LocalField, view: View, background: Tensor, settings: RenderSettings
+        self, source: GaussianSource, camera: Camera, background: Tensor, settings: RenderSettings
     ) -> dict[str, Any] | None:
-        record_frame = partial(_record, source, view, background, settings)
-        key = self._key(source, view, settings)
+        record_frame = partial(_record, source, camera, background, settings)
+        key = self._key(source, camera, settings)
         frame = self._frames.get(key, record_frame)
         if frame is None:
             return None
-        images, needed = _replay(frame, view, background)
+        images, needed = _replay(frame, camera, background)
         if needed > frame.capacity:
             frame = record_frame(capacity=int(SPARE_CAPACITY * needed))
             self._frames.put(key, frame)
-            images, _ = _replay(frame, view, background)
+            images, _ = _replay(frame, camera, background)
         return images
 
-    def _key(self, source: LocalField, view: View, settings: RenderSettings) -> object:
+    def _key(self, source: GaussianSource, camera: Camera, settings: RenderSettings) -> object:
         """What a recorded frame has fixed. Addresses identify the field, because the frame reads these."""
-        field = source.field
-        addresses = tuple((name, value.data_ptr(), value.shape) for name, value in field.items())
-        if addresses != self._field:
+        gaussians = source.gaussians
+        addresses = tuple((name, value.data_ptr(), value.shape) for name, value in gaussians.items())
+        if addresses != self._gaussians:
             self._frames.clear()
-            self._field = addresses
+            self._gaussians = addresses
         head = settings.head
         of_head: tuple[object, ...] | None = None
         if head is not None:
             # The network itself and not its id, which a later network could reuse.
             options = tuple(vars(head.config).values())
-            of_head = (head.net, head.addresses(), options, *scale_plan(view, settings.trained_focal))
-        degree = degree_in_use(field.sh_degree, settings.active_sh_degree)
-        return view.width, view.height, settings.antialiased, field.encoding, degree, of_head
+            of_head = (head.net, head.addresses(), options, *scale_plan(camera, settings.trained_focal))
+        degree = degree_in_use(gaussians.sh_degree, settings.active_sh_degree)
+        return camera.width, camera.height, settings.antialiased, gaussians.encoding, degree, of_head
 
 
-def _recordable(source: LocalField, settings: RenderSettings) -> bool:
+def _recordable(source: GaussianSource, settings: RenderSettings) -> bool:
     return (
         settings.backend.name == "gsplat"
         and source.replayable
         and not settings.training
         and not torch.is_grad_enabled()
-        and source.field.num_primitives > 0
+        and source.gaussians.num_gaussians > 0
     )
 
 
 def _record(
-    source: LocalField, view: View, background: Tensor, settings: RenderSettings, capacity: int | None = None
+    source: GaussianSource, camera: Camera, background: Tensor, settings: RenderSettings, capacity: int | None = None
 ) -> _Frame:
-    """Record a frame with a capacity for tile and primitive pairs; by default measured on this view, with a reserve."""
+    """Record a frame with a capacity for tile and Gaussian pairs; by default measured on this view, with a reserve."""
     with torch.inference_mode(False), torch.no_grad():
-        inputs = (view.viewmat.clone(), view.K.clone(), background.to(view.viewmat).clone())
-        here = view._replace(viewmat=inputs[0], K=inputs[1])
+        inputs = (camera.viewmat.clone(), camera.K.clone(), background.to(camera.viewmat).clone())
+        here = camera._replace(viewmat=inputs[0], K=inputs[1])
 
         def run(pairs: Capacity) -> dict[str, Any]:
             limited = replace(settings, backend=RecordableGsplat(pairs))
             return render_view(source, here, inputs[2], limited, depth=False)[0]
 
-        device = view.viewmat.device
+        device = camera.viewmat.device
         if capacity is None:
             measured = Capacity()
             with warm_up(device):
@@ -291,9 +293,9 @@ def _record(
     return _Frame(graph, inputs, images, capacity, needed)
 
 
-def _replay(frame: _Frame, view: View, background: Tensor) -> tuple[dict[str, Any], int]:
+def _replay(frame: _Frame, camera: Camera, background: Tensor) -> tuple[dict[str, Any], int]:
     """Images, and the number of pairs; the images are wrong if these exceed the capacity."""
-    torch._foreach_copy_(list(frame.inputs), [view.viewmat, view.K, background.to(view.viewmat)])
+    torch._foreach_copy_(list(frame.inputs), [camera.viewmat, camera.K, background.to(camera.viewmat)])
     frame.graph.replay()
     images = {name: image.clone() for name, image in frame.images.items()}
     return images, int(frame.needed)

@@ -29,9 +29,9 @@ def random_points(n: int, extent: float, generator: torch.Generator | None = Non
 def from_points(
     points: Tensor, rgb: Tensor, *, sh_degree: int, num_features: int, generator: torch.Generator | None = None
 ) -> dict[str, Tensor]:
-    """Parameters of a field with one primitive per point.
+    """Parameters of a field with one Gaussian per point.
 
-    The standard deviation of a primitive is the mean distance to its three nearest neighbours (3DGS, Kerbl et al.
+    The standard deviation of a Gaussian is the mean distance to its three nearest neighbours (3DGS, Kerbl et al.
     2023). Coincident points get the smallest positive one of the cloud, where 3DGS would take the logarithm of zero.
 
     Args:

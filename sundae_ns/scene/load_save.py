@@ -1,4 +1,4 @@
-"""Scenes as files: packed scenes, primitives of any program, and runs of ns-train. Needs no nerfstudio."""
+"""Scenes as files: packed scenes, Gaussians of any program, and runs of ns-train. Needs no nerfstudio."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sundae_ns.data.capture import read_json
 from sundae_ns.head.head import SIZES, CompensationHead, HeadConfig
 from sundae_ns.io import checkpoint, formats
 from sundae_ns.io.config_file import find_config, model_options, parser_options
-from sundae_ns.io.formats import FORMATS, ViewerFile, kind_of, kind_of_primitives
+from sundae_ns.io.formats import FORMATS, ViewerFile, kind_of, kind_of_gaussians
 from sundae_ns.scene.cameras import is_frame
 from sundae_ns.scene.page import write_page
 from sundae_ns.scene.render import degree_in_use
@@ -31,7 +31,7 @@ FRAME_FILE = "dataparser_transforms.json"
 def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     """Open a finished scene. Nothing in its files is executed, and nerfstudio is not needed.
 
-    Opacities of exactly 0 or 1 and widths of 0, which files store as infinite, become finite. Primitives that are NaN,
+    Opacities of exactly 0 or 1 and widths of 0, which files store as infinite, become finite. Gaussians that are NaN,
     or infinite without a meaning, are left out. A warning says how many.
 
     Args:
@@ -41,7 +41,7 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
         device: of the scene.
 
     Raises:
-        DataError: a file of primitives is missing, damaged, or has no finite primitive.
+        DataError: a file of Gaussians is missing, damaged, or has no finite Gaussian.
         PackError: a packed scene is damaged, or states impossible values.
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
 
@@ -49,24 +49,24 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     >>> path = pathlib.Path(tempfile.mkdtemp(), "cloud.ply")
     >>> sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), path)
     >>> sn.load(path)
-    Scene(50 primitives, SH degree 0, no head, cpu)
+    Scene(50 Gaussians, SH degree 0, no head, cpu)
     """
     return load_with_mask(Path(path), device)[0]
 
 
 def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scene, Tensor | None]:
-    """As :func:`load`, with True for the primitives of a file that the scene has, bool ``[N]``; None for others."""
+    """As :func:`load`, with True for the Gaussians of a file that the scene has, bool ``[N]``; None for others."""
     kind = kind_of(path)
     if kind == "packed" or (kind is None and path.suffix.lower() == ".sundae"):
         from sundae_ns.io.pack.packed_scene import read_scene
         from sundae_ns.scene.packing import scene_of  # its decoder needs a compiler, which other files do not
 
         return scene_of(read_scene(path)).to(device), None
-    if kind_of_primitives(path) is None:
+    if kind_of_gaussians(path) is None:
         return _of_run(path).to(device), None
-    found = formats.read_primitives(path)
-    scene = Scene(found.mended.field, antialiased=found.antialiased, in_model_frame=found.in_model_frame)
-    return scene.to(device), found.mended.mask
+    found = formats.read_gaussian_file(path)
+    scene = Scene(found.sanitised.gaussians, antialiased=found.antialiased, in_model_frame=found.in_model_frame)
+    return scene.to(device), found.sanitised.mask
 
 
 def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
@@ -90,7 +90,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
     >>> scene = sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3))
     >>> path = pathlib.Path(tempfile.mkdtemp(), "cloud.sundae")
     >>> sn.save(scene, path)
-    >>> sn.load(path).num_primitives
+    >>> sn.load(path).num_gaussians
     50
     """
     path = Path(path)
@@ -123,7 +123,7 @@ def packed_file(path: Path) -> tuple[Scene, bytes]:
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:
     """Write base colours in a format of other viewers; returns what was left out or clamped. See :func:`save`."""
     facts = {"antialiased": scene.antialiased, "in_model_frame": scene.in_model_frame}
-    return formats.write_for_viewers(path, scene.field, upright=upright, **facts)
+    return formats.write_for_viewers(path, scene.gaussians, upright=upright, **facts)
 
 
 def _of_run(path: Path) -> Scene:
@@ -144,24 +144,24 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         CheckpointError: the run is of another method, or its parts do not fit together.
     """
     options = model_options(config)
-    field, state = checkpoint.field_of(loaded, source), checkpoint.model_state(loaded)
+    gaussians, state = checkpoint.gaussians_of(loaded, source), checkpoint.model_state(loaded)
     extra = state.get(checkpoint.EXTRA_STATE)
     extra = extra if isinstance(extra, Mapping) else {}
     focal = extra.get("trained_focal")
     head = _head_of(state, options, source) if extra.get("head_enabled") else None
     if head is not None:
-        field[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
-    degree, interval = field.sh_degree, options.get("sh_degree_interval")
+        gaussians[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
+    degree, interval = gaussians.sh_degree, options.get("sh_degree_interval")
     if options.get("warm_start") is None and isinstance(interval, int):
         # Coefficients of degrees that training has not reached are not in use.
         degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))
-    field["features_rest"] = field["features_rest"][:, : (degree + 1) ** 2 - 1]
-    field = formats.usable(field, source).field
+    gaussians["features_rest"] = gaussians["features_rest"][:, : (degree + 1) ** 2 - 1]
+    gaussians = formats.usable(gaussians, source).gaussians
     frame = _frame_of(config.parent)
     # nerfstudio turns captures so that z is upwards, unless the options forbid it.
     upright = parser_options(config).get("orientation_method") in ("up", "vertical")
     return Scene(
-        field,
+        gaussians,
         head,
         background_color=options.get("background_color", "random"),
         antialiased=options.get("rasterize_mode") == "antialiased",

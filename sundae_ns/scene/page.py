@@ -21,7 +21,7 @@ from PIL import Image
 
 from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, writing
 from sundae_ns.core.files import write_bytes, write_text
-from sundae_ns.scene.cameras import view_in_front
+from sundae_ns.scene.cameras import camera_in_front
 from sundae_ns.scene.scene import Scene, image_of, render
 
 SCENE_FILE = "scene.sundae"
@@ -92,10 +92,10 @@ def render_first(scene: Scene) -> Image.Image:
     """The image of the scene's start view, else of its first one, head included, at most 640 pixels wide and high.
 
     Raises:
-        MemoryExhaustedError: the view has more primitives than any real scene, or needs more memory than there is.
+        MemoryExhaustedError: the view has more Gaussians than any real scene, or needs more memory than there is.
     """
-    view = scene.start or (scene.views[0] if scene.views else view_in_front(scene))
-    return image_of(render(scene, view.zoomed(min(640 / max(view.width, view.height), 1.0))).rgb)
+    camera = scene.start or (scene.cameras[0] if scene.cameras else camera_in_front(scene))
+    return image_of(render(scene, camera.zoomed(min(640 / max(camera.width, camera.height), 1.0))).rgb)
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.gaussians import FEATURES, Field
+from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.head.head import CompensationHead, ScalePlan, plan, resize
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterize.interface import blending_weights, harmonic_colors, rasterize
@@ -39,10 +39,10 @@ class StepResolution(NamedTuple):
     """Whether half of the steps see their image in a mirror."""
 
 
-class TrainingView(NamedTuple):
+class TrainingCamera(NamedTuple):
     """A training view for passes that do not train."""
 
-    view: View
+    camera: Camera
     """The camera."""
     mask: Tensor | None
     """Pixels that count, bool ``[H, W, 1]``; None for all."""
@@ -57,21 +57,21 @@ class ColorSettings:
     """Highest SH degree in use; None for the degree of the field."""
 
 
-def colors_from(params: Mapping[str, Tensor], field: Field, center: Tensor, settings: ColorSettings) -> Tensor:
-    """Colours of primitives as seen from a place.
+def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tensor, settings: ColorSettings) -> Tensor:
+    """Colours of Gaussians as seen from a place.
 
     Args:
-        params: ``means`` ``[M, 3]``, ``features_dc`` and ``features_rest`` of the primitives.
-        field: the field that they belong to, for its encoding.
-        center: camera centre ``[3]``, or one for each primitive ``[M, 3]``; world units.
+        params: ``means`` ``[M, 3]``, ``features_dc`` and ``features_rest`` of the Gaussians.
+        gaussians: the field that they belong to, for its encoding.
+        center: camera centre ``[3]``, or one for each Gaussian ``[M, 3]``; world units.
         settings: backend and SH degree.
 
     Returns:
         ``[M, 3]``, at least 0.
     """
-    if field.encoding == "logits":
+    if gaussians.encoding == "logits":
         return params["features_dc"].sigmoid()
-    degree = degree_in_use(field.sh_degree, settings.active_sh_degree)
+    degree = degree_in_use(gaussians.sh_degree, settings.active_sh_degree)
     coefficients = params["features_dc"], params["features_rest"]
     return harmonic_colors(degree, params["means"], center, *coefficients, backend=settings.backend)
 
@@ -81,38 +81,38 @@ def degree_in_use(sh_degree: int, active: int | None) -> int:
     return sh_degree if active is None else min(active, sh_degree)
 
 
-class LocalField:
-    """The primitives of one process.
+class GaussianSource:
+    """The Gaussians of one process.
 
     Args:
-        field: the primitives.
+        gaussians: the Gaussians.
         whole: False for a part, whose tensors are new each time.
     """
 
-    def __init__(self, field: Field, *, whole: bool = True) -> None:
-        self.field = field
+    def __init__(self, gaussians: Gaussians, *, whole: bool = True) -> None:
+        self.gaussians = gaussians
         self.replayable = whole
         """Whether frames may be recorded: the tensors stay where they are."""
 
     @property
     def total(self) -> int:
-        """Number of primitives of the whole field."""
-        return self.field.num_primitives
+        """Number of Gaussians of the whole field."""
+        return self.gaussians.num_gaussians
 
     def primitives(
-        self, view: View, settings: ColorSettings, *, features: bool, colors: bool = True
+        self, camera: Camera, settings: ColorSettings, *, features: bool, colors: bool = True
     ) -> dict[str, Tensor]:
-        """Parameters of the primitives that the view may see ``[M, ...]``, with ``colors`` from its camera ``[M, 3]``.
+        """Parameters of the Gaussians that the view may see ``[M, ...]``, with ``colors`` from its camera ``[M, 3]``.
 
         Args:
-            view: the camera.
+            camera: the camera.
             settings: how colours are evaluated.
             features: whether feature vectors are needed.
             colors: whether colours are needed.
         """
-        primitives = dict(self.field)
+        primitives = dict(self.gaussians)
         if colors:
-            primitives["colors"] = colors_from(self.field, self.field, view.center, settings)
+            primitives["colors"] = colors_from(self.gaussians, self.gaussians, camera.center, settings)
         return primitives
 
 
@@ -136,17 +136,17 @@ class RenderSettings(ColorSettings):
         return replace(self, head=None)
 
 
-def pass_options(params: Mapping[str, Tensor], view: View, settings: RenderSettings) -> dict[str, Any]:
+def pass_options(params: Mapping[str, Tensor], camera: Camera, settings: RenderSettings) -> dict[str, Any]:
     """Arguments that every pass over a view hands to the rasteriser: activated parameters, camera and settings."""
     return {
         "means": params["means"],
         "quats": params["quats"],
         "scales": params["scales"].exp(),
         "opacities": params["opacities"].sigmoid().squeeze(-1),
-        "viewmat": view.viewmat,
-        "K": view.K,
-        "width": view.width,
-        "height": view.height,
+        "viewmat": camera.viewmat,
+        "K": camera.K,
+        "width": camera.width,
+        "height": camera.height,
         "near_plane": NEAR_PLANE,
         "antialiased": settings.antialiased,
         "backend": settings.backend,
@@ -154,25 +154,25 @@ def pass_options(params: Mapping[str, Tensor], view: View, settings: RenderSetti
 
 
 def splat(
-    params: Mapping[str, Tensor], view: View, channels: Tensor, settings: RenderSettings, **options: Any
+    params: Mapping[str, Tensor], camera: Camera, channels: Tensor, settings: RenderSettings, **options: Any
 ) -> Rasterization:
-    """Splat values of the primitives ``[N, C]``; options are those of ``rasterize``."""
-    return rasterize(colors=channels, **pass_options(params, view, settings), **options)
+    """Splat values of the Gaussians ``[N, C]``; options are those of ``rasterize``."""
+    return rasterize(colors=channels, **pass_options(params, camera, settings), **options)
 
 
-def scale_plan(view: View, trained_focal: tuple[float, float] | None) -> ScalePlan:
+def scale_plan(camera: Camera, trained_focal: tuple[float, float] | None) -> ScalePlan:
     """Scale and strength of the correction for a view, given the focal lengths that the head was trained at."""
-    return plan(view.focal, trained_focal, view.width * view.height)
+    return plan(camera.focal, trained_focal, camera.width * camera.height)
 
 
 def draw(
-    primitives: Mapping[str, Tensor], view: View, background: Tensor, settings: RenderSettings, *, depth: bool
+    primitives: Mapping[str, Tensor], camera: Camera, background: Tensor, settings: RenderSettings, *, depth: bool
 ) -> tuple[dict[str, Any], Rasterization]:
     """Splat colours, features and depth in one pass.
 
     Args:
-        primitives: from a :class:`LocalField`; with ``features`` if the head is enabled.
-        view: the camera.
+        Gaussians: from a :class:`GaussianSource`; with ``features`` if the head is enabled.
+        camera: the camera.
         background: colour ``[3]``.
         settings: everything else.
         depth: whether to render depth.
@@ -184,7 +184,7 @@ def draw(
     channels = primitives["colors"]
     if settings.head is not None:
         channels = torch.cat([channels, primitives[FEATURES]], dim=1)
-    splatted = splat(primitives, view, channels, settings, render_depth=depth, absgrad=settings.absgrad)
+    splatted = splat(primitives, camera, channels, settings, render_depth=depth, absgrad=settings.absgrad)
     blended, features = splatted.colors[..., :3], splatted.colors[..., 3:]
     base = (blended + (1 - splatted.alpha) * background).clamp(0.0, 1.0)
     images = {
@@ -222,21 +222,21 @@ def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, ba
 
 
 def render_view(
-    source: LocalField,
-    view: View,
+    source: GaussianSource,
+    camera: Camera,
     background: Tensor,
     settings: RenderSettings,
     *,
     depth: bool = True,
 ) -> tuple[dict[str, Any], Rasterization]:
-    """The images of one view: primitives, one splatting pass, and the head.
+    """The images of one view: Gaussians, one splatting pass, and the head.
 
     An image of another scale than the head was trained at is rendered at the trained scale too, and gets the resized
     correction (:mod:`sundae_ns.head.head`).
 
     Args:
-        source: of the primitives.
-        view: the camera.
+        source: of the Gaussians.
+        camera: the camera.
         background: colour ``[3]``.
         settings: everything else; ``head=None`` leaves the head out.
         depth: whether to render depth.
@@ -245,18 +245,18 @@ def render_view(
         ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result.
     """
     head = settings.head
-    primitives = source.primitives(view, settings, features=head is not None)
-    images, splatted = draw(primitives, view, background, settings, depth=depth)
+    primitives = source.primitives(camera, settings, features=head is not None)
+    images, splatted = draw(primitives, camera, background, settings, depth=depth)
     if head is None:
         return images, splatted
-    zoom, weight = ScalePlan(1.0, 1.0) if settings.training else scale_plan(view, settings.trained_focal)
+    zoom, weight = ScalePlan(1.0, 1.0) if settings.training else scale_plan(camera, settings.trained_focal)
     base = images["base_rgb"]
     if zoom == 1.0:
         images["rgb"] = compensate(head, base, splatted, background)
     elif weight > 0:
-        at_scale, _ = render_view(source, view.zoomed(zoom), background, settings, depth=False)
+        at_scale, _ = render_view(source, camera.zoomed(zoom), background, settings, depth=False)
         correction = at_scale["rgb"] - at_scale["base_rgb"]
-        images["rgb"] = base + weight * resize(correction, view.height, view.width)
+        images["rgb"] = base + weight * resize(correction, camera.height, camera.width)
     if not settings.training:
         images["rgb"] = images["rgb"].clamp(0.0, 1.0)
     return images, splatted
@@ -264,53 +264,53 @@ def render_view(
 
 @torch.no_grad()
 def contribution(
-    source: LocalField,
-    views: Sequence[TrainingView],
+    source: GaussianSource,
+    cameras: Sequence[TrainingCamera],
     background: Tensor,
     settings: RenderSettings,
     count: int | None = None,
     *,
     console: Console | None = None,
 ) -> Tensor:
-    """Blending weight of each primitive, summed over the pixels of all views ``[N]``.
+    """Blending weight of each Gaussian, summed over the pixels of all views ``[N]``.
 
     Args:
-        source: of the primitives.
-        views: the training views.
+        source: of the Gaussians.
+        cameras: the training views.
         background: colour ``[3]``; fixed, so that the result does not depend on a random one.
         settings: how images are made.
-        count: number of primitives that a prune will keep. If given, pixels are weighted by the detail that these
+        count: number of Gaussians that a prune will keep. If given, pixels are weighted by the detail that these
             cannot show (:func:`sundae_ns.pruning.scores.pixel_detail`).
         console: shows a progress bar; None for none.
 
     Raises:
         DataError: a mask has another size than its view.
     """
-    total = torch.zeros(source.field.num_primitives, device=source.field["means"].device)
-    shown: Iterable[TrainingView] = views
+    total = torch.zeros(source.gaussians.num_gaussians, device=source.gaussians["means"].device)
+    shown: Iterable[TrainingCamera] = cameras
     if console is not None:
         from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
 
-        shown = track(views, "Contribution of primitives", transient=True, console=console)
-    for view, mask in shown:
-        if mask is not None and tuple(mask.shape) != (view.height, view.width, 1):
+        shown = track(cameras, "Contribution of Gaussians", transient=True, console=console)
+    for camera, mask in shown:
+        if mask is not None and tuple(mask.shape) != (camera.height, camera.width, 1):
             raise DataError(
-                f"a mask is {list(mask.shape)} but its view is {view.width} x {view.height} px; "
+                f"a mask is {list(mask.shape)} but its view is {camera.width} x {camera.height} px; "
                 "give masks the size of their images"
             )
-        primitives = source.primitives(view, settings, features=False, colors=count is not None)
+        primitives = source.primitives(camera, settings, features=False, colors=count is not None)
         pixels = None if mask is None else mask[..., 0].to(total)
         if count is None:
-            total += blending_weights(pixels=pixels, **pass_options(primitives, view, settings))
+            total += blending_weights(pixels=pixels, **pass_options(primitives, camera, settings))
         else:
             share = count / source.total
-            total += _detail_weights(primitives, view, background.to(total.device), settings, share, pixels)
+            total += _detail_weights(primitives, camera, background.to(total.device), settings, share, pixels)
     return total
 
 
 def _detail_weights(
     primitives: Mapping[str, Tensor],
-    view: View,
+    camera: Camera,
     background: Tensor,
     settings: RenderSettings,
     share: float,
@@ -321,8 +321,8 @@ def _detail_weights(
     fixed = {name: value.detach() for name, value in primitives.items()}
     fixed["colors"].requires_grad_()
     with torch.enable_grad():
-        images, splatted = draw(fixed, view, background, settings.without_head(), depth=False)
-    # A prune keeps the same share of the visible primitives as of all.
+        images, splatted = draw(fixed, camera, background, settings.without_head(), depth=False)
+    # A prune keeps the same share of the visible Gaussians as of all.
     detail = pixel_detail(images["base_rgb"], share * float((splatted.radii > 0).sum()))
     pixels = detail if pixels is None else detail * pixels
     with torch.enable_grad():

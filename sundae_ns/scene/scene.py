@@ -12,30 +12,30 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.core.metrics import psnr, ssim
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.rasterize.interface import BackendName, select_backend
 from sundae_ns.scene.initialization import from_points
-from sundae_ns.scene.render import SHOWN_BACKGROUNDS, LocalField, RenderSettings, render_view
+from sundae_ns.scene.render import SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, render_view
 
-Camera = TypeVar("Camera")
+AnyCamera = TypeVar("AnyCamera")
 Background = Literal["random", "black", "white"]
 """Names of backgrounds; ``random`` is that of a run trained over random ones, and shows nerfstudio's grey."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A field of Gaussian primitives, with its compensation head if it has one.
+    """A field of Gaussian Gaussians, with its compensation head if it has one.
 
     Scenes are values: functions return new ones and change none.
     """
 
-    field: Field
-    """The primitives: tensors ``[N, ...]`` by name, see :mod:`sundae_ns.core.gaussians`; any device."""
+    gaussians: Gaussians
+    """The Gaussians: tensors ``[N, ...]`` by name, see :mod:`sundae_ns.core.gaussians`; any device."""
     head: CompensationHead | None = None
     """The compensation head, on the device of the field; None without one."""
     background_color: Background = "black"
@@ -43,11 +43,11 @@ class Scene:
     """Whether opacities compensate for the smallest footprint, as in training (``rasterize_mode`` of splatfacto)."""
     trained_focal: tuple[float, float] | None = None
     """Shortest and longest focal length of the images that the head was trained on, pixels."""
-    views: tuple[View, ...] = ()
+    cameras: tuple[Camera, ...] = ()
     """Cameras stored with the scene, such as some of its training views; on the CPU."""
     up: tuple[float, float, float] | None = None
     """The direction that is upwards, of unit length; None if it is not known. The web page turns about it."""
-    start: View | None = None
+    start: Camera | None = None
     """The camera that the web page opens with, on the CPU; None for the first of the stored ones."""
     in_model_frame: bool = False
     """Whether coordinates are those of nerfstudio's model, not of the capture or of another program."""
@@ -56,7 +56,7 @@ class Scene:
 
     @classmethod
     def from_points(cls, points: Tensor, colors: Tensor, *, sh_degree: int = 0) -> Scene:
-        """A scene of one primitive for each point, sized by the distance to its neighbours.
+        """A scene of one Gaussian for each point, sized by the distance to its neighbours.
 
         Args:
             points: positions ``[N, 3]``, world units.
@@ -68,23 +68,23 @@ class Scene:
 
         >>> import torch, sundae_ns as sn
         >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))
-        >>> scene.num_primitives
+        >>> scene.num_gaussians
         100
         """
         if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape or not len(points):
             shapes = f"{list(points.shape)} and {list(colors.shape)}"
             raise DataError(f"points and colours have shapes {shapes}; pass [N, 3] each, N at least 1")
-        return cls(Field(from_points(points, colors, sh_degree=sh_degree, num_features=0)))
+        return cls(Gaussians(from_points(points, colors, sh_degree=sh_degree, num_features=0)))
 
     @property
-    def num_primitives(self) -> int:
-        """Number of primitives N."""
-        return self.field.num_primitives
+    def num_gaussians(self) -> int:
+        """Number of Gaussians N."""
+        return self.gaussians.num_gaussians
 
     @property
     def device(self) -> torch.device:
         """Device of the field and the head."""
-        device: torch.device = self.field["means"].device
+        device: torch.device = self.gaussians["means"].device
         return device
 
     @property
@@ -96,7 +96,7 @@ class Scene:
         """The scene on another device; stored views stay on the CPU."""
         if torch.device(device) == self.device:
             return self
-        field = self.field.replaced({name: value.to(device) for name, value in self.field.items()})
+        gaussians = self.gaussians.replaced({name: value.to(device) for name, value in self.gaussians.items()})
         head = None
         if self.head is not None:
             # No deep copy: on a GPU the head keeps recorded CUDA graphs, which cannot be copied.
@@ -104,7 +104,7 @@ class Scene:
                 head = CompensationHead(dataclasses.replace(self.head.config))
             head.load_state_dict(self.head.state_dict())
             head = head.train(self.head.training).to(device)
-        return dataclasses.replace(self, field=field, head=head)
+        return dataclasses.replace(self, gaussians=gaussians, head=head)
 
     def settings(self, backend: BackendName = "auto", *, head: bool = True) -> RenderSettings:
         """Settings that render the scene with all of its SH degrees.
@@ -125,7 +125,7 @@ class Scene:
 
     def __repr__(self) -> str:
         head = "no head" if self.head is None else f"{self.head.config.size} head"
-        return f"Scene({self.num_primitives:,} primitives, SH degree {self.field.sh_degree}, {head}, {self.device})"
+        return f"Scene({self.num_gaussians:,} Gaussians, SH degree {self.gaussians.sh_degree}, {head}, {self.device})"
 
 
 class Rendering(NamedTuple):
@@ -134,7 +134,7 @@ class Rendering(NamedTuple):
     rgb: Tensor
     """The image, corrected by the head if there is one, in [0, 1] ``[H, W, 3]``."""
     base_rgb: Tensor
-    """The image of the primitives alone, in [0, 1] ``[H, W, 3]``."""
+    """The image of the Gaussians alone, in [0, 1] ``[H, W, 3]``."""
     depth: Tensor
     """Expected distance along the viewing axis, world units; 0 where nothing is seen ``[H, W, 1]``."""
     accumulation: Tensor
@@ -147,28 +147,28 @@ def image_of(rgb: Tensor) -> Image.Image:
 
 
 @torch.no_grad()
-def render(scene: Scene, view: View, *, head: bool = True, backend: BackendName = "auto") -> Rendering:
+def render(scene: Scene, camera: Camera, *, head: bool = True, backend: BackendName = "auto") -> Rendering:
     """Render one view of a scene, on the device of the scene.
 
     Args:
         scene: from :func:`sundae_ns.load`, or made by hand.
-        view: the camera, on any device.
+        camera: the camera, on any device.
         head: whether the head corrects the image; without one, ``rgb`` is ``base_rgb``.
         backend: the rasteriser.
 
     Raises:
         BackendError: the rasteriser cannot run on the device of the scene.
-        MemoryExhaustedError: the memory is full, or, on a CPU, the view has more primitives than any real scene.
+        MemoryExhaustedError: the memory is full, or, on a CPU, the view has more Gaussians than any real scene.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))
-    >>> view = sn.View.look_at((2.0, 2.0, 2.0), (0.5, 0.5, 0.5), width=64, height=48)
-    >>> sn.render(scene, view).rgb.shape
+    >>> camera = sn.Camera.look_at((2.0, 2.0, 2.0), (0.5, 0.5, 0.5), width=64, height=48)
+    >>> sn.render(scene, camera).rgb.shape
     torch.Size([48, 64, 3])
     """
-    with naming_full_memory(lambda: scene.num_primitives):
+    with naming_full_memory(lambda: scene.num_gaussians):
         settings = scene.settings(backend, head=head)
-        images, _ = render_view(LocalField(scene.field), view.to(scene.device), scene.background, settings)
+        images, _ = render_view(GaussianSource(scene.gaussians), camera.to(scene.device), scene.background, settings)
     return Rendering(*(images[name] for name in Rendering._fields))
 
 
@@ -193,7 +193,7 @@ class Quality:
 
 
 @torch.no_grad()
-def evaluate(render: Callable[[Camera], Tensor], cameras: Iterable[Camera], targets: Iterable[Tensor]) -> Quality:
+def evaluate(render: Callable[[AnyCamera], Tensor], cameras: Iterable[AnyCamera], targets: Iterable[Tensor]) -> Quality:
     """Compare rendered images with true ones.
 
     Args:
@@ -213,7 +213,7 @@ def evaluate(render: Callable[[Camera], Tensor], cameras: Iterable[Camera], targ
 def measure(
     scene: Scene,
     reference: Scene | Sequence[Tensor],
-    views: Sequence[View] | None = None,
+    cameras: Sequence[Camera] | None = None,
     *,
     head: bool = True,
     backend: BackendName = "auto",
@@ -224,7 +224,7 @@ def measure(
         scene: to measure.
         reference: a scene, whose own images count as true, or an image in [0, 1] ``[H, W, 3]`` for each view. Both
             scenes are rendered over the background of the reference.
-        views: the cameras; by default those stored with the reference, or with the scene.
+        cameras: the cameras; by default those stored with the reference, or with the scene.
         head: whether the heads of both scenes correct their images.
         backend: the rasteriser.
 
@@ -233,18 +233,20 @@ def measure(
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
-    >>> views = sn.virtual_views(scene, 2, size=32)
-    >>> sn.measure(sn.prune(scene, keep=0.5, views=views), scene, views).psnr > 10
+    >>> cameras = sn.virtual_cameras(scene, 2, size=32)
+    >>> sn.measure(sn.prune(scene, keep=0.5, cameras=cameras), scene, cameras).psnr > 10
     True
     """
-    stored = reference.views if isinstance(reference, Scene) else ()
-    views = tuple(views) if views is not None else stored or scene.views
-    if not views:
-        raise DataError("there is no view to measure in; give views, such as sundae_ns.virtual_views(scene)")
-    if not isinstance(reference, Scene) and len(reference) != len(views):
-        raise DataError(f"{len(reference)} images do not fit {len(views)} views; give one image for each view")
+    stored = reference.cameras if isinstance(reference, Scene) else ()
+    cameras = tuple(cameras) if cameras is not None else stored or scene.cameras
+    if not cameras:
+        raise DataError("there is no view to measure in; give views, such as sundae_ns.virtual_cameras(scene)")
+    if not isinstance(reference, Scene) and len(reference) != len(cameras):
+        raise DataError(f"{len(reference)} images do not fit {len(cameras)} views; give one image for each view")
     if isinstance(reference, Scene):
         scene = dataclasses.replace(scene, background_color=reference.background_color)
     options: dict[str, Any] = {"head": head, "backend": backend}
-    targets = (render(reference, view, **options).rgb for view in views) if isinstance(reference, Scene) else reference
-    return evaluate(lambda view: render(scene, view, **options).rgb, views, targets)
+    targets = (
+        (render(reference, camera, **options).rgb for camera in cameras) if isinstance(reference, Scene) else reference
+    )
+    return evaluate(lambda camera: render(scene, camera, **options).rgb, cameras, targets)

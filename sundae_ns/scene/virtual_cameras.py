@@ -10,11 +10,11 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from sundae_ns.core.camera import View, poses_looking_at, world_to_camera
+from sundae_ns.core.camera import Camera, poses_looking_at, world_to_camera
 from sundae_ns.core.covariance import chunks
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.core.gaussians import Field, mend
-from sundae_ns.rasterize.interface import rasterize_views
+from sundae_ns.core.gaussians import Gaussians, sanitise
+from sundae_ns.rasterize.interface import rasterize_cameras
 from sundae_ns.scene.render import pass_options
 from sundae_ns.scene.scene import Scene
 
@@ -25,14 +25,14 @@ SIDE = 512
 """Default width and height of their images, pixels."""
 T = TypeVar("T")
 
-# The search of virtual_views; distances are multiples of the median distance of the primitives from their middle.
+# The search of virtual_cameras; distances are multiples of the median distance of the Gaussians from their middle.
 NEAREST, FARTHEST = 0.3, 2.0  # of the eyes from the middle
 FIRST, ROUNDS, MOVED = 4, 4, 3  # cameras drawn for each one that is kept; then rounds, and the moved ones of a round
 STEP = 0.3  # how far an eye moves in a round, as a share of its distance
 RESAMPLED = 3  # rounds before which the even half is drawn anew, in proportion to exp(-coarseness)
 EVENNESS = 4.0  # weight of the deviation of the angles beside their mean, for the half that sees all parts alike
 _PROBE_SIZE, _PROBES = 24, 64  # sides of the images that candidates are judged by, pixels, and images at once
-_PROBE_PRIMITIVES = 20_000  # most primitives of these images
+_PROBE_GAUSSIANS = 20_000  # most Gaussians of these images
 
 
 def by_device(values: Mapping[str, T], device: torch.device) -> T:
@@ -40,45 +40,45 @@ def by_device(values: Mapping[str, T], device: torch.device) -> T:
     return values.get(device.type, values["cpu"])
 
 
-def virtual_views(scene: Scene, n: int | None = None, *, seed: int = 0, size: int | None = None) -> list[View]:
+def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: int | None = None) -> list[Camera]:
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
-    A field shows where its photographs were taken: training splits primitives until each covers few pixels of the
+    A field shows where its photographs were taken: training splits Gaussians until each covers few pixels of the
     images, so from there all of them look small, near and far ones alike. From elsewhere some are blobs, and so are
     matter and floaters that are too near. Eyes are drawn in all directions from the middle of the scene, at 0.3 to 2
-    times the median distance of its primitives, and look at random primitives. Small images judge them by the logarithm
-    of the angle of the primitives that they show; where nothing is seen, that of one radian.
+    times the median distance of its Gaussians, and look at random Gaussians. Small images judge them by the logarithm
+    of the angle of the Gaussians that they show; where nothing is seen, that of one radian.
 
-    Of every two cameras, one seeks the finest primitives, by the mean: it is the best of four, and four times the best
+    Of every two cameras, one seeks the finest Gaussians, by the mean: it is the best of four, and four times the best
     of three moved ones takes its place if it is better. The other seeks evenness too, by the mean and the deviation,
-    and those that have found little start again where others have found more. It then looks at a random primitive, so
+    and those that have found little start again where others have found more. It then looks at a random Gaussian, so
     that the cameras see what is around them.
 
     Args:
-        scene: its finite primitives count.
+        scene: its finite Gaussians count.
         n: number of cameras; by default 128 for a scene on a CPU and 256 for one on a GPU.
         seed: of the random draws, which are the same on every device up to rounding.
         size: width and height of the images, pixels; by default 512.
 
     Raises:
         ConfigError: ``n`` or ``size`` is less than 1.
-        DataError: no primitive is finite.
+        DataError: no Gaussian is finite.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))
-    >>> len(sn.virtual_views(scene, 8))
+    >>> len(sn.virtual_cameras(scene, 8))
     8
     """
     n = by_device(VIEWS, scene.device) if n is None else n
     size = SIDE if size is None else size
     if n < 1 or size < 1:
         raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
-    field = _usable(scene)
-    means = field["means"]
-    middle, reach = _middle_and_reach(field)
+    gaussians = _usable(scene)
+    means = gaussians["means"]
+    middle, reach = _middle_and_reach(gaussians)
     generator = torch.Generator().manual_seed(seed)
-    probe, sizes = _probe(field, middle, reach, generator)
-    judge = dataclasses.replace(scene, field=probe)
+    probe, sizes = _probe(gaussians, middle, reach, generator)
+    judge = dataclasses.replace(scene, gaussians=probe)
 
     def random_targets(count: int) -> Tensor:
         drawn = torch.randint(len(means), (count,), generator=generator)
@@ -106,7 +106,7 @@ def virtual_views(scene: Scene, n: int | None = None, *, seed: int = 0, size: in
                 eyes, targets, coarseness = eyes[drawn], targets[drawn], coarseness[drawn]
             near, ahead = eyes.repeat(MOVED, 1), targets.repeat(MOVED, 1)
             moved = near + STEP / 3**0.5 * near.norm(dim=1, keepdim=True) * normal(len(near))
-            turns = torch.rand(len(near), 1, generator=generator) < 0.5  # the others look at the same primitive
+            turns = torch.rand(len(near), 1, generator=generator) < 0.5  # the others look at the same Gaussian
             moved, ahead, found = best_of(moved, torch.where(turns, random_targets(len(near)), ahead))
             better = found < coarseness
             eyes, targets = torch.where(better[:, None], moved, eyes), torch.where(better[:, None], ahead, targets)
@@ -121,7 +121,7 @@ def virtual_views(scene: Scene, n: int | None = None, *, seed: int = 0, size: in
         eyes = torch.cat([eyes, even])[turns]
         targets = torch.cat([targets, random_targets(len(even))])[turns]
     return [
-        View.look_at(middle + reach * eye, middle + reach * target, fov=FOV, width=size, height=size)
+        Camera.look_at(middle + reach * eye, middle + reach * target, fov=FOV, width=size, height=size)
         for eye, target in zip(eyes, targets, strict=True)
     ]
 
@@ -132,79 +132,79 @@ def _resampled(chances: Tensor, generator: torch.Generator) -> Tensor:
     return torch.searchsorted(chances.cumsum(0), places / len(chances)).clamp_max(len(chances) - 1)
 
 
-def of_unit_size(scene: Scene, views: Sequence[View]) -> tuple[Scene, list[View]]:
+def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[Camera]]:
     """A scene of another program scaled to a size of 1, and its views along with it; see :func:`size_of`.
 
     The near plane is at a fixed distance, and would hide a scene of millimetres.
     """
-    views, size = list(views), size_of(scene)
+    cameras, size = list(cameras), size_of(scene)
     if size == 1:
-        return scene, views
+        return scene, cameras
     scaled = []
-    for view in views:
-        viewmat = view.viewmat.clone()
+    for camera in cameras:
+        viewmat = camera.viewmat.clone()
         viewmat[:3, 3] /= size
-        scaled.append(view._replace(viewmat=viewmat))
+        scaled.append(camera._replace(viewmat=viewmat))
     return resized(scene, 1 / size), scaled
 
 
 def size_of(scene: Scene) -> float:
-    """The median distance of the primitives from their middle; 1 for nerfstudio's model, which keeps its size."""
+    """The median distance of the Gaussians from their middle; 1 for nerfstudio's model, which keeps its size."""
     return 1.0 if scene.in_model_frame else middle_and_reach(scene)[1]
 
 
 def middle_and_reach(scene: Scene) -> tuple[Tensor, float]:
-    """Median of the finite centres ``[3]``, float64 on the CPU, and the median distance of the primitives from it."""
+    """Median of the finite centres ``[3]``, float64 on the CPU, and the median distance of the Gaussians from it."""
     return _middle_and_reach(_usable(scene))
 
 
-def split(views: Sequence[View]) -> tuple[list[View], list[View]]:
+def split(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
     """The views that decide, and those that are held out: every eighth, from the first on."""
-    return [view for i, view in enumerate(views) if i % 8], list(views[::8])
+    return [camera for i, camera in enumerate(cameras) if i % 8], list(cameras[::8])
 
 
 def resized(scene: Scene, factor: float) -> Scene:
     """The scene, without its stored views, ``factor`` times as large."""
     if factor == 1:
         return scene
-    values = {"means": scene.field["means"] * factor, "scales": scene.field["scales"] + math.log(factor)}
-    return dataclasses.replace(scene, field=scene.field.replaced(values), views=())
+    values = {"means": scene.gaussians["means"] * factor, "scales": scene.gaussians["scales"] + math.log(factor)}
+    return dataclasses.replace(scene, gaussians=scene.gaussians.replaced(values), cameras=())
 
 
-def _usable(scene: Scene) -> Field:
-    """The finite primitives, detached."""
-    field = mend(scene.field).field
-    if not field.num_primitives:
-        raise DataError(f"none of {scene.num_primitives:,} primitives is finite, so no camera sees the scene")
-    return Field({name: value.detach() for name, value in field.items()}, field.encoding)
+def _usable(scene: Scene) -> Gaussians:
+    """The finite Gaussians, detached."""
+    gaussians = sanitise(scene.gaussians).gaussians
+    if not gaussians.num_gaussians:
+        raise DataError(f"none of {scene.num_gaussians:,} Gaussians is finite, so no camera sees the scene")
+    return Gaussians({name: value.detach() for name, value in gaussians.items()}, gaussians.encoding)
 
 
-def _middle_and_reach(field: Field) -> tuple[Tensor, float]:
+def _middle_and_reach(gaussians: Gaussians) -> tuple[Tensor, float]:
     """Median of the centres ``[3]``, float64 on the CPU, and the median distance from it; in one place, a size."""
-    means = field["means"].detach().double()
+    means = gaussians["means"].detach().double()
     middle = means.median(dim=0).values
     reach = float((means - middle).norm(dim=1).median())
     if reach == 0:
-        reach = 3 * float(field["scales"].detach().double().amax(dim=1).median().exp())
+        reach = 3 * float(gaussians["scales"].detach().double().amax(dim=1).median().exp())
     return middle.cpu(), max(reach, 1e-30)
 
 
-def _probe(field: Field, middle: Tensor, reach: float, generator: torch.Generator) -> tuple[Field, Tensor]:
-    """A field of a few primitives that looks alike from afar, of unit size and around the origin.
+def _probe(gaussians: Gaussians, middle: Tensor, reach: float, generator: torch.Generator) -> tuple[Gaussians, Tensor]:
+    """A field of a few Gaussians that looks alike from afar, of unit size and around the origin.
 
-    Primitives are drawn by their size and opacity, and those drawn grow by as much as covers the others' area.
+    Gaussians are drawn by their size and opacity, and those drawn grow by as much as covers the others' area.
 
     Returns:
-        The field of M primitives, and the logarithms of their sizes before they grew ``[M]``.
+        The field of M Gaussians, and the logarithms of their sizes before they grew ``[M]``.
     """
-    sizes = field["scales"].double().sort(dim=1).values[:, 1:].mean(dim=1) - math.log(reach)
-    kept = field
-    if field.num_primitives > _PROBE_PRIMITIVES:
-        weight = sizes + torch.nn.functional.logsigmoid(field["opacities"].double()[:, 0]) / 2
+    sizes = gaussians["scales"].double().sort(dim=1).values[:, 1:].mean(dim=1) - math.log(reach)
+    kept = gaussians
+    if gaussians.num_gaussians > _PROBE_GAUSSIANS:
+        weight = sizes + torch.nn.functional.logsigmoid(gaussians["opacities"].double()[:, 0]) / 2
         size = (weight - weight.max()).exp()
-        chance = (_factor(size, _PROBE_PRIMITIVES) * size).clamp(max=1).cpu()
+        chance = (_factor(size, _PROBE_GAUSSIANS) * size).clamp(max=1).cpu()
         drawn = torch.rand(len(chance), generator=generator, dtype=torch.float64) < chance
-        kept, sizes = field.rows(drawn.to(field["means"].device)), sizes[drawn.to(sizes.device)]
+        kept, sizes = gaussians.rows(drawn.to(gaussians["means"].device)), sizes[drawn.to(sizes.device)]
         grown = kept["scales"] - chance[drawn].log().to(kept["scales"])[:, None] / 2
         kept = kept.replaced({"scales": grown})
     moved = (kept["means"].double() - middle.to(kept["means"].device)) / reach
@@ -225,16 +225,16 @@ def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, even
     """Of the logarithm of the angle of what the pixels of each camera show, at most 0: the mean ``[V]``.
 
     Args:
-        sizes: logarithms of the primitives' sizes ``[N]``.
+        sizes: logarithms of the Gaussians' sizes ``[N]``.
         eyes: ``[V, 3]``.
         targets: ``[V, 3]``.
         evenness: factor of the standard deviation, which is added.
     """
-    means, settings, found = scene.field["means"], scene.settings(head=False), []
+    means, settings, found = scene.gaussians["means"], scene.settings(head=False), []
     poses = poses_looking_at(eyes, targets, eyes.new_tensor([0.0, 0.0, 1.0]))
     eyes, viewmats = eyes.to(means), world_to_camera(poses.float()).to(scene.device)
-    view = View.from_fov(torch.eye(4), FOV, _PROBE_SIZE, _PROBE_SIZE).to(scene.device)
-    options = pass_options(scene.field, view, settings)
+    camera = Camera.from_fov(torch.eye(4), FOV, _PROBE_SIZE, _PROBE_SIZE).to(scene.device)
+    options = pass_options(scene.gaussians, camera, settings)
     K = options.pop("K")
     del options["viewmat"]
     for some in chunks(len(eyes), _PROBES):
@@ -243,7 +243,7 @@ def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, even
         # Blending adds nothing where nothing is seen: the logarithm of one radian.
         options |= {"viewmats": viewmats[some], "Ks": K.expand(len(distances), 3, 3)}
         powers = torch.stack([angles, angles.square()][: 2 if evenness else 1], dim=-1)
-        mean, *squares = rasterize_views(colors=powers, **options).mean(dim=(1, 2)).unbind(dim=1)
+        mean, *squares = rasterize_cameras(colors=powers, **options).mean(dim=(1, 2)).unbind(dim=1)
         for square in squares:
             mean = mean + evenness * (square - mean.square()).clamp_min(0).sqrt()
         found.append(mean)

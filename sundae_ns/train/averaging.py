@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.train.state import Extension, FieldState, TrainingRun
+from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ class RunningMean:
         """Count weights in; those of other shapes begin a new mean."""
         if not self.fits(weights):
             self.values, self.count = {name: value.clone() for name, value in weights.items()}, 0
-        if not weights:  # a rank without primitives
+        if not weights:  # a rank without Gaussians
             return
         self.count += 1
         torch._foreach_lerp_([self.values[name] for name in weights], list(weights.values()), 1 / self.count)
@@ -82,20 +82,20 @@ class RunningMean:
         return same_names and all(value.shape == self.values[name].shape for name, value in weights.items())
 
 
-def weights_of(state: FieldState) -> dict[str, Tensor]:
+def weights_of(state: TrainingState) -> dict[str, Tensor]:
     """Weights of the field and of the enabled head, by name; changes in place change the field."""
-    weights = {name: value.data for name, value in state.field.items() if value.numel() > 0}
+    weights = {name: value.data for name, value in state.gaussians.items() if value.numel() > 0}
     if state.head_enabled and state.head is not None:
         weights |= {f"head.{name}": value.data for name, value in state.head.named_parameters()}
     return weights
 
 
-class Averaging(Extension):
+class Averaging(Callback):
     """Ends a training with the mean of field and head, a first part of one too if it ends within the share.
 
     Args:
         share: of the schedule, at its end, over which weights are averaged.
-        settled_at: step of the schedule before which the number of primitives may change, so that nothing is averaged.
+        settled_at: step of the schedule before which the number of Gaussians may change, so that nothing is averaged.
     """
 
     name = "averaging"
@@ -116,7 +116,7 @@ class Averaging(Extension):
         """
         return {**self._mean.state_dict(), "replaced": self._replaced} if self._alone else {}
 
-    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`."""
         self._mean, self._restored = RunningMean.of(saved, state.device), state.restored
         self._replaced = {name: value.to(state.device) for name, value in saved.get("replaced", {}).items()}

@@ -7,14 +7,14 @@ from typing import Any, cast
 import torch
 
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.train.averaging import Averaging
 from sundae_ns.train.densification import Densification, make_strategy
-from sundae_ns.train.exposure import PhotoGains
-from sundae_ns.train.initialize import DenseStart, Frame, Points, Start, initial_field
+from sundae_ns.train.exposure import ExposureCompensation
+from sundae_ns.train.initialize import DenseStart, Frame, Points, Start, initial_gaussians
 from sundae_ns.train.pruning import FloaterRemoval, PruningSchedule, ScheduledPruning
-from sundae_ns.train.state import Extension, FieldState
+from sundae_ns.train.state import Callback, TrainingState
 from sundae_ns.train.trials import AfterPrune, Trials
 
 
@@ -44,7 +44,7 @@ def check(options: Any) -> None:
 
 def build(
     options: Any, num_images: int, points: Points | None, frame: Frame | None
-) -> tuple[FieldState, list[Extension], Start]:
+) -> tuple[TrainingState, list[Callback], Start]:
     """Build the parts on the CPU.
 
     Args:
@@ -64,11 +64,11 @@ def build(
     check(options)
     pruning, head, warm = options.pruning, options.head.resolved, options.warm_start is not None
     strategy, num_features = make_strategy(options, num_images), 0 if head.mode == "off" else head.num_features
-    params, start = initial_field(options, points, frame, num_features=num_features, cap=strategy.cap)
+    params, start = initial_gaussians(options, points, frame, num_features=num_features, cap=strategy.cap)
     gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
     networks = torch.nn.ModuleDict({} if head.mode == "off" else {"head": CompensationHead(head)})
-    state = FieldState(
-        field=Field(cast(Any, gauss_params), "logits" if options.sh_degree == 0 else "harmonics"),
+    state = TrainingState(
+        gaussians=Gaussians(cast(Any, gauss_params), "logits" if options.sh_degree == 0 else "harmonics"),
         networks=networks,
         offset=pruning.prune_at if warm else 0,
         densify_until=strategy.refine_stop_iter,
@@ -81,7 +81,7 @@ def build(
     begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
     removal = FloaterRemoval(None if points is None else points[0])
     dense = DenseStart(options, points, num_images, num_features=num_features, cap=strategy.cap)
-    extensions: list[Extension] = [dense, densification, removal]
+    train_callbacks: list[Callback] = [dense, densification, removal]
     scheduled, decides_head = ScheduledPruning(schedule, evaluate=options.evaluate_prune), options.head.mode == "auto"
     if pruning.decides or decides_head:
         trials = Trials(
@@ -92,10 +92,10 @@ def build(
             decides_head=decides_head,
             ssim_weight=options.ssim_lambda,
         )
-        extensions += [trials, scheduled, AfterPrune(trials)]
+        train_callbacks += [trials, scheduled, AfterPrune(trials)]
     else:
-        extensions.append(scheduled)
-    extensions.append(PhotoGains(num_images, options.photo_gains))
+        train_callbacks.append(scheduled)
+    train_callbacks.append(ExposureCompensation(num_images, options.exposure_compensation))
     if options.average_share > 0:
-        extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
-    return state, extensions, start
+        train_callbacks.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
+    return state, train_callbacks, start

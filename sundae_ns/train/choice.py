@@ -84,7 +84,7 @@ def mean_quality(views: Sequence[HeldOutQuality]) -> tuple[float, float]:
     return decibels, similarity
 
 
-def spread_views(indices: Sequence[int], count: int, half: int) -> list[int]:
+def spread_cameras(indices: Sequence[int], count: int, half: int) -> list[int]:
     """``count`` views evenly over a capture, because neighbours in a path look alike.
 
     Args:
@@ -103,7 +103,7 @@ def plan_heads(indices: Sequence[int], steps: int) -> tuple[list[list[int]], int
         steps: length of the schedule.
     """
     few = len(indices) < FEW_VIEWS
-    chosen = spread_views(indices, 2 if few else max(2, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY)), 1)
+    chosen = spread_cameras(indices, 2 if few else max(2, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY)), 1)
     length = LEAST_TRIAL * steps / 2 if few else max(LEAST_TRIAL * steps, min(HEAD_STEPS, MOST_TRIAL * steps))
     return [[index] for index in chosen] if few else [chosen], max(round(length), 1)
 
@@ -307,7 +307,7 @@ def choose_within(
     """The count by :func:`choose` within a number of Gaussians and of bytes of the packed scene, and why."""
     count, reason = choose(curve, tolerance), "the fewest that are as good as the best"
     fitting = None if most_bytes is None else affordable(curve, most_bytes)
-    for name, limit in (("max-primitives", most), ("max-bytes", fitting)):
+    for name, limit in (("max-gaussians", most), ("max-bytes", fitting)):
         if limit is not None and limit < count:
             count, reason = limit, f"the most that pruning.{name} allows"
     return count, reason

@@ -1,4 +1,4 @@
-"""The curve of expected quality over the number of primitives, as a run records it in ``trials.json``."""
+"""The curve of expected quality over the number of Gaussians, as a run records it in ``trials.json``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class CurvePoint:
     """What to expect of a field of one count, on the held-out training views."""
 
     count: int
-    """Number of primitives."""
+    """Number of Gaussians."""
     bytes: int | None
     """Bytes of the packed scene, with a head if trials have found that it pays, estimated; None if unknown."""
     psnr: float
@@ -42,7 +42,7 @@ class CountCurve:
     """The record of a decision."""
 
     chosen: int
-    """The number of primitives that the run has kept."""
+    """The number of Gaussians that the run has kept."""
     full: int
     """Their number before the prune."""
     reason: str
@@ -52,7 +52,7 @@ class CountCurve:
 
 
 def read_count_curve(folder: Path) -> CountCurve | None:
-    """The record of a run; None if trials have not decided about its number of primitives.
+    """The record of a run; None if trials have not decided about its number of Gaussians.
 
     Args:
         folder: of the run.
@@ -60,7 +60,7 @@ def read_count_curve(folder: Path) -> CountCurve | None:
     Raises:
         CheckpointError: the record is damaged.
     """
-    path, names = folder / RECORD, {field.name for field in fields(CurvePoint)}
+    path, names = folder / RECORD, {gaussians.name for gaussians in fields(CurvePoint)}
     try:
         found = json.loads(path.read_text(encoding="utf-8")).get("count")
         if found is None:
@@ -87,7 +87,7 @@ def expected_change(points: Sequence[CurvePoint], count: int, other: int) -> tup
 
     Args:
         points: of a curve, in any order.
-        count, other: numbers of primitives.
+        count, other: numbers of Gaussians.
     """
     known = sorted((point for point in points if math.isfinite(point.psnr_loss)), key=lambda point: point.count)
     if not known or not all(known[0].count <= one <= known[-1].count for one in (count, other)):

@@ -1,6 +1,6 @@
 """Growth of a field: gsplat's densification under a cap.
 
-Its running state holds ``peak``, the number of primitives right after growing and before culling.
+Its running state holds ``peak``, the number of Gaussians right after growing and before culling.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from torch import Tensor
 
-from sundae_ns.train.state import Extension, FieldState, TrainingRun
+from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 STATISTICS = ("grad2d", "count", "radii")  # Tensors [N] in the running state of gsplat's strategy
 
@@ -24,13 +24,13 @@ COUNTED = "counted"
 def limit_growth(
     state: MutableMapping[str, Any], small: Tensor, capacity: int, threshold: float, radius: float | None
 ) -> None:
-    """Let at most ``capacity`` primitives be added, by the highest gradients; others lose their statistics.
+    """Let at most ``capacity`` Gaussians be added, by the highest gradients; others lose their statistics.
 
     Args:
         state: of gsplat's strategy, with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used.
-        small: primitives that a high gradient duplicates; it splits the others, bool ``[N]``.
-        capacity: number of primitives that may be added: one for each duplicated or split, two for one that is both.
-        threshold: mean gradient above which a primitive grows.
+        small: Gaussians that a high gradient duplicates; it splits the others, bool ``[N]``.
+        capacity: number of Gaussians that may be added: one for each duplicated or split, two for one that is both.
+        threshold: mean gradient above which a Gaussian grows.
         radius: radius above which it is split, as a share of the image; None ignores the radius.
     """
     gradients = state["grad2d"] / state["count"].clamp_min(1)
@@ -65,7 +65,7 @@ def count_view(state: Mapping[str, Any], grads: Tensor, radii: Tensor, width: in
     Args:
         state: with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used; changed in place.
         grads: gradients of the projected centres, per pixel ``[N, 2]``.
-        radii: on the screen, pixels ``[N]``, or one per axis ``[N, 2]``; 0 where a primitive is not drawn.
+        radii: on the screen, pixels ``[N]``, or one per axis ``[N, 2]``; 0 where a Gaussian is not drawn.
         width: image width in pixels.
         height: image height in pixels.
     """
@@ -80,9 +80,9 @@ def count_view(state: Mapping[str, Any], grads: Tensor, radii: Tensor, width: in
 
 @dataclass
 class CappedStrategy(DefaultStrategy):
-    """gsplat's densification with an exact cap: under it, the primitives with the highest gradients grow first."""
+    """gsplat's densification with an exact cap: under it, the Gaussians with the highest gradients grow first."""
 
-    cap: int | None = None  # Highest number of primitives; None for no cap
+    cap: int | None = None  # Highest number of Gaussians; None for no cap
 
     def see_each_image_after_resets(self, steps: int) -> None:
         """Let the field grow again only once opacities have recovered from a reset.
@@ -118,7 +118,7 @@ class CappedStrategy(DefaultStrategy):
         return grown
 
 
-class Densification(Extension):
+class Densification(Callback):
     """Grows the field until the schedule's prune would undo it.
 
     Args:
@@ -130,21 +130,21 @@ class Densification(Extension):
     def __init__(self, strategy: CappedStrategy) -> None:
         self.strategy = strategy
 
-    def initialize(self, state: FieldState) -> None:
+    def initialize(self, state: TrainingState) -> None:
         """Start the running state anew, as for a field that has not been trained."""
         state.densification.clear()
         state.densification.update(self.strategy.initialize_state(scene_scale=1.0))
 
-    def before_backward(self, state: FieldState) -> None:
+    def before_backward(self, state: TrainingState) -> None:
         """Keep the gradients that densification reads."""
         if state.densifying:
             self.strategy.step_pre_backward(
-                state.field.data, state.optimizers, state.densification, state.schedule_step, state.info
+                state.gaussians.data, state.optimizers, state.densification, state.schedule_step, state.info
             )
 
     def after_step(self, run: TrainingRun) -> None:
-        """Let the strategy add, move and remove primitives."""
-        state, params = run.state, run.state.field.data
+        """Let the strategy add, move and remove Gaussians."""
+        state, params = run.state, run.state.gaussians.data
         if state.densifying:
             running = state.densification
             self.strategy.step_post_backward(params, state.optimizers, running, state.schedule_step, state.info)
@@ -159,7 +159,7 @@ def make_strategy(options: Any, num_images: int) -> CappedStrategy:
     """
     stop, cap, pruning = options.stop_split_at, None, options.pruning
     if pruning.mode == "continuous":
-        stop, cap = min(stop, pruning.stop), pruning.max_primitives
+        stop, cap = min(stop, pruning.stop), pruning.max_gaussians
     elif pruning.ends_growth_at is not None:
         stop = min(stop, pruning.ends_growth_at)
     strategy = CappedStrategy(

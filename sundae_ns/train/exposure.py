@@ -19,10 +19,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.graph.filters import Smoother
 from sundae_ns.graph.graph import build_graph
-from sundae_ns.train.state import Extension, FieldState, TrainingRun
+from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ CLIPPED = 0.98  # Pixels of a photo from this value on may be clipped, and are n
 SAMPLE = 1 << 14  # Approximate number of measured pixels of an image
 
 
-class PhotoGains(Extension):
+class ExposureCompensation(Callback):
     """Measures the gains of the training photos, and divides photos by them.
 
     Args:
@@ -52,7 +52,7 @@ class PhotoGains(Extension):
         mode: divide photos, do not, or decide once they are measured.
     """
 
-    name = "photo-gains"
+    name = "exposure-compensation"
 
     def __init__(self, num_photos: int, mode: Literal["auto", "on", "off"]) -> None:
         self._mode = mode
@@ -73,7 +73,7 @@ class PhotoGains(Extension):
         values = {"gains": self._gains.clone(), "sums": self._sums.clone(), "measured": measured, "counts": counts}
         return {"divides": self._divides, **values}
 
-    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`; other photos, or none as in an earlier version, begin anew."""
         if "divides" not in saved or len(saved["gains"]) != len(self._gains):
             return
@@ -91,10 +91,10 @@ class PhotoGains(Extension):
             self._divides = False
             if self._mode == "on":
                 few = f"{len(indices)} training photos are too few to be compared with those beside them"
-                log.warning(f"photo-gains is off: {few}")
+                log.warning(f"exposure-compensation is off: {few}")
             return
         self._state, self._rows = run.state, np.asarray(indices)
-        positions = places([own.view for own in run.training_views()]).cpu()
+        positions = places([own.camera for own in run.training_views()]).cpu()
         self._smoother = Smoother(build_graph(positions, num_neighbors=NEIGHBORS), SMOOTHING)
         if run.images_per_step > 1:  # of the first rank alone
             self._sums.zero_()
@@ -176,12 +176,12 @@ def _index(batch: Mapping[str, Any]) -> int | None:
     return None if index is None or batch["image"].shape[-1] == 4 else int(index)
 
 
-def places(views: Sequence[View]) -> Tensor:
+def places(cameras: Sequence[Camera]) -> Tensor:
     """One point for each camera ``[N, 3]``; cameras with similar views have points close together.
 
     The point lies behind the camera, at the root mean square distance of the cameras to their middle. So two cameras at
     one place with different directions have different points, and so do cameras around an object.
     """
-    centers = torch.stack([view.center for view in views])
-    forward = torch.stack([view.viewmat[2, :3] for view in views])
+    centers = torch.stack([camera.center for camera in cameras])
+    forward = torch.stack([camera.viewmat[2, :3] for camera in cameras])
     return centers - (centers - centers.mean(dim=0)).square().sum(dim=1).mean().sqrt() * forward

@@ -1,7 +1,7 @@
 """Whole training steps as CUDA graphs: the step, gradients, statistics of densification, and Adam.
 
 A step is some two hundred small kernels. Launched one by one from Python they take several times as long as the GPU
-works. A graph launches them together. It reads and writes fixed addresses and a fixed number of primitives, so the
+works. A graph launches them together. It reads and writes fixed addresses and a fixed number of Gaussians, so the
 field lies in buffers with memory for more.
 """
 
@@ -16,18 +16,18 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sundae_ns.core.gaussians import FEATURES, Field
+from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.cuda.adam import Update, adam_step
 from sundae_ns.cuda.cuda_graphs import record, warm_up
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
-from sundae_ns.scene.render import LocalField, RenderSettings, degree_in_use
+from sundae_ns.scene.render import GaussianSource, RenderSettings, degree_in_use
 from sundae_ns.train.densification import COUNTED, STATISTICS, count_view, start_counting
-from sundae_ns.train.state import FieldState
+from sundae_ns.train.state import TrainingState
 from sundae_ns.train.step import StepInputs, StepLosses, StepResult, TrainingStep
 
-SPARE = 1.1  # Capacity for a field that grows, as a multiple of its number of primitives
+SPARE = 1.1  # Capacity for a field that grows, as a multiple of its number of Gaussians
 
 MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's moments in the state of its optimizer
 
@@ -36,7 +36,7 @@ _UNSEEN = {"means": 1e15, "scales": -30.0, "opacities": -30.0}
 
 
 class _Rows(NamedTuple):
-    """A tensor of the state with a row for each primitive."""
+    """A tensor of the state with a row for each Gaussian."""
 
     name: str
     value: Tensor
@@ -52,18 +52,18 @@ class Buffers:
         self.capacity = 0
         self._rows = 0
 
-    def hold(self, state: FieldState, trained: tuple[str, ...], *, growing: bool) -> bool:
+    def hold(self, state: TrainingState, trained: tuple[str, ...], *, growing: bool) -> bool:
         """Let the tensors of a field be the first rows of the buffers; what was replaced since the last call is copied.
 
         Args:
             state: the field; its optimizers have states for the trained parameters.
             trained: names of the parameters that are trained.
-            growing: whether the number of primitives will change.
+            growing: whether the number of Gaussians will change.
 
         Returns:
             Whether the buffers are new, so that work on the older ones is void.
         """
-        n, rows = state.field.num_primitives, list(_rows_of(state, trained))
+        n, rows = state.gaussians.num_gaussians, list(_rows_of(state, trained))
         shapes = {row.name: row.value.shape[1:] for row in rows}
         fits = n <= self.capacity <= 2 * n if growing else n == self.capacity
         # Trials widen and narrow features.
@@ -86,7 +86,7 @@ class Buffers:
         return renewed
 
 
-def start_moments(state: FieldState, trained: tuple[str, ...]) -> None:
+def start_moments(state: TrainingState, trained: tuple[str, ...]) -> None:
     """Make the state of Adam for parameters that have none, as its first step would."""
     for name in trained:
         for group in state.optimizers[name].param_groups:
@@ -97,15 +97,15 @@ def start_moments(state: FieldState, trained: tuple[str, ...]) -> None:
                     held.update({moment: torch.zeros_like(value) for moment in MOMENTS})
 
 
-def trained_parameters(state: FieldState) -> tuple[str, ...]:
+def trained_parameters(state: TrainingState) -> tuple[str, ...]:
     """Names of the parameters of the field that a step trains: features are trained with the head only."""
-    used = (name for name in state.field if name != FEATURES or state.head_enabled)
-    return tuple(name for name in used if state.field[name].numel() > 0)
+    used = (name for name in state.gaussians if name != FEATURES or state.head_enabled)
+    return tuple(name for name in used if state.gaussians[name].numel() > 0)
 
 
-def _rows_of(state: FieldState, trained: tuple[str, ...]) -> Iterator[_Rows]:
+def _rows_of(state: TrainingState, trained: tuple[str, ...]) -> Iterator[_Rows]:
     for name in trained:
-        value = state.field[name]
+        value = state.gaussians[name]
         yield _Rows(name, value, partial(setattr, value, "data"))
         moments: dict[str, Any] = state.optimizers[name].state[value]
         for moment in MOMENTS:
@@ -287,7 +287,7 @@ class _Held:
     addresses: Hashable  # What a recording reads beside the buffers: the head's weights, and the counts of steps
 
     @classmethod
-    def of(cls, state: FieldState, trained: tuple[str, ...], head: CompensationHead | None) -> _Held:
+    def of(cls, state: TrainingState, trained: tuple[str, ...], head: CompensationHead | None) -> _Held:
         names = trained if head is None else (*trained, HEAD)
         groups = [
             (name, state.optimizers[name], group) for name in names for group in state.optimizers[name].param_groups
@@ -296,13 +296,13 @@ class _Held:
         states = [(held, value, held[value]) for held, value in members]
         tensors: list[tuple[Mapping[Any, Any], Any, Any]] = [
             *states,
-            *((state.field, name, state.field[name]) for name in trained),
+            *((state.gaussians, name, state.gaussians[name]) for name in trained),
             *((state.densification, *item) for item in state.densification.items() if isinstance(item[1], Tensor)),
         ]
         addresses = tuple(own[name].data_ptr() for _, _, own in states for name in (*MOMENTS, "step"))
         return cls(trained, state.densifying, groups, tensors, (addresses, None if head is None else head.addresses()))
 
-    def unchanged(self, state: FieldState, settings: RenderSettings) -> bool:
+    def unchanged(self, state: TrainingState, settings: RenderSettings) -> bool:
         """Whether the state still consists of these tensors."""
         with_head = self.groups[-1][0] == HEAD
         return (
@@ -327,7 +327,7 @@ class RecordedStep:
         self._held: _Held | None = None
         self._recordings = StepRecordings(record=record)
 
-    def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+    def __call__(self, state: TrainingState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train one step.
 
         Args:
@@ -345,7 +345,7 @@ class RecordedStep:
             held = self._held = self._hold(state, settings)
         # Pinned: copying from other memory would wait until the GPU has finished the last step.
         numbers = torch.tensor(
-            [*(float(group["lr"]) for _, _, group in held.groups), float(state.field.num_primitives)],
+            [*(float(group["lr"]) for _, _, group in held.groups), float(state.gaussians.num_gaussians)],
             pin_memory=state.device.type == "cuda",
         ).to(state.device, non_blocking=True)
         # The prior of a field that grows is a mean over fewer rows than the buffers have.
@@ -360,40 +360,40 @@ class RecordedStep:
         state.info = {COUNTED: True}
         return result
 
-    def _hold(self, state: FieldState, settings: RenderSettings) -> _Held:
+    def _hold(self, state: TrainingState, settings: RenderSettings) -> _Held:
         """Let the field be rows of the buffers, with all states that its optimizers need."""
         trained = trained_parameters(state)
         start_moments(state, trained if settings.head is None else (*trained, HEAD))
         if state.densifying:
-            start_counting(state.densification, state.field["means"])
+            start_counting(state.densification, state.gaussians["means"])
         if self._buffers.hold(state, trained, growing=state.densifying):
             self._recordings.forget(pairs=not state.densifying)  # a pruned field needs far fewer pairs
         return _Held.of(state, trained, settings.head)
 
     def _step(
-        self, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None
+        self, state: TrainingState, held: _Held, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None
     ) -> StepResult:
         """One step on the buffers; all of its work is recorded."""
-        tensors, head, view = self._buffers.tensors, settings.head, inputs.view
+        tensors, head, camera = self._buffers.tensors, settings.head, inputs.camera
         trained = {name: tensors[name] for name in held.trained}
         # With parameters that have no values, such as the features of a field without a head.
-        empty = {name: value for name, value in state.field.items() if name not in trained and value.numel() == 0}
-        field = Field(trained, state.field.encoding)
-        source = LocalField(Field({**empty, **trained}, state.field.encoding))
-        step = TrainingStep(source, state, self._losses, field)
+        empty = {name: value for name, value in state.gaussians.items() if name not in trained and value.numel() == 0}
+        gaussians = Gaussians(trained, state.gaussians.encoding)
+        source = GaussianSource(Gaussians({**empty, **trained}, state.gaussians.encoding))
+        step = TrainingStep(source, state, self._losses, gaussians)
         loss, splatted, result = step(inputs, settings)
         network = [] if head is None else list(head.parameters())
         counting, centers = state.densifying and "grad2d" in tensors, splatted.info["means2d"]
-        wanted = [*field.values(), *network, *([centers] if counting else [])]
+        wanted = [*gaussians.values(), *network, *([centers] if counting else [])]
         grads = torch.autograd.grad(loss, wanted, allow_unused=True)
         with torch.no_grad():
             overflow = self._recordings.overflow(capacity)
             if counting:
                 of_centers, radii = centers.absgrad if settings.absgrad else grads[-1], splatted.info["radii"]
                 radii = radii if overflow is None else radii * (overflow == 0)
-                count_view(tensors, of_centers[0], radii[0], view.width, view.height)
+                count_view(tensors, of_centers[0], radii[0], camera.width, camera.height)
             assert inputs.rates is not None
-            updates = self._updates(held, dict(zip([*field.values(), *network], grads, strict=False)))
+            updates = self._updates(held, dict(zip([*gaussians.values(), *network], grads, strict=False)))
             adam_step(updates, inputs.rates, overflow)
         return result
 
@@ -418,12 +418,12 @@ class RecordedStep:
         return groups
 
 
-def _kind(state: FieldState, inputs: StepInputs, settings: RenderSettings) -> Hashable:
-    """What decides on the kernels of a step, beside numbers of primitives."""
-    view, head = inputs.view, settings.head
-    degree = degree_in_use(state.field.sh_degree, settings.active_sh_degree)
+def _kind(state: TrainingState, inputs: StepInputs, settings: RenderSettings) -> Hashable:
+    """What decides on the kernels of a step, beside numbers of Gaussians."""
+    camera, head = inputs.camera, settings.head
+    degree = degree_in_use(state.gaussians.sh_degree, settings.active_sh_degree)
     return (
-        (view.width, view.height, inputs.mask is not None, degree, settings.antialiased, settings.absgrad),
+        (camera.width, camera.height, inputs.mask is not None, degree, settings.antialiased, settings.absgrad),
         (state.densifying, state.pruned, state.head_enabled),
         None if head is None else (head.net, *vars(head.config).values()),
     )

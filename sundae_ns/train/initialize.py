@@ -2,7 +2,7 @@
 
 Structure from motion finds points where it can tell one from another: a few hundred in a dozen photos, few on lawns and
 walls. There, :class:`DenseStart` adds points by a plane sweep through the images. Where a field begins without any, it
-explains each image by primitives near its camera, and other views do not agree.
+explains each image by Gaussians near its camera, and other views do not agree.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from sundae_ns.core.errors import CheckpointError
 from sundae_ns.core.gaussians import FEATURES, rgb_to_logit, sh_to_rgb
 from sundae_ns.core.surgery import replace_parameter
 from sundae_ns.io.coordinates import similarity
-from sundae_ns.io.formats import kind_of, read_field
+from sundae_ns.io.formats import kind_of, read_gaussians
 from sundae_ns.pruning.selection import neighbor_order, select_systematic
 from sundae_ns.scene.initialization import from_points, initial_features, random_points
 from sundae_ns.scene.virtual_cameras import by_device
 from sundae_ns.train.plane_sweep import Sweep
-from sundae_ns.train.state import Extension, FieldState, TrainingRun
+from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ class Start:
             log.warning(warning)
 
 
-def initial_field(
+def initial_gaussians(
     options: Any, points: Points | None, frame: Frame | None, *, num_features: int, cap: int | None
 ) -> tuple[dict[str, Tensor], Start]:
     """Parameters of a new model, float32 on the CPU, and what to report if it is trained.
@@ -70,23 +70,23 @@ def initial_field(
         points: sparse points of the capture, if it has any.
         frame: of the capture, if known.
         num_features: length of the feature vectors; 0 for none.
-        cap: highest number of primitives to start with; None for no cap.
+        cap: highest number of Gaussians to start with; None for no cap.
     """
     start = Start()
     try:
         if options.warm_start is None:
-            params, start = _sparse_field(options, points, num_features, cap)
+            params, start = _sparse_gaussians(options, points, num_features, cap)
         else:
-            params = _warm_field(options, options.warm_start, frame, num_features)
+            params = _warm_gaussians(options, options.warm_start, frame, num_features)
     except CheckpointError as error:
-        params, start = _sparse_field(options, points, num_features, cap)[0], Start(failure=error)
+        params, start = _sparse_gaussians(options, points, num_features, cap)[0], Start(failure=error)
     if options.sh_degree == 0:
         # splatfacto and nerfstudio's exporter store logits of colours at SH degree 0.
         params["features_dc"] = rgb_to_logit(sh_to_rgb(params["features_dc"]))
     return params, start
 
 
-def _sparse_field(
+def _sparse_gaussians(
     options: Any, points: Points | None, num_features: int, cap: int | None
 ) -> tuple[dict[str, Tensor], Start]:
     warnings: list[str] = []
@@ -112,8 +112,8 @@ def _sparse_field(
     return params, Start(tuple(warnings))
 
 
-def _warm_field(options: Any, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
-    params, in_model_frame, _ = read_field(source)
+def _warm_gaussians(options: Any, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
+    params, in_model_frame, _ = read_gaussians(source)
     if options.warm_start_frame != "auto":
         in_model_frame = options.warm_start_frame == "model"
     elif kind_of(source) == "gsplat":
@@ -134,7 +134,7 @@ def _warm_field(options: Any, source: Path, frame: Frame | None, num_features: i
     params["features_rest"] = rest
     if num_features:
         params[FEATURES] = initial_features(params["features_dc"], num_features)
-    log.info(f"warm start: {len(params['means'])} primitives from {source}")
+    log.info(f"warm start: {len(params['means'])} Gaussians from {source}")
     return params
 
 
@@ -145,7 +145,7 @@ FILLED = {"cuda": 100_000, "cpu": 20_000}
 """Number of points up to which a sparse cloud is filled; a larger one stays as it is."""
 
 
-class DenseStart(Extension):
+class DenseStart(Callback):
     """Begins the training anew from sparse and dense points, before the first step.
 
     Args:
@@ -153,7 +153,7 @@ class DenseStart(Extension):
         points: sparse points of the capture; None or none at all leave the field as it is.
         num_images: number of training images.
         num_features: length of the feature vectors; 0 for none.
-        cap: highest number of primitives to start with; None for no cap.
+        cap: highest number of Gaussians to start with; None for no cap.
     """
 
     name = "dense-start"
@@ -169,7 +169,7 @@ class DenseStart(Extension):
         """Nothing: a checkpoint holds the field that has begun."""
         return {}
 
-    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """A field of a checkpoint is in training."""
         self._done = True
 
@@ -187,9 +187,9 @@ class DenseStart(Extension):
         colours = colours.float()
         colours = colours if len(colours) else torch.full_like(sparse, 127.5)
         points = torch.cat([sparse, xyz.to(sparse)]), torch.cat([colours, 255 * rgb.to(colours)])
-        params, _ = initial_field(self._options, points, None, num_features=self._num_features, cap=self._cap)
+        params, _ = initial_gaussians(self._options, points, None, num_features=self._num_features, cap=self._cap)
         for name, value in params.items():  # without moments
-            replace_parameter(state.field.data, state.optimizers, name, value.to(state.device), {})
+            replace_parameter(state.gaussians.data, state.optimizers, name, value.to(state.device), {})
         log.info(
             f"{len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones "
             "(--pipeline.model.dense-start-views 0 leaves them out)"

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, normalize, pad
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.cuda.kernels import Launch, kernels_where_possible
 from sundae_ns.cuda.sweep import WINDOW, FusedCorrelations, Patches, sweep_kernels
 from sundae_ns.train.state import Photo
@@ -45,7 +45,7 @@ _LOOKED_AT = 16
 class _Reduced:
     """A photo of reduced size, 12 bytes a pixel with its depth: captures have hundreds."""
 
-    view: View
+    camera: Camera
     image: Tensor  # uint8 [H, W, 3]
     grey: Tensor  # [1, 1, H, W]
     usable: Tensor  # Pixels that count and have contrast, bool [H, W]
@@ -80,14 +80,14 @@ class Sweep:
         self.photos = [_reduced(photo, longest) for photo in photos]
         self._sparse = sparse
         self._neighbors = _neighbors(self.photos, sparse[:: -(-len(sparse) // JUDGES)] if len(sparse) else sparse)
-        upward = [-photo.view.viewmat[1, :3] for photo in self.photos]
+        upward = [-photo.camera.viewmat[1, :3] for photo in self.photos]
         self._up = torch.stack(upward).mean(dim=0) if upward else sparse.new_zeros(3)
         self._depths = [torch.zeros_like(photo.usable, dtype=torch.float32) for photo in self.photos]
 
     def add(self, index: int) -> Tensor:
         """Find the depths of a view ``[H, W]``, along its axis; 0 where there are none."""
         photo, others = self.photos[index], [self.photos[i] for i in self._neighbors[index].compared]
-        limits = self._limits(photo.view)
+        limits = self._limits(photo.camera)
         if limits is None or not others:
             return self._depths[index]
         low, high = limits
@@ -96,7 +96,7 @@ class Sweep:
         rows, columns = (torch.arange(side, device=best.device) for side in best.shape)
         rays = photo.rays(rows[:, None], columns)
         lengths, correlations = rays.norm(dim=-1), _correlations(photo, others, rays, (1 / high, 1 / low))
-        for normal in _directions(photo.view, self._up):
+        for normal in _directions(photo.camera, self._up):
             # A plane is normal . X = 1 / s, so a pixel has the inverse depth facing * s.
             facing = rays @ normal
             steep = facing > STEEPEST * lengths
@@ -122,10 +122,10 @@ class Sweep:
         places, colours = zip((empty, empty), *(self._agreeing(index, every) for index in range(len(self.photos))))
         return torch.cat(places), torch.cat(colours)
 
-    def _limits(self, view: View) -> tuple[float, float] | None:
+    def _limits(self, camera: Camera) -> tuple[float, float] | None:
         """Nearest and farthest depth to look at; None where too few sparse points are seen."""
-        x, y, z = _project(view, self._sparse)
-        seen = z[_in_view(view, x, y, z)].sort().values
+        x, y, z = _project(camera, self._sparse)
+        seen = z[_in_view(camera, x, y, z)].sort().values
         if len(seen) < SEEN:
             return None
         ends = seen[[int(0.02 * (len(seen) - 1)), int(0.98 * (len(seen) - 1))]].tolist()
@@ -141,17 +141,17 @@ class Sweep:
         photo, depth = self.photos[index], self._depths[index]
         rows, columns = (depth > 0).nonzero()[::every].T
         points = _to_world(photo, photo.rays(rows, columns) * depth[rows, columns][:, None])
-        x, y, _ = _project(photo.view, points)
+        x, y, _ = _project(photo.camera, points)
         total, count = points.clone(), torch.ones_like(x)
         for i in self._neighbors[index].confirming:
             other, depths = self.photos[i], self._depths[i]
-            there_x, there_y, z = _project(other.view, points)
-            column = there_x.nan_to_num().clamp(0, other.view.width - 1).long()
-            row = there_y.nan_to_num().clamp(0, other.view.height - 1).long()
+            there_x, there_y, z = _project(other.camera, points)
+            column = there_x.nan_to_num().clamp(0, other.camera.width - 1).long()
+            row = there_y.nan_to_num().clamp(0, other.camera.height - 1).long()
             found = depths[row, column]
             theirs = _to_world(other, other.rays(row, column) * found[:, None])
-            back_x, back_y, _ = _project(photo.view, theirs)
-            agrees = _in_view(other.view, there_x, there_y, z) & (found > 0) & ((found - z).abs() < LARGEST_ERROR * z)
+            back_x, back_y, _ = _project(photo.camera, theirs)
+            agrees = _in_view(other.camera, there_x, there_y, z) & (found > 0) & ((found - z).abs() < LARGEST_ERROR * z)
             agrees &= torch.hypot(back_x - x, back_y - y) < LARGEST_SHIFT
             total += torch.where(agrees[:, None], theirs, 0.0)
             count += agrees
@@ -160,18 +160,19 @@ class Sweep:
 
 
 def _reduced(photo: Photo, longest: int) -> _Reduced:
-    view, image = photo.view, photo.target.permute(2, 0, 1)[None]
+    camera, image = photo.camera, photo.target.permute(2, 0, 1)[None]
     mask = torch.ones_like(image[:, :1]) if photo.mask is None else photo.mask[None, None].to(image)
-    if longest < max(view.width, view.height):
-        view = view.zoomed(longest / max(view.width, view.height))
+    if longest < max(camera.width, camera.height):
+        camera = camera.zoomed(longest / max(camera.width, camera.height))
         image, mask = (
-            interpolate(value, (view.height, view.width), mode="bilinear", antialias=True) for value in (image, mask)
+            interpolate(value, (camera.height, camera.width), mode="bilinear", antialias=True)
+            for value in (image, mask)
         )
     grey = image.mean(dim=1, keepdim=True)
     patches = _patches(grey)
     usable = (patches.deviation > CONTRAST) & (_box(mask)[0, 0] / patches.size > 0.99)
     colours = (255 * image[0].permute(1, 2, 0)).round().clamp(0, 255).to(torch.uint8)
-    return _Reduced(view, colours, grey, usable, torch.linalg.inv(view.viewmat), torch.linalg.inv(view.K))
+    return _Reduced(camera, colours, grey, usable, torch.linalg.inv(camera.viewmat), torch.linalg.inv(camera.K))
 
 
 def _patches(grey: Tensor) -> Patches:
@@ -182,15 +183,15 @@ def _patches(grey: Tensor) -> Patches:
     return Patches(*(value[0, 0] for value in (grey, size, mean, deviation)))
 
 
-def _project(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels x, y and depths of points ``[..., 3]``; pixels mean something where depths are positive."""
-    x, y, z = ((points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]) @ view.K.T).unbind(dim=-1)
+    x, y, z = ((points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T).unbind(dim=-1)
     return x / z, y / z, z
 
 
-def _in_view(view: View, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+def _in_view(camera: Camera, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     """Whether projected points lie in the image, in front of the camera, bool."""
-    return (z > 0) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
+    return (z > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
 
 
 def _to_world(photo: _Reduced, points: Tensor) -> Tensor:
@@ -201,7 +202,7 @@ def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[_Neighbors]:
     """For each view the others that see most of its sparse points, from directions that differ by some degrees."""
     if len(photos) < 2 or not len(sparse):
         return [_Neighbors([], []) for _ in photos]
-    seen = torch.stack([_in_view(photo.view, *_project(photo.view, sparse)) for photo in photos])
+    seen = torch.stack([_in_view(photo.camera, *_project(photo.camera, sparse)) for photo in photos])
     directions = torch.stack([normalize(sparse - photo.pose[:3, 3], dim=-1) for photo in photos])
     found = []
     for i in range(len(photos)):
@@ -215,21 +216,23 @@ def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[_Neighbors]:
     return found
 
 
-def _directions(view: View, up: Tensor) -> list[Tensor]:
+def _directions(camera: Camera, up: Tensor) -> list[Tensor]:
     """Normals of the planes in camera coordinates, away from the camera: facing it, four turned ones, the ground."""
     c, s = _TILT
     fixed = [(0.0, 0.0, 1.0), (s, 0.0, c), (-s, 0.0, c), (0.0, s, c), (0.0, -s, c)]
-    return [*(view.K.new_tensor(normal) for normal in fixed), view.viewmat[:3, :3] @ -normalize(up, dim=0)]
+    return [*(camera.K.new_tensor(normal) for normal in fixed), camera.viewmat[:3, :3] @ -normalize(up, dim=0)]
 
 
 def _number_of_planes(photo: _Reduced, others: Sequence[_Reduced], normal: Tensor, ends: tuple[float, float]) -> int:
     """Number of planes between two, by the way that the middle of the image takes in the other views."""
-    row, column = (torch.tensor([side // 2], device=normal.device) for side in (photo.view.height, photo.view.width))
+    row, column = (
+        torch.tensor([side // 2], device=normal.device) for side in (photo.camera.height, photo.camera.width)
+    )
     (middle,) = photo.rays(row, column)
     points = _to_world(photo, torch.stack([middle / (torch.dot(middle, normal).clamp_min(STEEPEST) * s) for s in ends]))
     longest = 0.0
     for other in others:
-        x, y, z = _project(other.view, points)
+        x, y, z = _project(other.camera, points)
         if (z > 0).all():
             longest = max(longest, float(torch.hypot(x[1] - x[0], y[1] - y[0])))
     return int(min(max(longest / STEP, FEWEST), MOST))
@@ -245,7 +248,7 @@ def _correlations(
     """
     patches = _patches(photo.grey)
     # X' = R X + t with s normal . X = 1: the ray r projects to K (R r + s (normal . r) t).
-    ways = [other.view.K @ (other.view.viewmat @ photo.pose)[:3] for other in others]
+    ways = [other.camera.K @ (other.camera.viewmat @ photo.pose)[:3] for other in others]
     if kernels := _kernels(photo.grey):
         maps = torch.stack([torch.cat([way[:, :3] @ photo.unproject, way[:, 3:]], dim=1) for way in ways])
         images = [other.grey[0, 0] for other in others]
@@ -269,7 +272,7 @@ def _scores(
     scores = []
     for other, start, way in zip(others, starts, ways):
         x, y, z = (start[..., i] + inverse * way[i, 3] for i in range(3))
-        sides = z.new_tensor([other.view.width, other.view.height])
+        sides = z.new_tensor([other.camera.width, other.camera.height])
         grid = 2 * torch.stack([x, y], dim=-1) / (z.clamp_min(1e-6)[..., None] * sides) - 1
         valid = inside & (z > 1e-6) & (grid.abs() < 1).all(dim=-1)
         grey = other.grey.expand(len(inverse), -1, -1, -1)

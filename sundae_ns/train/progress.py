@@ -91,7 +91,7 @@ def long_on_cpu(seconds: float, left: int) -> str | None:
     """A warning if a training on a CPU takes more than half an hour; None otherwise.
 
     Args:
-        seconds: time of one of the first steps, which use smaller images and fewer primitives than later ones.
+        seconds: time of one of the first steps, which use smaller images and fewer Gaussians than later ones.
         left: number of steps to come.
     """
     if seconds * left <= LONG:

@@ -1,6 +1,6 @@
 """Pruning in training: its options, its schedule, the extensions that prune and remove floaters, and their records.
 
-A schedule decides, a :class:`sundae_ns.pruning.decision.FieldPruner` prunes. The running state is a dict of integers,
+A schedule decides, a :class:`sundae_ns.pruning.decision.Pruner` prunes. The running state is a dict of integers,
 which checkpoints carry: a resumed run neither prunes twice nor forgets its peak.
 """
 
@@ -21,12 +21,12 @@ from sundae_ns.core.files import write_text
 from sundae_ns.core.tables import without_nan
 from sundae_ns.core.timing import now, peak_memory
 from sundae_ns.io.run_folder import prunes_before
-from sundae_ns.pruning.decision import FieldPruner
+from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.floaters import MOST, near_cameras
 from sundae_ns.pruning.rule import PruneRule, ScoreName, check_share, kept_count
 from sundae_ns.scene.render import contribution
 from sundae_ns.train.schedules import notify_pruned
-from sundae_ns.train.state import Extension, FieldState, TrainingRun
+from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
@@ -36,20 +36,20 @@ USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise; also 
 
 @dataclass
 class PruningConfig(PruneRule):
-    """When to prune and how many primitives to keep, beside the rule that says which.
+    """When to prune and how many Gaussians to keep, beside the rule that says which.
 
     One class, because ``config.yml`` and the command line have these options side by side. Code that prunes takes the
     :class:`sundae_ns.pruning.rule.PruneRule` alone.
     """
 
     score: ScoreName = "detail-contribution"
-    """Importance of a primitive: its blending weight over the training views, with pixels weighted by the detail that
-    the kept primitives cannot show (detail-contribution), or its high-pass response (response)."""
+    """Importance of a Gaussian: its blending weight over the training views, with pixels weighted by the detail that
+    the kept Gaussians cannot show (detail-contribution), or its high-pass response (response)."""
     mode: Literal["one-shot", "continuous", "off"] = "one-shot"
     """Prune once (one-shot, the paper's main strategy), periodically during densification for less peak memory
     (continuous), or never (off)."""
     keep_ratio: float | None = USUAL_SHARE
-    """Share of the N primitives that one prune keeps, in (0, 1]: exactly round(keep_ratio * N). One-shot: None lets
+    """Share of the N Gaussians that one prune keeps, in (0, 1]: exactly round(keep_ratio * N). One-shot: None lets
     trials on held-out training views decide the number."""
     prune_at: int = 12000
     """Step after which the one-shot prune happens."""
@@ -59,12 +59,12 @@ class PruningConfig(PruneRule):
     """Last step of continuous pruning."""
     every: int = 2000
     """Steps from one continuous prune to the next."""
-    max_primitives: int | None = None
-    """Continuous: most primitives at any step, densification included; a prune keeps at most this many. One-shot: most
-    primitives that the prune keeps."""
-    target_primitives: int | None = None
+    max_gaussians: int | None = None
+    """Continuous: most Gaussians at any step, densification included; a prune keeps at most this many. One-shot: most
+    Gaussians that the prune keeps."""
+    target_gaussians: int | None = None
     """Each prune keeps exactly this many, instead of a share or of what trials choose. Continuous: the final field has
-    exactly this many; if densification ends with fewer, primitives are added."""
+    exactly this many; if densification ends with fewer, Gaussians are added."""
     max_drop: float | None = None
     """One-shot, where trials decide: PSNR in dB that a smaller field may lose against the best one, and SSIM in
     proportion. None for 0.1 dB and 0.003."""
@@ -73,8 +73,8 @@ class PruningConfig(PruneRule):
 
     @property
     def decides(self) -> bool:
-        """Whether trials decide how many primitives the one-shot prune keeps."""
-        return self.mode == "one-shot" and self.keep_ratio is None and self.target_primitives is None
+        """Whether trials decide how many Gaussians the one-shot prune keeps."""
+        return self.mode == "one-shot" and self.keep_ratio is None and self.target_gaussians is None
 
     @property
     def ends_growth_at(self) -> int | None:
@@ -91,13 +91,13 @@ class PruningConfig(PruneRule):
         """Step of the last scheduled prune; later ones happen only if the field exceeds a target or a cap."""
         if self.mode != "continuous":
             return self.prune_at
-        if self.target_primitives is not None or self.max_primitives is not None:
+        if self.target_gaussians is not None or self.max_gaussians is not None:
             return self.stop
         return self.start + (self.stop - self.start) // self.every * self.every
 
     @property
     def settled_at(self) -> int:
-        """Step after which the number of primitives does not change."""
+        """Step after which the number of Gaussians does not change."""
         return self.stop if self.mode == "continuous" else self.prune_at
 
     def validate(self) -> None:
@@ -109,24 +109,24 @@ class PruningConfig(PruneRule):
         super().validate()
         if self.keep_ratio is not None:
             check_share(self.keep_ratio)
-        self.check_at_least(every=1, prune_at=0, start=0, max_primitives=1, target_primitives=1, max_bytes=1)
+        self.check_at_least(every=1, prune_at=0, start=0, max_gaussians=1, target_gaussians=1, max_bytes=1)
         if self.mode == "continuous" and self.stop < self.start:
             raise ConfigError(f"start ({self.start}) lies after stop ({self.stop}): swap them")
-        if self.mode == "continuous" and self.keep_ratio is None and self.target_primitives is None:
+        if self.mode == "continuous" and self.keep_ratio is None and self.target_gaussians is None:
             raise ConfigError(
                 "keep_ratio is None and mode is continuous, without trials: give 0.5, or target_primitives"
             )
-        if self.mode == "off" and (self.max_primitives is not None or self.target_primitives is not None):
+        if self.mode == "off" and (self.max_gaussians is not None or self.target_gaussians is not None):
             raise ConfigError("mode is off, which prunes nothing: set mode to one-shot, or drop the number")
         for name in ("max_drop", "max_bytes"):
             if getattr(self, name) is not None and not self.decides:
                 raise ConfigError(
-                    f"{name} is set, and trials do not decide the number of primitives: set keep_ratio to None and "
+                    f"{name} is set, and trials do not decide the number of Gaussians: set keep_ratio to None and "
                     "mode to one-shot, as sundae does"
                 )
         if self.max_drop is not None and not 0 < self.max_drop < float("inf"):
             raise ConfigError(f"max_drop is {self.max_drop}: use a positive number of dB, 0.1 for one")
-        cap, target = self.max_primitives, self.target_primitives
+        cap, target = self.max_gaussians, self.target_gaussians
         if cap is not None and target is not None and target > cap:
             raise ConfigError(f"target_primitives ({target}) is more than max_primitives ({cap}): swap them")
 
@@ -136,18 +136,18 @@ class PruneReport:
     """Numbers of one prune."""
 
     step: int  # Training step after which it happened
-    before: int  # Number of primitives before it, including those that are not finite
-    after: int  # Number of primitives after it
-    dropped_nonfinite: int  # Primitives removed because a parameter was NaN or infinite
-    peak: int  # Highest number of primitives at any step so far
+    before: int  # Number of Gaussians before it, including those that are not finite
+    after: int  # Number of Gaussians after it
+    dropped_nonfinite: int  # Gaussians removed because a parameter was NaN or infinite
+    peak: int  # Highest number of Gaussians at any step so far
     seconds: float  # Wall-clock time of decision and surgery, synchronised
     tau: float | None = None  # Threshold of the graph on squared distances, squared scene units; None without a graph
     sigma: float | None = None  # Width of the edge weights, scene units; None without a graph
-    isolated: int | None = None  # Primitives without a neighbour within the threshold; None without a graph
+    isolated: int | None = None  # Gaussians without a neighbour within the threshold; None without a graph
 
     def summary(self) -> str:
         """One line for the log."""
-        parts = [f"step {self.step}: kept {self.after:,} of {self.before:,} primitives in {self.seconds:.1f} s"]
+        parts = [f"step {self.step}: kept {self.after:,} of {self.before:,} Gaussians in {self.seconds:.1f} s"]
         parts.append(f"peak {self.peak:,}")
         if self.dropped_nonfinite:
             parts.append(f"{self.dropped_nonfinite:,} were NaN or infinite")
@@ -190,10 +190,10 @@ def write_report(
 NEVER = -1  # Value of state["pruned_at"] before the first prune
 COUNT = "count"  # Key of the running state with the number that trials have chosen; 0 for the usual share
 LEAST_OPACITY = 0.005
-"""Lowest opacity of primitives that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
+"""Lowest opacity of Gaussians that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
 
 Contribute = Callable[[int | None], Tensor]
-"""Renders the training views and returns the contribution of the pruner's primitives ``[N]``; the argument is ``count``
+"""Renders the training views and returns the contribution of the pruner's Gaussians ``[N]``; the argument is ``count``
 of :func:`sundae_ns.scene.render.contribution`."""
 
 
@@ -204,8 +204,8 @@ class PruningSchedule:
     ``one-shot`` is the paper's main strategy: training, one prune that keeps ``keep_ratio`` or, once trials have chosen
     it, their number, then fine-tuning.
     ``continuous`` is the paper's alternative: periodic pruning during densification, for a lower peak of memory. Each
-    prune keeps ``keep_ratio``, so the final number is only roughly known; with ``target_primitives`` it is exact,
-    because the last prune comes after densification. ``max_primitives`` caps every prune, and every step in between
+    prune keeps ``keep_ratio``, so the final number is only roughly known; with ``target_gaussians`` it is exact,
+    because the last prune comes after densification. ``max_gaussians`` caps every prune, and every step in between
     through :class:`sundae_ns.train.densification.CappedStrategy`. ``off`` only
     records the peak.
     """
@@ -213,11 +213,11 @@ class PruningSchedule:
     config: PruningConfig  # Valid options; not changed
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """Whether a field of ``n`` primitives is to be pruned after this step.
+        """Whether a field of ``n`` Gaussians is to be pruned after this step.
 
         One-shot: after ``prune_at``, or at once if training was resumed from a later step without a prune. Continuous:
-        at ``start`` and every ``every`` steps until ``stop``; with a target only if there are more primitives. From
-        ``stop`` on at every step with more primitives than the target or, without a target, the cap.
+        at ``start`` and every ``every`` steps until ``stop``; with a target only if there are more Gaussians. From
+        ``stop`` on at every step with more Gaussians than the target or, without a target, the cap.
         """
         config = self.config
         if config.mode == "one-shot":
@@ -225,40 +225,40 @@ class PruningSchedule:
             return decided and state["pruned_at"] == NEVER and step >= config.prune_at
         if config.mode != "continuous":
             return False
-        target = config.target_primitives
+        target = config.target_gaussians
         scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
-        most = config.max_primitives if target is None else target
+        most = config.max_gaussians if target is None else target
         by_count = most is not None and n > most and (scheduled or step >= config.stop)
         return ((scheduled and target is None) or by_count) and step > state["pruned_at"]
 
     def target(self, n: int, state: Mapping[str, Any]) -> int:
-        """Number of primitives that a prune keeps of ``n`` finite ones. The one place that decides this number.
+        """Number of Gaussians that a prune keeps of ``n`` finite ones. The one place that decides this number.
 
-        ``target_primitives``, the number that trials have chosen, or ``round(keep_ratio * n)``, at least 1, under the
+        ``target_gaussians``, the number that trials have chosen, or ``round(keep_ratio * n)``, at least 1, under the
         cap.
         """
         config = self.config
-        if config.target_primitives is not None:
-            return min(config.target_primitives, n)
+        if config.target_gaussians is not None:
+            return min(config.target_gaussians, n)
         chosen = state.get(COUNT, 0) if config.decides else 0
         share = USUAL_SHARE if config.keep_ratio is None else config.keep_ratio
         count = min(chosen, n) if chosen else kept_count(share, n)
-        return count if config.max_primitives is None else min(count, config.max_primitives)
+        return count if config.max_gaussians is None else min(count, config.max_gaussians)
 
     def initialize_state(self) -> dict[str, Any]:
-        """Running state: step of the last prune (-1 for none), number of prunes, peak number of primitives."""
+        """Running state: step of the last prune (-1 for none), number of prunes, peak number of Gaussians."""
         return {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}
 
     def after_step(
-        self, pruner: FieldPruner, state: MutableMapping[str, Any], step: int, contribute: Contribute | None = None
+        self, pruner: Pruner, state: MutableMapping[str, Any], step: int, contribute: Contribute | None = None
     ) -> PruneReport | None:
-        """Prune if it is due; add the primitives that lack to the target. Call it after optimizers and densification.
+        """Prune if it is due; add the Gaussians that lack to the target. Call it after optimizers and densification.
 
         Args:
             pruner: of the field.
             state: from :meth:`initialize_state`, or from a checkpoint.
             step: training step that has just ended.
-            contribute: called only if the rule needs it, after primitives that are not finite have been removed.
+            contribute: called only if the rule needs it, after Gaussians that are not finite have been removed.
 
         Returns:
             A report, or None if no prune was due.
@@ -273,7 +273,7 @@ class PruningSchedule:
             # Continuous pruning draws anew each time, and the same after a resume.
             rule = replace(config, seed=config.seed + step) if config.mode == "continuous" else config
             report = prune_to(lambda n: self.target(n, state), rule, pruner, state, step, contribute)
-        lacking = (config.target_primitives or 0) - pruner.total
+        lacking = (config.target_gaussians or 0) - pruner.total
         if config.mode == "continuous" and step >= config.stop and lacking > 0:
             pruner.add(lacking, LEAST_OPACITY)
             state["peak"] = max(state["peak"], pruner.total)
@@ -283,7 +283,7 @@ class PruningSchedule:
 def prune_to(
     target: Callable[[int], int],
     rule: PruneRule,
-    pruner: FieldPruner,
+    pruner: Pruner,
     state: MutableMapping[str, Any],
     step: int,
     contribute: Contribute | None,
@@ -291,8 +291,8 @@ def prune_to(
     """Prune a field in training now: drop what is not finite, decide the count, render, cut, and record the step.
 
     Args:
-        target: maps the number of finite primitives to the number to keep.
-        rule: which primitives stay.
+        target: maps the number of finite Gaussians to the number to keep.
+        rule: which Gaussians stay.
         pruner, state, step, contribute: see :meth:`PruningSchedule.after_step`, also for errors.
     """
     device = pruner.params["means"].device
@@ -316,11 +316,11 @@ def prune_to(
     )
 
 
-class ScheduledPruning(Extension):
+class ScheduledPruning(Callback):
     """Prunes when the schedule says so.
 
     Args:
-        schedule: when, and to how many primitives.
+        schedule: when, and to how many Gaussians.
         evaluate: whether to evaluate all test views right before and right after the one-shot prune.
     """
 
@@ -351,7 +351,7 @@ class ScheduledPruning(Extension):
         total = run.source.total
         due = self.schedule.due(state.pruning, state.schedule_step, total)
         if due:
-            log.info(f"step {state.step}: pruning {total:,} primitives, with passes over the training views")
+            log.info(f"step {state.step}: pruning {total:,} Gaussians, with passes over the training views")
         evaluate = due and self.evaluate and config.ends_growth_at is not None
         before = _evaluated(run, "warm-up") if evaluate else {}
 
@@ -359,7 +359,7 @@ class ScheduledPruning(Extension):
             return contribution(run.source, run.training_views(), run.background, run.settings, count)
 
         try:
-            pruner = FieldPruner(state.field, state.optimizers, [state.densification])
+            pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
             report = self.schedule.after_step(pruner, state.pruning, state.schedule_step, contribute)
         except SundaeError:
             # Do not lose the warm-up to an option that can be corrected: a resumed run prunes at its first step.
@@ -374,7 +374,7 @@ class ScheduledPruning(Extension):
             return
         log.info(report.summary())
         if report.dropped_nonfinite:
-            log.warning(f"removed {report.dropped_nonfinite} primitives that were not finite")
+            log.warning(f"removed {report.dropped_nonfinite} Gaussians that were not finite")
         after = _evaluated(run, "pruned") if evaluate else {}
         write_report(run, report, before=before, after=after)
 
@@ -382,14 +382,14 @@ class ScheduledPruning(Extension):
         """Report the peak, and warn if nothing was pruned."""
         state = run.state
         primitives, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
-        log.info(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {state.device.type} memory")
+        log.info(f"peak: {primitives:,} Gaussians, {memory:,.0f} MB of {state.device.type} memory")
         run.log_scalars("Peak", {"primitives": primitives, "memory_mb": memory})
         _warn_if_too_short(run, self.schedule.config, run.state.step)
 
 
 def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int) -> None:
     """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""
-    state, target, pruned = run.state, pruning.target_primitives, run.state.pruning["num_prunes"]
+    state, target, pruned = run.state, pruning.target_gaussians, run.state.pruning["num_prunes"]
     # A warm start is pruned at once.
     first = pruning.first_prune if state.offset == 0 else None
     begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "prune-at")
@@ -402,7 +402,7 @@ def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int)
         event, step, option, found = "first prune", first, f"pruning.{begins}", "nothing is pruned" + and_head
     elif first is not None and last_step < pruning.last_due and not reached:
         event, step, option = "last prune", pruning.last_due, f"pruning.{ends}"
-        found = "more primitives are left than asked for" + and_head
+        found = "more Gaussians are left than asked for" + and_head
     elif idle:
         # The head is enabled in the steps after that one.
         event, step, found = "head", int(state.head_starts_at) + 1 - state.offset, "it stays disabled"
@@ -422,10 +422,10 @@ def _evaluated(run: TrainingRun, label: str) -> dict[str, float]:
     return results
 
 
-class FloaterRemoval(Extension):
+class FloaterRemoval(Callback):
     """Removes what floats in front of a camera before anything is pruned, and before counts are compared.
 
-    Afterwards no primitive is added, so what they showed is learnt by those that stay.
+    Afterwards no Gaussian is added, so what they showed is learnt by those that stay.
 
     Args:
         points: sparse points of the capture ``[P, 3]``; None if it has none, and then nothing is removed.
@@ -440,7 +440,7 @@ class FloaterRemoval(Extension):
         """Whether it is done."""
         return {"done": self._done}
 
-    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`; a run that was pruned before this extension existed is done."""
         self._done = self._points is None or bool(saved.get("done", state.pruning["num_prunes"] > 0))
 
@@ -455,11 +455,11 @@ class FloaterRemoval(Extension):
             return
         self._done = True
         assert self._points is not None
-        views = [own.view for own in run.training_views()]
-        if not views:
+        cameras = [own.camera for own in run.training_views()]
+        if not cameras:
             return
-        eyes = torch.stack([view.center for view in views])
-        pruner = FieldPruner(state.field, state.optimizers, [state.densification])
-        removed = pruner.drop(near_cameras(state.field["means"], eyes, self._points), at_most=MOST)
+        eyes = torch.stack([camera.center for camera in cameras])
+        pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
+        removed = pruner.drop(near_cameras(state.gaussians["means"], eyes, self._points), at_most=MOST)
         if removed:
             log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")

@@ -31,9 +31,9 @@ log = logging.getLogger(__name__)
 DecayShape = Literal["exponential", "cosine"]
 
 SPARSE = 15_000
-"""In a pruned field of fewer primitives centres move faster: on surfaces, they are the root of the quotient farther
+"""In a pruned field of fewer Gaussians centres move faster: on surfaces, they are the root of the quotient farther
 apart."""
-MOST_FACTOR = 5.0  # Largest factor on the rate of the centres, that of 600 primitives; nothing smaller was measured
+MOST_FACTOR = 5.0  # Largest factor on the rate of the centres, that of 600 Gaussians; nothing smaller was measured
 
 
 @dataclass
@@ -128,7 +128,7 @@ def notify_pruned(
     Args:
         schedulers: by name.
         step: training step of the prune.
-        primitives: number of primitives that were kept. With fewer than :data:`SPARSE` the rate of the centres rises.
+        Gaussians: number of Gaussians that were kept. With fewer than :data:`SPARSE` the rate of the centres rises.
         last: False while pruning goes on or the head is still disabled; rates that hold until then are left alone.
         ends_at: training step at which they reach their final value, as for a trial; None for that of the run.
     """
@@ -189,7 +189,7 @@ SCHEDULE = {
 """Options of the model that count steps, by the configuration that has them. Learning rates have more."""
 
 LEAST_IMAGES = 50
-"""Images that densification sees between two rounds, at least: fewer say too little of a primitive's gradient."""
+"""Images that densification sees between two rounds, at least: fewer say too little of a Gaussian's gradient."""
 LEAST_RECOVERY = 1000
 """Least steps between two resets of the opacities: shorter runs have no time to recover, and do without."""
 LONGEST_RISE = 12  # A learning rate rises over at most this fraction of the run

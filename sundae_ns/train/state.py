@@ -17,24 +17,24 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from sundae_ns.core.camera import View
-from sundae_ns.core.gaussians import FEATURES, Field
+from sundae_ns.core.camera import Camera
+from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.core.surgery import Snapshot, module_snapshot, restore, restore_module, snapshot
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.rasterize.types import Backend
-from sundae_ns.scene.render import LocalField, RenderSettings, TrainingView
+from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamera
 
 _HEAD = "head"
 
 
 @dataclass
-class FieldState:
+class TrainingState:
     """Everything that training changes, and when it changes.
 
-    Surgery (densification, prunes) replaces parameters in ``field`` and ``optimizers``, and slices the running states.
+    Surgery (densification, prunes) replaces parameters in ``gaussians`` and ``optimizers``, and slices running states.
     """
 
-    field: Field  # The primitives of this process
+    gaussians: Gaussians  # The Gaussians of this process
     networks: torch.nn.ModuleDict
     """Holds the head under ``head``. The model registers this module, so checkpoints lack a head that was removed."""
     optimizers: Mapping[str, Optimizer] = dataclasses.field(default_factory=dict)
@@ -66,7 +66,7 @@ class FieldState:
     @property
     def device(self) -> torch.device:
         """Device of the field."""
-        device: torch.device = self.field["means"].device
+        device: torch.device = self.gaussians["means"].device
         return device
 
     @property
@@ -76,7 +76,7 @@ class FieldState:
 
     @property
     def pruned(self) -> bool:
-        """Whether primitives were pruned and the field has stopped growing."""
+        """Whether Gaussians were pruned and the field has stopped growing."""
         return self.pruning.get("num_prunes", 0) > 0 and not self.densifying
 
     @property
@@ -98,8 +98,8 @@ class FieldState:
         """Do without head and features from now on. Parameters stay the same objects, as optimizers need them."""
         if _HEAD in self.networks:
             del self.networks[_HEAD]
-        if FEATURES in self.field:
-            features = self.field[FEATURES]
+        if FEATURES in self.gaussians:
+            features = self.gaussians[FEATURES]
             features.data, features.grad = features.data[:, :0], None
         for name in ("compensation", FEATURES):
             if name in self.optimizers:
@@ -109,7 +109,7 @@ class FieldState:
         """Give head and features the shapes of a configuration, in the same parameters; values are loaded later."""
         assert self.head is not None
         self.head.resize(config)
-        features = self.field[FEATURES]
+        features = self.gaussians[FEATURES]
         features.data = features.data.new_zeros(len(features), config.num_features)
 
     def render_settings(
@@ -135,19 +135,19 @@ class FieldState:
 
     def snapshot(self, *, head: bool) -> dict[str, Snapshot]:
         """Copy the field, and the head if asked for, with the states of their optimizers."""
-        saved = {"field": snapshot(self.field, self.optimizers)}
+        saved = {"field": snapshot(self.gaussians, self.optimizers)}
         if head:
             assert self.head is not None
             saved[_HEAD] = module_snapshot(self.head.parameters(), self.optimizers["compensation"])
         return saved
 
     def restore(self, saved: Mapping[str, Snapshot]) -> None:
-        """Restore a :meth:`snapshot`, with any number of primitives, and the width of its head."""
+        """Restore a :meth:`snapshot`, with any number of Gaussians, and the width of its head."""
         self.restored += 1
-        restore(self.field, self.optimizers, saved["field"])
+        restore(self.gaussians, self.optimizers, saved["field"])
         if _HEAD in saved:
             assert self.head is not None
-            width = self.field[FEATURES].shape[1]
+            width = self.gaussians[FEATURES].shape[1]
             if self.head.config.num_features != width:
                 self.head.resize(dataclasses.replace(self.head.config, num_features=width))
             restore_module(self.head.parameters(), self.optimizers["compensation"], saved[_HEAD])
@@ -166,7 +166,7 @@ class FieldState:
 class Photo(NamedTuple):
     """A training view with its image."""
 
-    view: View
+    camera: Camera
     target: Tensor  # The image over the background of TrainingRun.background, in [0, 1] [H, W, 3]
     mask: Tensor | None  # Pixels that count, bool [H, W]; None for all
 
@@ -174,8 +174,8 @@ class Photo(NamedTuple):
 class TrainingRun(Protocol):
     """What an extension may ask of the program that trains. nerfstudio's trainer stands behind it in ``ns-train``."""
 
-    state: FieldState  # The field in training
-    source: LocalField  # Where views get their primitives from
+    state: TrainingState  # The field in training
+    source: GaussianSource  # Where views get their Gaussians from
     background: Tensor  # Background of images that are not trained on [3]
 
     @property
@@ -202,7 +202,7 @@ class TrainingRun(Protocol):
     def num_heldout(self) -> int:
         """Number of held-out training views."""
 
-    def training_views(self) -> list[TrainingView]:
+    def training_views(self) -> list[TrainingCamera]:
         """All training views."""
 
     def view_indices(self) -> list[int]:
@@ -227,7 +227,7 @@ class TrainingRun(Protocol):
         """Write numbers to the run's event file."""
 
 
-class Extension:
+class Callback:
     """Base of the extensions: every verb does nothing. The model calls each verb on all extensions in their order."""
 
     name: str  # Key of its state in checkpoints
@@ -235,15 +235,15 @@ class Extension:
     def before_training(self, run: TrainingRun) -> None:
         """Check options and warn, before the first step and after a checkpoint has been loaded."""
 
-    def trains(self, state: FieldState) -> bool:
+    def trains(self, state: TrainingState) -> bool:
         """Whether this step trains; training is paused if one extension answers no."""
         return True
 
-    def before_backward(self, state: FieldState) -> None:
+    def before_backward(self, state: TrainingState) -> None:
         """Prepare ``state.info`` of a training image for the backward pass."""
 
     def needs_all(self, run: TrainingRun) -> bool:
-        """Whether :meth:`after_step` must see the primitives of all ranks at this step; the same on all of them."""
+        """Whether :meth:`after_step` must see the Gaussians of all ranks at this step; the same on all of them."""
         return False
 
     def after_step(self, run: TrainingRun) -> None:
@@ -253,11 +253,11 @@ class Extension:
         """Report after the last step."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Own state for a checkpoint, beside the running states of :class:`FieldState`; plain values and tensors."""
+        """Own state for a checkpoint, beside the running states of :class:`TrainingState`; plain values and tensors."""
         return {}
 
-    def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+    def prepare_loading(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Give field and head the shapes that they have in a checkpoint with this state of the extension."""
 
-    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Take over the state of a checkpoint, after field and head were loaded."""

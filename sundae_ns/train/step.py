@@ -1,7 +1,7 @@
 """The training step: from a view to its loss. Every training runs this one.
 
 nerfstudio asks for images and losses in two calls, and runs the backward pass and the optimizers itself. Captured steps
-and fine-tunes run both halves in one call. Several ranks give another source of primitives.
+and fine-tunes run both halves in one call. Several ranks give another source of Gaussians.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from pytorch_msssim import SSIM
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sundae_ns.core.camera import View, Window
+from sundae_ns.core.camera import Camera, Crop
 from sundae_ns.core.metrics import SSIM_WINDOW
 from sundae_ns.cuda.kernels import kernels_where_possible
 from sundae_ns.cuda.loss import SIGMA, fused_loss, loss_kernels
-from sundae_ns.head.head import training_window
+from sundae_ns.head.head import training_crop
 from sundae_ns.rasterize.types import Rasterization
-from sundae_ns.scene.render import LocalField, RenderSettings, StepResolution, render_view
-from sundae_ns.train.state import FieldState
+from sundae_ns.scene.render import GaussianSource, RenderSettings, StepResolution, render_view
+from sundae_ns.train.state import TrainingState
 
 LEAST_SQUARE = 1e-8  # Added to the mean square, so that its root has a gradient for equal images
 
@@ -40,7 +40,7 @@ class StepLosses:
 
     def __call__(
         self,
-        state: FieldState,
+        state: TrainingState,
         params: Mapping[str, Tensor],
         rgb: Tensor,
         base: Tensor,
@@ -57,7 +57,7 @@ class StepLosses:
             base: its base colours ``[H, W, 3]``.
             target: the truth ``[H, W, 3]``.
             mask: pixels that count ``[H, W, 1]``; None for all.
-            count: number of primitives ``[]``, where further rows are transparent and without width; None for N.
+            count: number of Gaussians ``[]``, where further rows are transparent and without width; None for N.
         """
         if mask is not None:
             target, rgb, base = target * mask, rgb * mask, base * mask
@@ -70,14 +70,14 @@ class StepLosses:
             losses["base_loss"] = options.base_loss_weight * base_loss
         weight = self.prior_weight(state)
         if weight > 0:
-            # Unused primitives become transparent and small (equation 10 of 3DGS-MCMC). In a pruned field they would
+            # Unused Gaussians become transparent and small (equation 10 of 3DGS-MCMC). In a pruned field they would
             # fit what differs between the training images.
             for name, values in (("opacity", params["opacities"].sigmoid()), ("scale", params["scales"].exp())):
                 mean = values.mean() if count is None else values.sum() / (values.shape[1] * count)
                 losses[f"{name}_loss"] = weight * mean
         return losses
 
-    def prior_weight(self, state: FieldState) -> float:
+    def prior_weight(self, state: TrainingState) -> float:
         """Weight of opacities and scales at this step."""
         # A prior counts once, and the loss is of one image: its weight falls with their number.
         return self.options.prior_after_prune / max(self.num_images, 1) if state.pruned else 0.0
@@ -193,17 +193,17 @@ def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_
 class StepInputs:
     """What a step trains on."""
 
-    view: View
+    camera: Camera
     target: Tensor  # The true image over the background [H, W, 3]
     mask: Tensor | None  # Pixels that count, float [H, W, 1]; None for all
     background: Tensor  # Colour [3]
-    window: Window | None = None  # The part of the training image that is shown; None for the whole image
+    crop: Crop | None = None  # The part of the training image that is shown; None for the whole image
     rates: Tensor | None = None  # Learning rates of the groups of parameters [G]; None where the optimizer holds them
     count: Tensor | None = None
-    """Number of primitives ``[]``, where parameters have rows for more and a loss is a mean over them."""
+    """Number of Gaussians ``[]``, where parameters have rows for more and a loss is a mean over them."""
 
     def _tensors(self) -> list[Tensor]:
-        always = (self.view.viewmat, self.view.K, self.target, self.background)
+        always = (self.camera.viewmat, self.camera.K, self.target, self.background)
         tensors = (*always, self.mask, self.rates, self.count)
         return [value.detach() for value in tensors if value is not None]
 
@@ -212,8 +212,8 @@ class StepInputs:
         copies = [value.clone(memory_format=torch.contiguous_format) for value in self._tensors()]
         viewmat, K, target, background, *rest = copies
         mask, rates, count = (None if one is None else rest.pop(0) for one in (self.mask, self.rates, self.count))
-        view = self.view._replace(viewmat=viewmat, K=K)
-        return StepInputs(view, target, mask, background, self.window, rates, count)
+        camera = self.camera._replace(viewmat=viewmat, K=K)
+        return StepInputs(camera, target, mask, background, self.crop, rates, count)
 
     def copy_to(self, other: StepInputs) -> None:
         """Write these into the inputs of a recording."""
@@ -229,39 +229,39 @@ class StepResult:
     loss: Tensor  # Their sum []
 
 
-def training_part(state: FieldState, view: View, at: StepResolution) -> tuple[View, Window | None]:
+def training_part(state: TrainingState, camera: Camera, at: StepResolution) -> tuple[Camera, Crop | None]:
     """The part of a training view that a step shows, and its window; None for the whole image.
 
     Args:
         state: the field in training; it remembers the focal lengths that the head is trained on.
-        view: the whole view.
+        camera: the whole view.
         at: resolution at this step.
     """
     if state.head_enabled and at.downscale == 1:
-        low, high = state.trained_focal or (view.focal, view.focal)
-        state.trained_focal = (min(low, view.focal), max(high, view.focal))
-    window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
-    return view if window is None else view.cut(window), window
+        low, high = state.trained_focal or (camera.focal, camera.focal)
+        state.trained_focal = (min(low, camera.focal), max(high, camera.focal))
+    crop = training_crop(camera.width, camera.height, at.window_pixels, seed=at.step, mirror=at.mirror)
+    return camera if crop is None else camera.cut(crop), crop
 
 
 class TrainingStep(NamedTuple):
     """The step of a field, from a view to its loss."""
 
-    source: LocalField  # Where the view gets its primitives from
-    state: FieldState  # Says what is enabled at this step
+    source: GaussianSource  # Where the view gets its Gaussians from
+    state: TrainingState  # Says what is enabled at this step
     losses: StepLosses  # Terms of the loss
     params: Mapping[str, Tensor]  # Trained parameters, for the terms that see them
 
     def images(
         self,
-        view: View,
+        camera: Camera,
         background: Tensor,
         settings: RenderSettings,
         *,
         depth: bool = False,
     ) -> tuple[dict[str, Any], Rasterization]:
-        """The first half: primitives, one splatting pass, and the head; see :func:`render_view`."""
-        return render_view(self.source, view, background, settings, depth=depth)
+        """The first half: Gaussians, one splatting pass, and the head; see :func:`render_view`."""
+        return render_view(self.source, camera, background, settings, depth=depth)
 
     def terms(
         self, images: Mapping[str, Tensor], target: Tensor, mask: Tensor | None, count: Tensor | None = None
@@ -276,7 +276,7 @@ class TrainingStep(NamedTuple):
             The loss ``[]`` with its graph, the rasteriser's result, and the detached result of the step.
         """
         with torch.enable_grad():
-            images, splatted = self.images(inputs.view, inputs.background, settings)
+            images, splatted = self.images(inputs.camera, inputs.background, settings)
             terms = self.terms(images, inputs.target, inputs.mask, inputs.count)
             loss = functools.reduce(torch.add, terms.values())
         shown = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}

@@ -42,7 +42,7 @@ from sundae_ns.head.head import HeadConfig
 from sundae_ns.io.accounting import megabytes, stored_bytes
 from sundae_ns.io.coordinates import scene_order
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
-from sundae_ns.pruning.decision import FieldPruner
+from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.rule import kept_count
 from sundae_ns.scene.initialization import initial_features
 from sundae_ns.scene.render import contribution, render_view
@@ -53,7 +53,7 @@ from sundae_ns.train.curve import RECORD, CurvePoint, curve_table
 from sundae_ns.train.densification import Densification
 from sundae_ns.train.pruning import COUNT, USUAL_SHARE, PruningConfig, prune_to
 from sundae_ns.train.schedules import limit_rise, notify_pruned, put_restarts, restarts
-from sundae_ns.train.state import Extension, FieldState, TrainingRun
+from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
@@ -114,15 +114,15 @@ def view_quality(image: Tensor, target: Tensor, mask: Tensor | None) -> HeldOutQ
     return HeldOutQuality(pixels, min(decibels, MOST_PSNR), similarity)
 
 
-def packed_size(field: Mapping[str, Tensor], head: torch.nn.Module | None = None) -> list[int] | None:
+def packed_size(gaussians: Mapping[str, Tensor], head: torch.nn.Module | None = None) -> list[int] | None:
     """Estimated bytes of the Gaussians and of the head in a packed scene; None if it cannot be packed.
 
     Args:
-        field: parameters by name ``[N, ...]``; neighbouring ones are packed as a sample.
+        gaussians: parameters by name ``[N, ...]``; neighbouring ones are packed as a sample.
         head: the head that reads the features; None leaves them out.
     """
-    n = len(field["means"])
-    packed = {name: value.detach() for name, value in field.items() if head is not None or name != FEATURES}
+    n = len(gaussians["means"])
+    packed = {name: value.detach() for name, value in gaussians.items() if head is not None or name != FEATURES}
     if n > SAMPLE:
         order = scene_order(packed["means"].float().cpu().numpy())
         middle = torch.from_numpy(order[(n - SAMPLE) // 2 :][:SAMPLE])
@@ -150,7 +150,7 @@ class Trial:
     """Steps at its end over which weights are averaged; the mean is measured. 0 measures the last weights."""
     num_features: int | None = None
     """Width of the features: 0 disables the head, another width begins with a fresh one. None changes nothing."""
-    counts: bool = True  # Whether its field goes on in any case; that of others is FieldState.provisional
+    counts: bool = True  # Whether its field goes on in any case; that of others is TrainingState.provisional
     began: int = 0  # Step of the schedule at which it began; the engine sets it
 
 
@@ -164,7 +164,7 @@ class TrialEngine:
     def __init__(self, head_starts_at: float = -math.inf) -> None:
         self.trial: Trial | None = None  # The current trial
         self.kept: dict[str, dict[str, Any]] = {}
-        """Copies of the field by name: a :meth:`FieldState.snapshot`, and the number of ``counted`` steps before it."""
+        """Copies of the Gaussians by name: a :meth:`TrainingState.snapshot`, and the ``counted`` steps before it."""
         self.taken_back = 0  # Steps after which the field went back to before them
         self.coming: dict[str, list[int]] = {}
         """Views that are held out for the trials to come of a stage. In a trial its own views are, and no others."""
@@ -177,7 +177,7 @@ class TrialEngine:
         trial = None if self.trial is None else asdict(self.trial)
         return {"trial": trial, "kept": self.kept, **numbers, **self._mean.state_dict()}
 
-    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`; the head is enabled as the trial has it."""
         self.trial = None if saved["trial"] is None else Trial(**saved["trial"])
         self.kept, self.taken_back, self.coming = dict(saved["kept"]), saved["taken_back"], dict(saved["coming"])
@@ -220,13 +220,13 @@ class TrialEngine:
         self._mean = RunningMean()
         return views
 
-    def take_mean(self, state: FieldState) -> None:
+    def take_mean(self, state: TrainingState) -> None:
         """Continue with the mean of the weights, if there is one."""
         self._mean.replace(weights_of(state))
         self._mean = RunningMean()
         state.restored += 1  # another mean must not contain the weights before it
 
-    def keep(self, name: str, state: FieldState, *, head: bool) -> None:
+    def keep(self, name: str, state: TrainingState, *, head: bool) -> None:
         """Keep a copy of the field, and of the head if asked for, until the stage ends."""
         self.kept[name] = {
             "counted": state.schedule_step - self.taken_back,
@@ -236,7 +236,7 @@ class TrialEngine:
             **state.snapshot(head=head),
         }
 
-    def go_back(self, name: str, state: FieldState) -> None:
+    def go_back(self, name: str, state: TrainingState) -> None:
         """Continue with a kept copy of the field, its learning rates and its counted steps."""
         kept = self.kept[name]
         state.restore(kept)
@@ -252,25 +252,25 @@ class TrialEngine:
         self.hold_out(run)
         self._mark(run.state)
 
-    def enable_head(self, state: FieldState, enabled: bool) -> None:
+    def enable_head(self, state: TrainingState, enabled: bool) -> None:
         """Enable or disable the head."""
         # Not from this step on: a run that is resumed on several GPUs counts other steps.
         state.head_starts_at = self._head_starts_at if enabled else math.inf
 
-    def _mark(self, state: FieldState) -> None:
+    def _mark(self, state: TrainingState) -> None:
         state.provisional = self.trial is not None and not self.trial.counts
 
 
-def _widen(state: FieldState, num_features: int) -> None:
+def _widen(state: TrainingState, num_features: int) -> None:
     """Give the field fresh features and a fresh head of a width that they do not have."""
     assert state.head is not None
     if state.head.config.num_features == num_features:
         return
     state.head.resize(replace(state.head.config, num_features=num_features))
     state.optimizers["compensation"].state.clear()
-    colors, generator = state.field["features_dc"].detach(), torch.Generator().manual_seed(0)
+    colors, generator = state.gaussians["features_dc"].detach(), torch.Generator().manual_seed(0)
     features = initial_features(colors, num_features, generator)
-    replace_parameter(state.field, state.optimizers, FEATURES, features, {})
+    replace_parameter(state.gaussians, state.optimizers, FEATURES, features, {})
 
 
 # ------------------------------------------------------------------------------------------------------------ trials
@@ -305,7 +305,7 @@ class Progress:
         )
 
 
-class Trials(Extension):
+class Trials(Callback):
     """Tries candidates for the number of Gaussians, the head, and the length of the training.
 
     It acts before the schedule prunes. :class:`AfterPrune` calls it again afterwards, for the stages that follow.
@@ -324,7 +324,7 @@ class Trials(Extension):
     def __init__(
         self,
         config: PruningConfig,
-        state: FieldState,
+        state: TrainingState,
         densification: Densification,
         *,
         begins_at: int,
@@ -344,7 +344,7 @@ class Trials(Extension):
         """What was tried and chosen, and the state of the engine."""
         return {"progress": asdict(self.progress), "engine": self.engine.state_dict(), "head": self.decides_head}
 
-    def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+    def prepare_loading(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Give head and features the width that they have in the checkpoint, or remove them.
 
         Raises:
@@ -363,7 +363,7 @@ class Trials(Extension):
         elif head == "plain":
             state.remove_head()
 
-    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`.
 
         Raises:
@@ -382,7 +382,7 @@ class Trials(Extension):
         if in_trial and not all(isinstance(kept.get(name), Mapping) for name in names.get(progress.stage, [])):
             raise CheckpointError("the checkpoint lacks a field that its trials would return to; give another")
 
-    def trains(self, state: FieldState) -> bool:
+    def trains(self, state: TrainingState) -> bool:
         """False while training is paused. After the end of the schedule it goes on: the user has asked for more."""
         return self.progress.stage != "paused" or state.schedule_step >= self.progress.steps
 
@@ -469,7 +469,7 @@ class Trials(Extension):
         row = Tried(stage, run.source.total, name, trial.length, views)
         progress.tried.append(row)
         if stage in ("count", "tenth"):
-            row.bytes = packed_size(state.field, state.head if state.head_enabled else None)
+            row.bytes = packed_size(state.gaussians, state.head if state.head_enabled else None)
             self.engine.go_back("start", state)
             self.engine.enable_head(state, False)
             self._try_count(run)
@@ -479,7 +479,7 @@ class Trials(Extension):
         else:
             self._try_length(run)
 
-    def _present_head(self, state: FieldState) -> str:
+    def _present_head(self, state: TrainingState) -> str:
         if state.head is None or not state.head_enabled:
             return "plain"
         return "features" if state.head.config.num_features == MORE_FEATURES and len(self._heads) == 3 else "head"
@@ -497,7 +497,7 @@ class Trials(Extension):
 
     def _count_views(self, run: TrainingRun) -> list[int]:
         indices = run.view_indices()
-        return choice.spread_views(indices, min(choice.MOST_HELD_OUT, len(indices) // choice.HELD_OUT_EVERY), 0)
+        return choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, len(indices) // choice.HELD_OUT_EVERY), 0)
 
     def _plan(self, run: TrainingRun) -> tuple[list[list[int]], int]:
         return choice.plan_heads(run.view_indices(), self.progress.steps)
@@ -512,11 +512,11 @@ class Trials(Extension):
 
     def _begin_counts(self, run: TrainingRun) -> None:
         progress, state = self.progress, run.state
-        FieldPruner(state.field, state.optimizers, [state.densification]).drop_nonfinite()
+        Pruner(state.gaussians, state.optimizers, [state.densification]).drop_nonfinite()
         self._densification.initialize(state)  # its statistics would not match the field that comes back
         progress.full = run.source.total
         log.info(
-            f"step {state.step}: how many primitives does the scene need? Up to {len(SHARES)} trials of "
+            f"step {state.step}: how many Gaussians does the scene need? Up to {len(SHARES)} trials of "
             f"{self._short:,} steps; {len(self._count_views(run))} of {len(run.view_indices())} training views "
             "are held out"
         )
@@ -564,11 +564,11 @@ class Trials(Extension):
             views = views[:: -(-len(views) // MOST_CONTRIBUTING)]
             return contribution(run.source, views, run.background, run.settings, kept)
 
-        pruner = FieldPruner(state.field, state.optimizers, [state.densification])
+        pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
         prune_to(lambda n: min(count, n), self.config, pruner, state.pruning, state.schedule_step, contribute)
 
     def _count_of(self, curve: list[CurvePoint]) -> tuple[int, str]:
-        limits = {"most": self.config.max_primitives, "most_bytes": self.config.max_bytes}
+        limits = {"most": self.config.max_gaussians, "most_bytes": self.config.max_bytes}
         return choice.choose_within(curve, self._tolerance, **limits)
 
     def _choose_count(self, run: TrainingRun, curve: list[CurvePoint]) -> None:
@@ -580,10 +580,10 @@ class Trials(Extension):
         count, reason = self._count_of(curve)
         self._set_count(run, count)
         log.info("\n".join(["expected at the end, on held-out training views:", *curve_table(curve)]))
-        log.info(f"keeping {count:,} of {progress.full:,} primitives: {reason}")
+        log.info(f"keeping {count:,} of {progress.full:,} Gaussians: {reason}")
         if choice.still_climbs(curve, self._tolerance):
             log.info(
-                "quality still grows at the full count: the scene may need more primitives than densification made; "
+                "quality still grows at the full count: the scene may need more Gaussians than densification made; "
                 "a lower --pipeline.model.densify-grad-thresh makes more"
             )
         points = [
@@ -596,13 +596,13 @@ class Trials(Extension):
         record |= {"steps_per_trial": self._short, "curve": points}
         if "tenth" in progress.chosen:
             length, figures = self._plan(run)[1], _figures(progress.of("tenth"))
-            log.info(f"a tenth of the primitives after {length:,} steps: {_in_words(figures)}")
+            log.info(f"a tenth of the Gaussians after {length:,} steps: {_in_words(figures)}")
             record["head"] = {"pays": progress.chosen["tenth"], "steps_per_trial": length, **figures}
         self._record(run, "count", record)
 
     def _keep_usual(self, run: TrainingRun, reason: str) -> None:
         log.warning(
-            f"pruning keeps {USUAL_SHARE:.0%} of the primitives: {reason}; --pipeline.model.pruning.keep-ratio sets it"
+            f"pruning keeps {USUAL_SHARE:.0%} of the Gaussians: {reason}; --pipeline.model.pruning.keep-ratio sets it"
         )
         self._set_count(run, 0)
 
@@ -682,8 +682,8 @@ class Trials(Extension):
             state.remove_head()
         self._record(run, "head", {"decision": head, "reason": reason, "step": state.step, **(record or {})})
 
-    def _stored_bytes(self, state: FieldState, head: str) -> list[int]:
-        params = {name: value for name, value in state.field.items() if head != "plain" or name != FEATURES}
+    def _stored_bytes(self, state: TrainingState, head: str) -> list[int]:
+        params = {name: value for name, value in state.gaussians.items() if head != "plain" or name != FEATURES}
         size = stored_bytes(params, None)
         config = None if head == "plain" or state.head is None else state.head.config
         return [size, stored_bytes(params, config) - size]
@@ -769,7 +769,7 @@ class Trials(Extension):
             write_text(run.folder / RECORD, text + "\n")
 
 
-class AfterPrune(Extension):
+class AfterPrune(Callback):
     """Calls trials again after the schedule's prune, because extensions act in their order."""
 
     name = "after-prune"

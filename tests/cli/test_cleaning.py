@@ -22,14 +22,14 @@ def scene(n: int = 400) -> sn.Scene:
     generator = torch.Generator().manual_seed(0)
     points = torch.cat([torch.rand(n, 3, generator=generator), torch.tensor([[3.0, 0.5, 0.5]])])
     made = sn.Scene.from_points(points, points.sigmoid())
-    field = made.field.replaced({"scales": torch.full((n + 1, 3), math.log(0.05))})
-    views = tuple(sn.View.look_at((x, -3, 0.5), (0.5, 0.5, 0.5), width=64, height=48) for x in (0.0, 1.0, 2.0))
-    return dataclasses.replace(made, field=field, views=views)
+    gaussians = made.gaussians.replaced({"scales": torch.full((n + 1, 3), math.log(0.05))})
+    cameras = tuple(sn.Camera.look_at((x, -3, 0.5), (0.5, 0.5, 0.5), width=64, height=48) for x in (0.0, 1.0, 2.0))
+    return dataclasses.replace(made, gaussians=gaussians, cameras=cameras)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene as ``.ply`` with a property of its own and a broken primitive, and as ``.sundae``."""
+    """The scene as ``.ply`` with a property of its own and a broken Gaussian, and as ``.sundae``."""
     folder = tmp_path_factory.mktemp("scenes")
     sn.save(scene(), folder / "packed.sundae")
     sn.save(scene(), folder / "plain.ply")
@@ -54,12 +54,12 @@ def test_export_cuts_a_ply_and_keeps_its_rows(folder: Path, tmp_path: Path, caps
     inside = (before["x"] >= 0) & (before["x"] <= 0.5)
     assert np.array_equal(after, before[inside])
     said = capsys.readouterr()
-    assert said.out == f"{tmp_path / 'a.ply'}: {int(inside.sum()):,} of 402 primitives\n"
-    assert f"{int(inside.sum())} of 401 primitives are in the box" in said.err
+    assert said.out == f"{tmp_path / 'a.ply'}: {int(inside.sum()):,} of 402 Gaussians\n"
+    assert f"{int(inside.sum())} of 401 Gaussians are in the box" in said.err
     assert run("export", folder / "a.ply", "-o", tmp_path / "b.ply", "--remove-floaters") == 0
     assert np.array_equal(vertices(tmp_path / "b.ply"), before[1:401])
     err = capsys.readouterr().err
-    assert "removed 1 floaters of 401 primitives, by their neighbours alone" in err
+    assert "removed 1 floaters of 401 Gaussians, by their neighbours alone" in err
 
 
 def test_export_to_a_page_and_to_other_formats(folder: Path, tmp_path: Path) -> None:
@@ -67,13 +67,13 @@ def test_export_to_a_page_and_to_other_formats(folder: Path, tmp_path: Path) -> 
         assert run("export", folder / "packed.sundae", "-o", tmp_path / name, "--remove-floaters") == 0
     assert run("export", folder / "packed.sundae", "-o", tmp_path / "c.spz", *INSIDE) == 0
     found = sn.load(tmp_path / "site" / "scene.sundae")
-    assert found.num_primitives <= 400
-    assert float(found.field["means"].max()) < 1.1
-    assert len(found.views) == 3
-    assert sn.load(tmp_path / "a.spz").num_primitives == found.num_primitives
-    assert sn.load(tmp_path / "b.ply").num_primitives == found.num_primitives
-    cut = sn.load(tmp_path / "c.spz").field["means"]
-    assert len(cut) == int((sn.load(folder / "packed.sundae").field["means"][:, 0] <= 0.5).sum())
+    assert found.num_gaussians <= 400
+    assert float(found.gaussians["means"].max()) < 1.1
+    assert len(found.cameras) == 3
+    assert sn.load(tmp_path / "a.spz").num_gaussians == found.num_gaussians
+    assert sn.load(tmp_path / "b.ply").num_gaussians == found.num_gaussians
+    cut = sn.load(tmp_path / "c.spz").gaussians["means"]
+    assert len(cut) == int((sn.load(folder / "packed.sundae").gaussians["means"][:, 0] <= 0.5).sum())
 
 
 def test_prune_keeps_a_share_of_what_remains(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,7 +84,7 @@ def test_prune_keeps_a_share_of_what_remains(folder: Path, tmp_path: Path, capsy
     assert len(found) == round(0.5 * inside)
     assert len(np.unique(found["mine"])) == len(found)
     assert set(found["mine"]) <= set(vertices(folder / "a.ply")["mine"][vertices(folder / "a.ply")["x"] <= 0.5])
-    assert f"{len(found)} of 402 primitives" in capsys.readouterr().out
+    assert f"{len(found)} of 402 Gaussians" in capsys.readouterr().out
     assert run("prune", folder / "a.ply", "-o", tmp_path / "b.ply", "--keep", 1, "--remove-floaters", *INSIDE) == 0
     assert np.array_equal(
         vertices(tmp_path / "b.ply")["mine"],
@@ -93,8 +93,8 @@ def test_prune_keeps_a_share_of_what_remains(folder: Path, tmp_path: Path, capsy
     out = tmp_path / "c.sundae"
     assert run("prune", folder / "packed.sundae", "-o", out, "--count", 20, "--remove-floaters") == 0
     found = sn.load(out)
-    assert found.num_primitives == 20
-    assert float(found.field["means"].max()) < 1.2
+    assert found.num_gaussians == 20
+    assert float(found.gaussians["means"].max()) < 1.2
 
 
 def test_pack_cuts_and_refuses_what_photos_would_judge(
@@ -102,20 +102,20 @@ def test_pack_cuts_and_refuses_what_photos_would_judge(
 ) -> None:
     out = tmp_path / "a.sundae"
     assert run("pack", folder / "a.ply", "-o", out, "--remove-floaters", "--crop", 0, 0, 0, 9, 9, 9) == 0
-    assert sn.load(out).num_primitives == 400
+    assert sn.load(out).num_gaussians == 400
     capsys.readouterr()
     for words, message in (
         (("--target-drop", 1, "--remove-floaters"), "leave out --remove-floaters"),
         (("--finetune", 5, *INSIDE), "leave out --crop"),
         (("--crop", 1, 1, 1, 0, 0, 0), "the box is empty"),
-        (("--crop", 7, 7, 7, 8, 8, 8), "no primitive is in the box; most of them lie between"),
+        (("--crop", 7, 7, 7, 8, 8, 8), "no Gaussian is in the box; most of them lie between"),
     ):
         assert run("pack", folder / "a.ply", "-o", tmp_path / "b.sundae", *words) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert line.startswith("sundae: ")
         assert message in line
     assert not (tmp_path / "b.sundae").exists()
-    alone = dataclasses.replace(scene(), field=scene().field.rows(torch.arange(401) >= 399), views=())
+    alone = dataclasses.replace(scene(), gaussians=scene().gaussians.rows(torch.arange(401) >= 399), cameras=())
     sn.save(alone, tmp_path / "alone.ply")
     assert run("export", tmp_path / "alone.ply", "-o", tmp_path / "b.spz", "--remove-floaters") == 2
-    assert "all primitives float" in capsys.readouterr().err
+    assert "all Gaussians float" in capsys.readouterr().err

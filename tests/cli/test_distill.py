@@ -49,9 +49,9 @@ def test_an_interrupted_distillation_goes_on(
     assert run(*words) == 0
     said = capsys.readouterr()
     assert "going on from step 4 of 6" in said.err
-    assert "100 of 200 primitives, without a head" in said.out
+    assert "100 of 200 Gaussians, without a head" in said.out
     assert sorted(path.name for path in source.parent.iterdir()) == ["a.ply", "b.spz"]
-    assert sn.load(out).num_primitives == 100
+    assert sn.load(out).num_gaussians == 100
 
 
 @pytest.mark.parametrize(

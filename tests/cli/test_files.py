@@ -22,7 +22,7 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.gaussians import SH_C0, SPLAT_NAMES
-from sundae_ns.io.formats import read_primitives, write_for_viewers
+from sundae_ns.io.formats import read_gaussian_file, write_for_viewers
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
 from sundae_ns.io.ply import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply
 from sundae_ns.scene import prune_scene as pruning
@@ -31,7 +31,7 @@ from sundae_ns.scene.initialization import from_points
 MODEL = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "black"}
 
 
-def field(n: int = 200, features: int = 0) -> dict[str, Tensor]:
+def gaussians(n: int = 200, features: int = 0) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(n, 3, generator=generator)
     made = from_points(points, points, sh_degree=1, num_features=features, generator=generator)
@@ -41,9 +41,9 @@ def field(n: int = 200, features: int = 0) -> dict[str, Tensor]:
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
-    write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": {**MODEL, "rasterize_mode": mode}}))
+    write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": {**MODEL, "rasterize_mode": mode}}))
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply") == 0
-    found, truth = read_ply(tmp_path / "a.ply"), read_scene(tmp_path / "a.sundae").field
+    found, truth = read_ply(tmp_path / "a.ply"), read_scene(tmp_path / "a.sundae").gaussians
     assert all(torch.equal(found[name], truth[name]) for name in SPLAT_NAMES)
     assert is_nerfstudio_ply(tmp_path / "a.ply")
     assert ("SplatRenderMode: mip" in PlyData.read(tmp_path / "a.ply").comments) == (mode == "antialiased")
@@ -52,11 +52,11 @@ def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
 @pytest.mark.parametrize("kind", [".spz", ".sog"])
 def test_export_to_other_formats(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     model = {**MODEL, "rasterize_mode": "antialiased"}
-    write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": model}))
+    write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": model}))
     out = tmp_path / f"a{kind}"
     assert run("export", tmp_path / "a.sundae", "-o", out) == 0
     output = " ".join(capsys.readouterr().out.split())
-    assert f"a{kind}: 200 primitives, degree 1, antialiased, {out.stat().st_size:,} bytes" in output
+    assert f"a{kind}: 200 Gaussians, degree 1, antialiased, {out.stat().st_size:,} bytes" in output
     assert out.read_bytes()[:2] == {".spz": b"\x1f\x8b", ".sog": b"PK"}[kind]
 
 
@@ -70,16 +70,16 @@ def test_export_of_a_ply_of_any_program(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The file's name does not matter, and the result equals that of the same field as a packed scene."""
-    given = field()
+    given = gaussians()
     given["means"][3] = torch.nan
     write_ply(tmp_path / "unnamed.bin", given, comments=comments)
     out, same = tmp_path / f"a{kind}", tmp_path / f"b{kind}"
     assert run("export", tmp_path / "unnamed.bin", "-o", out) == 0
     output = " ".join(capsys.readouterr().out.split())
     mode = ", antialiased" if comments else ""
-    assert f"a{kind}: 199 primitives, degree 1{mode}, {out.stat().st_size:,} bytes" in output
+    assert f"a{kind}: 199 Gaussians, degree 1{mode}, {out.stat().st_size:,} bytes" in output
     (line,) = caplog.messages
-    assert line.endswith("unnamed.bin: 200 primitives: dropped 1 that were not finite (NaN or infinite)")
+    assert line.endswith("unnamed.bin: 200 Gaussians: dropped 1 that were not finite (NaN or infinite)")
     finite = {name: value[torch.arange(200) != 3] for name, value in given.items()}
     write_for_viewers(same, finite, antialiased=bool(comments))
     assert out.read_bytes() == same.read_bytes()
@@ -89,7 +89,7 @@ def test_export_of_a_ply_of_any_program(
 def test_export_says_how_many_primitives_are_clamped(
     tmp_path: Path, kind: str, clamped: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = field()
+    given = gaussians()
     given["features_rest"].clamp_(-1, 1)
     given["scales"][3, 1] = -11.0
     given["scales"][4, 0] = 6.1
@@ -97,23 +97,23 @@ def test_export_says_how_many_primitives_are_clamped(
     write_ply(tmp_path / "in.ply", given)
     assert run("export", tmp_path / "in.ply", "-o", tmp_path / f"a{kind}") == 0
     text = capsys.readouterr().out
-    assert (f"clamped scales or colours of {clamped} primitives" in text) == (clamped > 0)
+    assert (f"clamped scales or colours of {clamped} Gaussians" in text) == (clamped > 0)
     assert ("clamped" in text) == (clamped > 0)
 
 
 def test_export_of_a_ply_of_nerfstudio_upright(tmp_path: Path) -> None:
-    write_ply(tmp_path / "in.ply", field(), comments=[MODEL_FRAME])
+    write_ply(tmp_path / "in.ply", gaussians(), comments=[MODEL_FRAME])
     assert run("export", tmp_path / "in.ply", "-o", tmp_path / "a.spz", "--upright") == 0
-    write_for_viewers(tmp_path / "b.spz", field(), upright=True)
+    write_for_viewers(tmp_path / "b.spz", gaussians(), upright=True)
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
 
 
 def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
-    given = field()
+    given = gaussians()
     given["features_rest"] = given["features_rest"][:, :0]
     write_scene(tmp_path / "a.sundae", PackedScene(given, meta={"model": {**MODEL, "sh_degree": 0}}))
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply", "--upright") == 0
-    truth = read_scene(tmp_path / "a.sundae").field
+    truth = read_scene(tmp_path / "a.sundae").gaussians
     found = read_ply(tmp_path / "a.ply")
     # Such a model stores logits of colours, a .ply the SH coefficient of degree 0.
     torch.testing.assert_close(0.5 + SH_C0 * found["features_dc"], truth["features_dc"].sigmoid(), rtol=0, atol=1e-6)
@@ -128,7 +128,7 @@ def test_prune_does_not_change_kept_rows(
     tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     source, out = tmp_path / "in.ply", tmp_path / "out.ply"
-    write_ply(source, field(), comments=["SplatRenderMode: mip", "by another program"])
+    write_ply(source, gaussians(), comments=["SplatRenderMode: mip", "by another program"])
     # Add a property that is not part of 3DGS, and an element beside the vertices.
     data = PlyData.read(source)
     rows = data["vertex"].data
@@ -142,7 +142,7 @@ def test_prune_does_not_change_kept_rows(
 
     assert run("prune", source, "-o", out, "--keep", "0.25", "--redistribution", "none", *options) == 0
     text = capsys.readouterr().out
-    assert "50 of 200 primitives" in text
+    assert "50 of 200 Gaussians" in text
     assert "dropped 1 that were not finite" in caplog.text
     found = PlyData.read(out)
     assert found.comments == ["SplatRenderMode: mip", "by another program"]
@@ -164,9 +164,9 @@ def test_prune_does_not_change_kept_rows(
         (["prune", "in.ply", "-o", "a.ply", "--target-drop", "0"], "target-drop is 0.0; give a positive number of dB"),
         (["prune", "in.ply", "-o", "a.ply", "--target-drop", "1", "--views", "1"], "a target needs two views or more"),
         (["prune", "in.ply", "-o", "a.ply", "--count", "0"], "count is 0; give 1 or more"),
-        (["prune", "none.ply", "-o", "a.ply"], "none.ply has 5 primitives, and none is finite; export it again"),
-        (["prune", "empty.ply", "-o", "a.ply"], "empty.ply has 0 primitives, and none is finite; export it again"),
-        (["export", "none.ply", "-o", "a.spz"], "none.ply has 5 primitives, and none is finite; export it again"),
+        (["prune", "none.ply", "-o", "a.ply"], "none.ply has 5 Gaussians, and none is finite; export it again"),
+        (["prune", "empty.ply", "-o", "a.ply"], "empty.ply has 0 Gaussians, and none is finite; export it again"),
+        (["export", "none.ply", "-o", "a.spz"], "none.ply has 5 Gaussians, and none is finite; export it again"),
         (["prune", "in.ply", "-o", "in.bin/a.ply"], "in.bin is no folder"),
         (["export", "in.ply", "-o", "a.splat"], "name it .ply or .spz or .sog or .glb"),
         (["export", "in.ply", "-o", "in.bin/new/a.sog"], "in.bin is no folder"),
@@ -193,7 +193,7 @@ def test_prune_does_not_change_kept_rows(
             ["prune", "trained", "-o", "a.ply"],
             "trained is a folder of 3DGS; give trained/point_cloud/iter",
         ),
-        (["view", "a.splat"], "a.splat is not a complete .splat (33 bytes are no whole number of primitives"),
+        (["view", "a.splat"], "a.splat is not a complete .splat (33 bytes are no whole number of Gaussians"),
         (["report", "in.ply", "-o", "out"], "in.ply is a .ply file; it comes without test views"),
         (["export", "nothing.sundae", "-o", "a.ply"], "nothing.sundae cannot be read"),
     ],
@@ -206,11 +206,11 @@ def test_refusals_are_one_line(
     message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    write_ply(Path("in.ply"), field())
-    write_scene(Path("in.sundae"), PackedScene(field(), meta={"model": MODEL}))
+    write_ply(Path("in.ply"), gaussians())
+    write_scene(Path("in.sundae"), PackedScene(gaussians(), meta={"model": MODEL}))
     Path("in.bin").write_bytes(b"\x1f\x8b\xff")
-    write_ply(Path("none.ply"), {name: torch.full_like(value[:5], torch.nan) for name, value in field().items()})
-    write_ply(Path("empty.ply"), {name: value[:0] for name, value in field().items()})
+    write_ply(Path("none.ply"), {name: torch.full_like(value[:5], torch.nan) for name, value in gaussians().items()})
+    write_ply(Path("empty.ply"), {name: value[:0] for name, value in gaussians().items()})
     for name in ("a.ksplat", "a.lcc", "a.glb", "a.pth", "a.splat"):
         Path(name).write_bytes(bytes(33))
     Path("trained/point_cloud/iteration_7").mkdir(parents=True)
@@ -230,15 +230,15 @@ def test_every_command_reads_files_of_other_programs(
     monkeypatch.chdir(tmp_path)
     truth = KSPLAT if name == "a.ksplat" else small_field()
     FOREIGN[name](Path(name), truth)
-    colors = read_primitives(Path(name)).mended.field["features_dc"]
+    colors = read_gaussian_file(Path(name)).sanitised.gaussians["features_dc"]
     assert run("prune", name, "-o", "pruned/a/b.ply", "--keep", "0.5", "--views", "4") == 0
     assert len(read_ply(Path("pruned/a/b.ply"))["means"]) == len(truth["means"]) // 2
     assert run("prune", name, "-o", "same/a.ply", "--keep", "1", "--views", "4") == 0
-    torch.testing.assert_close(read_primitives(Path("same/a.ply")).mended.field["features_dc"], colors)
+    torch.testing.assert_close(read_gaussian_file(Path("same/a.ply")).sanitised.gaussians["features_dc"], colors)
     assert run("export", name, "-o", "exported/a.spz") == 0
     assert run("export", name, "-o", "pages/a.html") == 0
     assert run("pack", name, "-o", "packed/a.sundae") == 0
-    found = read_scene(Path("packed/a.sundae")).field["means"]
+    found = read_scene(Path("packed/a.sundae")).gaussians["means"]
     assert torch.cdist(truth["means"].double(), found.double()).amin(dim=1).max() < 0.002
     assert run("render", name, "-o", "images/a.png", "--width", "64") == 0
     assert run("distill", name, "-o", "small/a.sundae", "--steps", "1", "--no-head", "--keep", "0.5") == 0
@@ -277,7 +277,7 @@ def without(package: str, commands: list[list[str]], folder: Path) -> tuple[list
 
 
 def test_files_are_exported_pruned_and_refused_without_nerfstudio(tmp_path: Path) -> None:
-    write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": MODEL}))
+    write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": MODEL}))
     write_kind(tmp_path / "head.sundae", KINDS["residual"])
     commands = [
         ["export", "a.sundae", "-o", "a.ply"],
@@ -299,7 +299,7 @@ def test_files_are_exported_pruned_and_refused_without_nerfstudio(tmp_path: Path
 
 
 def test_fields_are_pruned_without_a_compiler(tmp_path: Path) -> None:
-    write_ply(tmp_path / "a.ply", field())
+    write_ply(tmp_path / "a.ply", gaussians())
     codes, errors = without("numba", [["prune", "a.ply", "-o", "pruned.ply", "--views", "2"]], tmp_path)
     assert codes == [0], errors
 
@@ -308,8 +308,8 @@ def test_prune_by_the_cameras_of_files(tmp_path: Path, capsys: pytest.CaptureFix
     """Those of a packed scene, of a COLMAP model and of a transforms.json; each says how many it is."""
     scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
     sn.save(scene, tmp_path / "a.ply")
-    stored = sn.virtual_views(scene, 3, size=32)
-    sn.save(dataclasses.replace(scene, views=tuple(stored)), tmp_path / "a.sundae")
+    stored = sn.virtual_cameras(scene, 3, size=32)
+    sn.save(dataclasses.replace(scene, cameras=tuple(stored)), tmp_path / "a.sundae")
     write_model(tmp_path / "sparse", ["a.png", "b.png"], (32, 24))
     frame = {"transform_matrix": [[1, 0, 0, 0.5], [0, 1, 0, 0.5], [0, 0, 1, 3], [0, 0, 0, 1]]}
     lens = {"fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12, "w": 32, "h": 24}
@@ -319,7 +319,7 @@ def test_prune_by_the_cameras_of_files(tmp_path: Path, capsys: pytest.CaptureFix
         assert run(*arguments, "--count", "50", "--overwrite") == 0
         text = capsys.readouterr().out
         assert f"{number} cameras see " in text
-        assert "50 of 200 primitives" in text
+        assert "50 of 200 Gaussians" in text
     assert (
         run("prune", tmp_path / "a.ply", "-o", tmp_path / "transforms.json", "--cameras", tmp_path, "--overwrite") == 2
     )
@@ -338,5 +338,5 @@ def test_prune_uses_the_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     sn.save(sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3)), tmp_path / "a.ply")
     for name in ("out.ply", "out.sundae"):
         assert run("prune", tmp_path / "a.ply", "-o", tmp_path / name, "--count", "50", "--views", "8") == 0
-        assert sn.load(tmp_path / name).num_primitives == 50
+        assert sn.load(tmp_path / name).num_gaussians == 50
     assert devices == ["cuda", "cuda"]

@@ -27,10 +27,10 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a field in two formats, as current folder."""
     monkeypatch.chdir(tmp_path)
     points = torch.rand(400, 3)
-    field = from_points(points, points, sh_degree=1, num_features=0)
-    write_ply(tmp_path / "a.ply", field)
+    gaussians = from_points(points, points, sh_degree=1, num_features=0)
+    write_ply(tmp_path / "a.ply", gaussians)
     model = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "black"}
-    write_scene(tmp_path / "a.sundae", PackedScene(field, meta={"model": model}))
+    write_scene(tmp_path / "a.sundae", PackedScene(gaussians, meta={"model": model}))
     return tmp_path
 
 

@@ -18,7 +18,7 @@ from PIL import Image
 import sundae_ns
 
 VIEWS = [
-    sundae_ns.View.look_at((0.5 + dx, -2.0, 0.5), (0.5, 0.5, 0.5), fov=60.0, width=41, height=31) for dx in (0.0, 0.8)
+    sundae_ns.Camera.look_at((0.5 + dx, -2.0, 0.5), (0.5, 0.5, 0.5), fov=60.0, width=41, height=31) for dx in (0.0, 0.8)
 ]
 
 
@@ -69,7 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     points, colors = torch.rand(100, 3, generator=generator), torch.rand(100, 3, generator=generator)
     scene = sundae_ns.Scene.from_points(points, colors)
     sundae_ns.save(scene, folder / "cloud.ply")
-    scene = dataclasses.replace(scene, views=tuple(VIEWS))
+    scene = dataclasses.replace(scene, cameras=tuple(VIEWS))
     sundae_ns.save(scene, folder / "packed.sundae")
     return folder
 
@@ -79,7 +79,7 @@ def test_an_image_of_a_stored_view(folder: Path, tmp_path: Path, index: int) -> 
     out = tmp_path / "a.png"
     assert run(folder / "packed.sundae", "-o", out, "--view", index) == 0
     scene = sundae_ns.load(folder / "packed.sundae")
-    expected = (255 * sundae_ns.render(scene, scene.views[index]).rgb).round().byte().numpy()
+    expected = (255 * sundae_ns.render(scene, scene.cameras[index]).rgb).round().byte().numpy()
     assert expected.std() > 5
     assert np.array_equal(pixels(out), expected)
 
@@ -89,7 +89,7 @@ def test_an_image_of_the_camera_in_a_file(folder: Path, tmp_path: Path, capsys: 
     assert run(folder / "cloud.ply", "--camera", camera, "-o", out) == 0
     assert capsys.readouterr().out == f"{out}: 40 x 30 px\n"
     scene = sundae_ns.load(folder / "cloud.ply")
-    expected = 255 * sundae_ns.render(scene, sundae_ns.views_of(camera, scene)[0]).rgb.numpy()
+    expected = 255 * sundae_ns.render(scene, sundae_ns.cameras_of(camera, scene)[0]).rgb.numpy()
     assert np.abs(pixels(out) - expected).mean() < 10  # of JPEG
     assert run(folder / "cloud.ply", "--camera", camera, "-o", tmp_path / "b.png", "--width", 80) == 0
     assert pixels(tmp_path / "b.png").shape == (60, 80, 3)
@@ -128,7 +128,7 @@ def test_a_film_without_a_camera_path(
 
 def test_an_image_is_that_of_the_start_view(folder: Path, tmp_path: Path) -> None:
     scene = sundae_ns.load(folder / "packed.sundae")
-    start = scene.views[1].zoomed(2)
+    start = scene.cameras[1].zoomed(2)
     sundae_ns.save(dataclasses.replace(scene, start=start), tmp_path / "a.sundae")
     assert run(tmp_path / "a.sundae", "-o", tmp_path / "a.png") == 0
     assert pixels(tmp_path / "a.png").shape == (62, 82, 3)

@@ -11,8 +11,16 @@ from torch.nn.functional import normalize
 
 from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.gaussians import MAX_SH_DEGREE, SPLAT_NAMES, Field, mend, odd_shapes, sh_degree_of, sh_to_rgb
-from sundae_ns.pruning.decision import FieldPruner, prune_field
+from sundae_ns.core.gaussians import (
+    MAX_SH_DEGREE,
+    SPLAT_NAMES,
+    Gaussians,
+    odd_shapes,
+    sanitise,
+    sh_degree_of,
+    sh_to_rgb,
+)
+from sundae_ns.pruning.decision import Pruner, prune_gaussians
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.scene.initialization import (
     INITIAL_OPACITY,
@@ -25,7 +33,7 @@ from sundae_ns.scene.initialization import (
 N = 40
 
 
-def field() -> dict[str, Tensor]:
+def gaussians() -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(N, 3, generator=generator)
     return from_points(points, points, sh_degree=1, num_features=3, generator=generator)
@@ -44,15 +52,15 @@ def test_fields_have_no_odd_shapes(degree: int) -> None:
 @pytest.mark.parametrize("name", [name for name in SPLAT_NAMES if name != "means"])
 @pytest.mark.parametrize("shape", [(), (N,), (6, 3), (N, 9), (N, 3, 3, 1), (N, 7, 3), (N, 3, 4), (N, 35, 3)])
 def test_an_odd_shape_is_named(name: str, shape: tuple[int, ...]) -> None:
-    (found,) = odd_shapes(field() | {name: torch.zeros(shape)})
+    (found,) = odd_shapes(gaussians() | {name: torch.zeros(shape)})
     assert found.startswith(f"{name} has shape {list(shape)}; it must be [{N}, ")
 
 
 def test_means_set_the_number_of_primitives() -> None:
-    found = odd_shapes(field() | {"means": torch.zeros(N, 4)})
+    found = odd_shapes(gaussians() | {"means": torch.zeros(N, 4)})
     assert found == [f"means has shape [{N}, 4]; it must be [{N}, 3]"]
-    assert len(odd_shapes(field() | {"means": torch.zeros(6, 3)})) == len(SPLAT_NAMES) - 1
-    assert len(odd_shapes(field() | {"means": torch.zeros(())})) == len(SPLAT_NAMES)
+    assert len(odd_shapes(gaussians() | {"means": torch.zeros(6, 3)})) == len(SPLAT_NAMES) - 1
+    assert len(odd_shapes(gaussians() | {"means": torch.zeros(())})) == len(SPLAT_NAMES)
 
 
 # ------------------------------------------------------------------------------------------------------- initial values
@@ -155,24 +163,24 @@ def test_random_points_fill_the_cube_and_rotations_are_uniform() -> None:
 
 
 def test_a_finite_field_is_returned_as_it_is() -> None:
-    for given in (field(), {name: value[:0] for name, value in field().items()}):
-        mended = mend(given)
-        assert all(mended.field[name] is value for name, value in given.items())
-        assert (mended.clamped, mended.dropped, mended.summary()) == (False, 0, "")
+    for given in (gaussians(), {name: value[:0] for name, value in gaussians().items()}):
+        sanitised = sanitise(given)
+        assert all(sanitised.gaussians[name] is value for name, value in given.items())
+        assert (sanitised.clamped, sanitised.dropped, sanitised.summary()) == (False, 0, "")
 
 
 def test_values_with_a_meaning_are_clamped() -> None:
-    given = field()
+    given = gaussians()
     given["opacities"][:10], given["opacities"][10:12] = math.inf, -math.inf
     given["scales"][5:20, 2] = -math.inf
     given["quats"][30:33] = 0
     before = {name: value.clone() for name, value in given.items()}
-    mended = mend(given)
-    assert (mended.limits, mended.flat, mended.unrotated, mended.dropped) == (12, 15, 3, 0)
-    assert mended.summary() == (
-        "40 primitives: clamped 12 with opacity 0 or 1 and 15 with width 0 and 3 with rotation 0 to finite values"
+    sanitised = sanitise(given)
+    assert (sanitised.limits, sanitised.flat, sanitised.unrotated, sanitised.dropped) == (12, 15, 3, 0)
+    assert sanitised.summary() == (
+        "40 Gaussians: clamped 12 with opacity 0 or 1 and 15 with width 0 and 3 with rotation 0 to finite values"
     )
-    found = mended.field
+    found = sanitised.gaussians
     assert all(value.isfinite().all() for value in found.values())
     opacities = found["opacities"].sigmoid()
     assert (opacities[:10] > 1 - 1e-6).all()
@@ -188,27 +196,27 @@ def test_values_with_a_meaning_are_clamped() -> None:
 
 
 def test_flat_primitives_of_a_tiny_scene_are_as_narrow_as_its_narrowest() -> None:
-    given = field()
+    given = gaussians()
     given["scales"] -= 60
     given["scales"][3, 0] = -math.inf
     narrowest = given["scales"][torch.arange(N) != 3].min()
-    assert mend(given).field["scales"][3, 0] == narrowest
+    assert sanitise(given).gaussians["scales"][3, 0] == narrowest
 
 
 @pytest.mark.parametrize("size", [1e-30, 1e-15, 1e25])
 def test_quaternions_of_any_length_keep_their_rotation(size: float) -> None:
-    given = field()
+    given = gaussians()
     turned = normalize(torch.tensor([0.5, -0.3, 0.2, 0.7]), dim=0)
     given["quats"][7] = size * turned
-    mended = mend(given)
-    torch.testing.assert_close(normalize(mended.field["quats"][7], dim=0), turned)
-    assert not mended.clamped
+    sanitised = sanitise(given)
+    torch.testing.assert_close(normalize(sanitised.gaussians["quats"][7], dim=0), turned)
+    assert not sanitised.clamped
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *((name, math.nan) for name in field()),
+        *((name, math.nan) for name in gaussians()),
         *(
             (name, sign * math.inf)
             for name in ("means", "features_dc", "features_rest", "features")
@@ -220,36 +228,36 @@ def test_quaternions_of_any_length_keep_their_rotation(size: float) -> None:
     ],
 )
 def test_primitives_without_a_meaning_are_left_out(name: str, value: float) -> None:
-    given = field()
+    given = gaussians()
     given[name][4].view(-1)[0] = value
     given["opacities"][8] = math.inf
-    mended = mend(Field(given, "logits"))
-    assert mended.field.encoding == "logits"
-    assert (mended.dropped, mended.limits) == (1, 1)
-    assert (~mended.mask).nonzero().flatten().tolist() == [4]
-    assert mended.field.num_primitives == N - 1
-    assert mended.summary().endswith("finite values, dropped 1 that were not finite (NaN or infinite)")
+    sanitised = sanitise(Gaussians(given, "logits"))
+    assert sanitised.gaussians.encoding == "logits"
+    assert (sanitised.dropped, sanitised.limits) == (1, 1)
+    assert (~sanitised.mask).nonzero().flatten().tolist() == [4]
+    assert sanitised.gaussians.num_gaussians == N - 1
+    assert sanitised.summary().endswith("finite values, dropped 1 that were not finite (NaN or infinite)")
 
 
 @pytest.mark.parametrize("redistribution", ["none", "merge"])
 @pytest.mark.parametrize("count", [10, N])
 def test_a_prune_of_opaque_and_flat_primitives_is_exact_and_finite(redistribution: str, count: int) -> None:
-    given = field()
+    given = gaussians()
     given["opacities"][:], given["scales"][:, 1] = math.inf, -math.inf
     rule = PruneRule(redistribution=redistribution)  # type: ignore[arg-type]
     contribution = torch.linspace(0, 1, N)
-    found = prune_field(given, rule, count, contribution)
+    found = prune_gaussians(given, rule, count, contribution)
     assert found.decision.dropped_nonfinite == 0
-    assert found.field.num_primitives == count
-    assert all(value.isfinite().all() for value in found.field.values())
+    assert found.gaussians.num_gaussians == count
+    assert all(value.isfinite().all() for value in found.gaussians.values())
 
 
 def test_training_keeps_them_too() -> None:
-    params = {name: torch.nn.Parameter(value) for name, value in field().items()}
+    params = {name: torch.nn.Parameter(value) for name, value in gaussians().items()}
     with torch.no_grad():
         params["opacities"][:6], params["means"][9] = math.inf, math.nan
     optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
-    assert FieldPruner(params, optimizers).drop_nonfinite() == 1
+    assert Pruner(params, optimizers).drop_nonfinite() == 1
     assert len(params["means"]) == N - 1
     assert (params["opacities"][:6].sigmoid() > 1 - 1e-6).all()
     assert all(value.isfinite().all() for value in params.values())

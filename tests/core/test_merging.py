@@ -22,7 +22,7 @@ from sundae_ns.core.merging import merge
 from sundae_ns.core.surgery import rewrite
 
 
-def field(n: int = 12, seed: int = 0) -> dict[str, Tensor]:
+def gaussians(n: int = 12, seed: int = 0) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(seed)
     shapes = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "features_rest": (3, 3)}
     shapes |= {"opacities": (1,), "features": (5,)}
@@ -34,7 +34,7 @@ def covariance_of(params: dict[str, Tensor]) -> Tensor:
 
 
 def test_a_group_becomes_one_with_the_moments_of_the_mixture() -> None:
-    params, w = field(), torch.rand(12, dtype=torch.float64)
+    params, w = gaussians(), torch.rand(12, dtype=torch.float64)
     label = torch.tensor([0, 0, 0, 0, 4, 4, 6, 7, 7, 7, 0, -1])
     found = merge(params, label, w)
     assert {name: value.shape for name, value in found.items()} == {k: (4, *v.shape[1:]) for k, v in params.items()}
@@ -55,7 +55,7 @@ def test_a_group_becomes_one_with_the_moments_of_the_mixture() -> None:
 
 
 def test_transmittances_of_clones_multiply() -> None:
-    params = {name: value.expand(3, *value.shape[1:]).clone() for name, value in field(1).items()}
+    params = {name: value.expand(3, *value.shape[1:]).clone() for name, value in gaussians(1).items()}
     params["opacities"][:] = math.log(0.3 / 0.7)
     found = merge(params, torch.zeros(3, dtype=torch.long), torch.ones(3))
     assert float(found["opacities"].sigmoid()) == pytest.approx(1 - 0.7**3)
@@ -63,8 +63,8 @@ def test_transmittances_of_clones_multiply() -> None:
 
 
 def test_a_wall_of_small_primitives_absorbs_as_much_light_after_merging() -> None:
-    # From afar, a primitive absorbs its optical depth times its projected area.
-    params = field(100)
+    # From afar, a Gaussian absorbs its optical depth times its projected area.
+    params = gaussians(100)
     params["means"] = torch.cartesian_prod(*[torch.arange(10.0).double()] * 2, torch.zeros(1).double())
     params["scales"][:] = torch.tensor([0.4, 0.4, 1e-3]).double().log()
     params["quats"][:] = torch.tensor([1.0, 0, 0, 0]).double()
@@ -81,7 +81,7 @@ def test_a_wall_of_small_primitives_absorbs_as_much_light_after_merging() -> Non
 
 
 def test_merging_commutes_with_rotation_scale_and_shift() -> None:
-    params, label, w = field(), torch.tensor([0, 0, 0, 3, 3, 3, 6, 6, 6, 9, 9, -1]), torch.rand(12)
+    params, label, w = gaussians(), torch.tensor([0, 0, 0, 3, 3, 3, 6, 6, 6, 9, 9, -1]), torch.rand(12)
     turn = torch.randn(1, 4, dtype=torch.float64)
     R = rotation_matrices(turn)[0]
     moved = {**params, "means": 8 * params["means"] @ R.T + 100, "scales": params["scales"] + math.log(8)}
@@ -93,7 +93,7 @@ def test_merging_commutes_with_rotation_scale_and_shift() -> None:
 
 
 def test_groups_without_weight_are_unchanged_and_the_scale_of_weights_is_irrelevant() -> None:
-    params, label = field(), torch.tensor([0] * 6 + [6] * 6)
+    params, label = gaussians(), torch.tensor([0] * 6 + [6] * 6)
     for w in (torch.zeros(12), torch.full((12,), torch.nan)):
         found = merge(params, label, w)
         assert all(torch.equal(found[name], params[name][[0, 6]]) for name in params)
@@ -103,7 +103,7 @@ def test_groups_without_weight_are_unchanged_and_the_scale_of_weights_is_irrelev
 
 
 def test_weights_that_are_nan_infinite_or_negative_count_as_zero() -> None:
-    params, label, w = field(), torch.tensor([0] * 6 + [6] * 6), torch.rand(12, dtype=torch.float64)
+    params, label, w = gaussians(), torch.tensor([0] * 6 + [6] * 6), torch.rand(12, dtype=torch.float64)
     w[[1, 7]] = 0
     expected = merge(params, label, w)
     for odd in (torch.nan, torch.inf, -1.0):
@@ -113,7 +113,7 @@ def test_weights_that_are_nan_infinite_or_negative_count_as_zero() -> None:
 
 
 def test_a_group_with_an_axis_that_overflows_is_unchanged_and_others_are_merged() -> None:
-    params = field()
+    params = gaussians()
     params["scales"][2, 1] = 400.0
     params["quats"][2] = torch.tensor([1.0, 0, 0, 0]).double()
     found = merge(params, torch.tensor([0] * 6 + [6] * 6), torch.ones(12))
@@ -123,7 +123,7 @@ def test_a_group_with_an_axis_that_overflows_is_unchanged_and_others_are_merged(
 
 
 def test_extremes_stay_finite() -> None:
-    params = {name: value.float() for name, value in field().items()}
+    params = {name: value.float() for name, value in gaussians().items()}
     params["scales"][0] = torch.tensor([1e-8, 1e3, 1.0]).log()
     params["quats"][1] = 0
     params["opacities"][:4] = torch.tensor([30.0, -30.0, 200.0, -200.0])[:, None]
@@ -135,7 +135,7 @@ def test_extremes_stay_finite() -> None:
 
 
 def test_groups_that_overflow_or_vanish_are_unchanged() -> None:
-    params = field()
+    params = gaussians()
     params["scales"][0], params["scales"][6] = 500.0, -500.0
     params["scales"][7:] = -500.0
     params["means"][6:] = 0
@@ -146,7 +146,7 @@ def test_groups_that_overflow_or_vanish_are_unchanged() -> None:
 
 
 def test_overlap_with_itself_is_one_falls_with_distance_and_is_scale_invariant() -> None:
-    params = field(200)
+    params = gaussians(200)
     S, means = covariance_of(params), params["means"]
     indices = torch.stack([torch.arange(200), torch.arange(200).roll(1)], dim=1)
     found = overlap(means, S, indices, least_width=0.0)
@@ -182,7 +182,7 @@ def test_overlap_of_needles_survives_pivots_lost_to_rounding() -> None:
 
 
 def test_chunks_of_rows_give_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    params = field(50)
+    params = gaussians(50)
     indices = torch.randint(50, (50, 4))
     whole = overlap(params["means"], covariance_of(params), indices, least_width=0.1)
     label = torch.arange(50) // 5 * 5
@@ -227,7 +227,7 @@ def test_mean_projected_area_of_spheres_and_discs() -> None:
 
 
 def trained(n: int = 6) -> tuple[dict[str, Parameter], dict[str, torch.optim.Optimizer]]:
-    params = {name: Parameter(value) for name, value in field(n).items()}
+    params = {name: Parameter(value) for name, value in gaussians(n).items()}
     optimizers: dict[str, torch.optim.Optimizer] = {name: torch.optim.Adam([value]) for name, value in params.items()}
     torch.stack([value.square().sum() for value in params.values()]).sum().backward()
     for optimizer in optimizers.values():
@@ -255,7 +255,7 @@ def test_rewriting_resets_first_moments_of_changed_values_only() -> None:
 
 
 def test_rewriting_before_the_first_step_and_without_an_optimizer() -> None:
-    params = {name: Parameter(value) for name, value in field(6).items()}
+    params = {name: Parameter(value) for name, value in gaussians(6).items()}
     optimizers = {name: torch.optim.Adam([value]) for name, value in params.items() if name != "features"}
     values = {name: value.detach() + 1 for name, value in params.items()}
     rewrite(params, optimizers, values)
@@ -267,6 +267,6 @@ def test_rewriting_refuses_wrong_names_and_shapes_and_changes_nothing() -> None:
     params, optimizers = trained()
     before = params["means"].detach().clone()
     for values in ({"means": before + 1, "colour": before}, {"means": before + 1, "scales": before[:2]}):
-        with pytest.raises(DataError, match="one row per primitive"):
+        with pytest.raises(DataError, match="one row per Gaussian"):
             rewrite(params, optimizers, values)
     assert torch.equal(params["means"].detach(), before)

@@ -19,7 +19,7 @@ from sundae_ns.core.surgery import check_wiring, grow, keep, module_snapshot, na
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "features_rest": (8, 3), "opacities": (1,), "features": (13,)}
 
 
-def field(n: int = 20, seed: int = 0) -> tuple[dict[str, Parameter], dict[str, Optimizer]]:
+def gaussians(n: int = 20, seed: int = 0) -> tuple[dict[str, Parameter], dict[str, Optimizer]]:
     generator = torch.Generator().manual_seed(seed)
     params = {name: Parameter(torch.randn(n, *shape, generator=generator)) for name, shape in SHAPES.items()}
     params["quats"].requires_grad_(False)
@@ -55,7 +55,7 @@ def moments(optimizers: Mapping[str, Optimizer], params: Mapping[str, Tensor], n
 
 
 def test_training_continues_as_if_only_the_kept_primitives_had_existed() -> None:
-    (params, optimizers), (expected, expected_optimizers) = field(), field()
+    (params, optimizers), (expected, expected_optimizers) = gaussians(), gaussians()
     still_alive = params["means"].exp().sum()
     keep(expected, expected_optimizers, [], some())
     for held, holders in ((params, optimizers), (expected, expected_optimizers)):
@@ -70,7 +70,7 @@ def test_training_continues_as_if_only_the_kept_primitives_had_existed() -> None
 
 
 def test_optimizers_hold_the_new_parameters_and_sliced_moments() -> None:
-    params, optimizers = field()
+    params, optimizers = gaussians()
     train(params, optimizers)
     old = dict(params)
     before = {name: moments(optimizers, params, name).clone() for name in SHAPES if name != "quats"}
@@ -91,7 +91,7 @@ def test_optimizers_hold_the_new_parameters_and_sliced_moments() -> None:
 
 
 def test_per_primitive_state_is_sliced_and_other_state_is_unchanged() -> None:
-    params, optimizers = field()
+    params, optimizers = gaussians()
     other = torch.rand(5)
     state: dict[str, Any] = {
         "grad2d": torch.arange(20),
@@ -116,7 +116,7 @@ def test_per_primitive_state_is_sliced_and_other_state_is_unchanged() -> None:
 
 
 def test_a_one_element_step_of_one_primitive_is_not_sliced() -> None:
-    params, optimizers = field(1)
+    params, optimizers = gaussians(1)
     train(params, optimizers)
     step = optimizers["means"].state[params["means"]]["step"] = torch.ones(1)
     keep(params, optimizers, [], torch.tensor([True]))
@@ -133,14 +133,14 @@ def test_a_one_element_step_of_one_primitive_is_not_sliced() -> None:
     ],
 )
 def test_wrong_masks_are_refused(mask: Tensor, message: str) -> None:
-    params, optimizers = field()
+    params, optimizers = gaussians()
     with pytest.raises(DataError, match=message):
         keep(params, optimizers, [], mask)
 
 
 @pytest.mark.parametrize("fault", ["length", "stale", "two groups"])
 def test_nothing_changes_on_error(fault: str) -> None:
-    params, optimizers = field()
+    params, optimizers = gaussians()
     train(params, optimizers)
     if fault == "length":
         params["features"] = Parameter(torch.zeros(19, 13))
@@ -162,7 +162,7 @@ def test_nothing_changes_on_error(fault: str) -> None:
 
 
 def test_works_on_a_parameter_dict() -> None:
-    params, optimizers = field()
+    params, optimizers = gaussians()
     container = torch.nn.ParameterDict(params)
     keep(container, optimizers, [], some())
     assert {name: tuple(value.shape) for name, value in container.items()} == {n: (7, *s) for n, s in SHAPES.items()}
@@ -171,7 +171,7 @@ def test_works_on_a_parameter_dict() -> None:
 
 @pytest.mark.gpu
 def test_a_mask_on_the_cpu_prunes_a_field_on_the_gpu() -> None:
-    params = {name: Parameter(value.detach().cuda()) for name, value in field()[0].items()}
+    params = {name: Parameter(value.detach().cuda()) for name, value in gaussians()[0].items()}
     optimizers: dict[str, Optimizer] = {name: Adam([value]) for name, value in params.items()}
     train(params, optimizers)
     keep(params, optimizers, [], some())
@@ -184,7 +184,7 @@ def test_a_mask_on_the_cpu_prunes_a_field_on_the_gpu() -> None:
 
 
 def test_training_continues_from_a_snapshot_bit_for_bit() -> None:
-    params, optimizers = field()
+    params, optimizers = gaussians()
     train(params, optimizers, 3)
     saved = snapshot(params, optimizers)
     train(params, optimizers, 4)
@@ -202,7 +202,7 @@ def test_training_continues_from_a_snapshot_bit_for_bit() -> None:
 
 
 def test_a_snapshot_before_the_first_step_has_no_moments() -> None:
-    params, optimizers = field()
+    params, optimizers = gaussians()
     saved = snapshot(params, optimizers)
     train(params, optimizers)
     del optimizers["means"]
@@ -212,7 +212,7 @@ def test_a_snapshot_before_the_first_step_has_no_moments() -> None:
 
 
 def test_narrow_keeps_the_first_columns_and_their_moments() -> None:
-    params, optimizers = field()
+    params, optimizers = gaussians()
     train(params, optimizers, 2)
     wide, before = params["features_rest"].detach().clone(), moments(optimizers, params, "features_rest")
     for steps, width in ((2, 3), (3, 0)):
@@ -253,7 +253,7 @@ def test_a_network_is_restored_in_place() -> None:
 
 
 def integral(opacity: float, scale: float, copies: int) -> float:
-    """Integral along a line of the opacity of ``copies`` primitives at one place, by the midpoint rule."""
+    """Integral along a line of the opacity of ``copies`` Gaussians at one place, by the midpoint rule."""
     x = (torch.arange(20_000, dtype=torch.float64) + 0.5) / 20_000 * 24 - 12
     alpha = opacity * torch.exp(-0.5 * (x / scale) ** 2)
     return float((1 - (1 - alpha) ** copies).sum() * 24 / 20_000)
@@ -276,7 +276,7 @@ def test_copies_render_like_the_original(opacity: float) -> None:
 
 @pytest.mark.parametrize("count", [0, 7, 30, 95])
 def test_growing_adds_the_exact_number_upon_the_most_opaque(count: int) -> None:
-    params, optimizers = field(30)
+    params, optimizers = gaussians(30)
     train(params, optimizers)
     old, before = params["means"].detach().clone(), moments(optimizers, params, "features").clone()
     opaque = params["opacities"].detach().flatten().argsort(descending=True)

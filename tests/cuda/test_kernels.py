@@ -13,7 +13,7 @@ import torch
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, DataError, SundaeError
 from sundae_ns.cuda import adam, loss, sweep
 from sundae_ns.cuda.kernels import Launch, kernels_where_possible
@@ -229,8 +229,8 @@ def reduced(height: int, width: int, x: float, device: str = "cpu") -> plane_swe
     viewmat[0, 0], viewmat[0, 2], viewmat[2, 0], viewmat[2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
     viewmat[0, 3], viewmat[1, 3] = -x, 0.1 * x
     K = torch.tensor([[1.1 * width, 0, width / 2 + 1], [0, 1.2 * width, height / 2], [0, 0, 1]])
-    view = View(viewmat.to(device), K.to(device), width, height, 1.1 * width)
-    return plane_sweep._reduced(Photo(view, image.permute(1, 2, 0).contiguous().to(device), None), 1000)
+    camera = Camera(viewmat.to(device), K.to(device), width, height, 1.1 * width)
+    return plane_sweep._reduced(Photo(camera, image.permute(1, 2, 0).contiguous().to(device), None), 1000)
 
 
 def scores(device: str = "cpu") -> Tensor:

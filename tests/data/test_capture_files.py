@@ -26,7 +26,7 @@ from sundae_ns.data.capture_files import (
     write_smaller,
 )
 from sundae_ns.data.photos import find_photos, reads_heif
-from sundae_ns.scene.cameras import views_of
+from sundae_ns.scene.cameras import cameras_of
 
 PARAMETERS = [50.0, 60.0, 20.0, 15.0, 0.01, -0.02, 0.003, 0.004]
 ORIENTATION, MODEL, FOCAL, EXIF = 0x0112, 0x0110, 0x920A, 0x8769
@@ -63,12 +63,12 @@ def test_our_cameras_see_what_colmap_sees(tmp_path: Path, cameras: int) -> None:
     points = np.random.default_rng(0).normal(size=(10, 3))
     moved = torch.from_numpy(points @ APPLIED[:, :3].T)
     posed = sorted((image for image in made.images.values() if image.has_pose), key=lambda image: image.name[3:])
-    for view, image in zip(views_of(tmp_path), posed, strict=True):
-        pose, viewmat = image.cam_from_world().matrix(), view.viewmat.double()
+    for camera, image in zip(cameras_of(tmp_path), posed, strict=True):
+        pose, viewmat = image.cam_from_world().matrix(), camera.viewmat.double()
         seen = moved @ viewmat[:3, :3].T + viewmat[:3, 3]
         np.testing.assert_allclose(seen.numpy(), points @ pose[:, :3].T + pose[:, 3], atol=1e-5)
-        assert (view.width, view.height) == (39 + image.camera_id, 30)
-        assert (float(view.K[0, 0]), float(view.K[1, 2])) == (PARAMETERS[0], PARAMETERS[3])
+        assert (camera.width, camera.height) == (39 + image.camera_id, 30)
+        assert (float(camera.K[0, 0]), float(camera.K[1, 2])) == (PARAMETERS[0], PARAMETERS[3])
 
 
 def test_frames_name_their_photos_in_order() -> None:

@@ -19,7 +19,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch.amp import GradScaler
 
 from sundae_ns.head.head import HeadConfig
-from sundae_ns.io.formats import read_field
+from sundae_ns.io.formats import read_gaussians
 from sundae_ns.plugin.distributed import Ranks
 from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
@@ -91,7 +91,7 @@ def resume(path: Path) -> None:
 
 
 def start_warm(path: Path) -> None:
-    read_field(path)
+    read_gaussians(path)
 
 
 def test_a_valid_checkpoint_is_read(good: bytes, verdict: Any, tmp_path: Path) -> None:
@@ -197,7 +197,7 @@ ODD: dict[str, Callable[[dict[str, Any]], None]] = {
     "a densification state that is a list": _running("densification", [1, 2]),
     "statistics of other rows": _running("densification", {"grad2d": torch.zeros(7), "count": torch.zeros(7)}),
     "no extra state": lambda state: _at("_model._extra_state", None)(state["pipeline"]),
-    "no primitives": lambda state: [_param(n, lambda v: v[:0])(state) for n in ("means", "scales")] and None,
+    "no Gaussians": lambda state: [_param(n, lambda v: v[:0])(state) for n in ("means", "scales")] and None,
     "fewer centres than sizes": _param("means", lambda value: value[:5]),
     "a flat centre": _param("means", lambda value: value.flatten()),
     "a centre that is a number": _param("means", lambda value: torch.tensor(1.0)),
@@ -207,7 +207,7 @@ ODD: dict[str, Callable[[dict[str, Any]], None]] = {
     "sparse centres": _param("means", lambda value: value.to_sparse()),
     "quantized centres": _param("means", lambda value: torch.quantize_per_tensor(value, 0.1, 0, torch.quint8)),
     "centres without values": _param("means", lambda value: value.to("meta")),
-    "a billion primitives in 12 bytes": _param("means", lambda value: torch.zeros(1, 3).expand(10**9, 3)),
+    "a billion Gaussians in 12 bytes": _param("means", lambda value: torch.zeros(1, 3).expand(10**9, 3)),
 }
 
 

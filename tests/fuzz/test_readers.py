@@ -25,7 +25,7 @@ from hypothesis import HealthCheck, given, settings
 from plyfile import PlyData, PlyElement
 
 from sundae_ns.core.errors import PackError
-from sundae_ns.io.formats import read_field, read_primitives, write_for_viewers
+from sundae_ns.io.formats import read_gaussian_file, read_gaussians, write_for_viewers
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
 from sundae_ns.io.ply import read_point_cloud
 from sundae_ns.scene.initialization import from_points
@@ -96,9 +96,9 @@ def resealed(meta: dict[str, Any], body: bytes) -> bytes:
 
 
 def unpack(path: Path) -> None:
-    field = read_scene(path).field
-    assert all(torch.isfinite(value).all() for value in field.values())
-    assert len({len(value) for value in field.values()}) == 1
+    gaussians = read_scene(path).gaussians
+    assert all(torch.isfinite(value).all() for value in gaussians.values())
+    assert len({len(value) for value in gaussians.values()}) == 1
 
 
 def write_cloud(path: Path, text: bool) -> None:
@@ -120,17 +120,17 @@ def write_checkpoint(path: Path) -> None:
 
 READERS: dict[str, tuple[Callable[[Path], Any], Reader]] = {
     **{
-        name: (lambda path, write=write: write(path, small_field(60)), read_primitives)
+        name: (lambda path, write=write: write(path, small_field(60)), read_gaussian_file)
         for name, write in FOREIGN.items()
     },
     **{
-        f"a{suffix}": (lambda path: write_for_viewers(path, small_field(60)), read_primitives)
+        f"a{suffix}": (lambda path: write_for_viewers(path, small_field(60)), read_gaussian_file)
         for suffix in (".spz", ".sog", ".glb")
     },
-    "field.ply": (lambda path: FOREIGN["plain.ply"](path, small_field(20)), read_field),
+    "field.ply": (lambda path: FOREIGN["plain.ply"](path, small_field(20)), read_gaussians),
     "cloud.ply": (lambda path: write_cloud(path, text=False), read_cloud),
     "text.ply": (lambda path: write_cloud(path, text=True), read_cloud),
-    "a.ckpt": (write_checkpoint, read_field),
+    "a.ckpt": (write_checkpoint, read_gaussians),
     "a.sundae": (lambda path: write_scene(path, scene()), unpack),
 }
 """Files by their names: a writer, and the reader that must survive them."""
@@ -192,7 +192,7 @@ def test_damaged_pickles_with_valid_checksums(
             data = source.read(entry)
             target.writestr(entry, change(data) if entry.endswith("data.pkl") else data)
     (tmp_path / "a.ckpt").write_bytes(out.getvalue())
-    verdict(lambda: read_field(tmp_path / "a.ckpt"), len(out.getvalue()))
+    verdict(lambda: read_gaussians(tmp_path / "a.ckpt"), len(out.getvalue()))
 
 
 BINARY = b"binary_little_endian"
@@ -220,7 +220,7 @@ PLYS: dict[str, bytes] = {
 
 
 @pytest.mark.parametrize("kind", PLYS)
-@pytest.mark.parametrize("reader", [read_point_cloud, read_field])
+@pytest.mark.parametrize("reader", [read_point_cloud, read_gaussians])
 def test_odd_plys_are_refused(reader: Reader, verdict: Any, tmp_path: Path, kind: str) -> None:
     path = tmp_path / "ünï cöde.ply"
     path.write_bytes(PLYS[kind])
@@ -234,7 +234,7 @@ PACKS: dict[str, bytes] = {
     "no JSON": sealed(b"{", b""),
     "deep JSON": sealed(b"[" * 100_000, b""),
     "a list": sealed(b"[]", b""),
-    "not a number": sealed(b'{"sections": [], "primitives": NaN}', b""),
+    "not a number": sealed(b'{"sections": [], "Gaussians": NaN}', b""),
     "invalid UTF-8": sealed(b"\xff\xfe", b""),
     "a long header": b"\x89SUNDAE\n" + struct.pack("<II", 3, 2**32 - 1) + bytes(132),
 }
@@ -263,7 +263,7 @@ def test_bombs_are_refused_before_they_unpack(stated: int, words: str, good: Any
 def test_a_few_constant_planes_cannot_fill_the_memory(verdict: Any, tmp_path: Path) -> None:
     """Every section is within its limit, but the field that they describe is not."""
     n, path = 200_000, tmp_path / "a.sundae"
-    write_scene(path, PackedScene({k: v[:1].expand(n, *v.shape[1:]) for k, v in scene().field.items()}))
+    write_scene(path, PackedScene({k: v[:1].expand(n, *v.shape[1:]) for k, v in scene().gaussians.items()}))
     meta, body = parts(path.read_bytes())
     padding = meta["sections"].pop()
     assert padding["name"] == "padding"
@@ -279,7 +279,7 @@ def test_points_that_are_not_finite_are_dropped(verdict: Any, tmp_path: Path) ->
 
     def read() -> None:
         points, rgb = read_point_cloud(path)
-        field = from_points(points, rgb.float() / 255, sh_degree=0, num_features=0)
-        assert torch.equal(field["means"], torch.tensor([[1.0, 2.0, 3.0]]))
+        gaussians = from_points(points, rgb.float() / 255, sh_degree=0, num_features=0)
+        assert torch.equal(gaussians["means"], torch.tensor([[1.0, 2.0, 3.0]]))
 
     assert verdict(read, path.stat().st_size) is None

@@ -21,7 +21,7 @@ import pytest
 import torch
 
 from sundae_ns.io import checkpoint
-from sundae_ns.io.formats import read_field, write_for_viewers
+from sundae_ns.io.formats import read_gaussians, write_for_viewers
 from sundae_ns.io.pack import container
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
 from sundae_ns.io.ply import read_ply, write_ply
@@ -75,7 +75,7 @@ def test_the_hook_records_writes_and_no_reads(tmp_path: Path) -> None:
     assert [line.split()[0] for line in found] == ["os.mkdir", "open"]
 
 
-def field() -> dict[str, torch.Tensor]:
+def gaussians() -> dict[str, torch.Tensor]:
     points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
     return from_points(points, points, sh_degree=1, num_features=0)
 
@@ -83,7 +83,7 @@ def field() -> dict[str, torch.Tensor]:
 def a_checkpoint(path: Path, place: str) -> None:
     """Write a checkpoint that names ``place`` as a member of its archive, as the target of a link and as a tensor."""
     buffer = io.BytesIO()
-    state = {f"_model.gauss_params.{name}": value for name, value in field().items()}
+    state = {f"_model.gauss_params.{name}": value for name, value in gaussians().items()}
     torch.save({"step": 3, "pipeline": state | {place: torch.zeros(2)}}, buffer)
     with zipfile.ZipFile(buffer, "a", zipfile.ZIP_STORED) as archive:
         archive.writestr(place, b"outside")
@@ -96,7 +96,7 @@ def a_checkpoint(path: Path, place: str) -> None:
 def a_pack(path: Path, place: str, *, section: bool = True) -> None:
     """Write a packed scene that names ``place`` throughout its header, and as a section, which readers may refuse."""
     write_scene(
-        path, PackedScene(field(), meta={"source": {"method": place}, "name": place, "model": {"sh_degree": 1}})
+        path, PackedScene(gaussians(), meta={"source": {"method": place}, "name": place, "model": {"sh_degree": 1}})
     )
     if not section:
         return
@@ -108,12 +108,12 @@ def a_pack(path: Path, place: str, *, section: bool = True) -> None:
 
 def a_ply(path: Path, place: str) -> None:
     """Write a .ply that names ``place`` in its comments."""
-    write_ply(path, field(), comments=[place, f"TextureFile {place}"])
+    write_ply(path, gaussians(), comments=[place, f"TextureFile {place}"])
 
 
 CASES: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], Any]]] = {
     "a.ckpt": (a_checkpoint, checkpoint.read),
-    "b.ckpt": (a_checkpoint, read_field),
+    "b.ckpt": (a_checkpoint, read_gaussians),
     "a.sundae": (a_pack, read_scene),
     "a.ply": (a_ply, read_ply),
 }
@@ -134,7 +134,7 @@ def test_nothing_leaves_the_file(tmp_path: Path, name: str, place: str, verdict:
 
 def test_members_of_an_exported_archive_are_plain_names(tmp_path: Path) -> None:
     """A .sog is a zip that other programs unpack."""
-    write_for_viewers(tmp_path / "a.sog", field())
+    write_for_viewers(tmp_path / "a.sog", gaussians())
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         names = archive.namelist()
     assert "meta.json" in names

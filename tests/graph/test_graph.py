@@ -113,7 +113,7 @@ def test_smallest_graphs() -> None:
         found = build_graph(points, num_neighbors=1)
         check(found, points)
         assert (found.weights > 0).all()
-    with pytest.raises(DataError, match="1 primitives cannot have 1 neighbours"):
+    with pytest.raises(DataError, match="1 Gaussians cannot have 1 neighbours"):
         build_graph(torch.zeros(1, 3), num_neighbors=1)
 
 

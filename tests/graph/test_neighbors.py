@@ -78,7 +78,7 @@ def test_memory_and_time_grow_with_points_also_of_clones(place: Callable) -> Non
 @pytest.mark.parametrize(
     ("points", "k", "error", "words"),
     [
-        *((torch.zeros(n, 3), k, DataError, f"{n} primitives cannot have {k} .*at most {max(n - 1, 0)}")
+        *((torch.zeros(n, 3), k, DataError, f"{n} Gaussians cannot have {k} .*at most {max(n - 1, 0)}")
           for n, k in ((0, 1), (1, 1), (5, 5), (5, 9))),
         (torch.zeros(5, 3), 0, ConfigError, "at least 1"),
         (torch.zeros(5, 2), 1, DataError, r"\[5, 2\]"),

@@ -25,9 +25,9 @@ from viser import transforms
 
 from harness.viewer_page import Server, ViewerPage
 from sundae_ns.plugin.viewer import previewed_rule
-from sundae_ns.pruning.decision import prune_field
+from sundae_ns.pruning.decision import prune_gaussians
 from sundae_ns.pruning.rule import kept_count
-from sundae_ns.scene.render import LocalField, render_view
+from sundae_ns.scene.render import GaussianSource, render_view
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 SIDE = 256
@@ -132,12 +132,12 @@ def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> N
     rule = previewed_rule(model.config.pruning, "as configured")
     count = kept_count(keep_ratio, model.num_points)
     weights = model.contribution(pipeline.datamanager, count if rule.uses_detail else None)
-    pruned = prune_field(model.state.field, rule, count, weights)
+    pruned = prune_gaussians(model.state.gaussians, rule, count, weights)
     assert pruned.decision.values is not None
     settings = model.render_settings(training=False).without_head()
     with torch.no_grad():
         preview, _ = render_view(
-            LocalField(pruned.field), model.view_of(camera_of(page)), expected["background"][0, 0], settings
+            GaussianSource(pruned.gaussians), model.camera_of(camera_of(page)), expected["background"][0, 0], settings
         )
     previewed = scene(page)
     found["preview"] = differences(previewed, preview["rgb"])

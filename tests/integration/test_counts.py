@@ -1,4 +1,4 @@
-"""Whole runs that decide how many primitives they keep, on a scene of a few pixels."""
+"""Whole runs that decide how many Gaussians they keep, on a scene of a few pixels."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def trials_of(model: Any) -> Any:
-    return next(extension for extension in model.extensions if extension.name == "trials")
+    return next(callback for callback in model.train_callbacks if callback.name == "trials")
 
 
 def records_of(trainer: Trainer) -> Any:
@@ -97,7 +97,7 @@ def watch(trainer: Trainer) -> tuple[list[int], dict[str, torch.Tensor]]:
     """Collects the views that are served by step, and the field before the trials and before the prune."""
     manager, served, fields = trainer.pipeline.datamanager, [], {}
     model: Any = trainer.pipeline.model
-    deciding, pruning = ({one.name: one for one in model.extensions}[name] for name in ("trials", "pruning"))
+    deciding, pruning = ({one.name: one for one in model.train_callbacks}[name] for name in ("trials", "pruning"))
     serve, begin, prune = manager.view_of_step, deciding._begin_counts, pruning.after_step
 
     def view_of_step(step: int) -> int:
@@ -118,7 +118,7 @@ def watch(trainer: Trainer) -> tuple[list[int], dict[str, torch.Tensor]]:
 
 
 LEVEL = {1.0: 0.0, 0.4: 0.0, 0.2: 0.05, 0.1: 1.0, 0.05: 2.0, 0.025: 3.0}
-"""Losses that level off: between a tenth and a fifth of the primitives are enough."""
+"""Losses that level off: between a tenth and a fifth of the Gaussians are enough."""
 
 
 def test_trials_choose_the_count_and_leave_nothing_else_behind(make: Make, judge: Any) -> None:
@@ -192,13 +192,13 @@ def test_a_head_in_any_case_rests_during_the_trials_and_counts_its_own_steps(mak
     trainer = make(head="residual")
     enabled: dict[int, bool] = {}
     model: Any = trainer.pipeline.model
-    real = model.extensions[-1].after_step
+    real = model.train_callbacks[-1].after_step
 
     def after_step(run: Any) -> None:
         enabled[run.state.step] = run.state.head_enabled
         real(run)
 
-    model.extensions[-1].after_step = after_step
+    model.train_callbacks[-1].after_step = after_step
     trainer.train()
     decided = record_of(trainer)["step"]
     assert not any(enabled[step] for step in range(decided))
@@ -209,7 +209,7 @@ def test_a_head_in_any_case_rests_during_the_trials_and_counts_its_own_steps(mak
 
 @pytest.mark.parametrize(
     ("pruning", "kept"),
-    [({"max_primitives": 9}, 9), ({"max_bytes": 1}, 1), ({"max_drop": 20.0}, 5)],  # 5: 2.5% of 200
+    [({"max_gaussians": 9}, 9), ({"max_bytes": 1}, 1), ({"max_drop": 20.0}, 5)],  # 5: 2.5% of 200
 )
 def test_a_budget_works_on_the_same_curve(make: Make, judge: Any, pruning: dict[str, Any], kept: int) -> None:
     judge(LEVEL)
@@ -229,17 +229,17 @@ def test_a_budget_works_on_the_same_curve(make: Make, judge: Any, pruning: dict[
 def test_where_trials_cannot_decide_a_tenth_stays_and_one_line_says_so(
     make: Make, tmp_path: Path, options: dict[str, Any], reason: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    views = options.pop("views", None)
-    trainer = make(**options, **({} if views is None else {"data": tiny_scene(tmp_path, views)}))
+    cameras = options.pop("views", None)
+    trainer = make(**options, **({} if cameras is None else {"data": tiny_scene(tmp_path, cameras)}))
     trainer.train()
     assert trainer.pipeline.model.num_points == 20  # type: ignore[union-attr]
     said = " ".join(capsys.readouterr().out.split())
-    assert said.count(f"pruning keeps 10% of the primitives: {reason}") == 1
+    assert said.count(f"pruning keeps 10% of the Gaussians: {reason}") == 1
     assert "count" not in records_of(trainer)
 
 
 def test_a_number_that_the_user_gives_is_kept_exactly(make: Make) -> None:
-    trainer = make(pruning={"target_primitives": 33})
+    trainer = make(pruning={"target_gaussians": 33})
     trainer.train()
     assert trainer.pipeline.model.num_points == 33  # type: ignore[union-attr]
     assert "count" not in records_of(trainer)

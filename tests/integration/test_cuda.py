@@ -58,10 +58,10 @@ def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkp
         trainer.train()
     line = str(raised.value)
     found = re.fullmatch(
-        r"the GPU's memory is full: cannot allocate [\d.]+ [KMG]iB more with ([\d,]+) primitives; try "
+        r"the GPU's memory is full: cannot allocate [\d.]+ [KMG]iB more with ([\d,]+) Gaussians; try "
         r"--pipeline\.datamanager\.cache-images cpu \(.*\), "
         r"--pipeline\.datamanager\.camera-res-scale-factor 0\.5 \(.*\), "
-        r"or --pipeline\.model\.pruning\.mode continuous .*--pipeline\.model\.pruning\.max-primitives (\d+) \(.*\); "
+        r"or --pipeline\.model\.pruning\.mode continuous .*--pipeline\.model\.pruning\.max-gaussians (\d+) \(.*\); "
         r"--load-dir resumes from the last checkpoint",
         line,
     )

@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.core.metrics import psnr
 from sundae_ns.io.ply import read_ply
 from sundae_ns.plugin.finished_runs import load_model
-from sundae_ns.scene.render import LocalField, render_view
+from sundae_ns.scene.render import GaussianSource, render_view
 
 PROGRAM = shutil.which("splat-transform")
 
@@ -29,10 +29,13 @@ def test_exported_files_show_the_base_colours(tiny: Any, call: Any, tmp_path: Pa
 
     settings = run.model.render_settings(training=False).without_head()
 
-    def images(field: dict[str, Tensor]) -> list[Tensor]:
-        views = [run.model.view_of(camera) for camera in run.cameras]
+    def images(gaussians: dict[str, Tensor]) -> list[Tensor]:
+        cameras = [run.model.camera_of(ns_camera) for ns_camera in run.cameras]
         with torch.no_grad():
-            return [render_view(LocalField(Field(field)), view, background, settings)[0]["base_rgb"] for view in views]
+            return [
+                render_view(GaussianSource(Gaussians(gaussians)), camera, background, settings)[0]["base_rgb"]
+                for camera in cameras
+            ]
 
     own = images(dict(run.model.gauss_params))
     # The worst seen: 50.2 and 63.0 dB.

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import sundae_ns as sn
-from sundae_ns.plugin.camera_models import view_of
+from sundae_ns.plugin.camera_models import camera_of
 from sundae_ns.plugin.finished_runs import load_model
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "bench_formats.py"
@@ -59,15 +59,15 @@ def test_each_format_has_a_row(tiny: Any, transform: Path, tmp_path: Path, monke
     opened = load_model(tiny.folder)
     scene = sn.load(tiny.folder)
     assert scene.head is not None
-    views = [view_of(camera, "cpu") for camera in opened.cameras]
-    with_head, base = (sn.measure(scene, opened.truths, views, head=head).psnr for head in (True, False))
+    cameras = [camera_of(camera, "cpu") for camera in opened.cameras]
+    with_head, base = (sn.measure(scene, opened.truths, cameras, head=head).psnr for head in (True, False))
     assert abs(with_head - base) > 3e-4
     psnr = {place: float(row["psnr"]) for place, row in rows.items()}
     assert psnr["fp32", ""] == pytest.approx(with_head, abs=1e-4)
     assert psnr[".sundae", "sundae_ns"] == pytest.approx(with_head, abs=0.5)
     assert psnr[".ply", "sundae_ns"] == pytest.approx(base, abs=1e-4)  # over the background of the run
     for row in rows.values():
-        assert (row["capture"], row["primitives"]) == (opened.scene, str(scene.num_primitives))
+        assert (row["capture"], row["primitives"]) == (opened.scene, str(scene.num_gaussians))
         assert row["seed"] == str(opened.seed)
     sizes = {place: int(row["bytes"]) for place, row in rows.items()}
     assert sizes[".ply", "sundae_ns"] > sizes[".sog", "sundae_ns"] > 0
@@ -89,9 +89,9 @@ def test_a_file_of_another_program_takes_the_place_of_its_own_row(
 ) -> None:
     out, file = tmp_path / "formats.csv", tmp_path / "other.ply"
     scene = sn.load(tiny.folder)
-    views = sn.virtual_views(scene, 2)
-    for count in (scene.num_primitives, 20):
-        sn.save(sn.prune(scene, count=count, views=views) if count < scene.num_primitives else scene, file)
+    cameras = sn.virtual_cameras(scene, 2)
+    for count in (scene.num_gaussians, 20):
+        sn.save(sn.prune(scene, count=count, cameras=cameras) if count < scene.num_gaussians else scene, file)
         run(monkeypatch, tiny.folder, "-o", out, "--ply", file, "--program", f"tool {count}")
     rows = [row for row in rows_of(out) if row["format"] == ".ply"]
     assert [(row["program"], row["primitives"]) for row in rows] == [("tool 20", "20")]

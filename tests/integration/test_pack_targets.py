@@ -46,7 +46,7 @@ def test_a_target_of_bytes_is_met_and_used(tiny: Any, tmp_path: Path, capsys: py
 class Stated:
     """Judges packs by a function of their options; a finished run has 30 dB."""
 
-    before, views, all_views = Quality((30.0,), (0.9,)), 3, 3
+    before, cameras, all_cameras = Quality((30.0,), (0.9,)), 3, 3
 
     def __init__(self, drop: Callable[[PackConfig], float]) -> None:
         self.drop = drop
@@ -95,12 +95,12 @@ def test_the_quality_before_and_after_is_stated(tiny: Any, tmp_path: Path, capsy
 
 def test_positions_are_rounded_once(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By the steps that the search finds, not by those that it begins with."""
-    exact = contents_of(load_run(tiny.folder, max_cameras=0)).field["means"].double()
+    exact = contents_of(load_run(tiny.folder, max_cameras=0)).gaussians["means"].double()
     errors = []
     for words in ([], ["--target-bytes", 10**7]):
         file = tmp_path / f"{len(words)}.sundae"
         packed(capsys, tiny.folder, "-o", file, "--position-bits", 10, *words)
-        distances = torch.cdist(exact, read_scene(file).field["means"].double())
+        distances = torch.cdist(exact, read_scene(file).gaussians["means"].double())
         errors.append(float(distances.amin(dim=1).max()))
     assert errors[1] < errors[0] / 4  # three bits more
 
@@ -113,7 +113,9 @@ class Faithful(Stated):
         self.trained = trained
 
     def quality(self, scene: PackedScene, codecs: Codecs) -> Quality:
-        pairs = [(codecs.field[name], one) for name, one in self.trained.field.items() if isinstance(one, Transform)]
+        pairs = [
+            (codecs.gaussians[name], one) for name, one in self.trained.gaussians.items() if isinstance(one, Transform)
+        ]
         same = all(isinstance(a, Transform) and torch.equal(a.basis, b.basis) for a, b in pairs)
         return Quality((super().quality(scene, codecs).psnr - (0 if same else 1),), (0.9,))
 
@@ -134,8 +136,8 @@ def tuned(tiny: Any) -> Tuned:
     config = PackConfig(**FINETUNED)  # type: ignore[arg-type]
     scene, codecs = fit_scene(contents_of(load_run(tiny.folder, max_cameras=0)), config)
     generator = torch.Generator().manual_seed(0)
-    for name in codecs.field:
-        scene.field[name] += 0.3 * torch.randn(scene.field[name].shape, generator=generator)
+    for name in codecs.gaussians:
+        scene.gaussians[name] += 0.3 * torch.randn(scene.gaussians[name].shape, generator=generator)
     return Tuned(scene, codecs, len(pack_bytes(scene, codecs)[0]))
 
 

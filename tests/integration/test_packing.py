@@ -14,7 +14,7 @@ import torch
 
 from sundae_ns.cli import main
 from sundae_ns.core.metrics import psnr
-from sundae_ns.io.formats import read_field
+from sundae_ns.io.formats import read_gaussians
 from sundae_ns.plugin.finished_runs import load_model
 from sundae_ns.scene.load_save import load
 
@@ -33,7 +33,7 @@ def packed(tiny: Any, tmp_path_factory: pytest.TempPathFactory) -> Packed:
 
 
 def test_the_report_counts_every_byte(packed: Packed) -> None:
-    table, _, quality = packed.output.partition("bits per primitive")[2].partition("\nPSNR ")
+    table, _, quality = packed.output.partition("bits per Gaussian")[2].partition("\nPSNR ")
     assert re.fullmatch(
         r"\d+\.\d\d -> \d+\.\d\d dB, SSIM 0\.\d{4} -> 0\.\d{4}, before and after, on 3 of 3 test views\n", quality
     )
@@ -48,7 +48,7 @@ def test_the_up_axis_is_that_of_the_capture(packed: Packed) -> None:
     """nerfstudio turns a capture until the mean of its cameras' upward directions is z."""
     found = load(packed.file)
     assert found.up == (0, 0, 1)
-    ups = torch.stack([view.pose[:, 1] for view in found.views]).mean(dim=0)
+    ups = torch.stack([camera.pose[:, 1] for camera in found.cameras]).mean(dim=0)
     assert torch.nn.functional.cosine_similarity(ups, torch.tensor(found.up), dim=0) > 0.99
 
 
@@ -56,7 +56,7 @@ def test_a_run_is_cut_before_it_is_packed_or_exported(
     tiny: Any, packed: Packed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = load(packed.file)
-    places = load(tiny.folder).field["means"][:, 0]
+    places = load(tiny.folder).gaussians["means"][:, 0]
     middle = float(places.median())
     box = [-1e3, -1e3, -1e3, middle, 1e3, 1e3]
     for words in (["--crop", *box], ["--remove-floaters"]):
@@ -68,16 +68,16 @@ def test_a_run_is_cut_before_it_is_packed_or_exported(
         assert found.meta["capture"] == whole.meta["capture"]
         assert found.up == whole.up
         if words[0] == "--crop":
-            assert float(found.field["means"][:, 0].max()) < middle + 0.01
-            assert found.num_primitives == int((places <= middle).sum())
+            assert float(found.gaussians["means"][:, 0].max()) < middle + 0.01
+            assert found.num_gaussians == int((places <= middle).sum())
             assert "PSNR" not in said.out, "the photos show what is cut"
         else:
             before, after = map(float, re.findall(r"PSNR ([\d.]+) -> ([\d.]+) dB", said.out)[0])
             assert after > before - 0.15
-            assert found.num_primitives <= whole.num_primitives
+            assert found.num_gaussians <= whole.num_gaussians
         with pytest.raises(SystemExit, match="0"):
             main(["export", str(tiny.folder), "-o", str(tmp_path / "a.ply"), "--overwrite", *map(str, words)])
-        assert load(tmp_path / "a.ply").num_primitives == found.num_primitives
+        assert load(tmp_path / "a.ply").num_gaussians == found.num_gaussians
 
 
 def test_a_packed_scene_is_measured_on_its_capture(tiny: Any, packed: Packed) -> None:
@@ -95,7 +95,7 @@ def test_a_packed_scene_is_measured_on_its_capture(tiny: Any, packed: Packed) ->
 
 
 def test_a_warm_start_reads_a_packed_scene(packed: Packed) -> None:
-    found, truth = read_field(packed.file), load(packed.file)
+    found, truth = read_gaussians(packed.file), load(packed.file)
     assert found.in_model_frame
     assert "features" not in found.params
-    assert all(torch.equal(value, truth.field[name]) for name, value in found.params.items())
+    assert all(torch.equal(value, truth.gaussians[name]) for name, value in found.params.items())

@@ -77,7 +77,7 @@ def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypat
     # Images are made of rounded values: rounding them again changes nothing.
     assert codecs.head is not None
     for state in (seen[0], seen[1], seen[-1]):
-        shown = codecs.rounded({name: state[f"gauss_params.{name}"] for name in codecs.field})
+        shown = codecs.rounded({name: state[f"gauss_params.{name}"] for name in codecs.gaussians})
         assert all(torch.equal(shown[name], state[f"gauss_params.{name}"]) for name in ("scales", "features_dc"))
         for name in trained.head:
             value = state[f"networks.head.{name}"]
@@ -86,16 +86,16 @@ def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypat
     assert trained.meta["source"] == {**scene.meta["source"], "finetuned": 60}
     # The positions are those of a pack without it, and everything else has moved.
     fitted, _ = fit_scene(scene, COARSE)
-    assert torch.equal(trained.field["means"], fitted.field["means"])
-    for name in codecs.field:
-        assert not torch.equal(trained.field[name], fitted.field[name]), name
+    assert torch.equal(trained.gaussians["means"], fitted.gaussians["means"])
+    for name in codecs.gaussians:
+        assert not torch.equal(trained.gaussians[name], fitted.gaussians[name]), name
     for name, value in trained.head.items():
         assert not torch.equal(value, fitted.head[name]), name
 
     write_fitted(tmp_path / "a.sundae", trained, codecs)
     found = read_scene(tmp_path / "a.sundae")
-    shown = codecs.rounded(trained.field)
-    assert all(torch.equal(found.field[name], shown[name]) for name in codecs.field)
+    shown = codecs.rounded(trained.gaussians)
+    assert all(torch.equal(found.gaussians[name], shown[name]) for name in codecs.gaussians)
     write_fitted(tmp_path / "b.sundae", *fit_scene(scene, COARSE))
     plain = quality(tiny, tmp_path / "b.sundae")
     # As many steps without coarse rounding in the loop.
@@ -126,8 +126,8 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     stored = meta["attributes"]
     config = PackConfig(**{**FINETUNED, "feature_step": 0.01})  # type: ignore[arg-type]
     _, codecs = fit_scene(contents_of(load_run(run, data=tiny.scene)), config)
-    for name in codecs.field:
-        assert stored[name]["step"] == codecs.field[name].step, name  # type: ignore[attr-defined]
+    for name in codecs.gaussians:
+        assert stored[name]["step"] == codecs.gaussians[name].step, name  # type: ignore[attr-defined]
     assert stored["scales"]["step"] == FINETUNED["scale_step"]
     assert 0.01 <= stored["features"]["step"] < 0.01 / 0.02**0.5
 
@@ -156,8 +156,8 @@ def test_full_memory_is_one_line(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> 
 
     scene = contents_of(load_run(tiny.folder, max_cameras=0))
     monkeypatch.setattr(torch.autograd, "grad", full)
-    count = len(scene.field["means"])
-    with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} primitives"):
+    count = len(scene.gaussians["means"])
+    with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} Gaussians"):
         finetune(tiny.folder, scene, PackConfig(), 1)
 
 
@@ -165,10 +165,10 @@ def test_a_run_of_splatfacto(tiny: Any, tmp_path: Path) -> None:
     config = copy.deepcopy(all_methods["splatfacto"])
     config.data = config.pipeline.datamanager.data = tiny.scene
     config.pipeline.model.sh_degree = 2
-    field = contents_of(load_run(tiny.folder, max_cameras=0)).field
-    rest = 0.1 * torch.randn(len(field["means"]), 8, 3)
+    gaussians = contents_of(load_run(tiny.folder, max_cameras=0)).gaussians
+    rest = 0.1 * torch.randn(len(gaussians["means"]), 8, 3)
     rest[::2] = 0  # these colours stay view-independent
-    state = {f"_model.gauss_params.{name}": value for name, value in field.items() if name != "features"}
+    state = {f"_model.gauss_params.{name}": value for name, value in gaussians.items() if name != "features"}
     state |= {"_model.gauss_params.features_rest": rest, "_model.device_indicator_param": torch.zeros(0)}
     checkpoint.write({"step": 29999, "pipeline": state}, tmp_path / "nerfstudio_models" / "step-000029999.ckpt")
     (tmp_path / "config.yml").write_text(yaml.dump(config))
@@ -177,10 +177,10 @@ def test_a_run_of_splatfacto(tiny: Any, tmp_path: Path) -> None:
     assert codecs.head is None
     assert trained.head == {}
     fitted, _ = fit_scene(scene)
-    flat = [~scene.field["features_rest"].flatten(1).any(dim=1) for scene in (fitted, trained)]
+    flat = [~scene.gaussians["features_rest"].flatten(1).any(dim=1) for scene in (fitted, trained)]
     assert 0 < int(flat[0].sum()) < len(rest)
     assert torch.equal(*flat)
-    assert not torch.equal(trained.field["features_rest"], fitted.field["features_rest"])
+    assert not torch.equal(trained.gaussians["features_rest"], fitted.gaussians["features_rest"])
 
 
 def test_runs_that_cannot_be_fine_tuned(tiny: Any, tmp_path: Path) -> None:

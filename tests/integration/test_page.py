@@ -218,10 +218,10 @@ def test_a_view_of_too_many_primitives_is_not_drawn(drawn: str, tmp_path: Path) 
     flags = browser.WEBGPU if drawn == "webgpu" else WEBGL
     with opened((tmp_path / "a.html").as_uri(), flags=flags, size=(640, 480)) as page:
         assert page.evaluate("sundae.drawn") == drawn
-        assert "20,000 primitives cover each of its pixels" in page.evaluate(SAID)
+        assert "20,000 Gaussians cover each of its pixels" in page.evaluate(SAID)
         assert image(page, 1, True).min() == 1
         page.evaluate("document.getElementById('after').click()")
-        browser.wait_for(lambda: "primitives cover" not in page.evaluate(SAID), "another message", SECONDS)
+        browser.wait_for(lambda: "Gaussians cover" not in page.evaluate(SAID), "another message", SECONDS)
 
 
 @pytest.mark.browser

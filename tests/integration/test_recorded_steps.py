@@ -46,7 +46,7 @@ def trained(trainer_of: MakeTrainer, steps: type[RecordedStep] | None, seed: int
 
 
 def differences(one: Any, other: Any) -> dict[str, float]:
-    """Largest difference of the quartiles of each parameter; infinite if numbers of primitives differ by over 2%."""
+    """Largest difference of the quartiles of each parameter; infinite if numbers of Gaussians differ by over 2%."""
     if one.num_points != pytest.approx(other.num_points, rel=0.02):
         return {"primitives": float("inf")}
     shares = torch.tensor([0.25, 0.5, 0.75])
@@ -67,7 +67,7 @@ def usual_runs() -> dict[int, Any]:
 def alike(trainer_of: MakeTrainer, steps: type[RecordedStep], usual_runs: dict[int, Any]) -> tuple[Any, Any]:
     """A usual run and one by recorded steps that end alike, at the first of a few seeds.
 
-    Rounding decides about primitives at thresholds of densification. Of ten seeds two part by 0.03 and 0.07, six by
+    Rounding decides about Gaussians at thresholds of densification. Of ten seeds two part by 0.03 and 0.07, six by
     0.004 to 0.02, and two agree to 1e-5; which ones, depends on the processor. With L1 in place of the root all part by
     0.04 and more.
     """

@@ -65,7 +65,7 @@ def test_configuration(name: str) -> None:
     assert rule == (("response", "band", "none", "centres", "positions") if paper else default)
     modes = {"sundae-paper": "features", "sundae-tiny": "residual"}
     assert model.head.mode == modes.get(name, HeadConfig().mode)
-    assert model.photo_gains == ("off" if paper else "auto")
+    assert model.exposure_compensation == ("off" if paper else "auto")
     groups = {"means", "scales", "quats", "features_dc", "features_rest", "opacities", "features", "compensation"}
     assert groups <= set(config.optimizers)
     assert yaml.load(yaml.dump(config), Loader=yaml.Loader) == config
@@ -92,7 +92,7 @@ def test_help_of_ns_train(call_here: Any) -> None:
         assert f"--pipeline.model.pruning.{option}" in text
     for option in ("head.mode", "head.size", "head.num-features", "warm-start", "rasterizer"):
         assert f"--pipeline.model.{option}" in text
-    assert "Share of the N primitives that one prune keeps" in " ".join(text.split())
+    assert "Share of the N Gaussians that one prune keeps" in " ".join(text.split())
 
 
 def test_import_is_light_and_errors_of_ns_train_are_one_line() -> None:

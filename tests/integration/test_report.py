@@ -1,4 +1,4 @@
-"""``sundae report`` on the tiny run, and on a run of stock splatfacto with the same primitives."""
+"""``sundae report`` on the tiny run, and on a run of stock splatfacto with the same Gaussians."""
 
 from __future__ import annotations
 
@@ -45,10 +45,12 @@ def stock(tiny: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "nerfstudio_models").mkdir(parents=True)
     (folder / "config.yml").write_text(yaml.dump(config))
     state = torch.load(tiny.checkpoint(tiny.steps - 1), map_location="cpu")["pipeline"]
-    field = {key: value for key, value in state.items() if "gauss_params" in key and not key.endswith(".features")}
-    rest = field["_model.gauss_params.features_rest"]
-    field["_model.gauss_params.features_rest"] = torch.cat([rest, rest.new_zeros(len(rest), 15 - rest.shape[1], 3)], 1)
-    torch.save({"step": 6999, "pipeline": field}, folder / "nerfstudio_models" / "step-000006999.ckpt")
+    gaussians = {key: value for key, value in state.items() if "gauss_params" in key and not key.endswith(".features")}
+    rest = gaussians["_model.gauss_params.features_rest"]
+    gaussians["_model.gauss_params.features_rest"] = torch.cat(
+        [rest, rest.new_zeros(len(rest), 15 - rest.shape[1], 3)], 1
+    )
+    torch.save({"step": 6999, "pipeline": gaussians}, folder / "nerfstudio_models" / "step-000006999.ckpt")
     return folder
 
 
@@ -67,7 +69,7 @@ def test_rows_are_of_the_runs(report: Path, tiny: Any) -> None:
     assert (ours.scene, ours.method, ours.steps, ours.keep_ratio) == ("scene", "sundae-tiny", tiny.steps, 0.5)
     assert (theirs.scene, theirs.method, theirs.steps, theirs.keep_ratio) == ("scene", "splatfacto", 7000, 1.0)
     assert ours.primitives == theirs.primitives
-    # The same primitives without a head give the same images, whichever method the configuration names.
+    # The same Gaussians without a head give the same images, whichever method the configuration names.
     assert ours.psnr_base == theirs.psnr == theirs.psnr_base
     assert ours.psnr != ours.psnr_base
     assert min(ours.ms_frame, ours.ms_splat, ours.ms_head, theirs.ms_frame) > 0
@@ -119,7 +121,7 @@ def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any
         assert way["ms"] > 0
         with torch.no_grad():
             images, _ = render_view(
-                model.source, model.view_of(opened.cameras[1]), model._get_background_color(), settings
+                model.source, model.camera_of(opened.cameras[1]), model._get_background_color(), settings
             )
         expected = quality_of(images["rgb"], opened.truths[1])
         found = way["views"][1]

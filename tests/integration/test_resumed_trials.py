@@ -24,7 +24,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     losses = (0.0, 0.0, 0.05, 0.45, 0.65, 0.8)
 
     def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
-        progress = next(one for one in run.model.extensions if one.name == "trials").progress
+        progress = next(one for one in run.model.train_callbacks if one.name == "trials").progress
         number = len(progress.of(progress.stage))
         gain = {
             "count": -losses[number % 6],
@@ -34,7 +34,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         }
         figure = 25 + gain[progress.stage]
         # With a trace of the weights, so that other weights have other figures.
-        figure += 1e-6 * float(run.state.field["means"].detach().abs().mean())
+        figure += 1e-6 * float(run.state.gaussians["means"].detach().abs().mean())
         return [HeldOutQuality(100, figure, 0.5 + figure / 100, figure) for _ in run.heldout_views()]
 
     monkeypatch.setattr(trials, "measure_heldout", measured)
@@ -52,9 +52,9 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     ],
 )
 def test_a_run_resumed_at_any_step_is_the_run(
-    tmp_path: Path, views: int, keep_ratio: float | None, stops: tuple[int, ...]
+    tmp_path: Path, cameras: int, keep_ratio: float | None, stops: tuple[int, ...]
 ) -> None:
-    scene, stages = tiny_scene(tmp_path, views), set()
+    scene, stages = tiny_scene(tmp_path, cameras), set()
 
     def run(name: str, **options: Any) -> Any:
         def change(config: Any) -> None:
@@ -62,7 +62,7 @@ def test_a_run_resumed_at_any_step_is_the_run(
             config.pipeline.model.pruning = PruningConfig(keep_ratio=keep_ratio, prune_at=40)
 
         trainer: Any = tiny_run(scene, tmp_path, name=name, change=change, **options)
-        stages.add(next(one for one in trainer.model.extensions if one.name == "trials").progress.stage)
+        stages.add(next(one for one in trainer.model.train_callbacks if one.name == "trials").progress.stage)
         trainer.train()
         path = trainer.checkpoint_dir / f"step-{STEPS - 1:09d}.ckpt"
         records = json.loads((trainer.base_dir / "trials.json").read_text())

@@ -57,13 +57,13 @@ def _records(trainer: Trainer) -> Any:
 def _watched(trainer: Trainer) -> tuple[list[int], dict[int, torch.Tensor], dict[int, float]]:
     """Collects the training views that are served, and the centres and their rate after the extensions of each step."""
     model: Any = trainer.pipeline.model
-    manager, views, centres, rates = trainer.pipeline.datamanager, [], {}, {}
-    serve, last = manager.view_of_step, model.extensions[-1]
+    manager, cameras, centres, rates = trainer.pipeline.datamanager, [], {}, {}
+    serve, last = manager.view_of_step, model.train_callbacks[-1]
     act = last.after_step
 
     def view_of_step(step: int) -> int:
-        views.append(serve(step))
-        return views[-1]
+        cameras.append(serve(step))
+        return cameras[-1]
 
     def after_step(run: Any) -> None:
         act(run)
@@ -71,7 +71,7 @@ def _watched(trainer: Trainer) -> tuple[list[int], dict[int, torch.Tensor], dict
         rates[run.state.step] = run.state.schedulers["means"].lr_lambdas[0](run.state.step)
 
     manager.view_of_step, last.after_step = view_of_step, after_step
-    return views, centres, rates
+    return cameras, centres, rates
 
 
 def test_the_field_goes_back_trains_as_long_as_was_best_and_pauses(make: Make, curve: Curve) -> None:

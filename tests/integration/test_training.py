@@ -31,7 +31,7 @@ def load(path: Any) -> dict[str, Any]:
     return torch.load(path, map_location="cpu")
 
 
-def field(state: dict[str, Any]) -> dict[str, Tensor]:
+def gaussians(state: dict[str, Any]) -> dict[str, Tensor]:
     prefix = "_model.gauss_params."
     return {name[len(prefix) :]: value for name, value in state["pipeline"].items() if name.startswith(prefix)}
 
@@ -55,10 +55,10 @@ def test_prune_keeps_exactly_the_share(tiny: Any) -> None:
     assert found["peak"] >= found["before"]  # densification also drops some
     assert found["seconds"] > 0
     assert found["sigma"] > 0
-    counts = {step: len(field(load(tiny.checkpoint(step)))["means"]) for step in (30, 60, 90, 119)}
+    counts = {step: len(gaussians(load(tiny.checkpoint(step)))["means"]) for step in (30, 60, 90, 119)}
     assert found["before"] <= counts.pop(30) <= found["peak"]
     assert counts == {60: found["after"], 90: found["after"], 119: found["after"]}
-    assert f"kept {found['after']:,} of {found['before']:,} primitives" in " ".join(tiny.output.split())
+    assert f"kept {found['after']:,} of {found['before']:,} Gaussians" in " ".join(tiny.output.split())
 
 
 def test_the_schedule_follows_the_number_of_steps(tiny: Any) -> None:
@@ -79,7 +79,7 @@ def test_a_finished_training_says_what_it_made(tiny: Any) -> None:
     found = re.search(r"trained: PSNR (\d+\.\d\d) dB, SSIM 0\.\d{4} on 3 test views\n(.*)\nnext: (.*)\n", tiny.output)
     assert found is not None, tiny.output
     assert 5 < float(found[1]) < 60
-    assert re.fullmatch(rf"{n:,} primitives, with a head: 0\.\d\d MB before packing", found[2])
+    assert re.fullmatch(rf"{n:,} Gaussians, with a head: 0\.\d\d MB before packing", found[2])
     assert found[3] == f"sundae pack {tiny.folder} -o scene.sundae"
 
 
@@ -112,7 +112,7 @@ def test_checkpoints_are_plain_and_hold_no_lpips(tiny: Any) -> None:
         state = load(tiny.checkpoint(step))
         assert not [name for name in state["pipeline"] if "lpips" in name]
         assert state["pipeline"]["_model._extra_state"]["step"] == step
-        for name, value in field(state).items():
+        for name, value in gaussians(state).items():
             (moments,) = state["optimizers"][name]["state"].values()
             # Features have no gradient, and so no moments, before the head is enabled.
             assert (moments == {}) if (name, step) == ("features", 30) else moments["exp_avg"].shape == value.shape
@@ -153,7 +153,7 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(tiny: Any, trainer_of: A
     assert [step for step, _ in served] == list(range(start + 1, end + 1))
     # The views that an uninterrupted run sees at these steps.
     fresh = trainer.config.pipeline.datamanager.setup(device="cpu", test_mode="val")
-    assert [view for _, view in served] == [fresh.view_of_step(step) for step in range(start + 1, end + 1)]
+    assert [number for _, number in served] == [fresh.view_of_step(step) for step in range(start + 1, end + 1)]
 
     model = trainer.pipeline.model
     assert model.num_points == report(tiny)["after"]
@@ -277,7 +277,7 @@ def test_full_memory_in_the_backward_pass(tiny: Any, trainer_of: Any, monkeypatc
     trainer = trainer_of(change)
     monkeypatch.setattr(Tensor, "backward", full)
     count = trainer.pipeline.model.num_points
-    with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} primitives"):
+    with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} Gaussians"):
         trainer.train()
 
 
@@ -308,12 +308,12 @@ def check_warm(tiny: Any, params: dict[str, Tensor], start: dict[str, Tensor], t
 
 
 def test_warm_start_from_a_checkpoint(tiny: Any, trainer_of: Any) -> None:
-    params = field(load(tiny.checkpoint(119)))
+    params = gaussians(load(tiny.checkpoint(119)))
     check_warm(tiny, params, *warm(trainer_of, tiny.checkpoints))
 
 
 def test_warm_start_from_a_stock_checkpoint(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
-    params = {name: value for name, value in field(load(tiny.checkpoint(30))).items() if name in SPLAT_NAMES}
+    params = {name: value for name, value in gaussians(load(tiny.checkpoint(30))).items() if name in SPLAT_NAMES}
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
     config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
     scheduler = config.setup().get_scheduler(optimizer, lr_init=1.6e-4)
@@ -328,13 +328,13 @@ def test_warm_start_from_a_stock_checkpoint(tiny: Any, trainer_of: Any, tmp_path
 
 
 def test_warm_start_from_a_ply(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
-    params = {name: value for name, value in field(load(tiny.checkpoint(30))).items() if name in SPLAT_NAMES}
+    params = {name: value for name, value in gaussians(load(tiny.checkpoint(30))).items() if name in SPLAT_NAMES}
     write_ply(tmp_path / "a.ply", params, comments=[MODEL_FRAME])
     check_warm(tiny, params, *warm(trainer_of, tmp_path / "a.ply"))
 
 
 def test_warm_start_from_the_exported_ply(tiny: Any, trainer_of: Any, exported: Any) -> None:
-    params = {name: value for name, value in field(load(tiny.checkpoint(119))).items() if name in SPLAT_NAMES}
+    params = {name: value for name, value in gaussians(load(tiny.checkpoint(119))).items() if name in SPLAT_NAMES}
     check_warm(tiny, params, *warm(trainer_of, exported))
 
 

@@ -52,7 +52,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         real = trials.measure_heldout
 
         def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
-            state, width = run.state, run.state.field["features"].shape[1]
+            state, width = run.state, run.state.gaussians["features"].shape[1]
             decibels, similarity = NONE
             if state.head_enabled:
                 assert state.head.config.num_features == width
@@ -73,7 +73,7 @@ def _record(trainer: Trainer) -> dict[str, Any]:
 
 def _trials(model: Any) -> Any:
     """The extension that decides about the head."""
-    return next(extension for extension in model.extensions if extension.name == "trials")
+    return next(callback for callback in model.train_callbacks if callback.name == "trials")
 
 
 def _taken_back(model: Any) -> int:
@@ -136,7 +136,7 @@ def test_a_head_that_does_not_pay_costs_nothing(make: Make, judge: Any, gains: t
     assert torch.equal(images[0]["rgb"], images[0]["base_rgb"])
     scene = contents_of(load_run(trainer.base_dir))
     assert not scene.head
-    assert not any(value.numel() for name, value in scene.field.items() if name == "features")
+    assert not any(value.numel() for name, value in scene.gaussians.items() if name == "features")
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     with torch.no_grad():
         images = [one.eval().get_outputs_for_camera(camera)["rgb"] for one in (model, opened)]
     assert torch.equal(*images)
-    assert contents_of(load_run(trainer.base_dir)).field.get("features", torch.zeros(1, 0)).shape[1] == width
+    assert contents_of(load_run(trainer.base_dir)).gaussians.get("features", torch.zeros(1, 0)).shape[1] == width
 
 
 def test_with_few_views_two_are_held_out_in_turn(make: Make, judge: Any) -> None:

@@ -67,11 +67,11 @@ def test_check_box_switches_the_head_off(pipeline: Any) -> None:
     # As nerfstudio's control panel finds them.
     controls = [control for _, control in parse_object(pipeline.model, ViewerElement, "Custom Elements")]
     (box,) = [control for control in controls if isinstance(control, ViewerCheckbox) and "compensation" in control.name]
-    view = camera(pipeline, 40, 1.0)
-    on = pipeline.model.get_outputs_for_camera(view)
+    cam = camera(pipeline, 40, 1.0)
+    on = pipeline.model.get_outputs_for_camera(cam)
     box.value = False
-    off = as_the_viewer(lambda: pipeline.model.get_outputs_for_camera(view))
-    evaluated = pipeline.model.get_outputs_for_camera(view)
+    off = as_the_viewer(lambda: pipeline.model.get_outputs_for_camera(cam))
+    evaluated = pipeline.model.get_outputs_for_camera(cam)
     box.value = True
     assert torch.equal(off["rgb"], off["base_rgb"])
     assert not torch.equal(on["rgb"], on["base_rgb"])
@@ -82,11 +82,11 @@ def test_check_box_switches_the_head_off(pipeline: Any) -> None:
 
 @torch.no_grad()
 def test_training_state_of_the_viewer_does_not_show(pipeline: Any) -> None:
-    model, view = pipeline.model, camera(pipeline, 40, 1.0)
-    expected = model.eval().get_outputs_for_camera(view)["rgb"]
+    model, cam = pipeline.model, camera(pipeline, 40, 1.0)
+    expected = model.eval().get_outputs_for_camera(cam)["rgb"]
     model.train()
     model.eval()
-    assert torch.equal(model.get_outputs_for_camera(view)["rgb"], expected)
+    assert torch.equal(model.get_outputs_for_camera(cam)["rgb"], expected)
 
 
 def listening(port: int) -> set[str]:

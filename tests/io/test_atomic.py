@@ -98,9 +98,9 @@ def test_what_killed_processes_left_is_removed_and_what_others_write_stays(tmp_p
 def test_full_disk(tmp_path: Path) -> None:
     write_text(tmp_path / "a.ply", "old")
     points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
-    field = from_points(points, points, sh_degree=1, num_features=0)
+    gaussians = from_points(points, points, sh_degree=1, num_features=0)
     with small_disk(10_000), pytest.raises(StorageError, match=r"cannot write .*a\.ply: .*ulimit") as caught:
-        write_ply(tmp_path / "a.ply", field)
+        write_ply(tmp_path / "a.ply", gaussians)
     assert "\n" not in str(caught.value)
     assert (tmp_path / "a.ply").read_text() == "old"
     assert os.listdir(tmp_path) == ["a.ply"]
@@ -172,7 +172,10 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
     ],
 )
 def test_errors_of_reading_name_the_file(raised: Exception, kind: type[Exception], message: str) -> None:
-    with pytest.raises(kind, match=f"^{message}$"), reading(Path("a.x"), "a whole x", PackError, mend="get it again"):
+    with (
+        pytest.raises(kind, match=f"^{message}$"),
+        reading(Path("a.x"), "a whole x", PackError, sanitise="get it again"),
+    ):
         raise raised
 
 

@@ -12,15 +12,15 @@ import torch
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from torch import Tensor
 
-from sundae_ns.core import gaussians
+from sundae_ns.core import gaussians as core_gaussians
 from sundae_ns.core.errors import CheckpointError
 from sundae_ns.core.gaussians import SPLAT_NAMES, finite_mask, sh_to_rgb
 from sundae_ns.io import checkpoint
-from sundae_ns.io.formats import read_field
+from sundae_ns.io.formats import read_gaussians
 from sundae_ns.io.ply import MODEL_FRAME, write_ply
 
 
-def field(n: int = 6, degree: int = 3) -> dict[str, Tensor]:
+def gaussians(n: int = 6, degree: int = 3) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(n)
     shapes = {
         "means": (3,),
@@ -34,7 +34,7 @@ def field(n: int = 6, degree: int = 3) -> dict[str, Tensor]:
 
 
 def model_state(n: int = 6, degree: int = 3, **extra: Any) -> dict[str, Any]:
-    state: dict[str, Any] = {f"gauss_params.{name}": value for name, value in field(n, degree).items()}
+    state: dict[str, Any] = {f"gauss_params.{name}": value for name, value in gaussians(n, degree).items()}
     state["gauss_params.features"] = torch.zeros(n, 5)
     state["networks.head.weight"] = torch.zeros(4, 4)
     about = checkpoint.extra_state(
@@ -42,7 +42,7 @@ def model_state(n: int = 6, degree: int = 3, **extra: Any) -> dict[str, Any]:
         num_features=5,
         encoding="harmonics",
         running={"densification": {"grad2d": None}, "pruning": {"pruned_at": -1}},
-        extensions={},
+        train_callbacks={},
         head_enabled=False,
         trained_focal=None,
     )
@@ -51,14 +51,14 @@ def model_state(n: int = 6, degree: int = 3, **extra: Any) -> dict[str, Any]:
 
 
 def check(state: dict[str, Any], **options: Any) -> None:
-    """The checks of a checkpoint against a model of 6 primitives, in the order of loading."""
+    """The checks of a checkpoint against a model of 6 Gaussians, in the order of loading."""
     checkpoint.check_extra_state(state, 5, "harmonics")
     checkpoint.check_model_state(state, model_state(6), **options)
 
 
 def stock_checkpoint(path: Path, prefix: str = "_model.", n: int = 6) -> dict[str, Tensor]:
     """A checkpoint of splatfacto by nerfstudio's trainer, whose scheduler leaves a numpy number in it."""
-    params = field(n)
+    params = gaussians(n)
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
     config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
     scheduler = config.setup().get_scheduler(optimizer, lr_init=1.6e-4)
@@ -86,7 +86,7 @@ def test_another_number_of_primitives_fits() -> None:
 
 
 def test_a_field_may_not_be_empty() -> None:
-    with pytest.raises(CheckpointError, match=r"parameters of \[0\] primitives"):
+    with pytest.raises(CheckpointError, match=r"parameters of \[0\] Gaussians"):
         check(model_state(0))
 
 
@@ -104,7 +104,7 @@ def _without(name: str) -> dict[str, Any]:
         (model_state(format=99), "format 99"),
         (model_state(encoding="logits"), "colours as logits, the model as harmonics; .*sh-degree"),
         (model_state(running=None), "where training stopped"),
-        (model_state(extensions=[]), "where training stopped"),
+        (model_state(train_callbacks=[]), "where training stopped"),
         (
             {
                 **model_state(),
@@ -134,7 +134,7 @@ def test_stock_checkpoint_with_numpy_numbers(tmp_path: Path, prefix: str) -> Non
     params = stock_checkpoint(tmp_path / "step-000000001.ckpt", prefix)
     with pytest.raises(Exception, match="[Ww]eights.only"):
         torch.load(tmp_path / "step-000000001.ckpt", weights_only=True)
-    read, in_model_frame, _ = read_field(tmp_path / "step-000000001.ckpt")
+    read, in_model_frame, _ = read_gaussians(tmp_path / "step-000000001.ckpt")
     assert in_model_frame
     assert tuple(read) == SPLAT_NAMES
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
@@ -145,7 +145,7 @@ SUNDAE = {"method": "sundae", "format": checkpoint.FORMAT}
 
 def save_without_harmonics(folder: Path, extra: Any) -> None:
     """A checkpoint of SH degree 0, with the state of a model beside its tensors if any is given."""
-    state = {f"_model.gauss_params.{name}": value for name, value in field().items()}
+    state = {f"_model.gauss_params.{name}": value for name, value in gaussians().items()}
     state["_model.gauss_params.features_rest"] = state["_model.gauss_params.features_rest"][:, :0]
     if extra is not None:
         state["_model._extra_state"] = extra
@@ -165,8 +165,8 @@ def save_without_harmonics(folder: Path, extra: Any) -> None:
 def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path: Path, extra: Any, logits: bool) -> None:
     """Logits if the model was built at degree 0, harmonics if a search has lowered the degree."""
     save_without_harmonics(tmp_path, extra)
-    read, _, _ = read_field(tmp_path)
-    stored = field()["features_dc"]
+    read, _, _ = read_gaussians(tmp_path)
+    stored = gaussians()["features_dc"]
     expected = sh_to_rgb(read["features_dc"]).logit() if logits else read["features_dc"]
     torch.testing.assert_close(expected, stored)
 
@@ -187,28 +187,28 @@ def test_a_field_of_another_format_is_refused(tmp_path: Path, extra: Any, cause:
     """Its colours could be misread silently."""
     save_without_harmonics(tmp_path, extra)
     with pytest.raises(CheckpointError, match=cause) as caught:
-        read_field(tmp_path)
+        read_gaussians(tmp_path)
     assert one_line(caught.value)
 
 
 def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mended: list[int] = []
+    sanitised: list[int] = []
 
     def count(params: Any) -> Any:
-        mended.append(len(params["means"]))
+        sanitised.append(len(params["means"]))
         return finite_mask(params)
 
-    monkeypatch.setattr(gaussians, "finite_mask", count)
+    monkeypatch.setattr(core_gaussians, "finite_mask", count)
     stored = stock_checkpoint(tmp_path / "step-000000001.ckpt", n=4)
-    assert torch.equal(read_field(tmp_path)[0]["means"], stored["means"])
-    assert mended == [4]
+    assert torch.equal(read_gaussians(tmp_path)[0]["means"], stored["means"])
+    assert sanitised == [4]
     loaded = checkpoint.read(tmp_path / "step-000000001.ckpt")
     loaded["pipeline"]["_model.gauss_params.means"].fill_(torch.nan)
     torch.save(loaded, tmp_path / "step-000000002.ckpt")
-    with pytest.raises(CheckpointError, match=r"has 4 primitives, and none is finite"):
-        read_field(tmp_path)
+    with pytest.raises(CheckpointError, match=r"has 4 Gaussians, and none is finite"):
+        read_gaussians(tmp_path)
 
 
 @pytest.mark.parametrize("inside", [".", "nerfstudio_models"])
@@ -216,18 +216,18 @@ def test_newest_of_a_folder(tmp_path: Path, inside: str) -> None:
     (tmp_path / inside).mkdir(exist_ok=True)
     stock_checkpoint(tmp_path / inside / "step-000000999.ckpt", n=3)
     newest = stock_checkpoint(tmp_path / inside / "step-000029999.ckpt", n=4)
-    assert torch.equal(read_field(tmp_path)[0]["means"], newest["means"])
+    assert torch.equal(read_gaussians(tmp_path)[0]["means"], newest["means"])
 
 
 @pytest.mark.parametrize(("comments", "in_model_frame"), [((), False), ((MODEL_FRAME,), True)])
 def test_ply(tmp_path: Path, comments: tuple[str, ...], in_model_frame: bool) -> None:
-    params = field()
+    params = gaussians()
     write_ply(tmp_path / "a.ply", params, comments=list(comments))
-    read, in_frame, _ = read_field(tmp_path / "a.ply")
+    read, in_frame, _ = read_gaussians(tmp_path / "a.ply")
     assert in_frame is in_model_frame
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
     renamed = (tmp_path / "a.ply").rename(tmp_path / "cloud")
-    assert torch.equal(read_field(renamed)[0]["means"], params["means"])
+    assert torch.equal(read_gaussians(renamed)[0]["means"], params["means"])
 
 
 class Burglar:
@@ -244,13 +244,13 @@ def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
     stolen = tmp_path / "stolen"
     torch.save({"pipeline": {}, "extra": Burglar(stolen)}, tmp_path / "a.ckpt")
     with pytest.raises(CheckpointError, match="cannot be read"):
-        read_field(tmp_path / "a.ckpt")
+        read_gaussians(tmp_path / "a.ckpt")
     assert not stolen.exists()
 
 
 def test_numpy_is_allowed_for_one_file_only(tmp_path: Path) -> None:
     stock_checkpoint(tmp_path / "a.ckpt")
-    read_field(tmp_path / "a.ckpt")
+    read_gaussians(tmp_path / "a.ckpt")
     with pytest.raises(Exception, match="[Ww]eights.only"):
         torch.load(tmp_path / "a.ckpt", weights_only=True)
 
@@ -279,7 +279,7 @@ def test_a_file_without_a_field_is_refused(tmp_path: Path, wrong: str) -> None:
     path = tmp_path / "a.ckpt"
     make(path)
     with pytest.raises(CheckpointError, match=cause) as caught:
-        read_field(path)
+        read_gaussians(path)
     assert one_line(caught.value)
 
 
@@ -289,7 +289,7 @@ def test_extra_state_is_plain_data(tmp_path: Path) -> None:
         num_features=5,
         encoding="harmonics",
         running={"densification": {"grad2d": torch.ones(3), "scene_scale": 1.0}, "pruning": {"pruned_at": 7}},
-        extensions={"budget": {"numbers": {"phase": "before"}}},
+        train_callbacks={"budget": {"numbers": {"phase": "before"}}},
         head_enabled=False,
         trained_focal=(900.0, 1100.0),
     )

@@ -21,7 +21,7 @@ from torch import Tensor
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import SPLAT_NAMES
-from sundae_ns.io.formats import kind_of, read_primitives, unread
+from sundae_ns.io.formats import kind_of, read_gaussian_file, unread
 from sundae_ns.io.ply import ply_comments, read_ply, read_point_cloud, write_ply
 from sundae_ns.io.sog import write_sog
 
@@ -30,7 +30,7 @@ RGB = ("red", "green", "blue")
 
 
 def found(path: Path) -> dict[str, Tensor]:
-    return dict(read_primitives(path).mended.field)
+    return dict(read_gaussian_file(path).sanitised.gaussians)
 
 
 def check(values: dict[str, Tensor], tolerances: dict[str, float], truth: dict[str, Tensor] = FIELD) -> None:
@@ -59,11 +59,11 @@ def test_ends_of_a_splat_have_a_meaning(tmp_path: Path) -> None:
     given["scales"][2, 1] = -math.inf
     given["quats"][3] = 0
     write_small_splat(tmp_path / "a.splat", given)
-    mended = read_primitives(tmp_path / "a.splat").mended
-    assert mended.dropped == 0
-    assert (mended.flat, mended.unrotated) == (1, 1)
-    assert mended.field["opacities"].sigmoid()[:2, 0].tolist() == pytest.approx([1, 0], abs=2e-6)
-    assert all(value.isfinite().all() for value in mended.field.values())
+    sanitised = read_gaussian_file(tmp_path / "a.splat").sanitised
+    assert sanitised.dropped == 0
+    assert (sanitised.flat, sanitised.unrotated) == (1, 1)
+    assert sanitised.gaussians["opacities"].sigmoid()[:2, 0].tolist() == pytest.approx([1, 0], abs=2e-6)
+    assert all(value.isfinite().all() for value in sanitised.gaussians.values())
 
 
 @pytest.mark.parametrize("n", [1, 256, 257, 300])
@@ -91,8 +91,11 @@ def test_compressed_ply_as_another_reader_reads_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("dtype", "most"), [("u1", 255), ("<u2", 65535), ("<f4", 1), ("<f4", 255)])
 def test_colours_in_place_of_harmonics(tmp_path: Path, dtype: str, most: float) -> None:
     write_colored_ply(tmp_path / "a.ply", FIELD, dtype, most)
-    read = read_primitives(tmp_path / "a.ply")
-    check(dict(read.mended.field), {"means": 0, "scales": 0, "quats": 1e-6, "features_dc": 0.002, "opacities": 1e-6})
+    read = read_gaussian_file(tmp_path / "a.ply")
+    check(
+        dict(read.sanitised.gaussians),
+        {"means": 0, "scales": 0, "quats": 1e-6, "features_dc": 0.002, "opacities": 1e-6},
+    )
     assert read.in_model_frame
 
 
@@ -162,7 +165,7 @@ def _replaced(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
 
 DAMAGED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "an empty .splat": ("a.splat", lambda path: path.touch(), "0 bytes are no whole number"),
-    "half a primitive": ("a.splat", _cut("a.splat", 48), "48 bytes are no whole number of primitives of 32 bytes"),
+    "half a Gaussian": ("a.splat", _cut("a.splat", 48), "48 bytes are no whole number of Gaussians of 32 bytes"),
     "a short compressed .ply": ("a.ply", _cut("a.compressed.ply", 2000), "its header states at least"),
     "no chunks": ("a.ply", _replaced("a.compressed.ply", b"element chunk", b"element chump"), "compressed .ply"),
     "too few chunks": ("a.ply", _replaced("a.compressed.ply", b"vertex 300", b"vertex 999"), "its header states"),
@@ -185,7 +188,7 @@ DAMAGED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "only NaN": (
         "a.splat",
         lambda path: write_small_splat(path, {**FIELD, "means": torch.full((300, 3), math.nan)}),
-        "300 primitives, and none is finite",
+        "300 Gaussians, and none is finite",
     ),
 }
 
@@ -196,7 +199,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path, monkeypatch: pyte
     name, write, message = DAMAGED[kind]
     write(tmp_path / name)
     with pytest.raises(DataError, match=re.escape(message)) as caught:
-        read_primitives(tmp_path / name)
+        read_gaussian_file(tmp_path / name)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "harm").exists()
 
@@ -214,7 +217,7 @@ def test_a_sog_that_is_a_folder(tmp_path: Path, name: str) -> None:
     folder = unbundled(tmp_path / "scene")
     whole, parts = found(tmp_path / "scene.sog"), found(folder / name)
     assert all(torch.equal(parts[each], whole[each]) for each in SPLAT_NAMES)
-    assert sn.load(folder / name).num_primitives == 300
+    assert sn.load(folder / name).num_gaussians == 300
 
 
 @pytest.mark.parametrize(
@@ -231,7 +234,7 @@ def test_other_folders_are_refused(tmp_path: Path, change: dict[str, Any], messa
     content = {name: value for name, value in {**json.loads(meta.read_text()), **change}.items() if value is not None}
     meta.write_text(json.dumps(content))
     with pytest.raises(DataError, match=re.escape(message)):
-        read_primitives(meta)
+        read_gaussian_file(meta)
 
 
 @pytest.mark.parametrize("text", [False, True])

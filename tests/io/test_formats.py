@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sundae_ns.core.errors import CheckpointError, ConfigError, DataError
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.io.accounting import Sizes, bytes_of, bytes_of_module, megabytes
-from sundae_ns.io.formats import ANTIALIASED, FORMATS, kind_of, read_primitives, refuse, write_for_viewers
+from sundae_ns.io.formats import ANTIALIASED, FORMATS, kind_of, read_gaussian_file, refuse, write_for_viewers
 from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
 from sundae_ns.io.ply import read_ply, write_ply
 from sundae_ns.io.spz import fractional_bits
@@ -62,8 +62,8 @@ def test_what_is_written_is_read(tmp_path: Path, kind: str, n: int, degree: int,
     antialiased, in_model_frame = marks
     written = write_for_viewers(path, truth, antialiased=antialiased, in_model_frame=in_model_frame)
     assert written == (n, 0, degree, 0, False, path.stat().st_size)
-    read = read_primitives(path)
-    check(dict(read.mended.field), truth, kind)
+    read = read_gaussian_file(path)
+    check(dict(read.sanitised.gaussians), truth, kind)
     assert read.antialiased == antialiased
     assert read.in_model_frame == (in_model_frame and kind in (".ply", ".glb"))
 
@@ -84,18 +84,18 @@ def test_another_program_reads_the_same_scene(tmp_path: Path, kind: str, degree:
     truth, file, back = small_field(300, degree), tmp_path / f"a{kind}", tmp_path / "back.ply"
     write_for_viewers(file, truth, antialiased=antialiased)
     subprocess.run([str(PROGRAM), "--quiet", str(file), str(back)], check=True, capture_output=True, timeout=120)
-    read = read_primitives(back)
-    check(dict(read.mended.field), truth, kind)
+    read = read_gaussian_file(back)
+    check(dict(read.sanitised.gaussians), truth, kind)
     assert read.antialiased == antialiased
 
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_primitives_that_are_not_finite_are_dropped(tmp_path: Path, kind: str) -> None:
-    field = small_field()
-    field["means"][3, 0] = torch.nan
-    field["scales"][7, 1] = torch.inf
-    field["scales"][9, 1] = -torch.inf  # a flat primitive
-    written = write_for_viewers(tmp_path / f"a{kind}", field)
+    gaussians = small_field()
+    gaussians["means"][3, 0] = torch.nan
+    gaussians["scales"][7, 1] = torch.inf
+    gaussians["scales"][9, 1] = -torch.inf  # a flat Gaussian
+    written = write_for_viewers(tmp_path / f"a{kind}", gaussians)
     assert (written.primitives, written.dropped) == (298, 2)
 
 
@@ -106,23 +106,23 @@ def test_sh_degree_4_is_cut_to_the_format(tmp_path: Path, kind: str, degree: int
 
 
 def test_colours_of_models_of_sh_degree_0(tmp_path: Path) -> None:
-    field = small_field(degree=0)
-    write_for_viewers(tmp_path / "a.ply", Field(field, "logits"))
+    gaussians = small_field(degree=0)
+    write_for_viewers(tmp_path / "a.ply", Gaussians(gaussians, "logits"))
     colors = 0.5 + 0.28209479 * read_ply(tmp_path / "a.ply")["features_dc"]
-    torch.testing.assert_close(colors, field["features_dc"].sigmoid(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(colors, gaussians["features_dc"].sigmoid(), rtol=0, atol=1e-6)
 
 
 def test_upright_rotates_z_to_minus_y(tmp_path: Path) -> None:
-    field = small_field()
-    field["means"][0] = torch.tensor([1.0, 2.0, 3.0])
-    write_for_viewers(tmp_path / "b.ply", field, upright=True)
-    read = read_primitives(tmp_path / "b.ply")
+    gaussians = small_field()
+    gaussians["means"][0] = torch.tensor([1.0, 2.0, 3.0])
+    write_for_viewers(tmp_path / "b.ply", gaussians, upright=True)
+    read = read_gaussian_file(tmp_path / "b.ply")
     assert not read.in_model_frame
-    turned = read.mended.field
+    turned = read.sanitised.gaussians
     torch.testing.assert_close(turned["means"][0], torch.tensor([1.0, -3.0, 2.0]))
     # SH rotate, too: from above, along +z before and -y after, the colours are the same.
     above, turned_above = (harmonic_basis(1, torch.tensor([d]))[0, 1:] for d in ([0.0, 0.0, 1.0], [0.0, -1.0, 0.0]))
-    before = torch.einsum("k,nkc->nc", above, field["features_rest"])
+    before = torch.einsum("k,nkc->nc", above, gaussians["features_rest"])
     after = torch.einsum("k,nkc->nc", turned_above, turned["features_rest"])
     torch.testing.assert_close(after, before, rtol=0, atol=1e-5)
 
@@ -131,7 +131,7 @@ BAD = {"opacities": torch.zeros(300)}, {"features_rest": torch.zeros(300, 4, 3)}
 REFUSED: list[tuple[str, dict[str, Tensor], type[Exception], str]] = [
     ("a.splat", {}, ConfigError, "name it .ply or .spz or .sog or .glb"),
     *((f"a{kind}", change, DataError, "has shape") for kind in FORMATS for change in BAD),
-    *((f"a{kind}", {"means": torch.full((300, 3), torch.nan)}, DataError, "no primitives") for kind in FORMATS[1:]),
+    *((f"a{kind}", {"means": torch.full((300, 3), torch.nan)}, DataError, "no Gaussians") for kind in FORMATS[1:]),
     ("a.spz", {"means": torch.full((300, 3), 1e5)}, DataError, "1e+05 from the origin"),
 ]
 
@@ -151,28 +151,30 @@ def test_refusals_leave_the_older_file(
 )
 def test_positions_of_a_spz_get_as_many_bits_as_fit(tmp_path: Path, farthest: float, bits: int) -> None:
     assert fractional_bits(torch.tensor([[0.0, farthest, 0.0]])) == bits
-    field = small_field(50)
-    field["means"] *= farthest / field["means"].abs().max() or 1e-9
-    write_for_viewers(tmp_path / "a.spz", field)
+    gaussians = small_field(50)
+    gaussians["means"] *= farthest / gaussians["means"].abs().max() or 1e-9
+    write_for_viewers(tmp_path / "a.spz", gaussians)
     raw = gzip.decompress((tmp_path / "a.spz").read_bytes())
     assert len(raw) == 16 + 50 * (9 + 1 + 3 + 3 + 4 + 9)
-    means = read_primitives(tmp_path / "a.spz").mended.field["means"]
-    assert (means - field["means"]).abs().max() <= 2.0 ** -(bits + 1) + 1e-7
+    means = read_gaussian_file(tmp_path / "a.spz").sanitised.gaussians["means"]
+    assert (means - gaussians["means"]).abs().max() <= 2.0 ** -(bits + 1) + 1e-7
 
 
 def test_values_beyond_the_range_of_a_spz_are_counted(tmp_path: Path) -> None:
-    field = small_field()
-    field["scales"][0, 0], field["features_dc"][1, 2], field["features_rest"][2, 0, 0] = 7.0, 4.0, -1.5
-    assert write_for_viewers(tmp_path / "a.spz", field).clamped == 3
+    gaussians = small_field()
+    gaussians["scales"][0, 0], gaussians["features_dc"][1, 2], gaussians["features_rest"][2, 0, 0] = 7.0, 4.0, -1.5
+    assert write_for_viewers(tmp_path / "a.spz", gaussians).clamped == 3
 
 
 @pytest.mark.parametrize("kind", [".spz", ".sog", ".glb"])
 def test_zero_quaternions_become_the_identity(tmp_path: Path, kind: str) -> None:
-    field = small_field(3)
-    field["quats"][:] = torch.tensor([0.0, 1e-30, 0.0, 0.0])
-    field["quats"][0] = 0
-    write_for_viewers(tmp_path / f"a{kind}", field)
-    quats = matched(dict(read_primitives(tmp_path / f"a{kind}").mended.field), {**field, "quats": torch.ones(3, 4)})
+    gaussians = small_field(3)
+    gaussians["quats"][:] = torch.tensor([0.0, 1e-30, 0.0, 0.0])
+    gaussians["quats"][0] = 0
+    write_for_viewers(tmp_path / f"a{kind}", gaussians)
+    quats = matched(
+        dict(read_gaussian_file(tmp_path / f"a{kind}").sanitised.gaussians), {**gaussians, "quats": torch.ones(3, 4)}
+    )
     torch.testing.assert_close(quats["quats"][0].abs(), torch.tensor([1.0, 0, 0, 0]), rtol=0, atol=0.006)
 
 

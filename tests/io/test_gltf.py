@@ -1,4 +1,4 @@
-"""Primitives in .glb files: exact, upright, and of other programs."""
+"""Gaussians in .glb files: exact, upright, and of other programs."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError, SundaeError
-from sundae_ns.core.gaussians import SPLAT_NAMES, Field
+from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians
 from sundae_ns.io.gltf import EXTENSION, read_glb, semantics, write_glb
 
 THEIRS = Path(__file__).parent / "foreign" / "splat_transform.glb"
-"""Five primitives of SH degree 2, by ``splat-transform`` 3.7.0 from a .ply that ``theirs`` makes again."""
+"""Five Gaussians of SH degree 2, by ``splat-transform`` 3.7.0 from a .ply that ``theirs`` makes again."""
 Document = dict[str, Any]
 
 
@@ -57,21 +57,21 @@ def close(found: dict[str, Tensor], truth: dict[str, Tensor], tolerance: float =
 @pytest.mark.parametrize("in_model_frame", [False, True])
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_a_field_comes_back(tmp_path: Path, degree: int, in_model_frame: bool, antialiased: bool) -> None:
-    field = small_field(40, degree)
-    write_glb(tmp_path / "a.glb", field, antialiased=antialiased, in_model_frame=in_model_frame)
+    gaussians = small_field(40, degree)
+    write_glb(tmp_path / "a.glb", gaussians, antialiased=antialiased, in_model_frame=in_model_frame)
     found = read_glb(tmp_path / "a.glb")
-    close(found.params, field)
+    close(found.params, gaussians)
     assert (found.antialiased, found.in_model_frame) == (antialiased, in_model_frame)
 
 
 @pytest.mark.parametrize("in_model_frame", [False, True])
 def test_up_is_plus_y(tmp_path: Path, in_model_frame: bool) -> None:
     """A point above the origin: along z in the model, along -y elsewhere."""
-    field = small_field(3, 0)
-    field["means"] = torch.tensor(
+    gaussians = small_field(3, 0)
+    gaussians["means"] = torch.tensor(
         [[0.0, 0, 2], [1, 0, 0], [0, 1, 0]] if in_model_frame else [[0.0, -2, 0], [1, 0, 0], [0, 0, 1]]
     )
-    write_glb(tmp_path / "a.glb", field, in_model_frame=in_model_frame)
+    write_glb(tmp_path / "a.glb", gaussians, in_model_frame=in_model_frame)
     document, binary = parts(tmp_path / "a.glb")
     means = np.frombuffer(binary, np.float32, 9).reshape(3, 3)
     np.testing.assert_allclose(means[0], [0, 2, 0], atol=1e-6)
@@ -81,8 +81,8 @@ def test_up_is_plus_y(tmp_path: Path, in_model_frame: bool) -> None:
 
 
 def test_names_and_types_are_those_of_the_extension(tmp_path: Path) -> None:
-    field = small_field(4, 3)
-    write_glb(tmp_path / "a.glb", field)
+    gaussians = small_field(4, 3)
+    write_glb(tmp_path / "a.glb", gaussians)
     document, binary = parts(tmp_path / "a.glb")
     (primitive,) = document["meshes"][0]["primitives"]
     assert document["extensionsUsed"] == [EXTENSION]
@@ -94,9 +94,9 @@ def test_names_and_types_are_those_of_the_extension(tmp_path: Path) -> None:
     kinds = {name: document["accessors"][i]["type"] for name, i in primitive["attributes"].items()}
     assert kinds[f"{EXTENSION}:ROTATION"] == "VEC4"
     assert kinds[f"{EXTENSION}:OPACITY"] == "SCALAR"
-    view = document["bufferViews"][document["accessors"][primitive["attributes"][f"{EXTENSION}:SCALE"]]["bufferView"]]
-    widths = np.frombuffer(binary, np.float32, 12, view["byteOffset"]).reshape(4, 3)
-    np.testing.assert_allclose(widths, field["scales"].exp(), rtol=1e-6)
+    camera = document["bufferViews"][document["accessors"][primitive["attributes"][f"{EXTENSION}:SCALE"]]["bufferView"]]
+    widths = np.frombuffer(binary, np.float32, 12, camera["byteOffset"]).reshape(4, 3)
+    np.testing.assert_allclose(widths, gaussians["scales"].exp(), rtol=1e-6)
     assert document["buffers"][0]["byteLength"] == len(binary)
 
 
@@ -105,7 +105,7 @@ def test_a_file_of_another_program() -> None:
     torch.testing.assert_close(found.params["means"], theirs()["means"])
     assert found.params["features_rest"].shape == (5, 8, 3)
     assert not found.in_model_frame
-    assert sn.load(THEIRS).num_primitives == 5
+    assert sn.load(THEIRS).num_gaussians == 5
 
 
 def test_what_another_program_wrote_is_written_alike(tmp_path: Path) -> None:
@@ -114,13 +114,13 @@ def test_what_another_program_wrote_is_written_alike(tmp_path: Path) -> None:
     (ours, data), (document, truth) = parts(tmp_path / "a.glb"), parts(THEIRS)
     names = ours["meshes"][0]["primitives"][0]["attributes"]
     for name, i in document["meshes"][0]["primitives"][0]["attributes"].items():
-        accessor, view = document["accessors"][i], document["bufferViews"][document["accessors"][i]["bufferView"]]
+        accessor, camera = document["accessors"][i], document["bufferViews"][document["accessors"][i]["bufferView"]]
         mine = ours["bufferViews"][ours["accessors"][names[name]]["bufferView"]]
         assert accessor["type"] == ours["accessors"][names[name]]["type"], name
         if accessor["componentType"] == 5126:
-            count = view["byteLength"] // 4
+            count = camera["byteLength"] // 4
             a = np.frombuffer(data, np.float32, count, mine["byteOffset"])
-            b = np.frombuffer(truth, np.float32, count, view["byteOffset"])
+            b = np.frombuffer(truth, np.float32, count, camera["byteOffset"])
             if name == f"{EXTENSION}:ROTATION":  # theirs have the length of the .ply's
                 a, b = (q.reshape(-1, 4) * np.sign(q.reshape(-1, 4)[:, :1]) for q in (a, b))
                 b = b / np.linalg.norm(b, axis=1, keepdims=True)
@@ -129,8 +129,8 @@ def test_what_another_program_wrote_is_written_alike(tmp_path: Path) -> None:
 
 def test_nodes_place_gaussians(tmp_path: Path) -> None:
     """A node that turns, moves and scales, below another one; and two meshes."""
-    field = small_field(50, 1)
-    write_glb(tmp_path / "a.glb", field)
+    gaussians = small_field(50, 1)
+    write_glb(tmp_path / "a.glb", gaussians)
     document, binary = parts(tmp_path / "a.glb")
     half = math.sqrt(0.5)
     document["nodes"] = [
@@ -140,24 +140,24 @@ def test_nodes_place_gaussians(tmp_path: Path) -> None:
     ]
     put(tmp_path / "b.glb", document, binary)
     found = sn.load(tmp_path / "b.glb")
-    assert found.num_primitives == 100
+    assert found.num_gaussians == 100
     plain = sn.load(tmp_path / "a.glb")
     # In glTF's axes: turned by 90 degrees about y, twice as large, and 3 up; in the file's, -y is up.
-    x, y, z = (plain.field["means"] * torch.tensor([-1.0, -1.0, 1.0])).unbind(dim=1)
+    x, y, z = (plain.gaussians["means"] * torch.tensor([-1.0, -1.0, 1.0])).unbind(dim=1)
     moved = torch.stack([2 * z, 2 * y + 3, -2 * x], dim=1) * torch.tensor([-1.0, -1.0, 1.0])
-    first, second = found.field["means"][:50], found.field["means"][50:]
+    first, second = found.gaussians["means"][:50], found.gaussians["means"][50:]
     turned, still = (first, second) if torch.allclose(first, moved, atol=1e-5) else (second, first)
     torch.testing.assert_close(turned, moved, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(still, plain.field["means"] - torch.tensor([0.0, 3.0, 0.0]))
+    torch.testing.assert_close(still, plain.gaussians["means"] - torch.tensor([0.0, 3.0, 0.0]))
 
 
 def test_integers_are_normalised(tmp_path: Path) -> None:
-    field = small_field(4, 0)
-    write_glb(tmp_path / "a.glb", field)
+    gaussians = small_field(4, 0)
+    write_glb(tmp_path / "a.glb", gaussians)
     document, binary = parts(tmp_path / "a.glb")
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
-    opacities = field["opacities"].sigmoid()[:, 0].numpy()
-    turns = np.roll(torch.nn.functional.normalize(field["quats"]).numpy(), -1, axis=1)
+    opacities = gaussians["opacities"].sigmoid()[:, 0].numpy()
+    turns = np.roll(torch.nn.functional.normalize(gaussians["quats"]).numpy(), -1, axis=1)
     turns = np.stack([-turns[:, 1], turns[:, 0], turns[:, 3], -turns[:, 2]], axis=1)  # after half a turn about z
     added = np.rint(65535 * opacities).astype("<u2").tobytes()
     for name, data, kind, component in (
@@ -202,7 +202,7 @@ HOSTILE: dict[str, tuple[Callable[[Document], object], str]] = {
     "no Gaussians": (_mesh, f"no mesh of its scene has {EXTENSION}"),
     "no widths": (_without, "SCALE"),
     "another kernel": (_splats(kernel="box"), "of another kernel"),
-    "compressed": (_splats(extensions={"KHR_gaussian_splatting_compression_spz": {}}), "compressed"),
+    "compressed": (_splats(train_callbacks={"KHR_gaussian_splatting_compression_spz": {}}), "compressed"),
     "other colours": (_splats(colorSpace="lin_rec709_display"), "lin_rec709_display"),
     "a node below itself": (_in("nodes", children=[0]), "a node below itself"),
     "a node beyond all": (_in("scenes", nodes=[7]), "not that of a glTF scene"),
@@ -257,14 +257,14 @@ def test_any_cut_or_flipped_byte_is_a_success_or_one_line(tmp_path: Path) -> Non
 def test_a_field_that_does_not_fit(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="up to 3"):
         write_glb(tmp_path / "a.glb", small_field(4, 4))
-    with pytest.raises(DataError, match="no primitives"):
+    with pytest.raises(DataError, match="no Gaussians"):
         write_glb(tmp_path / "a.glb", small_field(0))
     assert not list(tmp_path.iterdir())
 
 
 def test_the_front_door_writes_and_reads(tmp_path: Path) -> None:
-    scene = sn.Scene(Field(small_field(30)), in_model_frame=True)
+    scene = sn.Scene(Gaussians(small_field(30)), in_model_frame=True)
     sn.save(scene, tmp_path / "a.glb")
     found = sn.load(tmp_path / "a.glb")
     assert found.in_model_frame
-    close(dict(found.field), dict(scene.field))
+    close(dict(found.gaussians), dict(scene.gaussians))

@@ -48,8 +48,8 @@ def test_values_are_those_of_the_ply(level: int, degree: int) -> None:
 
 def test_the_front_door_reads_it() -> None:
     scene = sn.load(ksplat(2, 1))
-    assert scene.num_primitives == 30
-    assert scene.field["features_rest"].shape == (30, 3, 3)
+    assert scene.num_gaussians == 30
+    assert scene.gaussians["features_rest"].shape == (30, 3, 3)
 
 
 def changed(path: Path, changes: Iterable[tuple[int, str, float]]) -> Path:
@@ -67,18 +67,18 @@ HOSTILE: dict[str, tuple[list[tuple[int, str, float]], str]] = {
     "another level": ([(20, "<H", 3)], "level 3 of compression"),
     "sections beyond all": ([(4, "<I", 2**32 - 1)], "cannot hold 4,294,967,295 sections"),
     "more sections used than stored": ([(8, "<I", 3)], "cannot hold 3 sections"),
-    "no sections": ([(8, "<I", 0)], "it has no primitives"),
+    "no sections": ([(8, "<I", 0)], "it has no Gaussians"),
     "an odd SH degree": ([(SECTION + 40, "<H", 3)], "SH degree 3; the format ends at 2"),
     "different SH degrees": ([(SECTION + 1024, "<I", 5), (SECTION + 1024 + 40, "<H", 1)], "different SH degrees"),
-    "primitives beyond all": ([(SECTION, "<I", 2**32 - 1), (SECTION + 4, "<I", 2**32 - 1)], "a section of 4,294,967"),
-    "more primitives used than stored": ([(SECTION, "<I", 17)], "a section of 17 primitives"),
+    "Gaussians beyond all": ([(SECTION, "<I", 2**32 - 1), (SECTION + 4, "<I", 2**32 - 1)], "a section of 4,294,967"),
+    "more Gaussians used than stored": ([(SECTION, "<I", 17)], "a section of 17 Gaussians"),
     "buckets beyond all": ([(SECTION + 12, "<I", 2**32 - 1)], "cannot hold a section"),
     "no buckets": ([(SECTION + 12, "<I", 0)], "do not fit together"),
     "centres of other sizes": ([(SECTION + 20, "<H", 8)], "do not fit together"),
     "full buckets beyond all": ([(SECTION + 32, "<I", 2**32 - 1)], "do not fit together"),
-    "buckets of an absurd size": ([(SECTION + 8, "<I", 2**32 - 1)], "do not hold 16 primitives"),
-    "a last bucket of an absurd size": ([(LENGTHS, "<I", 2**32 - 1)], "do not hold 16 primitives"),
-    "a sum beyond 32 bits": ([(LENGTHS + i, "<I", 2**31 + 1) for i in (0, 4)], "do not hold 16 primitives"),
+    "buckets of an absurd size": ([(SECTION + 8, "<I", 2**32 - 1)], "do not hold 16 Gaussians"),
+    "a last bucket of an absurd size": ([(LENGTHS, "<I", 2**32 - 1)], "do not hold 16 Gaussians"),
+    "a sum beyond 32 bits": ([(LENGTHS + i, "<I", 2**31 + 1) for i in (0, 4)], "do not hold 16 Gaussians"),
 }
 
 

@@ -13,7 +13,7 @@ from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.ply import is_nerfstudio_ply, read_ply, read_point_cloud, write_ply
 
 
-def _field(n=7, degree=3, seed=0):
+def _gaussians(n=7, degree=3, seed=0):
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape):
@@ -32,7 +32,7 @@ def _field(n=7, degree=3, seed=0):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 @pytest.mark.parametrize("n", [0, 1, 50])
 def test_round_trip_is_exact(tmp_path, n, degree):
-    params = _field(n, degree)
+    params = _gaussians(n, degree)
     write_ply(tmp_path / "a.ply", {**params, "features": torch.zeros(n, 13)})
     back = read_ply(tmp_path / "a.ply")
     assert tuple(back) == SPLAT_NAMES
@@ -43,14 +43,14 @@ def test_round_trip_is_exact(tmp_path, n, degree):
 
 
 def test_parameters_of_any_kind_are_written_as_float32(tmp_path):
-    params = {name: torch.nn.Parameter(value.double()) for name, value in _field().items()}
+    params = {name: torch.nn.Parameter(value.double()) for name, value in _gaussians().items()}
     write_ply(tmp_path / "a.ply", params)
     back = read_ply(tmp_path / "a.ply")
     assert all(torch.equal(back[name], params[name].detach().float()) for name in SPLAT_NAMES)
 
 
 def test_layout(tmp_path):
-    params = _field(n=3, degree=1)
+    params = _gaussians(n=3, degree=1)
     write_ply(tmp_path / "a.ply", params, comments=["SplatRenderMode: mip"])
     data = PlyData.read(str(tmp_path / "a.ply"))
     assert data.byte_order == "<"
@@ -72,7 +72,7 @@ def test_same_vertices_as_nerfstudio_exports(tmp_path, monkeypatch):
     from nerfstudio.models.splatfacto import SplatfactoModel
 
     exporter = importlib.import_module("nerfstudio.scripts.exporter")
-    params = _field(n=9, degree=3)
+    params = _gaussians(n=9, degree=3)
     model = SplatfactoModel.__new__(SplatfactoModel)
     torch.nn.Module.__init__(model)
     model.gauss_params = torch.nn.ParameterDict(params)
@@ -91,7 +91,7 @@ def test_same_vertices_as_nerfstudio_exports(tmp_path, monkeypatch):
 
 
 def test_other_properties_types_and_orders_are_read(tmp_path):
-    params = _field(n=4, degree=1)
+    params = _gaussians(n=4, degree=1)
     write_ply(tmp_path / "a.ply", params)
     vertices = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
     names = sorted(vertices.dtype.names, reverse=True)
@@ -121,7 +121,7 @@ def _without(path, names):
 )
 def test_missing_properties(tmp_path, names, cause):
     path = tmp_path / "a.ply"
-    write_ply(path, _field(degree=1))
+    write_ply(path, _gaussians(degree=1))
     _without(path, names)
     with pytest.raises(DataError, match=cause) as caught:
         read_ply(path)
@@ -152,7 +152,7 @@ WRONG = {
 def test_wrong_files(tmp_path, wrong):
     change, cause = WRONG[wrong]
     path = tmp_path / "a.ply"
-    write_ply(path, _field())
+    write_ply(path, _gaussians())
     change(path)
     with pytest.raises(DataError, match=cause) as caught:
         read_ply(path)
@@ -178,7 +178,7 @@ def _lists(path, element):
 @pytest.mark.parametrize("kind", ["vertex", "face", "ascii"])
 def test_what_is_read_row_by_row_is_refused_by_the_header(tmp_path, monkeypatch, kind):
     path = tmp_path / "a.ply"
-    write_ply(path, _field())
+    write_ply(path, _gaussians())
     _ascii(path) if kind == "ascii" else _lists(path, kind)
     monkeypatch.setattr(PlyData, "read", lambda *_: pytest.fail("the rows were read"))
     with pytest.raises(
@@ -192,6 +192,6 @@ def test_what_is_read_row_by_row_is_refused_by_the_header(tmp_path, monkeypatch,
 
 def test_faces_of_a_point_cloud_are_ignored(tmp_path):
     path = tmp_path / "a.ply"
-    write_ply(path, _field())
+    write_ply(path, _gaussians())
     _lists(path, "face")
-    assert torch.equal(read_point_cloud(path)[0], _field()["means"])
+    assert torch.equal(read_point_cloud(path)[0], _gaussians()["means"])

@@ -16,7 +16,7 @@ import sundae_ns as sn
 from sundae_ns.cli import main
 from sundae_ns.core.errors import CheckpointError
 from sundae_ns.io import checkpoint
-from sundae_ns.io.formats import read_field
+from sundae_ns.io.formats import read_gaussians
 
 N = 20
 
@@ -55,7 +55,7 @@ def exported(run: Path) -> None:
 
 READERS: dict[str, Callable[[Path], object]] = {
     "load": sn.load,
-    "read_field": read_field,
+    "read_gaussians": read_gaussians,
     "export": exported,
 }
 
@@ -92,7 +92,7 @@ def test_every_read_beside_a_training_that_saves_all_the_time_succeeds(training:
     thread.start()
     try:
         while training.step < 50:
-            assert sn.load(training.run).num_primitives == N
+            assert sn.load(training.run).num_gaussians == N
     finally:
         done.set()
         thread.join()

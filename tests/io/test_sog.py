@@ -22,7 +22,7 @@ from sundae_ns.io.sog import codebook, kmeans, palette, write_sog
 from sundae_ns.scene.initialization import from_points
 
 
-def field(n: int = 150, degree: int = 3) -> dict[str, Tensor]:
+def gaussians(n: int = 150, degree: int = 3) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(0)
     points = 4 * torch.rand(n, 3, generator=generator) - 2
     made = from_points(points, points / 4 + 0.5, sh_degree=degree, num_features=3, generator=generator)
@@ -36,7 +36,7 @@ def field(n: int = 150, degree: int = 3) -> dict[str, Tensor]:
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """``meta.json``, and the primitives as sections 3.1 to 3.5 of the description decode them."""
+    """``meta.json``, and the Gaussians as sections 3.1 to 3.5 of the description decode them."""
     with zipfile.ZipFile(path) as bundle:
         meta = json.loads(bundle.read("meta.json"))
 
@@ -75,7 +75,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_values_come_back(tmp_path: Path, degree: int) -> None:
-    truth = field(degree=degree)
+    truth = gaussians(degree=degree)
     write_sog(tmp_path / "a.sog", truth)
     meta, found = read(tmp_path / "a.sog")
     assert (meta["version"], meta["count"]) == (2, 150)
@@ -97,7 +97,7 @@ def test_values_come_back(tmp_path: Path, degree: int) -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 64, 65])
 def test_few_equal_primitives(tmp_path: Path, n: int) -> None:
-    truth = {name: value[:1].expand(n, *value.shape[1:]) for name, value in field().items()}
+    truth = {name: value[:1].expand(n, *value.shape[1:]) for name, value in gaussians().items()}
     write_sog(tmp_path / "a.sog", truth)
     _, found = read(tmp_path / "a.sog")
     for name in ("means", "scales", "features_dc", "features_rest"):

@@ -28,7 +28,7 @@ def transform() -> Tensor:
     return torch.cat([rotation(), torch.tensor([[0.4], [-1.1], [0.7]], dtype=torch.float64)], dim=1)
 
 
-def field(degree: int = 3, n: int = 60) -> dict[str, Tensor]:
+def gaussians(degree: int = 3, n: int = 60) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(2)
 
     def normal(*shape: int) -> Tensor:
@@ -46,25 +46,25 @@ def field(degree: int = 3, n: int = 60) -> dict[str, Tensor]:
 
 
 def camera() -> Tensor:
-    view = torch.eye(4, dtype=torch.float64)
-    view[:3, :3] = rotation(3)
-    view[:3, 3] = torch.tensor([0.1, -0.2, 3.0])
-    return view
+    camera = torch.eye(4, dtype=torch.float64)
+    camera[:3, :3] = rotation(3)
+    camera[:3, 3] = torch.tensor([0.1, -0.2, 3.0])
+    return camera
 
 
 def moved_camera() -> Tensor:
     """World-to-camera of the transformed camera; its coordinates are ``SCALE`` times as large."""
-    view, (turn, shift) = camera(), transform().split([3, 1], dim=1)
-    moved = view.clone()
-    moved[:3, :3] = view[:3, :3] @ turn.T
-    moved[:3, 3:] = SCALE * (view[:3, 3:] - moved[:3, :3] @ shift)
+    cam, (turn, shift) = camera(), transform().split([3, 1], dim=1)
+    moved = cam.clone()
+    moved[:3, :3] = cam[:3, :3] @ turn.T
+    moved[:3, 3:] = SCALE * (cam[:3, 3:] - moved[:3, :3] @ shift)
     return moved
 
 
-def image(params: dict[str, Tensor], view: Tensor) -> tuple[Tensor, Tensor]:
+def image(params: dict[str, Tensor], camera: Tensor) -> tuple[Tensor, Tensor]:
     backend = select_backend("reference", "cpu")
     K = torch.tensor([[30.0, 0.0, SIZE / 2], [0.0, 30.0, SIZE / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    center = -view[:3, :3].T @ view[:3, 3]
+    center = -camera[:3, :3].T @ camera[:3, 3]
     coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
     colors = spherical_harmonics(3, params["means"] - center, coeffs, backend=backend) + 0.5
     rendered = rasterize(
@@ -73,7 +73,7 @@ def image(params: dict[str, Tensor], view: Tensor) -> tuple[Tensor, Tensor]:
         params["scales"].exp(),
         params["opacities"].sigmoid().squeeze(1),
         colors,
-        view,
+        camera,
         K,
         SIZE,
         SIZE,
@@ -85,7 +85,7 @@ def image(params: dict[str, Tensor], view: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def test_transformed_field_and_camera_give_the_same_image() -> None:
-    params = field()
+    params = gaussians()
     colors, depth = image(params, camera())
     moved_colors, moved_depth = image(similarity(params, transform(), SCALE), moved_camera())
     assert colors.std() > 0.1
@@ -95,7 +95,7 @@ def test_transformed_field_and_camera_give_the_same_image() -> None:
 
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "features_rest"])
 def test_each_transformed_parameter_changes_the_image(name: str) -> None:
-    params = field()
+    params = gaussians()
     colors, _ = image(params, camera())
     wrong = {**similarity(params, transform(), SCALE), name: params[name]}
     assert (image(wrong, moved_camera())[0] - colors).abs().max() > 0.02
@@ -103,7 +103,7 @@ def test_each_transformed_parameter_changes_the_image(name: str) -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_rotated_harmonics_are_the_rotated_function(degree: int) -> None:
-    rest = field(degree, n=4)["features_rest"]
+    rest = gaussians(degree, n=4)["features_rest"]
     degree_0 = torch.zeros(4, 1, 3, dtype=torch.float64)
     directions = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=1)
     before = evaluate_harmonics(degree, directions, torch.cat([degree_0, rest], dim=1))
@@ -124,14 +124,14 @@ def test_rotated_harmonics_are_the_rotated_function(degree: int) -> None:
     ids=["identity", "half turn x", "half turn z", "COLMAP to nerfstudio", "any"],
 )
 def test_rotations_follow(matrix: Tensor) -> None:
-    params = field()
+    params = gaussians()
     moved = similarity(params, torch.cat([matrix, torch.zeros(3, 1, dtype=torch.float64)], dim=1), 1.0)
     expected = matrix @ rotation_matrices(params["quats"])
     torch.testing.assert_close(rotation_matrices(moved["quats"]), expected, atol=1e-12, rtol=0)
 
 
 def test_other_parameters_are_shared_and_the_input_is_unchanged() -> None:
-    params = field()
+    params = gaussians()
     before = {name: value.clone() for name, value in params.items()}
     moved = similarity({**params, "features": torch.ones(60, 2)}, transform(), SCALE)
     assert moved["opacities"] is params["opacities"]
@@ -141,7 +141,7 @@ def test_other_parameters_are_shared_and_the_input_is_unchanged() -> None:
 
 
 def test_there_and_back_in_float32() -> None:
-    params = {name: value.float() for name, value in field().items()}
+    params = {name: value.float() for name, value in gaussians().items()}
     there = similarity(params, transform(), SCALE)
     turn, shift = transform().split([3, 1], dim=1)
     back = similarity(there, torch.cat([turn.T, -SCALE * turn.T @ shift], dim=1), 1 / SCALE)

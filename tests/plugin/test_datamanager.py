@@ -84,7 +84,7 @@ def test_held_back_views_are_not_trained_on_and_are_loaded_when_their_turn_comes
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = manager(capture)
-    assert (made.holdout_indices, list(made.views([]))) == ([], [])
+    assert (made.holdout_indices, list(made.cameras([]))) == ([], [])
     made.hold_back([2, 5])
     assert made.holdout_indices == [2, 5]
     assert {made.view_of_step(step) for step in range(50)} == {0, 1, 3, 4, 6}
@@ -92,15 +92,15 @@ def test_held_back_views_are_not_trained_on_and_are_loaded_when_their_turn_comes
     assert masks == (None,) * VIEWS
     poses = torch.cat([camera.camera_to_worlds for camera in cameras])
     assert torch.equal(poses, made.train_dataset.cameras.camera_to_worlds)
-    (camera, batch), _ = made.views(made.holdout_indices)
+    (camera, batch), _ = made.cameras(made.holdout_indices)
     assert batch["image_idx"] == 2
     assert torch.equal(camera.camera_to_worlds[0], made.train_dataset.cameras.camera_to_worlds[2])
     assert batch["image"].shape == (16, 20, 3)
     moved: list[int] = []
-    monkeypatch.setattr(made, "_view", moved.append)
-    views = made.views(made.holdout_indices)
+    monkeypatch.setattr(made, "_camera", moved.append)
+    rest = made.cameras(made.holdout_indices)
     assert moved == []
-    next(views)
+    next(rest)
     assert moved == [2]
 
 

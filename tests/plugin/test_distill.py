@@ -19,69 +19,74 @@ def ball() -> sn.Scene:
     generator = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(1500, 3, generator=generator), dim=1)
     scene = sn.Scene.from_points(points, (points * 4).sin() / 2 + 0.5)
-    scene.field["opacities"][:] = 3.0
+    scene.gaussians["opacities"][:] = 3.0
     return scene
 
 
 @pytest.fixture(scope="module")
-def views() -> list[sn.View]:
+def cameras() -> list[sn.Camera]:
     turns = torch.arange(12) * 0.5
     eyes = torch.stack([2.5 * turns.cos(), 2.5 * turns.sin(), turns.sin()], dim=1)
-    return [sn.View.look_at(eye, (0, 0, 0), width=40, height=40) for eye in eyes]
+    return [sn.Camera.look_at(eye, (0, 0, 0), width=40, height=40) for eye in eyes]
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-3])
-def test_it_is_better_than_the_prune_alone(size: float, ball: sn.Scene, views: list[sn.View]) -> None:
+def test_it_is_better_than_the_prune_alone(size: float, ball: sn.Scene, cameras: list[sn.Camera]) -> None:
     """Also for a scene that the near plane would hide; other cameras than those of the steps judge."""
-    field = ball.field.replaced({"means": ball.field["means"] * size, "scales": ball.field["scales"] + math.log(size)})
-    teacher = sn.Scene(field)
+    gaussians = ball.gaussians.replaced(
+        {"means": ball.gaussians["means"] * size, "scales": ball.gaussians["scales"] + math.log(size)}
+    )
+    teacher = sn.Scene(gaussians)
     made = sn.distill(teacher, keep=0.2, steps=150, head=False, size=40)
-    pruned = sn.prune(teacher, keep=0.2, views=sn.virtual_views(teacher, 16, size=64))
-    assert made.num_primitives == pruned.num_primitives == 300
-    grown = {"means": made.field["means"] / size, "scales": made.field["scales"] - math.log(size)}
-    judged = sn.Scene(made.field.replaced(grown))
-    before = {"means": pruned.field["means"] / size, "scales": pruned.field["scales"] - math.log(size)}
-    quality, base = (sn.measure(one, ball, views).psnr for one in (judged, sn.Scene(pruned.field.replaced(before))))
+    pruned = sn.prune(teacher, keep=0.2, cameras=sn.virtual_cameras(teacher, 16, size=64))
+    assert made.num_gaussians == pruned.num_gaussians == 300
+    grown = {"means": made.gaussians["means"] / size, "scales": made.gaussians["scales"] - math.log(size)}
+    judged = sn.Scene(made.gaussians.replaced(grown))
+    before = {"means": pruned.gaussians["means"] / size, "scales": pruned.gaussians["scales"] - math.log(size)}
+    quality, base = (
+        sn.measure(one, ball, cameras).psnr for one in (judged, sn.Scene(pruned.gaussians.replaced(before)))
+    )
     assert quality > base + 2
 
 
-def test_it_is_the_same_for_a_seed(ball: sn.Scene, views: list[sn.View]) -> None:
+def test_it_is_the_same_for_a_seed(ball: sn.Scene, cameras: list[sn.Camera]) -> None:
     one, two, other = (
-        sn.distill(ball, keep=0.1, views=views, steps=5, seed=seed, head=False).field["means"] for seed in (0, 0, 1)
+        sn.distill(ball, keep=0.1, cameras=cameras, steps=5, seed=seed, head=False).gaussians["means"]
+        for seed in (0, 0, 1)
     )
     assert torch.equal(one, two)
     assert not torch.equal(one, other)
 
 
 def test_a_head_is_kept_only_where_it_pays(
-    ball: sn.Scene, views: list[sn.View], monkeypatch: pytest.MonkeyPatch
+    ball: sn.Scene, cameras: list[sn.Camera], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sundae_ns.train.choice.LEAST_GAIN", 1000.0)
-    made = Distillation(ball, keep=0.1, views=views, steps=20)
+    made = Distillation(ball, keep=0.1, cameras=cameras, steps=20)
     assert made.train(lambda *_: True)
     assert made.gain is not None
     assert made.result().head is None
-    assert "features" not in made.result().field
+    assert "features" not in made.result().gaussians
     for name in ("LEAST_GAIN", "GAIN_PER_DOUBLING"):
         monkeypatch.setattr(f"sundae_ns.train.choice.{name}", -1000.0)
-    made = Distillation(ball, keep=0.1, views=views, steps=20)
+    made = Distillation(ball, keep=0.1, cameras=cameras, steps=20)
     assert made.train(lambda *_: True)
     result = made.result()
     assert result.head is not None
-    assert result.trained_focal == (views[0].focal, views[0].focal)
-    image = sn.render(result, views[0])
+    assert result.trained_focal == (cameras[0].focal, cameras[0].focal)
+    image = sn.render(result, cameras[0])
     assert not torch.equal(image.rgb, image.base_rgb)
 
 
 @pytest.mark.parametrize("head", [False, True])
 def test_a_resumed_training_ends_as_an_uninterrupted_one(
-    head: bool, ball: sn.Scene, views: list[sn.View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    head: bool, ball: sn.Scene, cameras: list[sn.Camera], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("LEAST_GAIN", "GAIN_PER_DOUBLING"):
         monkeypatch.setattr(f"sundae_ns.train.choice.{name}", -1000.0)
 
     def begun() -> Distillation:
-        return Distillation(ball, keep=0.1, views=views, steps=20, head=head)
+        return Distillation(ball, keep=0.1, cameras=cameras, steps=20, head=head)
 
     whole, first, second = begun(), begun(), begun()
     assert whole.train(lambda *_: True)
@@ -90,9 +95,9 @@ def test_a_resumed_training_ends_as_an_uninterrupted_one(
     first.save(tmp_path / "partial")
     second.load(tmp_path / "partial")
     assert second.train(lambda *_: True)
-    for name, value in whole.result().field.items():
-        assert torch.equal(value, second.result().field[name]), name
-    other = Distillation(ball, keep=0.2, views=views, steps=20, head=head)
+    for name, value in whole.result().gaussians.items():
+        assert torch.equal(value, second.result().gaussians[name]), name
+    other = Distillation(ball, keep=0.2, cameras=cameras, steps=20, head=head)
     with pytest.raises(CheckpointError, match="of another scene or other options"):
         other.load(tmp_path / "partial")
     (tmp_path / "partial").write_bytes(b"nothing")

@@ -20,16 +20,16 @@ from splat_inputs import geometry
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from sundae_ns.core.camera import View
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.camera import Camera
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.core.surgery import keep
 from sundae_ns.head.head import CompensationHead, HeadConfig
-from sundae_ns.plugin.distributed import BatchOptimizers, Ranks, ShardedField, _summed, may_be_seen
+from sundae_ns.plugin.distributed import BatchOptimizers, Ranks, ShardedSource, _summed, may_be_seen
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.rasterize.interface import rasterize, select_backend
 from sundae_ns.rasterize.reference import project
-from sundae_ns.scene.render import ColorSettings, LocalField
-from sundae_ns.train.state import Extension, FieldState
+from sundae_ns.scene.render import ColorSettings, GaussianSource
+from sundae_ns.train.state import Callback, TrainingState
 
 REFERENCE = select_backend("reference", "cpu")
 COLORS = ColorSettings(REFERENCE)
@@ -53,12 +53,12 @@ def gaussians(n: int = N) -> dict[str, Tensor]:
     }
 
 
-def field_of(values: dict[str, Tensor], start: int = 0, end: int = N) -> Field:
+def gaussians_of(values: dict[str, Tensor], start: int = 0, end: int = N) -> Gaussians:
     rows: Any = ParameterDict({name: Parameter(value[start:end].clone()) for name, value in values.items()})
-    return Field(rows)
+    return Gaussians(rows)
 
 
-def camera(rank: int, *, behind: bool = False) -> View:
+def camera(rank: int, *, behind: bool = False) -> Camera:
     """Cameras that differ in all: position, size and intrinsics."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = torch.tensor([0.4 * rank, -0.1, 2.5])
@@ -66,15 +66,15 @@ def camera(rank: int, *, behind: bool = False) -> View:
         pose = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]).double()) @ pose
     width, height, focal = (40, 32, 35.0) if rank == 0 else (24, 48, 28.0)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-    return View(pose, K, width, height, focal)
+    return Camera(pose, K, width, height, focal)
 
 
-def draw(source: LocalField, view: View) -> Any:
-    params = source.primitives(view, COLORS, features=True)
+def draw(source: GaussianSource, camera: Camera) -> Any:
+    params = source.primitives(camera, COLORS, features=True)
     shown = rasterize(
         *(params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid().squeeze(-1)),
         torch.cat([params["colors"], params["features"]], dim=1),
-        *(view.viewmat, view.K, view.width, view.height),
+        *(camera.viewmat, camera.K, camera.width, camera.height),
         absgrad=True,
         render_depth=True,
         backend=REFERENCE,
@@ -89,12 +89,12 @@ def loss_of(shown: Any, rank: int) -> Tensor:
     return (shown.colors * weights).mean() + shown.depth.mean() + shown.alpha.square().mean()
 
 
-def state_of(field: Field, **running: Any) -> FieldState:
+def state_of(gaussians: Gaussians, **running: Any) -> TrainingState:
     """A field in training whose moments say to which row they belong."""
-    state = FieldState(field, torch.nn.ModuleDict(), densification=running, densify_until=10)
+    state = TrainingState(gaussians, torch.nn.ModuleDict(), densification=running, densify_until=10)
     state.pruning = {"pruned_at": -1, "num_prunes": 0, "peak": 0}
     state.optimizers = {}
-    for name, value in field.items():
+    for name, value in gaussians.items():
         rows = torch.arange(len(value)).double().reshape(-1, *[1] * (value.ndim - 1)).expand_as(value).clone()
         state.optimizers[name] = torch.optim.Adam([value])
         state.optimizers[name].state[value] = {"step": torch.tensor(7.0), "exp_avg": rows, "exp_avg_sq": rows + 0.5}
@@ -105,36 +105,36 @@ def check_drawing(rank: int) -> None:
     """Images, gradients and statistics of two ranks are those of one process for both images."""
     for behind in (False, True):  # then rank 1 sees nothing, and takes part
         start, end = ((0, 60), (60, N))[rank]
-        source = ShardedField(field_of(gaussians(), start, end))
-        views = [camera(0), camera(1, behind=behind)]
-        shown = draw(source, views[rank])
+        source = ShardedSource(gaussians_of(gaussians(), start, end))
+        cameras = [camera(0), camera(1, behind=behind)]
+        shown = draw(source, cameras[rank])
         assert (source.sizes, source.total) == ([60, 30], N)
         loss_of(shown, rank).backward()
-        state = state_of(source.field, grad2d=None, count=None, radii=None)
+        state = state_of(source.gaussians, grad2d=None, count=None, radii=None)
         state.info = {**shown.info, "radii": shown.radii[None]}
         source.count_views(state, absgrad=True)
 
-        whole = LocalField(field_of(gaussians()))
-        both = [draw(whole, view) for view in views]
+        whole = GaussianSource(gaussians_of(gaussians()))
+        both = [draw(whole, cam) for cam in cameras]
         (sum(loss_of(image, index) for index, image in enumerate(both)) / RANKS).backward()  # type: ignore[union-attr]
         for image in ("colors", "depth", "alpha"):
             torch.testing.assert_close(getattr(shown, image), getattr(both[rank], image), rtol=0, atol=1e-14)
-        for name, value in whole.field.items():
+        for name, value in whole.gaussians.items():
             assert value.grad is not None
-            torch.testing.assert_close(source.field[name].grad, value.grad[start:end], rtol=1e-10, atol=1e-14)
+            torch.testing.assert_close(source.gaussians[name].grad, value.grad[start:end], rtol=1e-10, atol=1e-14)
         norms, counts, radii = torch.zeros(3, N, dtype=torch.float64)
-        for image, view in zip(both, views):
-            halves = torch.tensor([view.width / 2, view.height / 2]).double()
+        for image, cam in zip(both, cameras):
+            halves = torch.tensor([cam.width / 2, cam.height / 2]).double()
             # The mean of two losses has half the gradient of each, and statistics are of each.
             norms += (image.info["means2d"].absgrad[0] * halves * RANKS).norm(dim=-1) * (image.radii > 0)
             counts += image.radii > 0
-            radii = radii.maximum(image.radii.double() / max(view.width, view.height))
+            radii = radii.maximum(image.radii.double() / max(cam.width, cam.height))
         for name, expected in (("grad2d", norms), ("count", counts), ("radii", radii)):
             found = state.densification[name]
             torch.testing.assert_close(found, expected[start:end].float(), rtol=1e-6, atol=1e-8)
 
 
-class Halving(Extension):
+class Halving(Callback):
     """Keeps every second Gaussian once."""
 
     name = "halving"
@@ -148,7 +148,7 @@ class Halving(Extension):
         self.calls += 1
         if not self.done:
             state, mask = run.state, torch.arange(N) % 2 == 0
-            keep(state.field.data, state.optimizers, [state.densification], mask)
+            keep(state.gaussians.data, state.optimizers, [state.densification], mask)
             state.pruning["num_prunes"] = 1
         self.done = True
 
@@ -159,19 +159,22 @@ class Halving(Extension):
         self.done = saved["done"]
 
 
-def shared(rank: int, state: FieldState) -> tuple[Ranks, Any]:
-    ranks, model = Ranks(rank, RANKS), SimpleNamespace(state=state, extensions=[], source=LocalField(state.field))
+def shared(rank: int, state: TrainingState) -> tuple[Ranks, Any]:
+    ranks, model = (
+        Ranks(rank, RANKS),
+        SimpleNamespace(state=state, train_callbacks=[], source=GaussianSource(state.gaussians)),
+    )
     model.device = torch.device("cpu")
     optimizers: Any = SimpleNamespace(parameters={})
     ranks.share(model, SimpleNamespace(rank=0), optimizers)
-    assert all(held[0] is state.field[name] for name, held in optimizers.parameters.items())
+    assert all(held[0] is state.gaussians[name] for name, held in optimizers.parameters.items())
     return ranks, model
 
 
 def check_gathering(rank: int) -> None:
     """A prune by the first rank: rows move with their moments and statistics, in order; notes are shared."""
     values = gaussians() if rank == 0 else {name: value + 1 for name, value in gaussians().items()}
-    state = state_of(field_of(values), grad2d=torch.arange(N), radii=None, peak=40 + rank)
+    state = state_of(gaussians_of(values), grad2d=torch.arange(N), radii=None, peak=40 + rank)
     ranks, model = shared(rank, state)
     assert model.source.sizes == [45, 45]
     state.trained_focal = (None, (30.0, 50.0))[rank]
@@ -180,7 +183,7 @@ def check_gathering(rank: int) -> None:
     assert (halving.done, halving.calls) == (True, 1)
     own = torch.arange(0, N, 2)[:22] if rank == 0 else torch.arange(0, N, 2)[22:]
     assert torch.equal(state.densification["grad2d"], own)
-    for name, value in state.field.items():
+    for name, value in state.gaussians.items():
         assert torch.equal(value, gaussians()[name][own]), name
         moments = state.optimizers[name].state[value]
         assert torch.equal(moments["exp_avg"].flatten(1)[:, 0].long(), own)
@@ -192,22 +195,22 @@ def check_gathering(rank: int) -> None:
         assert first == again == (rank == 0)
         assert model.source.total == (45 if first else 23)
         if first:
-            assert torch.equal(state.field["means"], gaussians()["means"][::2])
+            assert torch.equal(state.gaussians["means"], gaussians()["means"][::2])
 
 
 def check_an_empty_shard(rank: int) -> None:
     """Fewer Gaussians than ranks: a rank without any renders those of the other, and takes a step."""
-    alone = LocalField(field_of(gaussians()))
+    alone = GaussianSource(gaussians_of(gaussians()))
     seen = int(draw(alone, camera(0)).radii.argmax())
-    state = state_of(field_of(gaussians(), seen, seen + 1))
+    state = state_of(gaussians_of(gaussians(), seen, seen + 1))
     _, model = shared(rank, state)
     assert model.source.sizes == [0, 1]
-    shown, expected = draw(model.source, camera(0)), LocalField(field_of(gaussians(), seen, seen + 1))
+    shown, expected = draw(model.source, camera(0)), GaussianSource(gaussians_of(gaussians(), seen, seen + 1))
     loss_of(shown, 0).backward()
     loss_of(draw(expected, camera(0)), 0).backward()
-    for name, value in state.field.items():
+    for name, value in state.gaussians.items():
         if rank == 1:  # both ranks have the same image, so the mean is that of one
-            torch.testing.assert_close(value.grad, expected.field[name].grad, rtol=1e-10, atol=1e-14)
+            torch.testing.assert_close(value.grad, expected.gaussians[name].grad, rtol=1e-10, atol=1e-14)
         state.optimizers[name].step()
 
 

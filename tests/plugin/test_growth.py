@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.core.gaussians import Field, sh_to_rgb
+from sundae_ns.core.gaussians import Gaussians, sh_to_rgb
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.pruning.decision import decide
 
@@ -18,7 +18,7 @@ Build = Callable[..., SundaeModel]
 TrainingOf = Callable[[SundaeModel], Any]
 
 N = 60
-"""Primitives of a model that is built without a count."""
+"""Gaussians of a model that is built without a count."""
 
 
 @pytest.mark.parametrize("head_start", [None, 2])
@@ -32,8 +32,8 @@ def test_continuous_pruning_and_densification_share_a_field(
             "start": 4,
             "stop": 12,
             "every": 4,
-            "target_primitives": 40,
-            "max_primitives": 70,
+            "target_gaussians": 40,
+            "max_gaussians": 70,
         },
         warmup_length=0,
         refine_every=3,
@@ -42,7 +42,7 @@ def test_continuous_pruning_and_densification_share_a_field(
         stop_split_at=14,
     )
     training = training_of(model)
-    training.extensions["densification"].strategy.pause_refine_after_reset = 0
+    training.train_callbacks["densification"].strategy.pause_refine_after_reset = 0
     counts = []
     for step in range(15):
         training.step(step)
@@ -72,7 +72,7 @@ def test_continuous_pruning_merges_and_leaves_adam_in_order(
         **densified,
     )
     training = training_of(model)
-    training.extensions["densification"].strategy.pause_refine_after_reset = 0
+    training.train_callbacks["densification"].strategy.pause_refine_after_reset = 0
     for step in range(13):
         training.step(step)
         assert training.live() or step < 4
@@ -94,7 +94,7 @@ def test_nothing_grows_after_the_prune(build: Build, training_of: TrainingOf, pr
     grows = {"warmup_length": 0, "refine_every": 3, "reset_alpha_every": 100, "densify_grad_thresh": 1e-9}
     model = build(pruning={"prune_at": prune_at}, stop_split_at=14, **grows)
     training, counts = training_of(model), []
-    training.extensions["densification"].strategy.pause_refine_after_reset = 0
+    training.train_callbacks["densification"].strategy.pause_refine_after_reset = 0
     for step in range(11):
         training.step(step)
         counts.append(model.num_points)
@@ -109,8 +109,10 @@ def test_a_prune_merges_colours(build: Build, training_of: TrainingOf, datamanag
     training = training_of(model)
     with torch.no_grad():
         model.gauss_params["features_dc"].mul_(4)
-    assert model.state.field.encoding == "logits"
-    harmonics = Field({name: value.detach().clone() for name, value in model.state.field.as_harmonics().items()})
+    assert model.state.gaussians.encoding == "logits"
+    harmonics = Gaussians(
+        {name: value.detach().clone() for name, value in model.state.gaussians.as_harmonics().items()}
+    )
     count = model.num_points // 2
     expected = decide(harmonics, model.config.pruning, count, model.contribution(datamanager, count)).values
     assert expected is not None

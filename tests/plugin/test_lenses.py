@@ -20,7 +20,7 @@ from PIL import Image
 from sundae_ns.core.errors import DataError
 from sundae_ns.data.lenses import COLMAP_LENSES, lens_of
 from sundae_ns.plugin.camera_models import check_projection
-from sundae_ns.scene.cameras import views_of
+from sundae_ns.scene.cameras import cameras_of
 
 Load = Callable[..., Any]
 Edit = Callable[..., None]
@@ -69,7 +69,7 @@ def test_other_projections_are_refused(
     assert model in str(caught.value)
     assert "\n" not in str(caught.value)
     with pytest.raises(DataError, match=help_):
-        views_of(capture)
+        cameras_of(capture)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in CameraType if kind != CameraType.PERSPECTIVE])
@@ -270,7 +270,7 @@ def test_an_angle_of_view_gives_the_focal_length(capture: Path, load: Load, edit
     cameras = load(capture).train_dataset.cameras
     assert float(cameras.fx[0]) == float(cameras.fy[0]) == pytest.approx(known["fl_x"], rel=1e-6)
     assert (float(cameras.cx[0]), float(cameras.cy[0]), int(cameras.width[0])) == (12.0, 12.0, 24)
-    assert views_of(capture)[0].K[0, 0] == pytest.approx(known["fl_x"], rel=1e-6)
+    assert cameras_of(capture)[0].K[0, 0] == pytest.approx(known["fl_x"], rel=1e-6)
     edit(capture, camera_angle_y=2 * math.atan(12 / 30))
     assert float(load(capture).train_dataset.cameras.fy[0]) == pytest.approx(30.0, rel=1e-6)
     edit(capture, camera_angle_x=50.0)

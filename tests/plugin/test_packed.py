@@ -36,7 +36,7 @@ from sundae_ns.scene.packing import contents_of, scene_of
 Json = dict[str, Any]
 
 
-def field(degree: int = 1, features: int = 5) -> dict[str, Tensor]:
+def gaussians(degree: int = 1, features: int = 5) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(60, 3, generator=generator) - 0.5
     made = from_points(points, points + 0.5, sh_degree=degree, num_features=features, generator=generator)
@@ -78,15 +78,15 @@ def meta() -> Json:
 
 
 def scene() -> PackedScene:
-    return PackedScene(field(), head(), cameras(), meta())
+    return PackedScene(gaussians(), head(), cameras(), meta())
 
 
 def test_a_packed_scene_becomes_a_model() -> None:
     truth = scene()
     model = model_of(scene_of(truth))
     found = {name: value.detach() for name, value in model.gauss_params.items()}
-    assert torch.equal(found.pop("features_rest")[:, :3], truth.field["features_rest"])
-    assert all(torch.equal(value, truth.field[name]) for name, value in found.items())
+    assert torch.equal(found.pop("features_rest")[:, :3], truth.gaussians["features_rest"])
+    assert all(torch.equal(value, truth.gaussians[name]) for name, value in found.items())
     assert model.head is not None
     assert all(torch.equal(value, truth.head[name]) for name, value in model.head.state_dict().items())
     assert model.state.head_enabled
@@ -140,7 +140,7 @@ def merged(base: Json, changes: Json) -> Json:
 def test_headers_that_lie_are_refused(lie: str) -> None:
     stated = merged(meta(), LIES[lie])
     with pytest.raises(PackError):
-        scene_of(PackedScene(field(), head(), cameras(), stated))
+        scene_of(PackedScene(gaussians(), head(), cameras(), stated))
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path
     config = copy.deepcopy(all_methods[method])
     for name, value in model.items():
         setattr(config.pipeline.model, name, value)
-    truth = field(degree=2, features=0 if method == "splatfacto" else 5)
+    truth = gaussians(degree=2, features=0 if method == "splatfacto" else 5)
     state: Json = {f"gauss_params.{name}": value for name, value in truth.items()}
     state["device_indicator_param"] = torch.zeros(0)
     if method != "splatfacto":
@@ -247,8 +247,8 @@ def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path
 def test_a_packed_run_holds_what_its_images_need(tmp_path: Path) -> None:
     run, truth = run_folder(tmp_path / "run", "sundae-tiny", 1100)
     found = contents_of(load_run(run, max_cameras=0))
-    assert set(found.field) == set(truth)
-    assert all(torch.equal(found.field[name], truth[name]) for name in truth)
+    assert set(found.gaussians) == set(truth)
+    assert all(torch.equal(found.gaussians[name], truth[name]) for name in truth)
     assert found.head
     assert found.cameras is None
     assert found.meta["source"] == {"method": "sundae-tiny", "step": 1100}
@@ -262,8 +262,8 @@ def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path: Path) ->
     run, truth = run_folder(tmp_path / "run", "sundae-tiny", 30, sh_degree_interval=20)
     found = contents_of(load_run(run, max_cameras=0))
     assert found.head == {}
-    assert "features" not in found.field
-    assert torch.equal(found.field["features_rest"], truth["features_rest"][:, :3])
+    assert "features" not in found.gaussians
+    assert torch.equal(found.gaussians["features_rest"], truth["features_rest"][:, :3])
     assert model_of(scene_of(found)).config.sh_degree == 1
 
 
@@ -271,7 +271,7 @@ def test_a_run_of_splatfacto(tmp_path: Path) -> None:
     run, truth = run_folder(tmp_path / "run", "splatfacto", 29999, sh_degree=2, rasterize_mode="antialiased")
     found = contents_of(load_run(run, max_cameras=0))
     assert found.head == {}
-    assert all(torch.equal(found.field[name], truth[name]) for name in truth)
+    assert all(torch.equal(found.gaussians[name], truth[name]) for name in truth)
     assert found.meta["model"]["rasterize_mode"] == "antialiased"
 
 

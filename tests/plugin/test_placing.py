@@ -20,7 +20,7 @@ from sundae_ns.core.errors import DataError
 from sundae_ns.plugin.camera_models import other_frame
 from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanagerConfig
 from sundae_ns.plugin.finished_runs import datamanager_of, describe_capture
-from sundae_ns.scene.cameras import views_of
+from sundae_ns.scene.cameras import cameras_of
 from sundae_ns.scene.scene import Scene
 
 Load = Callable[..., Any]
@@ -141,7 +141,7 @@ def test_a_run_that_is_resumed_in_other_coordinates_is_named(
 def test_cameras_of_a_capture_in_the_coordinates_of_a_run(
     capture: Path, load: Load, edit: Edit, tmp_path: Path, times: float, offset: np.ndarray
 ) -> None:
-    """``views_of`` finds them by the transform that the run states."""
+    """``cameras_of`` finds them by the transform that the run states."""
     if times > 1:
         stray(capture, times, edit)
     moved(capture, offset, edit)
@@ -151,7 +151,7 @@ def test_cameras_of_a_capture_in_the_coordinates_of_a_run(
     points = torch.zeros(3, 3)
     scene = Scene.from_points(points, points)
     scene = replace(scene, in_model_frame=True, meta={"frame": json.loads(json.dumps(frame))})
-    seen = {tuple(view.center.tolist()) for view in views_of(capture, scene)}
+    seen = {tuple(camera.center.tolist()) for camera in cameras_of(capture, scene)}
     nearest = torch.cdist(made.train_dataset.cameras.camera_to_worlds[:, :, 3], torch.tensor(sorted(seen)))
     limit = 1e-5 * max(1.0, float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].abs().max()))
     assert float(nearest.min(dim=1).values.max()) < limit
@@ -183,7 +183,7 @@ def test_a_scale_in_the_rotations_is_none_of_the_cameras(
     edit(capture, frames=frames)
     found, expected = (load(data).train_dataset.cameras.camera_to_worlds for data in (capture, still_life))
     torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
-    torch.testing.assert_close(views_of(capture)[2].viewmat, views_of(still_life)[2].viewmat, atol=1e-6, rtol=0)
+    torch.testing.assert_close(cameras_of(capture)[2].viewmat, cameras_of(still_life)[2].viewmat, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("change", [{(0, 0): 2.0}, {(0, 1): 0.5}], ids=["stretched", "sheared"])

@@ -25,10 +25,10 @@ from sundae_ns.head.head import HeadConfig
 from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.plugin.viewer import RuleName, ViewerControls, previewed_rule
-from sundae_ns.pruning.decision import FieldPruner
+from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import response
-from sundae_ns.scene.render import LocalField, render_view
+from sundae_ns.scene.render import GaussianSource, render_view
 from sundae_ns.train.curve import CurvePoint, expected_change
 from sundae_ns.train.pruning import PruningConfig, PruningSchedule
 
@@ -77,10 +77,10 @@ def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:
         for value in model.head.parameters():
             value += 0.05 * torch.randn(value.shape, generator=generator)
     model.step = 10
-    views = Views()
-    pipeline = SimpleNamespace(model=model, datamanager=views)
+    cameras = Views()
+    pipeline = SimpleNamespace(model=model, datamanager=cameras)
     model.viewer_controls.control._setup(SimpleNamespace(pipeline=pipeline, viser_server=None))  # type: ignore[arg-type]
-    return model.eval(), views
+    return model.eval(), cameras
 
 
 def as_the_viewer(call: Callable[[], Any]) -> Any:
@@ -129,9 +129,9 @@ def test_the_slider_tells_what_fewer_primitives_lose() -> None:
     model, _ = build()
     controls = ViewerControls(model.state, model.config.pruning, model.contribution, lambda: points)
     for share, text in (
-        (1.0, f"{N:,} primitives: +0.00 dB, SSIM +0.0000"),
-        (1 / 3, f"{N // 3} primitives: -0.60 dB, SSIM -0.0150"),
-        (0.1, f"{N // 10} primitives"),  # nobody has tried so few
+        (1.0, f"{N:,} Gaussians: +0.00 dB, SSIM +0.0000"),
+        (1 / 3, f"{N // 3} Gaussians: -0.60 dB, SSIM -0.0150"),
+        (0.1, f"{N // 10} Gaussians"),  # nobody has tried so few
     ):
         controls.keep_ratio.value = share
         controls._show_expected(controls.keep_ratio)
@@ -164,7 +164,7 @@ PRUNES: list[dict[str, Any]] = [
 @torch.no_grad()
 @pytest.mark.parametrize("options", PRUNES, ids=lambda options: options.get("score", "default"))
 def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None:
-    model, views = build(**options)
+    model, cameras = build(**options)
     model.viewer_controls.keep_ratio.value = 0.2
     preview = as_the_viewer(model.viewer_controls.preview)
     seen = as_the_viewer(lambda: picture(model))
@@ -172,23 +172,23 @@ def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None
     optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in model.gauss_params.items()}
     schedule = PruningSchedule(model.config.pruning)
     report = schedule.after_step(
-        FieldPruner(model.state.field, optimizers),
+        Pruner(model.state.gaussians, optimizers),
         schedule.initialize_state(),
         model.config.pruning.prune_at,
-        lambda count: model.contribution(views, count),  # type: ignore[arg-type]
+        lambda count: model.contribution(cameras, count),  # type: ignore[arg-type]
     )
     assert report is not None
     assert report.after == int(preview.decision.mask.sum()) == 18
-    assert all(torch.equal(value, preview.field[name]) for name, value in model.state.field.items())
+    assert all(torch.equal(value, preview.gaussians[name]) for name, value in model.state.gaussians.items())
     # A merge and growth show in the picture too.
     settings = model.render_settings(training=False).without_head()
-    left, _ = render_view(model.source, model.view_of(camera()), seen["background"][0, 0], settings)
+    left, _ = render_view(model.source, model.camera_of(camera()), seen["background"][0, 0], settings)
     assert torch.equal(seen["rgb"], left["rgb"])
 
 
 def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
     model, _ = build()
-    known = response(model.state.field, previewed_rule(model.config.pruning, "band: both"))
+    known = response(model.state.gaussians, previewed_rule(model.config.pruning, "band: both"))
     masks = {rule: shown(model, rule, 0.2) for rule in RULES}
     high, low, both = (masks[rule] for rule in ("band: high", "band: low", "band: both"))
     assert high is not None
@@ -201,7 +201,7 @@ def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
     # The share of the slider counts, whatever budget the run had.
     for options in (
         {"keep_ratio": None, "max_bytes": 900},
-        {"mode": "continuous", "target_primitives": 7, "start": 20000},
+        {"mode": "continuous", "target_gaussians": 7, "start": 20000},
     ):
         busy, _ = build(**{"stop": 20000, **options})
         mask = shown(busy, "as configured", 0.2)
@@ -220,7 +220,7 @@ def test_a_crop_box_cuts_the_preview_too() -> None:
     assert 0 < int(rows.sum()) < len(rows)
     settings = model.render_settings(training=False).without_head()
     expected, _ = render_view(
-        LocalField(preview.field.rows(rows)), model.view_of(camera()), seen["background"][0, 0], settings
+        GaussianSource(preview.gaussians.rows(rows)), model.camera_of(camera()), seen["background"][0, 0], settings
     )
     assert torch.equal(seen["rgb"], expected["rgb"])
 
@@ -229,13 +229,13 @@ def test_a_crop_box_cuts_the_preview_too() -> None:
 @pytest.mark.parametrize("rule", RULES)
 def test_only_the_viewer_sees_the_preview_and_only_while_it_is_on(rule: RuleName) -> None:
     """On, it shows base colours; it changes neither the model nor what training and evaluation see."""
-    model, views = build()
+    model, cameras = build()
     controls, before = model.viewer_controls, picture(model)
     state = {name: value.clone() for name, value in model.state_dict().items() if isinstance(value, Tensor)}
     versions = [value._version for value in model.parameters()]
     controls.rule.value = rule
     assert same(as_the_viewer(lambda: picture(model)), before)
-    assert views.asked == 0
+    assert cameras.asked == 0
     controls.keep_ratio.value = 0.3
     seen = as_the_viewer(lambda: picture(model))
     assert torch.equal(seen["rgb"], seen["base_rgb"])
@@ -258,29 +258,29 @@ def test_only_the_viewer_sees_the_preview_and_only_while_it_is_on(rule: RuleName
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Sizes of the fields whose graph was built, by the preview or by a decision."""
     seen: list[int] = []
-    original = sundae_ns.plugin.viewer.field_graph
+    original = sundae_ns.plugin.viewer.gaussian_graph
 
     def counted(params: Any, rule: PruneRule) -> Any:
         seen.append(len(params["means"]))
         return original(params, rule)
 
-    monkeypatch.setattr(sundae_ns.plugin.viewer, "field_graph", counted)
-    monkeypatch.setattr(sundae_ns.pruning.decision, "field_graph", counted)
+    monkeypatch.setattr(sundae_ns.plugin.viewer, "gaussian_graph", counted)
+    monkeypatch.setattr(sundae_ns.pruning.decision, "gaussian_graph", counted)
     return seen
 
 
 def test_graph_and_views_are_used_once_a_field(calls: list[int]) -> None:
-    model, views = build()
+    model, cameras = build()
     for rule in RULES:
         for keep_ratio in (0.1, 0.2, 0.3):
             shown(model, rule, keep_ratio)
     # One graph with the configured edges and one with the paper's; the detail that counts depends on the share.
     assert calls == [N, N]
-    assert views.asked == 3
+    assert cameras.asked == 3
 
 
 def test_a_changed_field_is_scored_anew(calls: list[int]) -> None:
-    model, views = build()
+    model, cameras = build()
     first = shown(model, "band: high", 0.2)
     with torch.no_grad():
         model.means[:45] *= 3  # the same tensor, other values
@@ -295,16 +295,16 @@ def test_a_changed_field_is_scored_anew(calls: list[int]) -> None:
     assert third is not None
     assert third.shape == (70,)
     assert calls == [N, N, 70]
-    assert views.asked == 1
+    assert cameras.asked == 1
 
 
 def test_a_prune_in_training_is_seen_and_a_step_is_not(calls: list[int]) -> None:
-    model, views = build()
+    model, cameras = build()
     model.step = 0
     groups = model.get_param_groups()
     configs = {name: {"optimizer": FusedAdamConfig(lr=5e-3), "scheduler": None} for name in groups}
     optimizers = Optimizers(configs, groups)
-    pipeline = SimpleNamespace(datamanager=views, model=model)
+    pipeline = SimpleNamespace(datamanager=cameras, model=model)
     callbacks = model.get_training_callbacks(
         TrainingCallbackAttributes(optimizers, None, pipeline, None)  # type: ignore[arg-type]
     )

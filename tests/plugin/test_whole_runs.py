@@ -65,7 +65,7 @@ def configured(folder: Path, name: str) -> SundaeTrainerConfig:
 def frozen(folder: Path, name: str) -> SundaeTrainerConfig:
     """One batch at rates of 0 from the saved warm-up, and a prune: any number of ranks prunes the same field.
 
-    Half of each image is masked; a prune that ignores the masks keeps other primitives.
+    Half of each image is masked; a prune that ignores the masks keeps other Gaussians.
     """
     config = configured(folder, name)
     config.max_num_iterations = RANKS
@@ -125,7 +125,7 @@ def check_frozen(rank: int, folder: Path) -> None:
 
 
 def check_few(rank: int, folder: Path) -> None:
-    """A field of one primitive trains, is saved and resumed, with nothing on one rank."""
+    """A field of one Gaussian trains, is saved and resumed, with nothing on one rank."""
     config = frozen(folder, "few")
     model: Any = config.pipeline.model
     model.pruning.keep_ratio = 1e-6
@@ -241,7 +241,7 @@ def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
 
 
 def test_the_prune_is_that_of_one_process(folder: Path) -> None:
-    """The same primitives of the same field stay, with the same values."""
+    """The same Gaussians of the same field stay, with the same values."""
     one = train(frozen(folder, "one"), 0, 1)
     two = checkpoint.read(models(folder, "two") / f"step-{RANKS - 1:09d}.ckpt")["pipeline"]
     for name, value in one.pipeline.model.gauss_params.items():

@@ -11,16 +11,16 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from prunes import PAPER, decide_share, field
+from prunes import PAPER, decide_share, gaussians
 from torch import Tensor
 from torch.nn import Parameter
 
 import sundae_ns.pruning.decision
 from sundae_ns.core.covariance import covariances, quaternions, rotation_matrices
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError
-from sundae_ns.core.gaussians import Field, mend
-from sundae_ns.pruning.decision import Decision, FieldPruner, decide, prune_field
-from sundae_ns.pruning.merge import field_graph, voronoi_labels
+from sundae_ns.core.gaussians import Gaussians, sanitise
+from sundae_ns.pruning.decision import Decision, Pruner, decide, prune_gaussians
+from sundae_ns.pruning.merge import gaussian_graph, voronoi_labels
 from sundae_ns.pruning.rule import PruneRule, band_rule, kept_count
 from sundae_ns.pruning.scores import response
 from sundae_ns.train.pruning import PruningConfig
@@ -49,7 +49,7 @@ def cloud(n: int = 600, dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 def of(means: Tensor, seed: int = 0) -> dict[str, Tensor]:
-    return field(means=means, seed=seed)
+    return gaussians(means=means, seed=seed)
 
 
 def decided(params: dict[str, Tensor], config: PruneRule, share: float = SHARE) -> Decision:
@@ -60,7 +60,7 @@ def decided(params: dict[str, Tensor], config: PruneRule, share: float = SHARE) 
     again = decide_share(params, config, share, contribution)
     assert torch.equal(again.mask, decision.mask)
     unmerged = config.redistribution == "none" or bool(decision.mask.all())
-    assert (decision.values is None) == (unmerged and not mend(params).clamped)
+    assert (decision.values is None) == (unmerged and not sanitise(params).clamped)
     if decision.values is not None and again.values is not None:
         for name, value in decision.values.items():
             assert value.shape == (decision.kept, *params[name].shape[1:])
@@ -75,14 +75,14 @@ def kept(params: dict[str, Tensor], config: PruneRule, share: float = SHARE) -> 
 
 
 def scaled(params: dict[str, Tensor], scale: float, config: PruneRule) -> dict[str, Tensor]:
-    """The field at another scale; primitives are scaled too if the rule uses their overlap."""
+    """The field at another scale; Gaussians are scaled too if the rule uses their overlap."""
     if config.edges == "centres":
         return {**params, "means": params["means"] * scale}
     return {**params, "means": params["means"] * scale, "scales": params["scales"] + math.log(scale)}
 
 
 def rotated(params: dict[str, Tensor], rotation: Tensor) -> dict[str, Tensor]:
-    """The field and its primitives, rotated."""
+    """The field and its Gaussians, rotated."""
     quats = quaternions(rotation @ rotation_matrices(params["quats"]))
     return {**params, "means": params["means"] @ rotation.T, "quats": quats}
 
@@ -194,7 +194,7 @@ def test_a_primitive_of_extreme_colour_has_an_heir() -> None:
     params, wild = of(means), int(means.norm(dim=1).argmin())
     params["features_dc"][:] = 0
     params["features_dc"][wild] = 1e6
-    graph = field_graph(params, DEFAULT)
+    graph = gaussian_graph(params, DEFAULT)
     assert not graph.isolated[wild]
     mask = torch.arange(2000) % 10 == (wild + 1) % 10
     assert int(voronoi_labels(graph, mask)[wild]) >= 0
@@ -267,13 +267,13 @@ def test_any_cells_at_any_scale(
     [
         {"keep_ratio": None, "max_drop": 0.2, "stop": 15000, "start": 30000},
         {"keep_ratio": None, "max_bytes": 1000},
-        {"mode": "continuous", "target_primitives": 10, "max_primitives": 20},
+        {"mode": "continuous", "target_gaussians": 10, "max_gaussians": 20},
         {"mode": "off"},
     ],
 )
 def test_the_schedule_that_comes_with_a_rule_is_ignored(options: dict[str, Any]) -> None:
-    expected = decide_share(field(), PruneRule(), 0.25, torch.ones(60)).mask
-    assert torch.equal(decide_share(field(), PruningConfig(**options), 0.25, torch.ones(60)).mask, expected)
+    expected = decide_share(gaussians(), PruneRule(), 0.25, torch.ones(60)).mask
+    assert torch.equal(decide_share(gaussians(), PruningConfig(**options), 0.25, torch.ones(60)).mask, expected)
 
 
 def test_the_band_rule_is_the_papers() -> None:
@@ -286,18 +286,18 @@ def test_the_band_rule_is_the_papers() -> None:
         edges="centres",
         redistribution="none",
     )
-    found = decide_share(field(), band_rule(PruneRule(signal="positions", num_neighbors=7, seed=3), 0.7), 0.2)
-    assert torch.equal(found.mask, decide_share(field(), paper, 0.2).mask)
+    found = decide_share(gaussians(), band_rule(PruneRule(signal="positions", num_neighbors=7, seed=3), 0.7), 0.2)
+    assert torch.equal(found.mask, decide_share(gaussians(), paper, 0.2).mask)
     assert found.values is None
 
 
 @pytest.mark.parametrize("options", [{}, {"score": "response", "selection": "band", "redistribution": "none"}])
 def test_a_given_graph_is_used_and_changes_nothing(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    params, rule, weights = field(), PruneRule(**options), torch.ones(60)
+    params, rule, weights = gaussians(), PruneRule(**options), torch.ones(60)
     params["opacities"][4] = torch.nan
     usable = {name: value[torch.arange(60) != 4] for name, value in params.items()}
-    expected, graph = decide_share(params, rule, 0.3, weights), field_graph(usable, rule)
-    monkeypatch.delattr(sundae_ns.pruning.decision, "field_graph")
+    expected, graph = decide_share(params, rule, 0.3, weights), gaussian_graph(usable, rule)
+    monkeypatch.delattr(sundae_ns.pruning.decision, "gaussian_graph")
     found = decide_share(params, rule, 0.3, weights, graph)
     assert torch.equal(found.mask, expected.mask)
     for name, value in (expected.values or {}).items():
@@ -308,7 +308,7 @@ def test_a_given_graph_is_used_and_changes_nothing(options: dict[str, Any], monk
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
 def test_primitives_that_are_not_finite_are_dropped_and_do_not_count(value: float) -> None:
-    params = field()
+    params = gaussians()
     params["features_rest"][7, 1, 2] = value
     params["means"][8] = value
     contribution = torch.ones(60)
@@ -324,40 +324,44 @@ def test_primitives_that_are_not_finite_are_dropped_and_do_not_count(value: floa
 def test_a_contribution_is_needed_only_by_rules_that_use_it() -> None:
     for rule in (PAPER, RULES["a function"]):
         assert not rule.uses_contribution
-        decide_share(field(), rule)
+        decide_share(gaussians(), rule)
     assert DEFAULT.uses_contribution
-    decide_share(field(), DEFAULT, 1.0)
+    decide_share(gaussians(), DEFAULT, 1.0)
 
 
 @pytest.mark.parametrize("rule", [DEFAULT, PAPER], ids=["merged", "plain"])
 def test_prune_leaves_what_the_decision_says_and_the_field_alone(rule: PruneRule) -> None:
-    params = field()
+    params = gaussians()
     params["means"][8] = torch.nan
-    before = Field({name: value.clone() for name, value in params.items()}, "logits")
-    found = prune_field(Field(params, "logits"), rule, 12, torch.ones(60))
+    before = Gaussians({name: value.clone() for name, value in params.items()}, "logits")
+    found = prune_gaussians(Gaussians(params, "logits"), rule, 12, torch.ones(60))
     decision = decide(before, rule, 12, torch.ones(60))
     assert torch.equal(found.decision.mask, decision.mask)
-    assert found.field.encoding == "logits"
-    assert found.field.num_primitives == decision.kept == 12
+    assert found.gaussians.encoding == "logits"
+    assert found.gaussians.num_gaussians == decision.kept == 12
     assert found.decision.dropped_nonfinite == 1
     assert (decision.values is None) == (rule.redistribution == "none")
     for name, value in params.items():
         expected = (decision.values or {}).get(name, before[name][decision.mask])
-        assert torch.equal(found.field[name], expected), name
+        assert torch.equal(found.gaussians[name], expected), name
         assert torch.equal(value.nan_to_num(), before[name].nan_to_num()), name
-        assert value.data_ptr() != found.field[name].data_ptr()
+        assert value.data_ptr() != found.gaussians[name].data_ptr()
 
 
 def test_invalid_input_raises_one_line() -> None:
     ones = torch.ones(60)
     cases: list[tuple[type[Exception], str, Any]] = [
-        (DataError, "none of 60", lambda: decide_share({k: v * torch.nan for k, v in field().items()}, PAPER)),
-        (ConfigError, "training views", lambda: decide_share(field(), PruneRule())),
-        (DataError, r"shape \[59\] for 60", lambda: decide_share(field(), PruneRule(), 0.1, torch.ones(59))),
-        (ConfigError, "keep_ratio", lambda: decide_share(field(), PruneRule(), 0.0)),
-        (ConfigError, "gamma", lambda: decide_share(field(), PruneRule(gamma=2.0))),
+        (DataError, "none of 60", lambda: decide_share({k: v * torch.nan for k, v in gaussians().items()}, PAPER)),
+        (ConfigError, "training views", lambda: decide_share(gaussians(), PruneRule())),
+        (DataError, r"shape \[59\] for 60", lambda: decide_share(gaussians(), PruneRule(), 0.1, torch.ones(59))),
+        (ConfigError, "keep_ratio", lambda: decide_share(gaussians(), PruneRule(), 0.0)),
+        (ConfigError, "gamma", lambda: decide_share(gaussians(), PruneRule(gamma=2.0))),
         (ConfigError, "score is 'opacity': use one of detail-c", lambda: PruneRule(score="opacity").validate()),
-        (DataError, r"score has shape \[3\] for 60", lambda: decide(field(), PruneRule(score=lambda _: ones[:3]), 6)),
+        (
+            DataError,
+            r"score has shape \[3\] for 60",
+            lambda: decide(gaussians(), PruneRule(score=lambda _: ones[:3]), 6),
+        ),
         (ConfigError, "num_neighbors is 0: use at least 1", lambda: PruneRule(num_neighbors=0).validate()),
     ]
     for error, message, call in cases:
@@ -370,11 +374,11 @@ def test_invalid_input_raises_one_line() -> None:
 @pytest.mark.parametrize("bad", [[], [3], [0, 5, 19], [*range(19)], [*range(20)]])
 def test_a_field_in_training_loses_what_is_not_finite(bad: list[int]) -> None:
     removed = len(bad)
-    params, statistics = {name: Parameter(value) for name, value in field(20).items()}, {"count": torch.arange(20)}
+    params, statistics = {name: Parameter(value) for name, value in gaussians(20).items()}, {"count": torch.arange(20)}
     params["opacities"].data[bad] = torch.nan
-    pruner = FieldPruner(params, {}, [statistics])
+    pruner = Pruner(params, {}, [statistics])
     if removed == 20:
-        with pytest.raises(DataError, match="none of 20 primitives is finite"):
+        with pytest.raises(DataError, match="none of 20 Gaussians is finite"):
             pruner.drop_nonfinite()
         assert pruner.total == 20
         return
@@ -384,15 +388,15 @@ def test_a_field_in_training_loses_what_is_not_finite(bad: list[int]) -> None:
 
 
 def test_a_cut_leaves_the_field_that_prune_returns() -> None:
-    params, statistics = {name: Parameter(value) for name, value in field(20).items()}, {"count": torch.arange(20)}
+    params, statistics = {name: Parameter(value) for name, value in gaussians(20).items()}, {"count": torch.arange(20)}
     rule, weights = PruneRule(score=opacity, num_neighbors=5), torch.linspace(1, 2, 20)
-    expected = prune_field(field(20), rule, 10, weights)
-    decision = FieldPruner(params, {}, [statistics]).cut(rule, 10, weights)
+    expected = prune_gaussians(gaussians(20), rule, 10, weights)
+    decision = Pruner(params, {}, [statistics]).cut(rule, 10, weights)
     assert decision.kept == len(params["means"]) == 10
     assert torch.equal(decision.mask, expected.decision.mask)
     assert torch.equal(statistics["count"], decision.mask.nonzero().squeeze(1))
-    assert all(torch.equal(params[name], value) for name, value in expected.field.items())
-    assert not torch.equal(params["means"], field(20)["means"][decision.mask])
+    assert all(torch.equal(params[name], value) for name, value in expected.gaussians.items())
+    assert not torch.equal(params["means"], gaussians(20)["means"][decision.mask])
 
 
 @pytest.mark.gpu
@@ -405,10 +409,10 @@ def test_cpu_and_gpu_select_the_same_up_to_ties(rule: PruneRule, name: str) -> N
     on_device = {key: value.cuda() for key, value in params.items()}
     on_gpu = decide_share(on_device, rule, SHARE, contribution.cuda())
     differing = on_gpu.mask.cpu() != on_cpu.mask
-    print(f"{name}: {int(differing.sum())} of {n} primitives differ")
+    print(f"{name}: {int(differing.sum())} of {n} Gaussians differ")
     assert on_gpu.kept == on_cpu.kept
     if rule.score == "response":
-        # Responses agree up to rounding, so only primitives within rounding of a threshold may differ.
+        # Responses agree up to rounding, so only Gaussians within rounding of a threshold may differ.
         expected, found = response(params, rule), response(on_device, rule).cpu()
         largest = float(expected.nan_to_num().max())
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-6 * largest, equal_nan=True)

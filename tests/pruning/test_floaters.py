@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from sundae_ns.pruning.decision import FieldPruner
+from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.floaters import FREE, near_cameras
 
 
@@ -64,6 +64,6 @@ def test_without_points_or_cameras_nothing_floats() -> None:
 def test_more_floaters_than_there_can_be_stay(rows: int, removed: int) -> None:
     params, counts = {"means": Parameter(torch.arange(300.0).reshape(100, 3))}, {"count": torch.arange(100)}
     mask = torch.arange(100) < rows
-    assert FieldPruner(params, {}, [counts]).drop(mask, at_most=0.05) == removed
+    assert Pruner(params, {}, [counts]).drop(mask, at_most=0.05) == removed
     assert len(params["means"]) == len(counts["count"]) == 100 - removed
     assert params["means"][0, 0] == 3 * removed

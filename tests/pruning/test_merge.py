@@ -1,4 +1,4 @@
-"""Groups of primitives that one replaces: Voronoi cells along the graph, and pairs; and the values after a merge."""
+"""Groups of Gaussians that one replaces: Voronoi cells along the graph, and pairs; and the values after a merge."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import pytest
 import scipy.sparse as sp
 import torch
 from prunes import decide_share
-from prunes import field as random_field
+from prunes import gaussians as random_field
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.core.gaussians import Field, rgb_to_sh, sh_to_rgb
+from sundae_ns.core.gaussians import Gaussians, rgb_to_sh, sh_to_rgb
 from sundae_ns.graph.graph import NeighborGraph, build_graph
 from sundae_ns.pruning import merge
-from sundae_ns.pruning.decision import prune_field
-from sundae_ns.pruning.merge import field_graph, pair_labels, voronoi_labels
+from sundae_ns.pruning.decision import prune_gaussians
+from sundae_ns.pruning.merge import gaussian_graph, pair_labels, voronoi_labels
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.scene.initialization import from_points
 
 PAIRS = PruneRule(selection="pairs")
 
 
-def field(n: int = 300) -> dict[str, Tensor]:
+def gaussians(n: int = 300) -> dict[str, Tensor]:
     params = random_field(n, features=5)
     return {**params, "scales": params["scales"] * 0.3 - 2}
 
@@ -36,12 +36,12 @@ def weights(n: int = 300) -> Tensor:
 
 
 def test_labels_are_the_nearest_along_the_edges(monkeypatch: pytest.MonkeyPatch) -> None:
-    graph = build_graph(field()["means"].double(), num_neighbors=3)
+    graph = build_graph(gaussians()["means"].double(), num_neighbors=3)
     mask = torch.rand(300, generator=torch.Generator().manual_seed(1)) < 0.05
     found = voronoi_labels(graph, mask)
     rows, lengths = np.repeat(np.arange(300), 3), -graph.weights.log().numpy().ravel()
     edge = graph.weights.numpy().ravel() > 0
-    # Heirs follow edges from dropped primitives; the search from kept ones follows them backwards.
+    # Heirs follow edges from dropped Gaussians; the search from kept ones follows them backwards.
     backwards = sp.csr_matrix((lengths[edge], (graph.indices.numpy().ravel()[edge], rows[edge])), shape=(300, 300))
     kept = mask.nonzero().squeeze(1).numpy()
     distance, _, source = dijkstra(backwards, indices=kept, min_only=True, return_predecessors=True)
@@ -52,7 +52,7 @@ def test_labels_are_the_nearest_along_the_edges(monkeypatch: pytest.MonkeyPatch)
     assert torch.equal(found[reached], expected[reached])
     monkeypatch.setattr(merge, "ROWS", 7)
     assert torch.equal(voronoi_labels(graph, mask), found)
-    # The others follow edges in both directions; primitives in a component without a kept one have no label.
+    # The others follow edges in both directions; Gaussians in a component without a kept one have no label.
     _, component = connected_components(backwards, directed=False)
     joined = torch.from_numpy(np.isin(component, component[kept]))
     assert torch.equal(found >= 0, joined)
@@ -72,7 +72,7 @@ def test_against_edges_the_nearest_wins_and_then_the_lowest_index() -> None:
     graph = NeighborGraph(torch.tensor([[0], [0], [0], [0]]), weights, weights[:, 0], 1.0, 1.0)
     assert voronoi_labels(graph, torch.tensor([False, True, True, True])).tolist() == [2, 1, 2, 3]
     assert voronoi_labels(graph, torch.tensor([False, True, False, False])).tolist() == [1, 1, 1, 1]
-    # A primitive without an edge has no label.
+    # A Gaussian without an edge has no label.
     alone = NeighborGraph(torch.tensor([[1], [0], [2]]), torch.tensor([[1.0], [1.0], [0.0]]), torch.ones(3), 1.0, 1.0)
     assert voronoi_labels(alone, torch.tensor([True, False, False])).tolist() == [0, 0, -1]
 
@@ -88,17 +88,17 @@ def test_a_chain_has_one_label_over_many_hops_and_islands_have_none() -> None:
 
 
 def test_appearance_keeps_labels_on_their_side_of_an_edge() -> None:
-    params = field(400)
+    params = gaussians(400)
     params["means"] = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
     params["scales"] = torch.full((400, 3), 0.5).log()
     left = params["means"][:, 0] < 9.5
     params["features_dc"] = rgb_to_sh(torch.where(left, 0.1, 0.9)[:, None].expand(-1, 3)).clone()
     mask = torch.zeros(400, dtype=torch.bool)
-    # One kept primitive next to the edge on the left, and one far from it on the right.
+    # One kept Gaussian next to the edge on the left, and one far from it on the right.
     mask[[8 * 20 + 10, 19 * 20 + 10]] = True
     wrong = []
     for edges in ("centres", "appearance"):
-        labels = voronoi_labels(field_graph(params, PruneRule(num_neighbors=8, edges=edges)), mask)
+        labels = voronoi_labels(gaussian_graph(params, PruneRule(num_neighbors=8, edges=edges)), mask)
         wrong.append(int((left[labels] != left).sum()))
     assert wrong[0] > 40
     assert wrong[1] == 0
@@ -106,14 +106,14 @@ def test_appearance_keeps_labels_on_their_side_of_an_edge() -> None:
 
 @pytest.mark.parametrize("edges", ["centres", "appearance"])
 def test_a_merge_keeps_the_weighted_sum_of_colours(edges: Any) -> None:
-    params = field()
+    params = gaussians()
     config = PruneRule(edges=edges)
     before = {name: value.clone() for name, value in params.items()}
     decision = decide_share(params, config, 0.1, weights())
     assert all(torch.equal(params[name], before[name]) for name in params)
     assert decision.values is not None
     assert {name: len(value) for name, value in decision.values.items()} == dict.fromkeys(params, 30)
-    labels = voronoi_labels(field_graph(params, config), decision.mask)
+    labels = voronoi_labels(gaussian_graph(params, config), decision.mask)
     total = torch.zeros(300).index_add_(0, labels.clamp_min(0), weights() * (labels >= 0))[decision.mask]
     found = (total[:, None] * decision.values["features_dc"]).sum(dim=0)
     expected = (weights() * (labels >= 0)) @ params["features_dc"]
@@ -127,12 +127,12 @@ def test_a_merge_keeps_the_weighted_sum_of_colours(edges: Any) -> None:
 @pytest.mark.parametrize("rule", [{}, {"score": "response", "edges": "centres"}])
 def test_logits_are_pruned_as_their_colours(rule: dict[str, Any]) -> None:
     """The selection is that of the same field in harmonics, and colours are averaged instead of logits."""
-    logits = field()
+    logits = gaussians()
     logits["features_dc"] *= 4
     harmonics = {**logits, "features_dc": rgb_to_sh(logits["features_dc"].sigmoid())}
     config = PruneRule(**rule)
     found, expected = (
-        decide_share(Field(logits, "logits"), config, 0.3, weights()),
+        decide_share(Gaussians(logits, "logits"), config, 0.3, weights()),
         decide_share(harmonics, config, 0.3, weights()),
     )
     assert torch.equal(found.mask, expected.mask)
@@ -149,14 +149,14 @@ def test_logits_are_pruned_as_their_colours(rule: dict[str, Any]) -> None:
 
 def test_a_merge_without_training_views_is_refused() -> None:
     with pytest.raises(ConfigError, match="training views.* set redistribution to none"):
-        decide_share(field(), PruneRule(score="response"))
+        decide_share(gaussians(), PruneRule(score="response"))
 
 
 @pytest.mark.gpu
 def test_a_merge_on_the_gpu_gives_the_same_values() -> None:
     config = PruneRule()
-    on_cpu = decide_share(field(), config, 0.1, weights())
-    on_gpu = decide_share({name: value.cuda() for name, value in field().items()}, config, 0.1, weights().cuda())
+    on_cpu = decide_share(gaussians(), config, 0.1, weights())
+    on_gpu = decide_share({name: value.cuda() for name, value in gaussians().items()}, config, 0.1, weights().cuda())
     assert torch.equal(on_gpu.mask.cpu(), on_cpu.mask)
     assert on_cpu.values is not None
     assert on_gpu.values is not None
@@ -165,40 +165,40 @@ def test_a_merge_on_the_gpu_gives_the_same_values() -> None:
         torch.testing.assert_close(on_gpu.values[name].cpu(), value, rtol=1e-4, atol=1e-5)
 
 
-def points(n: int = 400, seed: int = 0) -> Field:
+def points(n: int = 400, seed: int = 0) -> Gaussians:
     generator = torch.Generator().manual_seed(seed)
     places, colors = torch.rand(n, 3, generator=generator), torch.rand(n, 3, generator=generator)
-    return Field(from_points(places, colors, sh_degree=1, num_features=0))
+    return Gaussians(from_points(places, colors, sh_degree=1, num_features=0))
 
 
-def graph_of(field: Field) -> NeighborGraph:
-    return field_graph(field, PAIRS)
+def graph_of(gaussians: Gaussians) -> NeighborGraph:
+    return gaussian_graph(gaussians, PAIRS)
 
 
-def row(*places: float, colors: Tensor | None = None) -> Field:
-    """Primitives of width 0.5 along the x axis, grey unless colours are given."""
+def row(*places: float, colors: Tensor | None = None) -> Gaussians:
+    """Gaussians of width 0.5 along the x axis, grey unless colours are given."""
     n = len(places)
     means = torch.zeros(n, 3)
     means[:, 0] = torch.tensor(places)
-    field = Field(
+    gaussians = Gaussians(
         from_points(means, torch.full((n, 3), 0.5) if colors is None else colors, sh_degree=0, num_features=0)
     )
-    field["scales"] = torch.full((n, 3), 0.5).log()
-    return field
+    gaussians["scales"] = torch.full((n, 3), 0.5).log()
+    return gaussians
 
 
 @pytest.mark.parametrize("count", [1, 7, 40, 200, 399])
 def test_a_prune_by_pairs_keeps_the_exact_count(count: int) -> None:
-    field, weight = points(), torch.arange(400.0)
-    pruned = prune_field(field, PAIRS, count, weight)
-    assert pruned.field.num_primitives == int(pruned.decision.mask.sum()) == pruned.decision.kept == count
-    again = prune_field(field, PAIRS, count, weight)
-    assert all(torch.equal(value, again.field[name]) for name, value in pruned.field.items())
+    gaussians, weight = points(), torch.arange(400.0)
+    pruned = prune_gaussians(gaussians, PAIRS, count, weight)
+    assert pruned.gaussians.num_gaussians == int(pruned.decision.mask.sum()) == pruned.decision.kept == count
+    again = prune_gaussians(gaussians, PAIRS, count, weight)
+    assert all(torch.equal(value, again.gaussians[name]) for name, value in pruned.gaussians.items())
 
 
 def test_labels_name_a_member_and_the_unseen_are_dropped() -> None:
-    field, weight = points(), torch.arange(400.0)
-    labels = pair_labels(field, graph_of(field), weight, 40)
+    gaussians, weight = points(), torch.arange(400.0)
+    labels = pair_labels(gaussians, graph_of(gaussians), weight, 40)
     assert (labels[:12] == -1).all()  # together less than a thousandth of all weight
     merged = labels >= 0
     assert (labels[labels[merged]] == labels[merged]).all()
@@ -217,23 +217,23 @@ def test_the_most_alike_pair_merges_first() -> None:
 
 def test_equal_pairs_merge_many_at_once() -> None:
     """All pairs of a chain cost the same; in their own order only the first would be the cheapest of both ends."""
-    field = row(*[0.0] * 256)
+    gaussians = row(*[0.0] * 256)
     first = torch.arange(255)
-    groups = merge._Groups(field, torch.ones(256), torch.device("cpu"))
+    groups = merge._Groups(gaussians, torch.ones(256), torch.device("cpu"))
     chosen = merge._cheapest_of_both((first, first + 1), groups.cost(first, first + 1), 256)
     assert len(chosen) > 50
 
 
 def test_clones_that_share_their_neighbours_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(merge, "MOST_ROUNDS", 3)
-    pruned = prune_field(row(*[0.0] * 256), PAIRS, 64, torch.ones(256))
-    assert pruned.field.num_primitives == 64
+    pruned = prune_gaussians(row(*[0.0] * 256), PAIRS, 64, torch.ones(256))
+    assert pruned.gaussians.num_gaussians == 64
 
 
 def test_of_islands_the_heaviest_stay() -> None:
-    field = row(*(1e6 * island + step for island in range(4) for step in range(20)))
+    gaussians = row(*(1e6 * island + step for island in range(4) for step in range(20)))
     weight = torch.tensor([1.0, 4.0, 2.0, 3.0]).repeat_interleave(20)
-    labels = pair_labels(field, graph_of(field), weight, 2)
+    labels = pair_labels(gaussians, graph_of(gaussians), weight, 2)
     kept = labels[labels >= 0].unique()
     assert (kept // 20).tolist() == [1, 3]
     assert (labels[:20] == -1).all()
@@ -242,27 +242,29 @@ def test_of_islands_the_heaviest_stay() -> None:
 
 @pytest.mark.parametrize("factor", [1e-3, 1e6])
 def test_pairs_do_not_depend_on_the_scale_of_the_scene(factor: float) -> None:
-    field, weight = points(), torch.rand(400, generator=torch.Generator().manual_seed(1))
-    scaled = field.replaced({"means": field["means"] * factor, "scales": field["scales"] + math.log(factor)})
-    masks = [prune_field(each, PAIRS, 40, weight).decision.mask for each in (field, scaled)]
+    gaussians, weight = points(), torch.rand(400, generator=torch.Generator().manual_seed(1))
+    scaled = gaussians.replaced(
+        {"means": gaussians["means"] * factor, "scales": gaussians["scales"] + math.log(factor)}
+    )
+    masks = [prune_gaussians(each, PAIRS, 40, weight).decision.mask for each in (gaussians, scaled)]
     assert (masks[0] == masks[1]).float().mean() > 0.95
 
 
 def test_a_primitive_that_overflows_stops_nothing() -> None:
-    field = points()
-    field["scales"][5] = 400.0
-    assert prune_field(field, PAIRS, 40, torch.ones(400)).field.num_primitives == 40
+    gaussians = points()
+    gaussians["scales"][5] = 400.0
+    assert prune_gaussians(gaussians, PAIRS, 40, torch.ones(400)).gaussians.num_gaussians == 40
 
 
 def test_a_merge_by_pairs_loses_less_than_draws() -> None:
     """By the weighted variance of colours and places within the groups, which images show."""
-    field = points(2000)
-    graph, weight = graph_of(field), torch.ones(2000)
-    values = torch.cat([field["means"], field["features_dc"]], dim=1).double()
+    gaussians = points(2000)
+    graph, weight = graph_of(gaussians), torch.ones(2000)
+    values = torch.cat([gaussians["means"], gaussians["features_dc"]], dim=1).double()
 
     def spread(rule: PruneRule) -> float:
-        pruned = prune_field(field, rule, 200, weight, graph)
-        own = torch.cat([pruned.field["means"], pruned.field["features_dc"]], dim=1).double()
+        pruned = prune_gaussians(gaussians, rule, 200, weight, graph)
+        own = torch.cat([pruned.gaussians["means"], pruned.gaussians["features_dc"]], dim=1).double()
         return float(torch.cdist(values, own).min(dim=1).values.square().mean())
 
     assert spread(PAIRS) < 0.9 * spread(PruneRule())

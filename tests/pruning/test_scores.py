@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from prunes import PAPER, field
+from prunes import PAPER, gaussians
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import rgb_to_sh
@@ -13,7 +13,7 @@ from sundae_ns.pruning.scores import attribute_signal, pixel_detail, response, s
 
 
 def test_scores_by_hand() -> None:
-    params, weights = field(40), torch.arange(40.0).index_fill(0, torch.tensor([7]), torch.nan)
+    params, weights = gaussians(40), torch.arange(40.0).index_fill(0, torch.tensor([7]), torch.nan)
     expected = torch.arange(40.0).double().index_fill(0, torch.tensor([7]), 0)  # NaN counts as 0
     assert torch.equal(score(params, PruneRule(), None, weights), expected)
     magnitude = response(params, PAPER)
@@ -23,18 +23,18 @@ def test_scores_by_hand() -> None:
 
 
 def test_responses_follow_a_permutation_and_need_two_primitives() -> None:
-    params, order = field(600), torch.randperm(600)
+    params, order = gaussians(600), torch.randperm(600)
     shuffled = {key: value[order] for key, value in params.items()}
     for rule in (PruneRule(score="response"), PAPER):
         found, expected = response(shuffled, rule), response(params, rule)[order]
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=0, equal_nan=True)
-    with pytest.raises(DataError, match="1 primitives cannot have 1 neighbours"):
-        response(field(1), PAPER)
+    with pytest.raises(DataError, match="1 Gaussians cannot have 1 neighbours"):
+        response(gaussians(1), PAPER)
 
 
 def test_attribute_response_finds_the_colour_edge() -> None:
     n = 400
-    params = field(n)
+    params = gaussians(n)
     grid = torch.arange(20.0)
     params["means"] = torch.cartesian_prod(grid, grid, torch.zeros(1))
     left = params["means"][:, 0] < 10
@@ -47,7 +47,7 @@ def test_attribute_response_finds_the_colour_edge() -> None:
 
 
 def test_signals_have_no_unit_and_no_dominating_group() -> None:
-    params = field()
+    params = gaussians()
     signal = attribute_signal(params)
     assert signal.shape == (60, 10)
     for group in (slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10)):
@@ -57,7 +57,7 @@ def test_signals_have_no_unit_and_no_dominating_group() -> None:
 
 
 def test_constant_and_almost_constant_attributes_are_finite() -> None:
-    params = field()
+    params = gaussians()
     params["scales"] = torch.full((60, 3), 2.0)
     params["opacities"] = torch.zeros(60, 1)
     params["opacities"][0] = 3.0

@@ -39,7 +39,7 @@ def test_any_scores_keep_the_exact_count(score: Tensor, keep_ratio: float, gamma
         ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 1.0, [2, 4, 6, 7]),
         ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 0.0, [0, 1, 3, 5]),
         ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 0.25, [1, 2, 3, 5]),
-        # Isolated primitives fill neither end.
+        # Isolated Gaussians fill neither end.
         ([math.nan, 3.0, math.nan, 1.0, 2.0, 4.0], 2, 0.5, [3, 5]),
         ([math.nan, 3.0, math.nan, 1.0, 2.0, 4.0], 4, 0.5, [1, 3, 4, 5]),
         ([math.nan, 3.0, math.nan, 1.0, 2.0, 4.0], 5, 0.0, [0, 1, 3, 4, 5]),
@@ -76,7 +76,7 @@ def test_probabilities_are_in_proportion_up_to_1_and_sum_to_the_count() -> None:
     assert values[certain].min() > values[~certain].max()
     ratio = probabilities[~certain] / values[~certain]
     torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio))
-    # No primitive is certain without need.
+    # No Gaussian is certain without need.
     assert float(probabilities[~certain].max()) < 1
 
 
@@ -107,7 +107,7 @@ def test_every_stretch_keeps_its_expected_number() -> None:
     values, order = scores(), torch.randperm(500)
     probabilities = inclusion_probabilities(values, 100)[order]
     for seed in range(20):
-        # Certain primitives are selected first and count in full.
+        # Certain Gaussians are selected first and count in full.
         kept = select_systematic(values, 100, order, seed)[order]
         gap = (kept.double() - probabilities).cumsum(0)
         assert float(gap.max() - gap.min()) < 2 + 1e-9  # between any two places
@@ -179,7 +179,7 @@ def test_the_order_walks_through_small_clusters_too() -> None:
         (torch.ones(3), 5, 3, "cannot keep 5 of 3"),
         (torch.ones(3), 0, 3, "cannot keep 0 of 3"),
         (torch.ones(3), 1, 2, r"\[3\] and their order \[2\]"),
-        (torch.ones(3, 2), 1, None, "one number per primitive"),
+        (torch.ones(3, 2), 1, None, "one number per Gaussian"),
         (torch.ones(3), -1, None, "cannot keep -1 of 3"),
     ],
 )

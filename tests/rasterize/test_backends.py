@@ -47,10 +47,10 @@ def activated(values: Scene) -> Scene:
     return {**values, "scales": values["scales"].exp(), "opacities": values["opacities"].sigmoid()}
 
 
-def splat(values: Scene, view: dict[str, Any], backend: Any, **options: Any) -> Rasterization:
+def splat(values: Scene, camera: dict[str, Any], backend: Any, **options: Any) -> Rasterization:
     """Rasterise a scene in the dtype and on the device of its values."""
-    camera = {k: v.to(values["means"]) if isinstance(v, Tensor) else v for k, v in view.items()}
-    return rasterize(**activated(values), **camera, **options, backend=backend)
+    as_given = {k: v.to(values["means"]) if isinstance(v, Tensor) else v for k, v in camera.items()}
+    return rasterize(**activated(values), **as_given, **options, backend=backend)
 
 
 def leaves_of(values: Scene, dtype: torch.dtype, device: str = "cpu") -> Scene:
@@ -58,11 +58,11 @@ def leaves_of(values: Scene, dtype: torch.dtype, device: str = "cpu") -> Scene:
 
 
 def render(
-    values: Scene, view: dict[str, Any], dtype: torch.dtype, backend: Any, device: str = "cpu", **options: Any
+    values: Scene, camera: dict[str, Any], dtype: torch.dtype, backend: Any, device: str = "cpu", **options: Any
 ) -> dict[str, Tensor]:
     """Values, the gradients of a fixed random functional of all of them, and the statistics for densification."""
     leaves = leaves_of(values, dtype, device)
-    ours = splat(leaves, view, backend, **{"absgrad": True, "render_depth": True, **options})
+    ours = splat(leaves, camera, backend, **{"absgrad": True, "render_depth": True, **options})
     ours.info["means2d"].retain_grad()
     outputs = {"image": ours.colors, "alpha": ours.alpha}
     if ours.depth is not None:
@@ -92,11 +92,11 @@ def compare(ours: dict[str, Tensor], exact: dict[str, Tensor], values: float, gr
 # ------------------------------------------------------------------------------------------------- against other truths
 
 
-def loop_over_pixels(values: Scene, view: dict[str, Any], antialiased: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def loop_over_pixels(values: Scene, camera: dict[str, Any], antialiased: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Image, alpha, expected depth and weights, blended pixel by pixel in a Python loop."""
-    width, height = view["width"], view["height"]
-    camera = (view["viewmat"].double(), view["K"].double(), width, height)
-    splats = project(geometry(values["means"], values["quats"], values["scales"], *camera))
+    width, height = camera["width"], camera["height"]
+    as_given = (camera["viewmat"].double(), camera["K"].double(), width, height)
+    splats = project(geometry(values["means"], values["quats"], values["scales"], *as_given))
     opacities = values["opacities"] * (splats.compensations if antialiased else 1.0)
     mean, conic, radius = splats.means2d.tolist(), splats.conics.tolist(), splats.radii.tolist()
     opacity, depth = opacities.tolist(), splats.depths.tolist()
@@ -136,16 +136,16 @@ def loop_over_pixels(values: Scene, view: dict[str, Any], antialiased: bool) -> 
 def test_matches_a_loop_over_pixels(
     backend: Any, width: int, height: int, antialiased: bool, opaque: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    values, view = scene(120), make_view(width, height)
+    values, camera = scene(120), make_view(width, height)
     values["opacities"] += opaque  # pixels are finished after a few
     values = {name: value.double() for name, value in values.items()}
     values["scales"][0], values["opacities"][0] = 4.0, 30.0  # alpha is clamped in every pixel
-    expected = loop_over_pixels(activated(values), view, antialiased)
+    expected = loop_over_pixels(activated(values), camera, antialiased)
     monkeypatch.setattr("sundae_ns.rasterize.reference._SEGMENT", 7)
-    ours = splat(values, view, backend, antialiased=antialiased, render_depth=True)
-    camera = {k: v.double() if isinstance(v, Tensor) else v for k, v in view.items()}
+    ours = splat(values, camera, backend, antialiased=antialiased, render_depth=True)
+    as_given = {k: v.double() if isinstance(v, Tensor) else v for k, v in camera.items()}
     solid = {name: value for name, value in activated(values).items() if name != "colors"}
-    weights = blending_weights(**solid, **camera, antialiased=antialiased, backend=backend)
+    weights = blending_weights(**solid, **as_given, antialiased=antialiased, backend=backend)
     for value, exact in zip((ours.colors, ours.alpha, ours.depth, weights), expected, strict=True):
         torch.testing.assert_close(value, exact, rtol=1e-13, atol=1e-12)  # measured: 5.2e-15 of weights
 
@@ -157,13 +157,13 @@ def test_matches_a_loop_over_pixels(
 )
 def test_gradcheck(backend: Any, n: int, size: tuple[int, int], antialiased: bool, fast: bool) -> None:
     """With and without the camera; fast mode compares random projections, which allows a crowded scene."""
-    values, view = scene(n, 3), make_view(*size)
+    values, camera = scene(n, 3), make_view(*size)
     values["scales"][0], values["opacities"][0] = 4.0, 30.0
-    viewmat = view.pop("viewmat").double().requires_grad_()
+    viewmat = camera.pop("viewmat").double().requires_grad_()
 
     def outputs(viewmat: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         leaves = dict(zip(values, inputs, strict=True))
-        ours = splat(leaves, {"viewmat": viewmat, **view}, backend, antialiased=antialiased, render_depth=True)
+        ours = splat(leaves, {"viewmat": viewmat, **camera}, backend, antialiased=antialiased, render_depth=True)
         assert ours.depth is not None
         return ours.colors, ours.alpha, ours.depth
 
@@ -175,8 +175,8 @@ def test_gradcheck(backend: Any, n: int, size: tuple[int, int], antialiased: boo
 
 @each_backend
 def test_absgrad_is_the_sum_of_absolute_pixel_gradients(backend: Any) -> None:
-    values, view = scene(9), make_view(10, 7)
-    ours = splat(leaves_of(values, F64), view, backend, absgrad=True)
+    values, camera = scene(9), make_view(10, 7)
+    ours = splat(leaves_of(values, F64), camera, backend, absgrad=True)
     target = torch.rand(7, 10, 3, dtype=F64)
     losses = (ours.colors - target).square().sum(dim=-1) + ours.alpha[..., 0]
     expected, signed = torch.zeros(2, 1, 9, 2, dtype=F64)
@@ -206,9 +206,9 @@ def test_absgrad_is_the_sum_of_absolute_pixel_gradients(backend: Any) -> None:
 def test_the_compiled_loops_match_the_reference_up_to_rounding(
     n: int, width: int, height: int, channels: int, options: dict[str, Any]
 ) -> None:
-    values, view = scene(n), make_view(width, height)
+    values, camera = scene(n), make_view(width, height)
     values["colors"] = torch.rand(n, channels)
-    ours, exact = (render(values, view, F64, backend, **options) for backend in (CPU, REFERENCE))
+    ours, exact = (render(values, camera, F64, backend, **options) for backend in (CPU, REFERENCE))
     assert torch.equal(ours["radii"], exact["radii"])
     compare(ours, exact, 1e-12, 1e-10)  # measured: 3.0e-15 and 1.6e-13
 
@@ -225,13 +225,13 @@ def test_the_compiled_loops_match_the_reference_up_to_rounding(
 def test_any_scene(
     seed: int, n: int, size: tuple[int, int], channels: int, log_scale: float, logit: float, antialiased: bool
 ) -> None:
-    values, view = scene(n, seed), make_view(*size)
+    values, camera = scene(n, seed), make_view(*size)
     values["colors"] = torch.rand(n, channels)
     values["scales"] += log_scale + 2.5
     values["opacities"] += logit
     values["means"][: n // 3, 2] -= 2.5  # near the camera, and behind it
     values["means"][::5, 2] = 3.0  # ties are broken by index
-    ours, exact = (render(values, view, F64, b, antialiased=antialiased) for b in (CPU, REFERENCE))
+    ours, exact = (render(values, camera, F64, b, antialiased=antialiased) for b in (CPU, REFERENCE))
     assert torch.equal(ours["radii"], exact["radii"])
     compare(ours, exact, 1e-9, 1e-7)
 
@@ -240,14 +240,17 @@ def test_any_scene(
 @pytest.mark.parametrize("name", CASES)
 def test_hard_scenes(name: str, antialiased: bool) -> None:
     make, size, *bounds = CASES[name]
-    values, view = make(), make_view(size, size, turned=False)  # so that some lie on the near plane in both precisions
+    values, camera = (
+        make(),
+        make_view(size, size, turned=False),
+    )  # so that some lie on the near plane in both precisions
     options = {"antialiased": antialiased, "near_plane": NEAR}
-    exact = render(values, view, F64, REFERENCE, **options)
-    double = render(values, view, F64, CPU, **options)
+    exact = render(values, camera, F64, REFERENCE, **options)
+    double = render(values, camera, F64, CPU, **options)
     assert torch.equal(double["radii"], exact["radii"])
     compare(double, exact, 1e-9, 1e-7)  # measured: 2.2e-12 and 1.9e-10, of needles; else 3.3e-15 and 2.9e-13
     for backend in (CPU, REFERENCE):
-        ours = render(values, view, F32, backend, **options)
+        ours = render(values, camera, F32, backend, **options)
         compare(ours, exact, *bounds)
         assert 0 <= ours["alpha"].min() <= ours["alpha"].max() <= 1
 
@@ -257,8 +260,8 @@ def test_hard_scenes(name: str, antialiased: bool) -> None:
 @pytest.mark.parametrize("name", CASES)
 def test_gsplat_is_finite_on_hard_scenes(name: str, antialiased: bool) -> None:
     make, size, _, _ = CASES[name]
-    view, gsplat = make_view(size, size, turned=False), select_backend("gsplat", "cuda")
-    ours = render(make(), view, F32, gsplat, "cuda", antialiased=antialiased, near_plane=NEAR)
+    camera, gsplat = make_view(size, size, turned=False), select_backend("gsplat", "cuda")
+    ours = render(make(), camera, F32, gsplat, "cuda", antialiased=antialiased, near_plane=NEAR)
     assert all(value.isfinite().all() for value in ours.values())
     assert 0 <= ours["alpha"].min() <= ours["alpha"].max() <= 1
 
@@ -293,10 +296,10 @@ def test_extremes_are_finite(backend: Any, case: str) -> None:
 @pytest.mark.parametrize("scale", [1e9, 1e18, 1e30, math.inf, math.nan], ids=str)
 def test_footprints_that_overflow_integers(dtype: torch.dtype, scale: float) -> None:
     """Wide Gaussians are rendered while their size is finite, and broken ones do not harm the others."""
-    values, view = scene(40), make_view(20, 20)
+    values, camera = scene(40), make_view(20, 20)
     values["opacities"][:] = 0.0
     values["scales"][:10] = math.log(scale) if scale > 0 else math.nan
-    ours = render(values, view, dtype, CPU)
+    ours = render(values, camera, dtype, CPU)
     for name, value in ours.items():
         # The gradient behind the activation is NaN: zero times infinity.
         assert torch.isfinite(value[10:] if name == "dscales" else value).all(), name
@@ -305,7 +308,7 @@ def test_footprints_that_overflow_integers(dtype: torch.dtype, scale: float) -> 
         assert (ours["alpha"] > 0.99).all()
     if math.isnan(scale):
         others = {name: value[10:] for name, value in values.items()}
-        assert torch.equal(ours["alpha"], render(others, view, dtype, CPU)["alpha"])
+        assert torch.equal(ours["alpha"], render(others, camera, dtype, CPU)["alpha"])
 
 
 # ----------------------------------------------------------------------------------------------------------- invariants
@@ -313,49 +316,49 @@ def test_footprints_that_overflow_integers(dtype: torch.dtype, scale: float) -> 
 
 @each_backend
 def test_order_and_unseen_gaussians_do_not_matter_and_weights_sum_up(backend: Any) -> None:
-    values, view = leaves_of(scene(300), F64), make_view(32, 24)
+    values, camera = leaves_of(scene(300), F64), make_view(32, 24)
     values = {name: value.detach() for name, value in values.items()}
-    ours = splat(values, view, backend)
+    ours = splat(values, camera, backend)
     shuffle = torch.randperm(300)
-    other = splat({name: value[shuffle] for name, value in values.items()}, view, backend)
+    other = splat({name: value[shuffle] for name, value in values.items()}, camera, backend)
     torch.testing.assert_close(ours.colors, other.colors, rtol=0, atol=1e-13)
     assert torch.equal(ours.radii[shuffle], other.radii)
-    camera = {k: v.double() if isinstance(v, Tensor) else v for k, v in view.items()}
+    as_given = {k: v.double() if isinstance(v, Tensor) else v for k, v in camera.items()}
     solid = {name: value for name, value in activated(values).items() if name != "colors"}
-    weights = blending_weights(**solid, **camera, backend=backend)
+    weights = blending_weights(**solid, **as_given, backend=backend)
     assert (weights >= 0).all()
     torch.testing.assert_close(weights.sum(), ours.alpha.sum())
     torch.testing.assert_close((weights[:, None] * values["colors"]).sum(0), ours.colors.sum((0, 1)))
     assert (weights == 0).any()
-    seen = splat({name: value[weights > 0] for name, value in values.items()}, view, backend)
+    seen = splat({name: value[weights > 0] for name, value in values.items()}, camera, backend)
     torch.testing.assert_close(seen.colors, ours.colors, rtol=0, atol=1e-13)
 
 
 @each_backend
 def test_rigid_motion_of_scene_and_camera(backend: Any) -> None:
-    values, view = {name: value.double() for name, value in scene(200).items()}, make_view(32, 24, turned=False)
+    values, camera = {name: value.double() for name, value in scene(200).items()}, make_view(32, 24, turned=False)
     c, s, shift = math.cos(0.35), math.sin(0.35), torch.tensor([0.3, -1.0, 2.0], dtype=F64)
     rotation = torch.tensor([[c * c - s * s, 0, 2 * s * c], [0, 1, 0], [-2 * s * c, 0, c * c - s * s]], dtype=F64)
     w, x, y, z = values["quats"].unbind(-1)
     quats = torch.stack([c * w - s * y, c * x + s * z, c * y + s * w, c * z - s * x], dim=-1)
     moved, viewmat = {**values, "means": values["means"] @ rotation.T + shift, "quats": quats}, torch.eye(4).double()
     viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ shift
-    images = splat(values, view, backend).colors, splat(moved, {**view, "viewmat": viewmat}, backend).colors
+    images = splat(values, camera, backend).colors, splat(moved, {**camera, "viewmat": viewmat}, backend).colors
     torch.testing.assert_close(*images, rtol=0, atol=1e-11)
 
 
 @each_backend
 def test_footprints_end_with_the_bins_of_gsplat(backend: Any) -> None:
     """A 16-pixel bin that the three-sigma square does not reach stays empty, though alphas there would be visible."""
-    values, view = scene(1), make_view(40, 20, turned=False)
+    values, camera = scene(1), make_view(40, 20, turned=False)
     values["means"][:] = torch.tensor([0.0, 0.0, 1.0])
     # 8.8 square pixels with the blur: 3 sigma = 8.9, 3.33 = 9.9
-    values["scales"][:], values["opacities"][:] = math.log(math.sqrt(8.5) / float(view["K"][0, 0])), 30.0
-    view["K"][1, 1], view["K"][1, 2] = view["K"][0, 0].clone(), 10.5
+    values["scales"][:], values["opacities"][:] = math.log(math.sqrt(8.5) / float(camera["K"][0, 0])), 30.0
+    camera["K"][1, 1], camera["K"][1, 2] = camera["K"][0, 0].clone(), 10.5
     ends = {}
     for centre in (6.9, 7.1, -1.1):
-        view["K"][0, 2] = centre
-        ours = splat({name: value.double() for name, value in values.items()}, view, backend)
+        camera["K"][0, 2] = centre
+        ours = splat({name: value.double() for name, value in values.items()}, camera, backend)
         assert ours.radii.tolist() == [9]
         ends[centre] = int(ours.alpha[10, :, 0].nonzero().max())
     # 6.9 + 9 is inside the first bin; 7.1 + 9 is not; -1.1 + 9 is, and all of that bin is blended.
@@ -364,9 +367,9 @@ def test_footprints_end_with_the_bins_of_gsplat(backend: Any) -> None:
 
 @each_backend
 def test_zero_quaternions_are_the_identity_and_zero_directions_have_no_gradient(backend: Any) -> None:
-    values, view = scene(30), make_view(16, 16)
+    values, camera = scene(30), make_view(16, 16)
     identity = torch.tensor([[1.0, 0, 0, 0]]).expand(30, 4)
-    images = [splat({**values, "quats": quats}, view, backend).colors for quats in (torch.zeros(30, 4), identity)]
+    images = [splat({**values, "quats": quats}, camera, backend).colors for quats in (torch.zeros(30, 4), identity)]
     assert torch.equal(*images)
     directions, coeffs = torch.zeros(2, 3, requires_grad=True), torch.randn(2, 16, 3, requires_grad=True)
     value = spherical_harmonics(3, directions, coeffs, backend=backend)
@@ -466,32 +469,32 @@ def test_results_do_not_depend_on_the_number_of_threads(threads: None, monkeypat
     for name in ("backend._MIN_PER_THREAD", "backend._MIN_TO_EVALUATE", "tiles._MIN_PER_THREAD"):
         monkeypatch.setattr(f"sundae_ns.rasterize.cpu.{name}", 100)
     monkeypatch.setattr("sundae_ns.rasterize.cpu.compositing._MIN_PER_THREAD_TO_SUM", 100)
-    values, view = scene(3000), make_view(130, 70)
+    values, camera = scene(3000), make_view(130, 70)
     values["colors"] = torch.rand(3000, 8)
     directions, coeffs = torch.randn(500, 3), torch.randn(500, 16, 3)
     results = []
     for count in (1, 2, 3, 7, 1):
         torch.set_num_threads(count)
-        results.append([*render(values, view, F32, CPU).values(), *harmonics(3, directions, coeffs, CPU)])
+        results.append([*render(values, camera, F32, CPU).values(), *harmonics(3, directions, coeffs, CPU)])
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
 def test_threads_that_rasterise_at_once(threads: None) -> None:
     """A viewer renders beside a training run."""
     torch.set_num_threads(2)
-    values, view = scene(800), make_view(60, 50)
-    alone = render(values, view, F32, CPU)
+    values, camera = scene(800), make_view(60, 50)
+    alone = render(values, camera, F32, CPU)
     with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda _: render(values, view, F32, CPU), range(12)))
+        together = list(pool.map(lambda _: render(values, camera, F32, CPU), range(12)))
     assert all(torch.equal(value, other[name]) for other in together for name, value in alone.items())
 
 
 def test_layouts_that_are_not_contiguous() -> None:
-    values, view = activated(scene(100)), make_view(24, 20)
+    values, camera = activated(scene(100)), make_view(24, 20)
     odd = {name: torch.stack([value, value], dim=-1)[..., 0] for name, value in values.items()}
     odd["scales"] = values["scales"].T.contiguous().T
     assert not odd["means"].is_contiguous()
-    images = [rasterize(**each, **view, backend=CPU).colors for each in (values, odd)]
+    images = [rasterize(**each, **camera, backend=CPU).colors for each in (values, odd)]
     assert torch.equal(*images)
 
 

@@ -21,7 +21,7 @@ from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.rasterize.interface import (
     blending_weights,
     rasterize,
-    rasterize_views,
+    rasterize_cameras,
     select_backend,
     spherical_harmonics,
 )
@@ -48,7 +48,7 @@ def _scene(opacity: float, channels: int = 16, n: int = 3000) -> dict[str, Tenso
     }
 
 
-def _view(name: str) -> dict:
+def _camera(name: str) -> dict:
     device, dtype = ("cuda", torch.float32) if name == "gsplat" else ("cpu", torch.float64)
     viewmat = torch.eye(4)
     viewmat[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
@@ -109,10 +109,10 @@ def test_values_and_gradients(
     rim = opacity > 0.35 and not version("gsplat").startswith("1.4")
     results, leaves = {}, {}
     for name in ("gsplat", "reference"):
-        leaves[name], view = _place(scene, name), _view(name)
+        leaves[name], camera = _place(scene, name), _camera(name)
         if recordable and name == "gsplat":
-            view["backend"] = RecordableGsplat(Capacity())
-        results[name] = rasterize(**leaves[name], **view, antialiased=antialiased, absgrad=True, render_depth=True)
+            camera["backend"] = RecordableGsplat(Capacity())
+        results[name] = rasterize(**leaves[name], **camera, antialiased=antialiased, absgrad=True, render_depth=True)
         results[name].info["means2d"].retain_grad()
         _loss(results[name]).backward()
     ours, theirs = results["gsplat"], results["reference"]
@@ -138,19 +138,19 @@ def test_values_and_gradients(
 def test_several_views_are_those_of_single_passes(
     antialiased: bool, channels: int, recordable: bool, within: Callable
 ) -> None:
-    shared, views = several_views(3000, channels)
-    shared, views = ({name: value.cuda() for name, value in values.items()} for values in (shared, views))
+    shared, cameras = several_views(3000, channels)
+    shared, cameras = ({name: value.cuda() for name, value in values.items()} for values in (shared, cameras))
     options = {"width": 40, "height": 30, "antialiased": antialiased}
-    images = rasterize_views(**shared, **views, **options, backend=select_backend("gsplat", "cuda"))
+    images = rasterize_cameras(**shared, **cameras, **options, backend=select_backend("gsplat", "cuda"))
     backend = RecordableGsplat(Capacity()) if recordable else select_backend("gsplat", "cuda")
-    for image, colors, viewmat, K in zip(images, *views.values(), strict=True):
+    for image, colors, viewmat, K in zip(images, *cameras.values(), strict=True):
         single = rasterize(**shared, colors=colors, viewmat=viewmat, K=K, **options, backend=backend).colors
         within("image", image, single, 1e-6)
 
 
 def test_radii() -> None:
     scene = _scene(0.33)
-    radii = {name: rasterize(**_place(scene, name), **_view(name)).radii.cpu() for name in ("gsplat", "reference")}
+    radii = {name: rasterize(**_place(scene, name), **_camera(name)).radii.cpu() for name in ("gsplat", "reference")}
     ours, theirs = radii["gsplat"], radii["reference"]
     assert ours.shape == theirs.shape == (scene["means"].shape[0],)
     assert (theirs > 0).any()
@@ -160,7 +160,7 @@ def test_radii() -> None:
         assert (ours - theirs).abs().max() <= 1
         assert (ours != theirs).float().mean() < 1e-2
     else:
-        # 1.5 fits the radius to the opacity and to each axis, and culls invisible primitives.
+        # 1.5 fits the radius to the opacity and to each axis, and culls invisible Gaussians.
         assert (ours <= (theirs * 1.12).ceil() + 1).all()
 
 
@@ -169,7 +169,7 @@ def test_blending_weights(antialiased: bool, within: Callable) -> None:
     scene = _scene(0.33)
     del scene["colors"]
     weights = {
-        name: blending_weights(**_place(scene, name), **_view(name), antialiased=antialiased)
+        name: blending_weights(**_place(scene, name), **_camera(name), antialiased=antialiased)
         for name in ("gsplat", "reference")
     }
     within("weights", weights["gsplat"], weights["reference"], 1e-5)  # measured: 3.8e-7
@@ -177,11 +177,11 @@ def test_blending_weights(antialiased: bool, within: Callable) -> None:
 
 def test_reference_on_the_gpu_matches_itself_on_the_cpu(within: Callable) -> None:
     scene = _scene(1.0)
-    view = _view("gsplat")
-    view["backend"] = select_backend("reference", "cuda")
+    camera = _camera("gsplat")
+    camera["backend"] = select_backend("reference", "cuda")
     results = [
         (rasterize(**leaves, **options, absgrad=True), leaves)
-        for leaves, options in ((_place(scene, "gsplat"), view), (_place(scene, "reference"), _view("reference")))
+        for leaves, options in ((_place(scene, "gsplat"), camera), (_place(scene, "reference"), _camera("reference")))
     ]
     for ours, _ in results:
         _loss(ours).backward()
@@ -201,7 +201,7 @@ def test_spherical_harmonics(degree: int, within: Callable) -> None:
     grads, values = {}, {}
     for name in ("gsplat", "reference"):
         placed = _place(inputs, name)
-        values[name] = spherical_harmonics(degree, **placed, backend=_view(name)["backend"])
+        values[name] = spherical_harmonics(degree, **placed, backend=_camera(name)["backend"])
         (values[name] * torch.linspace(-1, 1, 1500).reshape(500, 3).to(values[name])).sum().backward()
         grads[name] = placed
     within("value", values["gsplat"], values["reference"], 2e-6)  # measured: 1.9e-7
@@ -213,14 +213,16 @@ def test_spherical_harmonics(degree: int, within: Callable) -> None:
 
 def test_no_gaussians_are_an_empty_image() -> None:
     leaves = _place({name: value[:0] for name, value in _scene(1.0).items()}, "gsplat")
-    ours = rasterize(**leaves, **_view("gsplat"), absgrad=True, render_depth=True)
+    ours = rasterize(**leaves, **_camera("gsplat"), absgrad=True, render_depth=True)
     _loss(ours).backward()
     assert not ours.colors.any()
 
 
 def test_zero_direction_is_finite() -> None:
     directions = torch.zeros(2, 3, device="cuda", requires_grad=True)
-    value = spherical_harmonics(3, directions, torch.ones(2, 16, 3, device="cuda"), backend=_view("gsplat")["backend"])
+    value = spherical_harmonics(
+        3, directions, torch.ones(2, 16, 3, device="cuda"), backend=_camera("gsplat")["backend"]
+    )
     value.sum().backward()
     assert torch.isfinite(value).all()
     assert (directions.grad == 0).all()
@@ -246,9 +248,9 @@ def test_default_strategy_takes_the_info(name: str, absgrad: bool) -> None:
     optimizers = {key: torch.optim.Adam([value], 1e-3) for key, value in params.items()}
     strategy = gsplat.DefaultStrategy(absgrad=absgrad, refine_scale2d_stop_iter=10)
     state = strategy.initialize_state()
-    view = _view("gsplat")
-    view["backend"] = select_backend(name, "cuda")  # type: ignore[arg-type]
-    ours = rasterize(**params, **view, absgrad=absgrad)
+    camera = _camera("gsplat")
+    camera["backend"] = select_backend(name, "cuda")  # type: ignore[arg-type]
+    ours = rasterize(**params, **camera, absgrad=absgrad)
     strategy.step_pre_backward(params, optimizers, state, 1, ours.info)
     _loss(ours).backward()
     strategy.step_post_backward(params, optimizers, state, 1, ours.info)

@@ -19,7 +19,7 @@ from sundae_ns.rasterize.gsplat_kernels import TILE, Capacity, GsplatLists, Spla
 from sundae_ns.rasterize.interface import harmonic_colors, select_backend
 from sundae_ns.rasterize.reference import Projection, composite
 
-Field = dict[str, Tensor]
+Gaussians = dict[str, Tensor]
 
 
 @pytest.fixture(autouse=True)
@@ -52,7 +52,7 @@ def test_second_derivatives_are_refused() -> None:
 # --------------------------------------------------------------------------------------------------------------- tiles
 
 
-def field(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Field:
+def gaussians(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Gaussians:
     """Footprints of all sizes and shapes, up to needles across the image, in and around it."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -78,8 +78,8 @@ def field(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 
     }
 
 
-def in_square(primitives: Field, column: int, row: int, columns: int, rows: int) -> Tensor:
-    """Whether gsplat's square of each primitive contains a tile ``[N]``."""
+def in_square(primitives: Gaussians, column: int, row: int, columns: int, rows: int) -> Tensor:
+    """Whether gsplat's square of each Gaussian contains a tile ``[N]``."""
     radii = primitives["radii"].float().view(len(primitives["depths"]), -1).expand(-1, 2) / TILE
     low = (primitives["means2d"] / TILE - radii).floor().clamp(min=0).minimum(torch.tensor([columns, rows]))
     high = (primitives["means2d"] / TILE + radii).ceil().clamp(min=0).minimum(torch.tensor([columns, rows]))
@@ -87,8 +87,8 @@ def in_square(primitives: Field, column: int, row: int, columns: int, rows: int)
     return (radii > 0).all(dim=1) & (low <= at).all(dim=1) & (high > at).all(dim=1)
 
 
-def most_alpha(primitives: Field, column: int, row: int, width: int, height: int) -> Tensor:
-    """Largest alpha of each primitive over the pixels of a tile, float64 ``[N]``."""
+def most_alpha(primitives: Gaussians, column: int, row: int, width: int, height: int) -> Tensor:
+    """Largest alpha of each Gaussian over the pixels of a tile, float64 ``[N]``."""
     ys, xs = torch.meshgrid(
         torch.arange(row * TILE, min(row * TILE + TILE, height)) + 0.5,
         torch.arange(column * TILE, min(column * TILE + TILE, width)) + 0.5,
@@ -101,7 +101,7 @@ def most_alpha(primitives: Field, column: int, row: int, width: int, height: int
     return (primitives["opacities"][:, None].double() * (-exponents).exp()).amax(dim=1)
 
 
-def by_tile(primitives: Field, width: int, height: int, capacity: Capacity | None = None) -> list[Tensor]:
+def by_tile(primitives: Gaussians, width: int, height: int, capacity: Capacity | None = None) -> list[Tensor]:
     splats = Splats(**{name: value[None] for name, value in primitives.items()})
     lists = tile_lists(splats, width, height, capacity=capacity or Capacity())
     ends = [*lists.starts.flatten()[1:].tolist(), len(lists.primitives)]
@@ -111,7 +111,7 @@ def by_tile(primitives: Field, width: int, height: int, capacity: Capacity | Non
 
 @pytest.mark.parametrize(("width", "height"), [(150, 100), (1, 1), (400, 37), (20, 700)])
 def test_all_blended_primitives_are_listed_and_hardly_any_others(width: int, height: int) -> None:
-    primitives = field(300, width, height, largest=5.5)
+    primitives = gaussians(300, width, height, largest=5.5)
     columns, rows = -(-width // TILE), -(-height // TILE)
     needed = listed = squares = 0
     for tile, found in enumerate(by_tile(primitives, width, height)):
@@ -137,12 +137,12 @@ def test_all_blended_primitives_are_listed_and_hardly_any_others(width: int, hei
 @given(seed=st.integers(0, 10**6), largest=st.sampled_from([1.0, 4.0, 7.0]), shift=st.sampled_from([0.0, 3000.0]))
 def test_needles_far_away_are_not_dropped(seed: int, largest: float, shift: float) -> None:
     width, height = 70, 50
-    primitives = field(40, width, height, largest=largest, seed=seed)
+    primitives = gaussians(40, width, height, largest=largest, seed=seed)
     primitives["means2d"] += shift * torch.randn(40, 2, generator=torch.Generator().manual_seed(seed))
     primitives["radii"][:] = 10000
     for tile, found in enumerate(by_tile(primitives, width, height)):
         row, column = divmod(tile, 5)
-        # gsplat sums the exponent in float32: primitives that are visible by rounding may be listed, visible ones must
+        # gsplat sums the exponent in float32: Gaussians that are visible by rounding may be listed, visible ones must
         # be.
         blended = most_alpha(primitives, column, row, width, height) >= 1.01 / 255
         assert not (blended & ~torch.zeros(40, dtype=torch.bool).index_fill(0, found, True)).any()
@@ -150,7 +150,7 @@ def test_needles_far_away_are_not_dropped(seed: int, largest: float, shift: floa
 
 def test_least_exponent_between_two_tiles() -> None:
     """A faint needle across the gap between two tiles reaches the tile on the far side of the border."""
-    primitives = field(1, 64, 64)
+    primitives = gaussians(1, 64, 64)
     c, s = math.cos(1.7074472511921694), math.sin(1.7074472511921694)
     xx, xy, yy = 625.1582971 * c * c + 0.3, 625.1582971 * c * s, 625.1582971 * s * s + 0.3
     primitives["conics"][0] = torch.tensor([yy, -xy, xx], dtype=torch.float64) / (xx * yy - xy * xy)
@@ -162,7 +162,7 @@ def test_least_exponent_between_two_tiles() -> None:
 
 
 def test_nan_is_left_to_gsplat() -> None:
-    primitives = field(20, 64, 64)
+    primitives = gaussians(20, 64, 64)
     primitives["radii"][:] = 100
     primitives["conics"][3], primitives["opacities"][5], primitives["conics"][7] = torch.nan, torch.nan, 0.0
     for found in by_tile(primitives, 64, 64):
@@ -170,7 +170,7 @@ def test_nan_is_left_to_gsplat() -> None:
 
 
 def test_radii_per_axis() -> None:
-    primitives = field(200, 150, 100)
+    primitives = gaussians(200, 150, 100)
     per_axis = {**primitives, "radii": primitives["radii"][:, None].repeat(1, 2)}
     assert all(
         torch.equal(a, b) for a, b in zip(by_tile(per_axis, 150, 100), by_tile(primitives, 150, 100), strict=True)
@@ -181,7 +181,7 @@ def test_radii_per_axis() -> None:
 
 
 def test_capacity_keeps_the_lists_and_reports_the_number_of_pairs() -> None:
-    primitives, capacity = field(200, 150, 100), Capacity()
+    primitives, capacity = gaussians(200, 150, 100), Capacity()
     exact = by_tile(primitives, 150, 100, capacity)
     (needed,) = capacity.needed
     assert int(needed) == sum(map(len, exact))
@@ -196,7 +196,7 @@ def test_capacity_keeps_the_lists_and_reports_the_number_of_pairs() -> None:
 
 
 def test_more_tiles_than_16_bits_count() -> None:
-    primitives = field(5, 30, 30)
+    primitives = gaussians(5, 30, 30)
     primitives["means2d"] = torch.tensor([[3275.0 * TILE, 5.0]] * 5)
     found = by_tile(primitives, 3300 * TILE, 10 * TILE)
     assert {tile % 3300 // 100 for tile, list_ in enumerate(found) if len(list_)} == {32}
@@ -228,7 +228,7 @@ def ellipses(n: int, channels: int, width: int, height: int, *, opacity: float =
 
 
 def every_tile(primitives: dict[str, Tensor], width: int, height: int, spare: int) -> GsplatLists:
-    """Every primitive in every tile, by depth, and a tile below the image with ``spare`` pairs."""
+    """Every Gaussian in every tile, by depth, and a tile below the image with ``spare`` pairs."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     order = primitives["depths"].argsort(stable=True).int()
     starts = torch.arange(columns * (rows + (spare > 0)), dtype=torch.int32).clamp(max=columns * rows) * len(order)

@@ -18,7 +18,7 @@ from sundae_ns.rasterize.interface import (
     BackendName,
     blending_weights,
     rasterize,
-    rasterize_views,
+    rasterize_cameras,
     select_backend,
     spherical_harmonics,
 )
@@ -158,11 +158,11 @@ def test_blending_weights_with_pixel_weights() -> None:
 
 @pytest.mark.parametrize("name", ["cpu", "reference"])
 def test_several_views_are_those_of_single_passes(name: BackendName) -> None:
-    shared, views = several_views()
+    shared, cameras = several_views()
     options = {"width": 40, "height": 30, "antialiased": True, "backend": select_backend(name, "cpu")}
-    images = rasterize_views(**shared, **views, **options)
+    images = rasterize_cameras(**shared, **cameras, **options)
     assert images.shape == (3, 30, 40, 4)
-    for image, colors, viewmat, K in zip(images, *views.values(), strict=True):
+    for image, colors, viewmat, K in zip(images, *cameras.values(), strict=True):
         assert float(image.max()) > 0.1
         torch.testing.assert_close(image, rasterize(**shared, colors=colors, viewmat=viewmat, K=K, **options).colors)
 
@@ -177,9 +177,9 @@ def test_several_views_are_those_of_single_passes(name: BackendName) -> None:
     ],
 )
 def test_wrong_views(change: dict, message: str) -> None:
-    shared, views = several_views()
+    shared, cameras = several_views()
     with pytest.raises(DataError, match=message):
-        rasterize_views(**shared, **{**views, **change}, width=4, height=4, backend=REFERENCE)
+        rasterize_cameras(**shared, **{**cameras, **change}, width=4, height=4, backend=REFERENCE)
 
 
 # --------------------------------------------------------------------------------------------------------------- memory
@@ -187,10 +187,10 @@ def test_wrong_views(change: dict, message: str) -> None:
 BACKENDS = ("cpu", "reference")
 
 
-def view(
+def camera(
     count: int, size: int, scale: float, *, spread: float = 0.0, backend: str = "reference", **options: Any
 ) -> Tensor:
-    """The image of faint primitives in front of a camera."""
+    """The image of faint Gaussians in front of a camera."""
     torch.manual_seed(0)
     means = torch.cat([spread * (torch.rand(count, 2) - 0.5), torch.full((count, 1), 2.0)], dim=1)
     values = {
@@ -211,35 +211,35 @@ def test_more_primitives_than_in_any_scene_are_refused(backend: str, monkeypatch
     monkeypatch.setattr(limits, "MOST_PER_TILE", 100)
     monkeypatch.setattr(limits, "ALWAYS", 0)
     tiles = {"cpu": 64, "reference": 16}[backend]
-    # Each primitive touches all tiles; four of them are its own.
+    # Each Gaussian touches all tiles; four of them are its own.
     most = 100 * tiles // (tiles - 4)
-    assert view(most, 64, 20.0, backend=backend).shape == (64, 64, 1)
-    with pytest.raises(MemoryExhaustedError, match=r"the view has \d+ primitives in each tile .* less than 100;"):
-        view(most + 1, 64, 20.0, backend=backend)
+    assert camera(most, 64, 20.0, backend=backend).shape == (64, 64, 1)
+    with pytest.raises(MemoryExhaustedError, match=r"the view has \d+ Gaussians in each tile .* less than 100;"):
+        camera(most + 1, 64, 20.0, backend=backend)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_step_of_a_training_is_not_refused(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "MOST_PER_TILE", 100)
     monkeypatch.setattr(limits, "ALWAYS", 0)
-    view(200, 64, 20.0, backend=backend, training=True)
+    camera(200, 64, 20.0, backend=backend, training=True)
     with torch.no_grad(), pytest.raises(MemoryExhaustedError):
-        view(200, 64, 20.0, backend=backend)
+        camera(200, 64, 20.0, backend=backend)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_many_small_primitives_in_a_small_image_are_drawn(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A large scene from far away, or as a thumbnail."""
     monkeypatch.setattr(limits, "ALWAYS", 0)
-    assert view(60_000, 16, 1e-3, spread=1.9, backend=backend).min() > 0
+    assert camera(60_000, 16, 1e-3, spread=1.9, backend=backend).min() > 0
     # On the corner of four tiles.
-    assert view(60_000, 16, 1e-3, backend=backend).max() > 0
+    assert camera(60_000, 16, 1e-3, backend=backend).max() > 0
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_small_image_of_large_primitives_is_drawn(backend: str) -> None:
     """It takes little, whatever its lists."""
-    assert view(20_000, 40, 20.0, backend=backend).shape == (40, 40, 1)
+    assert camera(20_000, 40, 20.0, backend=backend).shape == (40, 40, 1)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -247,14 +247,14 @@ def test_lists_that_exceed_the_memory_are_refused(backend: str, monkeypatch: pyt
     monkeypatch.setattr(limits, "_NEGLIGIBLE", 0)
     monkeypatch.setattr(limits, "available_memory", lambda: 100_000)
     # In a training too, where the memory would be full all the same.
-    with pytest.raises(MemoryExhaustedError, match="pairs of a tile and a primitive take .* GB, but .* are available"):
-        view(1000, 64, 20.0, backend=backend, training=True)
+    with pytest.raises(MemoryExhaustedError, match="pairs of a tile and a Gaussian take .* GB, but .* are available"):
+        camera(1000, 64, 20.0, backend=backend, training=True)
 
 
 def test_images_that_exceed_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "available_memory", lambda: 1 << 30)
     with pytest.raises(MemoryExhaustedError, match=r"images of 65,536 x 65,536 pixels take 51\.5 GB, but 1\.1 GB are"):
-        view(10, 65_536, 1e-3)
+        camera(10, 65_536, 1e-3)
 
 
 def test_the_memory_is_that_of_machine_and_control_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -93,7 +93,7 @@ def test_exp_negative_is_within_one_and_a_half_units_in_the_last_place(dtype: An
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_every_blended_pixel_is_listed_and_few_others(dtype: torch.dtype) -> None:
-    """Round primitives, oblique needles, and some that the image's edge cuts off."""
+    """Round Gaussians, oblique needles, and some that the image's edge cuts off."""
     generator = torch.Generator().manual_seed(0)
     n, width, height = 400, 70, 50
     means = torch.rand(n, 3, generator=generator) * torch.tensor([2.0, 1.6, 1.0]) + torch.tensor([-1.0, -0.8, 2.0])

@@ -68,7 +68,7 @@ def test_projection_matches_gsplat(antialiased: bool) -> None:
         means, covars, viewmat[None], K[None], WIDTH, HEIGHT, calc_compensations=antialiased
     )
     if radii.dim() == 3:
-        # gsplat 1.5 has one radius per axis and culls invisible primitives; the reference follows 1.4.
+        # gsplat 1.5 has one radius per axis and culls invisible Gaussians; the reference follows 1.4.
         seen = (radii[0] > 0).all(dim=-1) & (ours.radii > 0)
     else:
         seen = radii[0] > 0

@@ -18,11 +18,11 @@ def _pair(height=40, width=30, noise=0.1):
 
 def _ssim_by_definition(x, y):
     """Wang et al. 2004: Gaussian window of 11 pixels and sigma 1.5, kept where it fits inside the image."""
-    window = [math.exp(-(i**2) / (2 * 1.5**2)) for i in range(-5, 6)]
-    window = [w / sum(window) for w in window]
+    crop = [math.exp(-(i**2) / (2 * 1.5**2)) for i in range(-5, 6)]
+    crop = [w / sum(crop) for w in crop]
 
     def local_mean(image):
-        blurred = correlate1d(correlate1d(image, window, axis=0), window, axis=1)
+        blurred = correlate1d(correlate1d(image, crop, axis=0), crop, axis=1)
         return blurred[5:-5, 5:-5]
 
     x, y = x.numpy(), y.numpy()

@@ -30,11 +30,11 @@ from sundae_ns.report.report_page import (
     MOST_VIEWS,
     ShownRun,
     ShownView,
-    choose_views,
+    cameras_for_each,
+    choose_cameras,
     error_map,
     report_page,
     shown_view,
-    views_for_each,
 )
 from sundae_ns.train.curve import CountCurve, CurvePoint
 
@@ -120,7 +120,7 @@ def test_the_worst_and_the_best_view_are_among_those_that_are_shown(count: int) 
     for _ in range(20):
         qualities = random.uniform(10, 40, count).tolist()
         for most in (2, 3, 7, MOST_VIEWS):
-            chosen = choose_views(qualities, most)
+            chosen = choose_cameras(qualities, most)
             assert len(chosen) == min(most, count)
             assert chosen == sorted(set(chosen))
             assert {int(np.argmin(qualities)), int(np.argmax(qualities))} <= set(chosen)
@@ -129,7 +129,7 @@ def test_the_worst_and_the_best_view_are_among_those_that_are_shown(count: int) 
 def test_other_views_are_evenly_spaced() -> None:
     qualities = [25.0] * 300
     qualities[107], qualities[206] = 10.0, 40.0  # not among the evenly spaced ones
-    chosen = [index for index in choose_views(qualities, 24) if index not in (107, 206)]
+    chosen = [index for index in choose_cameras(qualities, 24) if index not in (107, 206)]
     assert (chosen[0], chosen[-1], len(chosen)) == (0, 299, 22)
     assert set(np.diff(chosen)) <= {14, 15}
 
@@ -137,13 +137,13 @@ def test_other_views_are_evenly_spaced() -> None:
 def test_a_view_without_a_figure_counts_as_worst() -> None:
     qualities = [20.0 + index for index in range(50)]
     qualities[31], qualities[17] = math.nan, math.inf
-    assert choose_views(qualities, 2) == [17, 31]
+    assert choose_cameras(qualities, 2) == [17, 31]
 
 
 def test_a_page_of_many_runs_shows_fewer_views_of_each() -> None:
-    assert views_for_each(1) == MOST_VIEWS
-    assert all(runs * views_for_each(runs) <= MOST_ON_A_PAGE for runs in range(1, MOST_ON_A_PAGE // 2 + 1))
-    assert views_for_each(1000) == 2
+    assert cameras_for_each(1) == MOST_VIEWS
+    assert all(runs * cameras_for_each(runs) <= MOST_ON_A_PAGE for runs in range(1, MOST_ON_A_PAGE // 2 + 1))
+    assert cameras_for_each(1000) == 2
 
 
 # ------------------------------------------------------------------------------------------------------- the error map
@@ -187,7 +187,9 @@ def test_an_error_map_needs_two_images_of_one_size() -> None:
 # ------------------------------------------------------------------------------------------------------------ one view
 
 
-def view_of(measured: Callable[..., Measured], height: int, width: int, *, head: bool = True) -> tuple[ShownView, Any]:
+def camera_of(
+    measured: Callable[..., Measured], height: int, width: int, *, head: bool = True
+) -> tuple[ShownView, Any]:
     run, photos = measured(), images(0, height, width)
     return shown_view(3, "a.png", *photos, run.full.views[0], run.base.views[0] if head else None), photos
 
@@ -196,17 +198,17 @@ def view_of(measured: Callable[..., Measured], height: int, width: int, *, head:
 def test_images_of_a_view_have_one_size(
     measured: Callable[..., Measured], size: tuple[int, int], expected: tuple[int, int]
 ) -> None:
-    view, _ = view_of(measured, *size)
+    view, _ = camera_of(measured, *size)
     assert (view.index, view.name, view.size, view.shown) == (3, "a.png", size[::-1], expected)
     assert list(view.images) == ["rendering", "head off", "error map"]
     for address in (view.photo, *view.images.values()):
         assert decoded(address).size == expected
-    assert list(view_of(measured, *size, head=False)[0].images) == ["rendering", "error map"]
+    assert list(camera_of(measured, *size, head=False)[0].images) == ["rendering", "error map"]
 
 
 @pytest.mark.parametrize(("width", "exact"), [(EXACT_SIDE, True), (EXACT_SIDE + 2, False)])
 def test_small_images_lose_nothing(measured: Callable[..., Measured], width: int, exact: bool) -> None:
-    view, (photo, rendering, bare) = view_of(measured, 24, width)
+    view, (photo, rendering, bare) = camera_of(measured, 24, width)
     addresses = (view.photo, view.images["rendering"], view.images["head off"])
     for address, image in zip(addresses, (photo, rendering, bare), strict=True):
         assert np.array_equal(np.asarray(decoded(address)), (255 * image).round().numpy()) is exact
@@ -295,7 +297,7 @@ def test_names_of_elements_are_unique(measured: Callable[..., Measured]) -> None
 
 def test_the_curve_marks_the_choice(measured: Callable[..., Measured]) -> None:
     page = Page(page_of(shown(measured(), curve=CURVE)))
-    assert "Chosen: 3,000 of 9,000 primitives" in page.words
+    assert "Chosen: 3,000 of 9,000 Gaussians" in page.words
     (plot,) = [image for image in page.all("img") if (image["src"] or "").startswith("data:image/svg+xml;base64,")]
     assert "3,000 of 9,000 were chosen" in (plot["alt"] or "")
     drawing = base64.b64decode((plot["src"] or "").partition(",")[2]).decode().lower()

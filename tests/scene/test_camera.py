@@ -13,7 +13,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.core.covariance import rotation_matrices
-from sundae_ns.plugin.camera_models import view_of
+from sundae_ns.plugin.camera_models import camera_of
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.scene.render import StepResolution
 
@@ -48,7 +48,7 @@ def test_a_window_is_a_part_of_the_whole_picture(
     """Pictures, truth and mask of a window are what the whole picture shows there, or its mirror image."""
     whole, cut = (perturb(build(head={"max_train_pixels": limit}, background_color="black")) for limit in (0, 600))
     with torch.no_grad():
-        # Rasterisers clamp how they linearise large primitives far outside of the picture, and a window is a picture.
+        # Rasterisers clamp how they linearise large Gaussians far outside of the picture, and a window is a picture.
         whole.gauss_params["scales"] -= 2
     cut.load_state_dict(whole.state_dict())
     masked = {**batch(), "mask": torch.rand(32, 40, 1, generator=torch.Generator().manual_seed(4)) > 0.5}
@@ -57,13 +57,13 @@ def test_a_window_is_a_part_of_the_whole_picture(
         model.step = step
     monkeypatch.setattr(whole, "resolution", lambda step: StepResolution(step, 1, 0))
     outputs = {model: model.get_outputs(camera()) for model in (whole, cut)}
-    window = outputs[cut]["window"]
+    crop = outputs[cut]["window"]
     assert outputs[whole]["window"] is None
-    assert window.width * window.height <= 600
-    assert window.mirrored == mirrored
+    assert crop.width * crop.height <= 600
+    assert crop.mirrored == mirrored
 
     def part(image: Tensor) -> Tensor:
-        seen = image[window.top : window.top + window.height, window.left : window.left + window.width]
+        seen = image[crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
         return seen.flip(1) if mirrored else seen
 
     for name in ("base_rgb", "accumulation"):
@@ -110,28 +110,28 @@ def test_a_view_is_what_the_matrices_say(seed: int, downscale: int, index: int) 
     """World-to-camera is the inverse of the pose with y and z turned; intrinsics shrink with the picture."""
     cameras = made(seed)
     camera = cameras[index : index + 1]
-    view = view_of(camera, "cpu", downscale=downscale)
+    cam = camera_of(camera, "cpu", downscale=downscale)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3] = cameras.camera_to_worlds[index].double() * torch.tensor([1.0, -1.0, -1.0, 1.0])
-    torch.testing.assert_close(view.viewmat.double(), torch.linalg.inv(pose), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(cam.viewmat.double(), torch.linalg.inv(pose), rtol=1e-5, atol=1e-5)
     K = cameras.get_intrinsics_matrices()[index].clone()
     K[:2] /= downscale
-    torch.testing.assert_close(view.K, K, rtol=1e-6, atol=0)
-    assert (view.width, view.height) == (
+    torch.testing.assert_close(cam.K, K, rtol=1e-6, atol=0)
+    assert (cam.width, cam.height) == (
         int(cameras.width[index]) // downscale,
         int(cameras.height[index]) // downscale,
     )
-    torch.testing.assert_close(torch.tensor(view.focal), K[[0, 1], [0, 1]].mean(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(torch.tensor(cam.focal), K[[0, 1], [0, 1]].mean(), rtol=1e-6, atol=0)
     for name in ("camera_to_worlds", "fx", "cy", "width"):
         assert torch.equal(getattr(cameras, name), getattr(made(seed), name)), "the camera does not change"
-    assert view.viewmat.is_contiguous()
-    assert view.K.is_contiguous()
+    assert cam.viewmat.is_contiguous()
+    assert cam.K.is_contiguous()
 
 
 def test_a_pose_that_learns_gives_the_same_view_and_a_gradient() -> None:
     camera = made(0)[1:2]
     pose = camera.camera_to_worlds.clone().requires_grad_()
-    plain, learned = view_of(camera, "cpu"), view_of(camera, "cpu", pose=pose)
+    plain, learned = camera_of(camera, "cpu"), camera_of(camera, "cpu", pose=pose)
     torch.testing.assert_close(plain.viewmat, learned.viewmat.detach(), rtol=1e-6, atol=1e-5)
     assert torch.equal(plain.K, learned.K)
     assert plain[2:] == learned[2:]
@@ -142,7 +142,7 @@ def test_a_pose_that_learns_gives_the_same_view_and_a_gradient() -> None:
 
 def test_a_view_keeps_no_hold_of_its_camera() -> None:
     camera = made(0)[:1]
-    view = view_of(camera, "cpu")
-    before = view.viewmat.clone()
+    cam = camera_of(camera, "cpu")
+    before = cam.viewmat.clone()
     camera.camera_to_worlds.mul_(2)
-    assert torch.equal(view.viewmat, before)
+    assert torch.equal(cam.viewmat, before)

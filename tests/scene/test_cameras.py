@@ -15,7 +15,7 @@ from short_prunes import short_prunes  # noqa: F401
 
 import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.scene import virtual_cameras as virtual
 from sundae_ns.scene.cameras import is_frame, read_cameras
 from sundae_ns.scene.prune_scene import prune_with_mask
@@ -37,12 +37,12 @@ def written(tmp_path: Path, content: Any) -> Path:
 
 
 def scene(**options: Any) -> sn.Scene:
-    return sn.Scene(Field(random_field(100, features=0)), **options)
+    return sn.Scene(Gaussians(random_field(100, features=0)), **options)
 
 
 def test_a_transforms_file(tmp_path: Path) -> None:
     path = written(tmp_path, {**LENS, "frames": [FRAME, {**FRAME, "fl_x": 70}]})
-    first, second = sn.views_of(tmp_path)
+    first, second = sn.cameras_of(tmp_path)
     assert (first.width, first.height, first.focal) == (64, 48, 55)
     assert float(second.K[0, 0]) == 70
     torch.testing.assert_close(first.center, torch.tensor([0.0, 0, 3]))
@@ -54,22 +54,22 @@ def test_a_transforms_file(tmp_path: Path) -> None:
 
 def test_a_camera_path(tmp_path: Path) -> None:
     found = read_cameras(written(tmp_path, PATH))
-    (view,) = found.views
+    (camera,) = found.cameras
     assert found.frames_per_second == 12
-    assert float(view.K[1, 1]) == pytest.approx(24)
-    torch.testing.assert_close(view.center, torch.tensor([0.0, 0, 3]))
+    assert float(camera.K[1, 1]) == pytest.approx(24)
+    torch.testing.assert_close(camera.center, torch.tensor([0.0, 0, 3]))
 
 
 def test_a_colmap_model(tmp_path: Path) -> None:
     """Its poses are world-to-camera, and the images of a run's capture move as those of a transforms.json do."""
     write_model(tmp_path, ["a.png", "b.png"], (64, 48))
-    _, view = sn.views_of(tmp_path)
-    assert (view.width, view.height, view.focal) == (64, 48, 18)
-    torch.testing.assert_close(view.viewmat[:3, 3], torch.tensor([0.3, 0.1, 3.0]))
+    _, camera = sn.cameras_of(tmp_path)
+    assert (camera.width, camera.height, camera.focal) == (64, 48, 18)
+    torch.testing.assert_close(camera.viewmat[:3, 3], torch.tensor([0.3, 0.1, 3.0]))
     turn = [[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
     trained = scene(in_model_frame=True, meta={"frame": {"transform": turn, "scale": 0.5}})
-    x, y, z = view.center.tolist()
-    moved = sn.views_of(tmp_path, trained)[1].center
+    x, y, z = camera.center.tolist()
+    moved = sn.cameras_of(tmp_path, trained)[1].center
     torch.testing.assert_close(moved, torch.tensor([(1 - y) / 2, (x + 2) / 2, (z + 3) / 2]))
 
 
@@ -78,14 +78,14 @@ def test_cameras_of_a_capture_move_with_its_model(tmp_path: Path) -> None:
     turn = [[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
     trained = scene(in_model_frame=True, meta={"frame": {"transform": turn, "scale": 0.5}})
     path = written(tmp_path, {**LENS, "frames": [FRAME]})
-    torch.testing.assert_close(sn.views_of(path, trained)[0].center, torch.tensor([0.5, 1.0, 3.0]))
-    torch.testing.assert_close(sn.views_of(path, scene())[0].center, torch.tensor([0.0, 0, 3]))
+    torch.testing.assert_close(sn.cameras_of(path, trained)[0].center, torch.tensor([0.5, 1.0, 3.0]))
+    torch.testing.assert_close(sn.cameras_of(path, scene())[0].center, torch.tensor([0.0, 0, 3]))
     # nerfstudio's transform begins before the one that a transforms.json states as applied.
     applied = {"applied_transform": [[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]], "applied_scale": 2.0}
     path = written(tmp_path, {**LENS, **applied, "frames": [FRAME]})
-    torch.testing.assert_close(sn.views_of(path, trained)[0].center, torch.tensor([0.25, 0.25, 1.5]))
+    torch.testing.assert_close(sn.cameras_of(path, trained)[0].center, torch.tensor([0.25, 0.25, 1.5]))
     path = written(tmp_path, PATH)
-    torch.testing.assert_close(sn.views_of(path, trained)[0].center, torch.tensor([0.0, 0, 3]))
+    torch.testing.assert_close(sn.cameras_of(path, trained)[0].center, torch.tensor([0.0, 0, 3]))
 
 
 @pytest.mark.parametrize(
@@ -107,28 +107,28 @@ def test_cameras_of_a_capture_move_with_its_model(tmp_path: Path) -> None:
 )
 def test_files_without_usable_cameras_are_refused_in_one_line(content: Any, message: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=message) as caught:
-        sn.views_of(written(tmp_path, content))
+        sn.cameras_of(written(tmp_path, content))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0)])
 @pytest.mark.parametrize("eye", [(1.0, -2.0, 0.5), (0.0, 0.0, 4.0), (0.0, 4.0, 0.0)])
 def test_a_camera_looks_at_its_target(eye: tuple[float, ...], up: tuple[float, ...]) -> None:
-    view = sn.View.look_at(eye, (0.0, 0.0, 0.0), up, fov=90, width=20, height=10)
-    x, y, z = view.viewmat[:3, 3].tolist()
+    camera = sn.Camera.look_at(eye, (0.0, 0.0, 0.0), up, fov=90, width=20, height=10)
+    x, y, z = camera.viewmat[:3, 3].tolist()
     assert (x, y) == (pytest.approx(0, abs=1e-6), pytest.approx(0, abs=1e-6))
     assert z == pytest.approx(math.dist(eye, (0, 0, 0)))
-    torch.testing.assert_close(view.viewmat[:3, :3] @ view.viewmat[:3, :3].T, torch.eye(3))
-    assert torch.det(view.viewmat[:3, :3]) == pytest.approx(1)
-    torch.testing.assert_close(sn.View.from_pose(view.pose, (5, 5, 10, 5), 20, 10).viewmat, view.viewmat)
-    assert float(view.K[1, 1]) == pytest.approx(5)
+    torch.testing.assert_close(camera.viewmat[:3, :3] @ camera.viewmat[:3, :3].T, torch.eye(3))
+    assert torch.det(camera.viewmat[:3, :3]) == pytest.approx(1)
+    torch.testing.assert_close(sn.Camera.from_pose(camera.pose, (5, 5, 10, 5), 20, 10).viewmat, camera.viewmat)
+    assert float(camera.K[1, 1]) == pytest.approx(5)
 
 
 def test_virtual_views_are_the_same_for_a_seed_and_see_the_scene() -> None:
-    one, same, other = (sn.virtual_views(scene(), 16, seed=seed) for seed in (0, 0, 1))
+    one, same, other = (sn.virtual_cameras(scene(), 16, seed=seed) for seed in (0, 0, 1))
     assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(one, same, strict=True))
     assert not torch.equal(one[0].viewmat, other[0].viewmat)
-    seen = [float(sn.render(scene(), view).accumulation.max()) for view in one]
+    seen = [float(sn.render(scene(), camera).accumulation.max()) for camera in one]
     assert min(seen) > 0
 
 
@@ -137,8 +137,8 @@ def test_virtual_views_are_the_same_for_a_seed_and_see_the_scene() -> None:
 def test_a_scene_of_any_size_is_pruned_alike(factor: float) -> None:
     """The near plane is 0.01 world units away, which is more than the whole of a small scene."""
     moved = scene()
-    moved.field["means"] *= factor
-    moved.field["scales"] += math.log(factor)
+    moved.gaussians["means"] *= factor
+    moved.gaussians["scales"] += math.log(factor)
     own, other = (prune_with_mask(each, 0.3, None, None, None, progress=False) for each in (scene(), moved))
     assert other.seen == own.seen
     assert (own.mask == other.mask).float().mean() > 0.95
@@ -156,7 +156,11 @@ def test_the_factor_of_a_limited_sum(count: int) -> None:
 @pytest.mark.parametrize("evenness", [0.0, 4.0])
 def test_a_gpu_judges_cameras_like_a_cpu(evenness: float) -> None:
     made, generator = scene(), torch.Generator().manual_seed(0)
-    sizes, eyes, targets = made.field["scales"].mean(dim=1), ball(150, generator).double(), made.field["means"][:1]
+    sizes, eyes, targets = (
+        made.gaussians["scales"].mean(dim=1),
+        ball(150, generator).double(),
+        made.gaussians["means"][:1],
+    )
     targets = targets.double().expand(150, 3)
     on_gpu = made.to("cuda")
     found = virtual._coarseness(on_gpu, sizes.cuda(), eyes, targets, evenness)
@@ -164,7 +168,7 @@ def test_a_gpu_judges_cameras_like_a_cpu(evenness: float) -> None:
 
 
 def centers_of(made: sn.Scene, n: int = 32) -> torch.Tensor:
-    return torch.stack([view.center for view in sn.virtual_views(made, n)])
+    return torch.stack([camera.center for camera in sn.virtual_cameras(made, n)])
 
 
 def ball(n: int, generator: torch.Generator) -> torch.Tensor:
@@ -172,20 +176,20 @@ def ball(n: int, generator: torch.Generator) -> torch.Tensor:
 
 
 def test_virtual_eyes_are_not_in_a_fog(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fewer are in a fog around half of a ball than of random ones; also if a few primitives stand for all."""
+    """Fewer are in a fog around half of a ball than of random ones; also if a few Gaussians stand for all."""
     generator = torch.Generator().manual_seed(0)
     points = ball(2000, generator)
     fog = 4 * torch.rand(1000, 3, generator=generator) - torch.tensor([0.0, 2.0, 2.0])
     made = sn.Scene.from_points(torch.cat([points, fog]), torch.rand(3000, 3, generator=generator))
-    made.field["opacities"][:2000], made.field["opacities"][2000:] = 4.0, -1.0
-    made.field["scales"][:2000], made.field["scales"][2000:] = math.log(0.05), math.log(0.4)
+    made.gaussians["opacities"][:2000], made.gaussians["opacities"][2000:] = 4.0, -1.0
+    made.gaussians["scales"][:2000], made.gaussians["scales"][2000:] = math.log(0.05), math.log(0.4)
 
     def in_fog() -> float:
         centers = centers_of(made)
         return float(((centers[:, 0] > 0) & (centers.norm(dim=1) > 1.2)).float().mean())
 
     all_judge = in_fog()
-    monkeypatch.setattr("sundae_ns.scene.virtual_cameras._PROBE_PRIMITIVES", 800)
+    monkeypatch.setattr("sundae_ns.scene.virtual_cameras._PROBE_GAUSSIANS", 800)
     few_judge = in_fog()
     monkeypatch.setattr("sundae_ns.scene.virtual_cameras.FIRST", 1)
     monkeypatch.setattr("sundae_ns.scene.virtual_cameras.ROUNDS", 0)
@@ -193,12 +197,12 @@ def test_virtual_eyes_are_not_in_a_fog(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_virtual_eyes_are_inside_of_a_room_whose_walls_are_fine_inside(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Primitives behind the walls, which no photograph saw, are coarse."""
+    """Gaussians behind the walls, which no photograph saw, are coarse."""
     generator = torch.Generator().manual_seed(0)
     points = torch.cat([ball(3000, generator), 1.2 * ball(300, generator)])
     made = sn.Scene.from_points(points, torch.rand(3300, 3, generator=generator))
-    made.field["opacities"][:] = 6.0
-    made.field["scales"][:3000], made.field["scales"][3000:] = math.log(0.03), math.log(0.15)
+    made.gaussians["opacities"][:] = 6.0
+    made.gaussians["scales"][:3000], made.gaussians["scales"][3000:] = math.log(0.03), math.log(0.15)
     inside = (centers_of(made).norm(dim=1) < 1).float().mean()
     assert inside > 0.9
     monkeypatch.setattr("sundae_ns.scene.virtual_cameras.FIRST", 1)
@@ -207,13 +211,15 @@ def test_virtual_eyes_are_inside_of_a_room_whose_walls_are_fine_inside(monkeypat
 
 
 def test_virtual_eyes_are_outside_of_an_object_and_look_at_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From within, its primitives are large; from far away, most of an image is empty."""
+    """From within, its Gaussians are large; from far away, most of an image is empty."""
     generator = torch.Generator().manual_seed(0)
     solid = ball(3000, generator) * torch.rand(3000, 1, generator=generator) ** (1 / 3)
     made = sn.Scene.from_points(solid, torch.rand(3000, 3, generator=generator))
-    made.field["opacities"][:], made.field["scales"][:] = 2.0, math.log(0.05)
-    views = sn.virtual_views(made, 32)
-    centers, ahead = (torch.stack(found) for found in ([v.center for v in views], [v.viewmat[2, :3] for v in views]))
+    made.gaussians["opacities"][:], made.gaussians["scales"][:] = 2.0, math.log(0.05)
+    cameras = sn.virtual_cameras(made, 32)
+    centers, ahead = (
+        torch.stack(found) for found in ([v.center for v in cameras], [v.viewmat[2, :3] for v in cameras])
+    )
     outside = centers.norm(dim=1) > 1
     assert float(torch.linalg.cross(centers, ahead).norm(dim=1)[outside].max()) < 1  # the line of sight hits it
     assert float(((ahead * centers).sum(dim=1) < 0)[outside].float().mean()) == 1
@@ -224,18 +230,18 @@ def test_virtual_eyes_are_outside_of_an_object_and_look_at_it(monkeypatch: pytes
 
 def test_virtual_views_that_see_nothing_are_refused() -> None:
     with pytest.raises(ConfigError, match="see nothing"):
-        sn.virtual_views(scene(), 0)
+        sn.virtual_cameras(scene(), 0)
     broken = scene()
-    broken.field["means"][:] = torch.nan
+    broken.gaussians["means"][:] = torch.nan
     with pytest.raises(DataError, match="no camera sees the scene"):
-        sn.virtual_views(broken)
+        sn.virtual_cameras(broken)
 
 
 def test_a_scene_that_no_view_sees_is_not_pruned() -> None:
     faint = scene()
-    faint.field["opacities"][:] = -20
-    with pytest.raises(DataError, match="4 views see none of 100 primitives"):
-        sn.prune(faint, keep=0.5, views=sn.virtual_views(faint, 4))
+    faint.gaussians["opacities"][:] = -20
+    with pytest.raises(DataError, match="4 views see none of 100 Gaussians"):
+        sn.prune(faint, keep=0.5, cameras=sn.virtual_cameras(faint, 4))
 
 
 EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

@@ -11,19 +11,19 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.scene.cleaning import crop_mask, floater_mask, within
 
-VIEWS = tuple(sn.View.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=96, height=72) for x in (-2.0, 0.0, 2.0))
+VIEWS = tuple(sn.Camera.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=96, height=72) for x in (-2.0, 0.0, 2.0))
 
 
 def scene_of(points: Tensor, scale: float) -> sn.Scene:
     made = sn.Scene.from_points(points, points.sigmoid())
     values = {
-        "scales": torch.full_like(made.field["scales"], math.log(scale)),
-        "opacities": made.field["opacities"] + 9,
+        "scales": torch.full_like(made.gaussians["scales"], math.log(scale)),
+        "opacities": made.gaussians["opacities"] + 9,
     }
-    return dataclasses.replace(made, field=made.field.replaced(values), views=VIEWS)
+    return dataclasses.replace(made, gaussians=made.gaussians.replaced(values), cameras=VIEWS)
 
 
 def wall(n: int = 4000) -> Tensor:
@@ -44,15 +44,15 @@ def planted(n: int = 30) -> Tensor:
 def test_planted_floaters_vanish_and_the_surface_stays(factor: float, with_views: bool) -> None:
     floaters, surface = planted(), wall()
     whole = scene_of(factor * torch.cat([surface, floaters]), factor * 0.02)
-    views = [view._replace(viewmat=view.viewmat.clone()) for view in VIEWS]
-    for view in views:
-        view.viewmat[:3, 3] *= factor
-    found = floater_mask(whole, views if with_views else ())
+    cameras = [camera._replace(viewmat=camera.viewmat.clone()) for camera in VIEWS]
+    for camera in cameras:
+        camera.viewmat[:3, 3] *= factor
+    found = floater_mask(whole, cameras if with_views else ())
     assert bool(found[len(surface) :].all())
     assert int(found[: len(surface)].sum()) <= 2
     if factor == 1:
-        clean = sn.remove_floaters(whole, views=views if with_views else ())
-        assert clean.num_primitives == int((~found).sum())
+        clean = sn.remove_floaters(whole, cameras=cameras if with_views else ())
+        assert clean.num_gaussians == int((~found).sum())
         truth = scene_of(surface, 0.02)
         assert sn.measure(clean, truth).psnr > 50
         assert sn.measure(whole, truth).psnr < 35
@@ -72,18 +72,18 @@ def test_what_no_view_sees_goes_and_no_image_changes() -> None:
 
 def test_floaters_are_counted_after_values_without_meaning() -> None:
     whole = scene_of(torch.cat([wall(), planted()]), 0.02)
-    means = whole.field["means"].clone()
+    means = whole.gaussians["means"].clone()
     means[7] = math.nan
-    found = floater_mask(dataclasses.replace(whole, field=whole.field.replaced({"means": means})), VIEWS)
+    found = floater_mask(dataclasses.replace(whole, gaussians=whole.gaussians.replaced({"means": means})), VIEWS)
     assert bool(found[7])
     assert int(found[:4000].sum()) <= 3
     assert bool(found[4000:].all())
-    nothing = dataclasses.replace(whole, field=whole.field.replaced({"means": means * math.nan}))
-    with pytest.raises(DataError, match="no primitive is finite"):
+    nothing = dataclasses.replace(whole, gaussians=whole.gaussians.replaced({"means": means * math.nan}))
+    with pytest.raises(DataError, match="no Gaussian is finite"):
         sn.remove_floaters(nothing)
-    away = [sn.View.look_at((0.0, -40.0, 0.0), (0.0, -80.0, 0.0), width=32, height=32)]
+    away = [sn.Camera.look_at((0.0, -40.0, 0.0), (0.0, -80.0, 0.0), width=32, height=32)]
     with pytest.raises(DataError, match="1 views see none"):
-        sn.remove_floaters(whole, views=away)
+        sn.remove_floaters(whole, cameras=away)
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
@@ -100,10 +100,10 @@ def test_a_box_is_exact_and_keeps_all_else() -> None:
     # 0.1 is not a float32: the box is compared in float64.
     assert crop_mask(whole, (0.1, 0, 0), (2, 2, 2)).tolist()[2] == (float(torch.tensor(0.1).double()) >= 0.1)
     found = sn.crop(whole, (0, 0, 0), (1, 1, 1))
-    assert torch.equal(found.field["means"], points[:3])
-    assert torch.equal(found.field["scales"], whole.field["scales"][:3])
-    assert (found.views, found.up, found.start, found.antialiased) == (whole.views, whole.up, whole.start, True)
-    assert whole.num_primitives == 5
+    assert torch.equal(found.gaussians["means"], points[:3])
+    assert torch.equal(found.gaussians["scales"], whole.gaussians["scales"][:3])
+    assert (found.cameras, found.up, found.start, found.antialiased) == (whole.cameras, whole.up, whole.start, True)
+    assert whole.num_gaussians == 5
 
 
 @pytest.mark.parametrize(
@@ -122,8 +122,8 @@ def test_impossible_boxes_are_refused(low: tuple[float, ...], high: tuple[float,
 def test_an_empty_result_says_where_the_scene_is() -> None:
     with pytest.raises(DataError, match=r"most of them lie between -1\.\d+ .* and 1\.\d+ "):
         sn.crop(scene_of(wall(), 0.1), (50, 50, 50), (51, 51, 51))
-    broken = sn.Scene(Field({name: value * math.nan for name, value in scene_of(wall(9), 0.1).field.items()}))
-    with pytest.raises(DataError, match="no primitive is in the box"):
+    broken = sn.Scene(Gaussians({name: value * math.nan for name, value in scene_of(wall(9), 0.1).gaussians.items()}))
+    with pytest.raises(DataError, match="no Gaussian is in the box"):
         sn.crop(broken, (0, 0, 0), (1, 1, 1))
 
 

@@ -1,4 +1,4 @@
-"""What each primitive contributes to the training pictures."""
+"""What each Gaussian contributes to the training pictures."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterize.interface import blending_weights, rasterize
-from sundae_ns.scene.render import LocalField, TrainingView, contribution, pass_options
+from sundae_ns.scene.render import GaussianSource, TrainingCamera, contribution, pass_options
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[[SundaeModel], Any]
 
 N = 60
-"""Primitives of a model that is built without a count."""
+"""Gaussians of a model that is built without a count."""
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
@@ -39,7 +39,7 @@ def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: A
     assert total[4] == 0
     model.eval()
     with torch.no_grad():
-        alphas = [model.get_outputs_for_camera(view)["accumulation"] for view, _ in datamanager.training_views()]
+        alphas = [model.get_outputs_for_camera(camera)["accumulation"] for camera, _ in datamanager.training_views()]
     assert float(total.sum()) == pytest.approx(float(torch.stack(alphas).sum()), rel=1e-4)
 
 
@@ -47,7 +47,7 @@ def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: A
 def test_what_masks_leave_out_of_training_asks_for_no_primitives(
     build: Build, datamanager: Any, count: int | None
 ) -> None:
-    """The two halves of an image add up to the whole; many primitives contribute to one half only."""
+    """The two halves of an image add up to the whole; many Gaussians contribute to one half only."""
     model = build()
     model.gauss_params["scales"].data[:] = -4.0
     whole = model.contribution(datamanager, count)
@@ -79,24 +79,28 @@ def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time(buil
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_weights_by_detail_are_those_of_an_image_and_a_second_pass(masked: bool) -> None:
-    scene = sn.Scene(Field(random_field(60, features=0)))
-    view, settings = sn.virtual_views(scene, 1, size=40)[0], scene.settings()
+    scene = sn.Scene(Gaussians(random_field(60, features=0)))
+    camera, settings = sn.virtual_cameras(scene, 1, size=40)[0], scene.settings()
     mask = torch.rand(40, 40, 1, generator=torch.Generator().manual_seed(0)) < 0.5 if masked else None
-    found = contribution(LocalField(scene.field), [TrainingView(view, mask)], scene.background, settings, 20)
-    image = sn.render(scene, view)
-    visible = rasterize(colors=scene.field["features_dc"], **pass_options(scene.field, view, settings)).radii > 0
+    found = contribution(
+        GaussianSource(scene.gaussians), [TrainingCamera(camera, mask)], scene.background, settings, 20
+    )
+    image = sn.render(scene, camera)
+    visible = (
+        rasterize(colors=scene.gaussians["features_dc"], **pass_options(scene.gaussians, camera, settings)).radii > 0
+    )
     pixels = pixel_detail(image.rgb, 20 / 60 * float(visible.sum()))
     pixels = pixels if mask is None else pixels * mask[..., 0]
-    expected = blending_weights(pixels=pixels, **pass_options(scene.field, view, settings))
+    expected = blending_weights(pixels=pixels, **pass_options(scene.gaussians, camera, settings))
     assert float(expected.max()) > 0.1
     torch.testing.assert_close(found, expected)
-    assert not any(value.requires_grad for value in scene.field.values())
+    assert not any(value.requires_grad for value in scene.gaussians.values())
 
 
 def test_a_prune_weighs_detail_for_the_count_that_it_keeps(
     build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    training = training_of(build(pruning={"mode": "continuous", "start": 3, "stop": 3, "target_primitives": 15}))
+    training = training_of(build(pruning={"mode": "continuous", "start": 3, "stop": 3, "target_gaussians": 15}))
     asked: list[float] = []
 
     def spy(image: Tensor, cells: float) -> Tensor:
@@ -109,5 +113,5 @@ def test_a_prune_weighs_detail_for_the_count_that_it_keeps(
         training.step(step)
         counts.append(training.model.num_points)
     assert counts == [60, 60, 60, 15, 15, 15]
-    # All primitives are visible in each of three views, and 15 of them stay.
+    # All Gaussians are visible in each of three views, and 15 of them stay.
     assert asked == [15.0] * 3

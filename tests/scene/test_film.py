@@ -22,7 +22,9 @@ def ball(n: int = 4000) -> sn.Scene:
     points = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1)
     points = points * torch.rand(n, 1, generator=generator) ** (1 / 3)
     scene = sn.Scene.from_points(points, torch.rand(n, 3, generator=generator))
-    return dataclasses.replace(scene, field=scene.field.replaced({"opacities": scene.field["opacities"] + 4}))
+    return dataclasses.replace(
+        scene, gaussians=scene.gaussians.replaced({"opacities": scene.gaussians["opacities"] + 4})
+    )
 
 
 def looking(
@@ -30,7 +32,7 @@ def looking(
 ) -> tuple:
     up = (math.sin(roll), 0.0, math.cos(roll))
     pairs = zip(eyes, targets, strict=True)
-    return tuple(sn.View.look_at(eye, target, up, fov=50, width=40, height=30) for eye, target in pairs)
+    return tuple(sn.Camera.look_at(eye, target, up, fov=50, width=40, height=30) for eye, target in pairs)
 
 
 def on_a_ring(n: int, radius: float = 4.0) -> list[tuple[float, float, float]]:
@@ -39,34 +41,34 @@ def on_a_ring(n: int, radius: float = 4.0) -> list[tuple[float, float, float]]:
     return [(radius * math.cos(turn), radius * math.sin(turn), 0.5 * math.cos(3 * turn)) for turn in turns]
 
 
-def film(scene: sn.Scene) -> list[sn.View]:
+def film(scene: sn.Scene) -> list[sn.Camera]:
     return film_views(scene, seconds=COUNT / 24, frames_per_second=24)
 
 
-def steps(views: list[sn.View], distance: float) -> Tensor:
+def steps(cameras: list[sn.Camera], distance: float) -> Tensor:
     """Motion and turning from each frame to the next, and from the last to the first ``[V]``."""
-    parts = torch.stack([torch.cat([view.center / distance, -view.pose[:, 2]]) for view in views]).double()
+    parts = torch.stack([torch.cat([camera.center / distance, -camera.pose[:, 2]]) for camera in cameras]).double()
     return (parts.roll(-1, dims=0) - parts).norm(dim=1)
 
 
-def check_upright(views: list[sn.View], up: Tensor) -> None:
-    for view in views:
-        assert abs(float(view.pose[:, 0] @ up)) < 1e-5
-        assert float(view.pose[:, 1] @ up) > 0.3
+def check_upright(cameras: list[sn.Camera], up: Tensor) -> None:
+    for camera in cameras:
+        assert abs(float(camera.pose[:, 0] @ up)) < 1e-5
+        assert float(camera.pose[:, 1] @ up) > 0.3
 
 
 def test_the_path_leads_through_views_and_closes() -> None:
     eyes = on_a_ring(23)
-    scene = dataclasses.replace(ball(), views=looking(eyes, len(eyes) * [(0.0, 0.0, 0.0)]))
-    views = film(scene)
-    assert len(views) == COUNT
-    assert (views[0].width, views[0].height) == (40, 30)
-    assert torch.equal(views[0].K, scene.views[0].K)
-    assert torch.allclose(views[0].viewmat, scene.views[0].viewmat, atol=1e-5)
-    found = steps(views, 3.0)  # the ball's near side is 3 away
+    scene = dataclasses.replace(ball(), cameras=looking(eyes, len(eyes) * [(0.0, 0.0, 0.0)]))
+    cameras = film(scene)
+    assert len(cameras) == COUNT
+    assert (cameras[0].width, cameras[0].height) == (40, 30)
+    assert torch.equal(cameras[0].K, scene.cameras[0].K)
+    assert torch.allclose(cameras[0].viewmat, scene.cameras[0].viewmat, atol=1e-5)
+    found = steps(cameras, 3.0)  # the ball's near side is 3 away
     assert float(found.max() / found.min()) < 1.2
-    check_upright(views, torch.tensor([0.0, 0.0, 1.0]))
-    centers = torch.stack([view.center for view in views])
+    check_upright(cameras, torch.tensor([0.0, 0.0, 1.0]))
+    centers = torch.stack([camera.center for camera in cameras])
     turns = torch.atan2(centers[:, 1], centers[:, 0])
     whole = (turns.roll(-1) - turns + math.pi).remainder(2 * math.pi) - math.pi
     assert abs(float(whole.sum())) == pytest.approx(2 * math.pi, rel=1e-5), "once around, not to and fro"
@@ -78,58 +80,60 @@ def test_the_path_leads_through_views_and_closes() -> None:
 def test_it_begins_with_the_start_view_and_keeps_the_up_axis() -> None:
     eyes = on_a_ring(9)
     rolled = looking(eyes, len(eyes) * [(0.0, 0.0, 0.0)], roll=0.3)
-    start = sn.View.look_at((0, -5, 1), (0, 0, 0), fov=30, width=3000, height=2000)
+    start = sn.Camera.look_at((0, -5, 1), (0, 0, 0), fov=30, width=3000, height=2000)
     up = (math.sin(0.3), 0.0, math.cos(0.3))
-    views = film(dataclasses.replace(ball(), views=rolled, start=start, up=up))
-    assert torch.allclose(views[0].center, start.center, atol=1e-4)
-    assert (views[0].width, views[0].height) == (1280, 853)
-    assert views[0].focal == pytest.approx(start.focal * 1280 / 3000, rel=1e-3)
-    check_upright(views, torch.tensor(up))
+    cameras = film(dataclasses.replace(ball(), cameras=rolled, start=start, up=up))
+    assert torch.allclose(cameras[0].center, start.center, atol=1e-4)
+    assert (cameras[0].width, cameras[0].height) == (1280, 853)
+    assert cameras[0].focal == pytest.approx(start.focal * 1280 / 3000, rel=1e-3)
+    check_upright(cameras, torch.tensor(up))
 
 
 def test_views_that_look_in_opposite_directions_are_turned_between() -> None:
     eyes = [(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.2, 0.0, 0.0)]
-    scene = dataclasses.replace(ball(), views=looking(eyes, [(0.0, 9.0, 0.0), (0.1, -9.0, 0.0), (0.2, 9.0, 0.0)]))
-    views = film(scene)
-    found = steps(views, 1.0)
+    scene = dataclasses.replace(ball(), cameras=looking(eyes, [(0.0, 9.0, 0.0), (0.1, -9.0, 0.0), (0.2, 9.0, 0.0)]))
+    cameras = film(scene)
+    found = steps(cameras, 1.0)
     assert float(found.max()) < 3 * float(found.mean())
-    check_upright(views, torch.tensor([0.0, 0.0, 1.0]))
+    check_upright(cameras, torch.tensor([0.0, 0.0, 1.0]))
 
 
 def test_views_that_see_nothing_make_a_path_too() -> None:
     eyes = on_a_ring(9, radius=400.0)
     outward = [(2 * x, 2 * y, z) for x, y, z in eyes]
-    views = film(dataclasses.replace(ball(), views=looking(eyes, outward)))
-    found = steps(views, 400.0)
+    cameras = film(dataclasses.replace(ball(), cameras=looking(eyes, outward)))
+    found = steps(cameras, 400.0)
     assert float(found.max() / found.min()) < 1.5
-    assert min(float(view.center.norm()) for view in views) > 300
+    assert min(float(camera.center.norm()) for camera in cameras) > 300
 
 
 def test_a_view_straight_down_is_passed_over() -> None:
     eyes = on_a_ring(5)
-    views = looking([(0.0, 0.0, 6.0), *eyes], 6 * [(0.0, 0.0, 0.0)])
-    found = film(dataclasses.replace(ball(), views=views, up=(0.0, 0.0, 1.0)))
+    cameras = looking([(0.0, 0.0, 6.0), *eyes], 6 * [(0.0, 0.0, 0.0)])
+    found = film(dataclasses.replace(ball(), cameras=cameras, up=(0.0, 0.0, 1.0)))
     check_upright(found, torch.tensor([0.0, 0.0, 1.0]))
-    assert max(float(view.center[2]) for view in found) < 2
+    assert max(float(camera.center[2]) for camera in found) < 2
 
 
 @pytest.mark.parametrize(("stored", "factor"), [(0, 1.0), (1, 1000.0), (4, 1.0)])
 def test_a_scene_without_a_path_is_seen_from_all_around(stored: int, factor: float) -> None:
     scene = ball(1500)
-    grown = {"means": factor * scene.field["means"], "scales": scene.field["scales"] + math.log(factor)}
-    view = looking([(0.0, -5.0 * factor, 0.0)], [(0.0, 0.0, 0.0)])
-    scene = dataclasses.replace(scene, field=scene.field.replaced(grown), views=stored * view, up=(0.0, -1.0, 0.0))
-    views = film(scene)
-    found = steps(views, float(views[0].center.norm()))
+    grown = {"means": factor * scene.gaussians["means"], "scales": scene.gaussians["scales"] + math.log(factor)}
+    camera = looking([(0.0, -5.0 * factor, 0.0)], [(0.0, 0.0, 0.0)])
+    scene = dataclasses.replace(
+        scene, gaussians=scene.gaussians.replaced(grown), cameras=stored * camera, up=(0.0, -1.0, 0.0)
+    )
+    cameras = film(scene)
+    found = steps(cameras, float(cameras[0].center.norm()))
     assert float(found.max() / found.min()) < 1.2
-    check_upright(views, torch.tensor([0.0, -1.0, 0.0]))
-    centers = torch.stack([view.center for view in views])
+    check_upright(cameras, torch.tensor([0.0, -1.0, 0.0]))
+    centers = torch.stack([camera.center for camera in cameras])
     turns = torch.atan2(centers[:, 0], centers[:, 2])
     whole = (turns.roll(-1) - turns + math.pi).remainder(2 * math.pi) - math.pi
     assert abs(float(whole.sum())) == pytest.approx(2 * math.pi, rel=1e-4)
-    seen = [float(sn.render(scene, view.zoomed(0.05)).accumulation.mean()) for view in views[::20]]
+    seen = [float(sn.render(scene, camera.zoomed(0.05)).accumulation.mean()) for camera in cameras[::20]]
     assert min(seen) > 0.1
-    assert (views[0].width, views[0].height) == ((40, 30) if stored else (1280, 720))
+    assert (cameras[0].width, cameras[0].height) == ((40, 30) if stored else (1280, 720))
 
 
 @pytest.mark.parametrize(

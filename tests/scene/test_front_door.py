@@ -16,20 +16,20 @@ from fields import random_field
 from short_prunes import SHORT
 
 import sundae_ns as sn
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.ply import write_ply
 
 ROOT = Path(__file__).parents[2]
-FUNCTIONS = ("crop", "load", "measure", "prune", "remove_floaters", "render", "save", "show", "views_of")
-FUNCTIONS += ("virtual_views",)
+FUNCTIONS = ("crop", "load", "measure", "prune", "remove_floaters", "render", "save", "show", "cameras_of")
+FUNCTIONS += ("virtual_cameras",)
 WITHOUT_NERFSTUDIO = """
 import sys
 sys.modules["nerfstudio"] = None
 %s
 import sundae_ns as sn
 scene = sn.load("headed.sundae")
-sn.render(scene, sn.View.look_at((2.0, 2.0, 2.0), (0.5, 0.5, 0.5), width=64, height=48))
+sn.render(scene, sn.Camera.look_at((2.0, 2.0, 2.0), (0.5, 0.5, 0.5), width=64, height=48))
 assert scene.head and "torch._dynamo" not in sys.modules  # the import of torch's compiler takes most of a second
 exec(sys.stdin.read())
 assert not any(name.split(".")[0] == "nerfstudio" and module for name, module in sys.modules.items())
@@ -45,13 +45,13 @@ def five_lines(text: str) -> str:
 
 @pytest.fixture
 def garden(tmp_path: Path) -> Path:
-    field = random_field(200, features=0)
-    field["scales"] += 2
-    write_ply(tmp_path / "garden.ply", field)
+    gaussians = random_field(200, features=0)
+    gaussians["scales"] += 2
+    write_ply(tmp_path / "garden.ply", gaussians)
     # With a head for its one feature.
-    field["features"] = torch.zeros(200, 1)
+    gaussians["features"] = torch.zeros(200, 1)
     head = CompensationHead(HeadConfig(size="tiny", num_features=1))
-    sn.save(sn.Scene(Field(field), head), tmp_path / "headed.sundae")
+    sn.save(sn.Scene(Gaussians(gaussians), head), tmp_path / "headed.sundae")
     return tmp_path
 
 
@@ -68,7 +68,7 @@ def test_the_lines_of_the_pages_run_without_nerfstudio(garden: Path) -> None:
     )
     done = subprocess.run(code, input=told, cwd=garden, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert [sn.load(garden / f"small-{number}.sundae").num_primitives for number in range(2)] == [20, 20]
+    assert [sn.load(garden / f"small-{number}.sundae").num_gaussians for number in range(2)] == [20, 20]
 
 
 def test_every_public_name_is_there_and_documented() -> None:

@@ -78,19 +78,19 @@ def test_a_page_of_too_many_primitives_has_no_first_image(
         main(["export", str(bomb), "-o", str(tmp_path / "a.html")])
     assert caught.value.code == 0, capsys.readouterr().err
     (line,) = caplog.messages
-    assert "the page has no first image: the view has 20,000 primitives in each tile" in line
+    assert "the page has no first image: the view has 20,000 Gaussians in each tile" in line
     page = (tmp_path / "a.html").read_text()
     assert "image/jpeg" not in page
     (code,) = re.findall(r'src="data:image/gif;base64,([^"]*)"', page)
     assert Image.open(io.BytesIO(base64.b64decode(code))).convert("RGBA").getpixel((0, 0))[3] == 0
     # An image is refused, and its other view is rendered.
-    for view in (0, 1):
+    for camera in (0, 1):
         with pytest.raises(SystemExit) as caught:
-            main(["render", str(bomb), "-o", str(tmp_path / "a.png"), "--view", str(view)])
-        assert caught.value.code == (0 if view else 2)
+            main(["render", str(bomb), "-o", str(tmp_path / "a.png"), "--view", str(camera)])
+        assert caught.value.code == (0 if camera else 2)
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    assert "primitives in each tile of its image" in err
+    assert "Gaussians in each tile of its image" in err
 
 
 def test_a_folder_has_page_and_scene_apart(packed: Path, tmp_path: Path) -> None:
@@ -152,13 +152,13 @@ def test_the_decoder_agrees_with_python(decode: Callable[..., list[Json]], tmp_p
     files = [write_kind(tmp_path / f"{i}.sundae", kind) for i, kind in enumerate(KINDS.values())]
     for file, found, kind in zip(files, decode(*files), KINDS.values(), strict=True):
         truth = read_scene(file)
-        assert found["count"] == len(truth.field["means"])
+        assert found["count"] == len(truth.gaussians["means"])
         assert (found["degree"], found["logits"], found["antialiased"]) == (
             kind.degree,
             kind.degree == 0,
             kind.antialiased,
         )
-        for name, value in {**truth.field, **truth.head}.items():
+        for name, value in {**truth.gaussians, **truth.head}.items():
             array = np.fromfile(f"{file}.{name}", np.float32)
             # Sums of the transform and lengths of quaternions round in another order.
             exact = name == "means" or name in truth.head
@@ -210,10 +210,10 @@ def put(path: str, value: Any) -> Callable[[Json], None]:
 
 POSE = [[1, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 0]]
 LIES: dict[str, Callable[[Json], None]] = {
-    "a billion primitives": put("primitives", 10**9),
-    "no primitives": put("primitives", 0),
-    "half a primitive": put("primitives", 0.5),
-    "more primitives than it has": put("primitives", 401),
+    "a billion Gaussians": put("primitives", 10**9),
+    "no Gaussians": put("primitives", 0),
+    "half a Gaussian": put("primitives", 0.5),
+    "more Gaussians than it has": put("primitives", 401),
     "no attributes": put("attributes", 3),
     "an attribute of another codec": put("attributes.scales.codec", "pickle"),
     "harmonics of an older codec": put("attributes.features_rest.codec", "codebooks"),
@@ -319,12 +319,12 @@ def test_the_page_counts_fragments_before_it_draws(tmp_path: Path) -> None:
     found = subprocess.run(["node", program, *files], check=True, capture_output=True, text=True)
     for file, line in zip(files, found.stdout.splitlines(), strict=True):
         scene, counted = load(file), json.loads(line)
-        field, view = scene.field, scene.views[0]
-        opacities = field["opacities"].sigmoid()[:, 0]
-        K, size = view.K, (view.width, view.height)
-        shapes = (field["means"], field["quats"], field["scales"].exp(), opacities, field["means"])
+        gaussians, camera = scene.gaussians, scene.cameras[0]
+        opacities = gaussians["opacities"].sigmoid()[:, 0]
+        K, size = camera.K, (camera.width, camera.height)
+        shapes = (gaussians["means"], gaussians["quats"], gaussians["scales"].exp(), opacities, gaussians["means"])
         flags = {"antialiased": False, "absgrad": False, "render_depth": False}
-        splats = project(Inputs(*shapes, view.viewmat, K, *size, near_plane=0.01, far_plane=1e10, **flags))
+        splats = project(Inputs(*shapes, camera.viewmat, K, *size, near_plane=0.01, far_plane=1e10, **flags))
         reach = (2 * (255 * opacities).log()).clamp(min=0).sqrt().clamp(max=3.4)[:, None]
         reach = reach * splats.covars2d[:, [0, 2]].sqrt()
         low = (splats.means2d - reach).clamp(min=0)
@@ -368,10 +368,10 @@ def test_the_page_in_the_frame_holds_the_scene(scene: sn.Scene, tmp_path: Path) 
     (tmp_path / "shown.sundae").write_bytes(base64.b64decode(inside, validate=True))
     sn.save(scene, tmp_path / "saved.sundae")
     shown, saved = sn.load(tmp_path / "shown.sundae"), sn.load(tmp_path / "saved.sundae")
-    assert shown.num_primitives == scene.num_primitives
-    view = scene.views[0]
-    torch.testing.assert_close(sn.render(shown, view).rgb, sn.render(saved, view).rgb, atol=0, rtol=0)
-    assert float((sn.render(shown, view).rgb - sn.render(scene, view).rgb).abs().mean()) < 0.02  # packed once more
+    assert shown.num_gaussians == scene.num_gaussians
+    camera = scene.cameras[0]
+    torch.testing.assert_close(sn.render(shown, camera).rgb, sn.render(saved, camera).rgb, atol=0, rtol=0)
+    assert float((sn.render(shown, camera).rgb - sn.render(scene, camera).rgb).abs().mean()) < 0.02  # packed once more
 
 
 def test_a_hostile_title_stays_text(scene: sn.Scene) -> None:

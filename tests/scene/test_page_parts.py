@@ -30,8 +30,8 @@ def test_addresses_name_views(parts_of_page: Callable[..., Json]) -> None:
     place = {"position": [1.5, -2e-7, 300.0], "ahead": [0.0, 1.0, -4.25], "lens": 1}
     links = parts_of_page(places=[[2, place], [None, place]])["links"]
     assert links == ["#camera=3", "#camera=1.5,-2e-7,300,0,1,-4.25,2"]
-    views = parts_of_page(addresses=[*links, links[1].replace(",", "%2C")])["views"]
-    assert views == [2, place, place]
+    cameras = parts_of_page(addresses=[*links, links[1].replace(",", "%2C")])["views"]
+    assert cameras == [2, place, place]
 
 
 HOSTILE = [

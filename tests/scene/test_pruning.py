@@ -13,9 +13,9 @@ from torch.utils._pytree import tree_leaves
 
 import sundae_ns as sn
 from sundae_ns.core import covariance
-from sundae_ns.core.gaussians import Encoding, Field, sh_to_rgb
+from sundae_ns.core.gaussians import Encoding, Gaussians, sh_to_rgb
 from sundae_ns.pruning import merge
-from sundae_ns.pruning.decision import prune_field
+from sundae_ns.pruning.decision import prune_gaussians
 from sundae_ns.scene import prune_scene as module
 from sundae_ns.scene.prune_scene import count_for_drop, refit
 
@@ -27,49 +27,51 @@ def scene(encoding: Encoding = "harmonics") -> sn.Scene:
     generator = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(N, 3, generator=generator), dim=1)
     made = sn.Scene.from_points(points, 0.5 + 0.4 * (6 * points).sin())
-    made.field["opacities"][:], made.field["scales"][:] = 2.0, math.log(0.05)
+    made.gaussians["opacities"][:], made.gaussians["scales"][:] = 2.0, math.log(0.05)
     if encoding == "harmonics":
         return made
-    colors = sh_to_rgb(made.field["features_dc"]).logit()
-    return sn.Scene(Field({**made.field, "features_dc": colors}, encoding))
+    colors = sh_to_rgb(made.gaussians["features_dc"]).logit()
+    return sn.Scene(Gaussians({**made.gaussians, "features_dc": colors}, encoding))
 
 
-def pruned(full: sn.Scene, count: int = 150) -> Field:
-    return prune_field(full.field, sn.PruneRule(selection="pairs"), count, torch.ones(N)).field
+def pruned(full: sn.Scene, count: int = 150) -> Gaussians:
+    return prune_gaussians(full.gaussians, sn.PruneRule(selection="pairs"), count, torch.ones(N)).gaussians
 
 
 @pytest.mark.parametrize("encoding", ["harmonics", "logits"])
 def test_a_refit_matches_views_that_it_was_not_given(encoding: Encoding) -> None:
     full = scene(encoding)
-    small, views = pruned(full), sn.virtual_views(full, 32, size=32)
+    small, cameras = pruned(full), sn.virtual_cameras(full, 32, size=32)
     values = {name: value.clone() for name, value in small.items()}
-    found = refit(small, full.field, views, full.settings())
+    found = refit(small, full.gaussians, cameras, full.settings())
     assert all(torch.equal(small[name], value) for name, value in values.items())
     assert found.encoding == encoding
-    assert found.num_primitives == 150
+    assert found.num_gaussians == 150
     assert not any(value.requires_grad for value in found.values())
-    again = refit(small, full.field, views, full.settings())
+    again = refit(small, full.gaussians, cameras, full.settings())
     assert all(torch.equal(found[name], again[name]) for name in found)
-    held_out = sn.virtual_views(full, 8, seed=1, size=32)
-    before, after = (sn.measure(sn.Scene(field), full, held_out).psnr for field in (small, found))
+    held_out = sn.virtual_cameras(full, 8, seed=1, size=32)
+    before, after = (sn.measure(sn.Scene(gaussians), full, held_out).psnr for gaussians in (small, found))
     assert after > before + 1
 
 
 def test_a_field_that_matches_already_is_unchanged() -> None:
     full = scene()
-    assert refit(full.field, full.field, sn.virtual_views(full, 4, size=24), full.settings()) is full.field
+    assert (
+        refit(full.gaussians, full.gaussians, sn.virtual_cameras(full, 4, size=24), full.settings()) is full.gaussians
+    )
 
 
 def test_a_refit_that_diverges_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     full = scene()
-    small, views = pruned(full), sn.virtual_views(full, 4, size=24)
+    small, cameras = pruned(full), sn.virtual_cameras(full, 4, size=24)
 
     def diverge(_: Any, optimizers: Any, *__: Any, **___: Any) -> None:
         for group in optimizers["field"].param_groups:
             group["params"][0].data.fill_(math.nan)
 
     monkeypatch.setattr(module, "optimise", diverge)
-    assert refit(small, full.field, views, full.settings()) is small
+    assert refit(small, full.gaussians, cameras, full.settings()) is small
 
 
 def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,15 +79,15 @@ def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None
     full, sizes = scene(), set()
     images = module._blended
 
-    def spy(field: Field, views: list[sn.View], settings: object) -> list[torch.Tensor]:
-        sizes.update((view.width, view.height) for view in views)
-        return images(field, views, settings)  # type: ignore[arg-type]
+    def spy(gaussians: Gaussians, cameras: list[sn.Camera], settings: object) -> list[torch.Tensor]:
+        sizes.update((camera.width, camera.height) for camera in cameras)
+        return images(gaussians, cameras, settings)  # type: ignore[arg-type]
 
     monkeypatch.setattr(module, "_blended", spy)
     refit(
         pruned(full),
-        full.field,
-        [*sn.virtual_views(full, 2, size=96), *sn.virtual_views(full, 1, size=12)],
+        full.gaussians,
+        [*sn.virtual_cameras(full, 2, size=96), *sn.virtual_cameras(full, 1, size=12)],
         full.settings(),
     )
     assert sizes == {(24, 24), (12, 12)}
@@ -94,9 +96,9 @@ def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None
 def test_images_are_those_of_the_renderer() -> None:
     """Also of views of several sizes."""
     full = scene()
-    views = [*sn.virtual_views(full, 2, size=24), *sn.virtual_views(full, 1, size=12)]
-    for view, image in zip(views, module._blended(full.field, views, full.settings()), strict=True):
-        truth = sn.render(full, view)
+    cameras = [*sn.virtual_cameras(full, 2, size=24), *sn.virtual_cameras(full, 1, size=12)]
+    for camera, image in zip(cameras, module._blended(full.gaussians, cameras, full.settings()), strict=True):
+        truth = sn.render(full, camera)
         torch.testing.assert_close(image[..., 3:], truth.accumulation)
         torch.testing.assert_close(image[..., :3] + (1 - image[..., 3:]) * full.background, truth.rgb)
 
@@ -105,30 +107,36 @@ def test_images_are_those_of_the_renderer() -> None:
 @pytest.mark.parametrize("encoding", ["harmonics", "logits"])
 def test_a_gpu_takes_the_views_of_a_step_together(encoding: Encoding) -> None:
     full = scene(encoding).to("cuda")
-    full.field["scales"][:, 0] += 0.7  # rotations of balls have no gradient but noise
-    settings, views = full.settings(), [view.to("cuda") for view in sn.virtual_views(full, 40, size=48)]
-    field = full.field.replaced({name: value.clone().requires_grad_() for name, value in full.field.items()})
+    full.gaussians["scales"][:, 0] += 0.7  # rotations of balls have no gradient but noise
+    settings, cameras = full.settings(), [camera.to("cuda") for camera in sn.virtual_cameras(full, 40, size=48)]
+    gaussians = full.gaussians.replaced(
+        {name: value.clone().requires_grad_() for name, value in full.gaussians.items()}
+    )
     weights = torch.rand(4, 48, 48, 4, device="cuda")
-    together = (torch.stack(module._blended(field, views[:4], settings)) * weights).sum()
-    apart = sum((module._blended(field, [v], settings)[0] * w).sum() for v, w in zip(views[:4], weights, strict=True))
+    together = (torch.stack(module._blended(gaussians, cameras[:4], settings)) * weights).sum()
+    apart = sum(
+        (module._blended(gaussians, [v], settings)[0] * w).sum() for v, w in zip(cameras[:4], weights, strict=True)
+    )
     names = ("means", "scales", "quats", "opacities", "features_dc")
-    gradients = [torch.autograd.grad(loss, [field[name] for name in names]) for loss in (together, apart)]
+    gradients = [torch.autograd.grad(loss, [gaussians[name] for name in names]) for loss in (together, apart)]
     for one, other in zip(*gradients, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3 * float(other.abs().max()))
-    small = prune_field(full.field, sn.PruneRule(selection="pairs"), 150, torch.ones(N, device="cuda")).field
-    found = refit(small, full.field, views, settings)
-    before, after = (sn.measure(sn.Scene(one), full, views[:8]).psnr for one in (small, found))
+    small = prune_gaussians(
+        full.gaussians, sn.PruneRule(selection="pairs"), 150, torch.ones(N, device="cuda")
+    ).gaussians
+    found = refit(small, full.gaussians, cameras, settings)
+    before, after = (sn.measure(sn.Scene(one), full, cameras[:8]).psnr for one in (small, found))
     assert after > before + 1
 
 
 def test_prune_refits_after_merges_by_pairs_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     full, called = scene(), []
     monkeypatch.setattr("sundae_ns.scene.prune_scene.refit", lambda small, *_, **__: called.append(small) or small)
-    views = sn.virtual_views(full, 2, size=24)
+    cameras = sn.virtual_cameras(full, 2, size=24)
     for rule in (sn.PruneRule(), sn.PruneRule(selection="pairs", redistribution="none"), None):
         assert not called
-        sn.prune(full, keep=0.1, views=views, rule=rule)
-    assert [small.num_primitives for small in called] == [150]
+        sn.prune(full, keep=0.1, cameras=cameras, rule=rule)
+    assert [small.num_gaussians for small in called] == [150]
 
 
 @pytest.fixture(scope="module")
@@ -137,33 +145,33 @@ def ball() -> sn.Scene:
     torch.manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(2000, 3), dim=1)
     scene = sn.Scene.from_points(points, (points + 1) / 2)
-    scene.field["opacities"][:] = 3.0
+    scene.gaussians["opacities"][:] = 3.0
     return scene
 
 
 @pytest.fixture(scope="module")
-def views() -> list[sn.View]:
+def cameras() -> list[sn.Camera]:
     turns = torch.arange(16) * 0.4
     eyes = torch.stack([2.5 * turns.cos(), 2.5 * turns.sin(), 0.1 * turns], dim=1)
-    return [sn.View.look_at(eye, (0, 0, 0), width=48, height=48) for eye in eyes]
+    return [sn.Camera.look_at(eye, (0, 0, 0), width=48, height=48) for eye in eyes]
 
 
 @pytest.mark.parametrize("drop", [1.0, 6.0])
-def test_the_count_meets_the_tolerated_loss(drop: float, ball: sn.Scene, views: list[sn.View]) -> None:
-    kept, curve = count_for_drop(ball, drop, views, sn.PruneRule())
+def test_the_count_meets_the_tolerated_loss(drop: float, ball: sn.Scene, cameras: list[sn.Camera]) -> None:
+    kept, curve = count_for_drop(ball, drop, cameras, sn.PruneRule())
     counts = [count for count, _ in curve]
     assert counts == [2000 // 2 ** (i + 1) for i in range(len(counts))]
     assert counts[-1] <= kept <= 2 * counts[-1] + 1
-    held_out = views[::8]
-    shown = [view for i, view in enumerate(views) if i % 8]
-    small = sn.prune(ball, count=kept, views=shown, rule=sn.PruneRule())
+    held_out = cameras[::8]
+    shown = [camera for i, camera in enumerate(cameras) if i % 8]
+    small = sn.prune(ball, count=kept, cameras=shown, rule=sn.PruneRule())
     error = 10 ** (-sn.measure(small, ball, held_out).psnr / 10)
     tolerated = 1e-3 * (10 ** (drop / 10) - 1)
     assert tolerated / 2 < error < 2 * tolerated
 
 
-def test_more_loss_keeps_fewer(ball: sn.Scene, views: list[sn.View]) -> None:
-    one, three = (count_for_drop(ball, drop, views, sn.PruneRule())[0] for drop in (0.5, 6.0))
+def test_more_loss_keeps_fewer(ball: sn.Scene, cameras: list[sn.Camera]) -> None:
+    one, three = (count_for_drop(ball, drop, cameras, sn.PruneRule())[0] for drop in (0.5, 6.0))
     assert three < one
 
 
@@ -183,11 +191,11 @@ class Doubles(TorchDispatchMode):
 
 
 def test_values_between_are_computed_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of twenty million primitives, each number of an edge in float64 takes 2.6 GB."""
+    """Of twenty million Gaussians, each number of an edge in float64 takes 2.6 GB."""
     for part, name, size in ((covariance, "ROWS", 64), (merge, "ROWS", 64), (covariance, "PAIRS", 1024)):
         monkeypatch.setattr(part, name, size)
     weights = torch.rand(N, generator=torch.Generator().manual_seed(0))
     with Doubles() as found:
-        prune_field(random_field(N), sn.PruneRule(), N // 10, weights)
+        prune_gaussians(random_field(N), sn.PruneRule(), N // 10, weights)
     assert max(found.sizes) == 9 * N  # the covariances
     assert found.sizes.count(9 * N) == 1

@@ -13,13 +13,13 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.utils import colormaps
 from torch import Tensor
 
-from sundae_ns.core.camera import Window, crop_image
+from sundae_ns.core.camera import Crop, crop_image
 from sundae_ns.core.errors import MemoryExhaustedError
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.head.head import resize
 from sundae_ns.method_configs import sundae
 from sundae_ns.plugin.model import SundaeModel
-from sundae_ns.scene.render import LocalField, render_view
+from sundae_ns.scene.render import GaussianSource, render_view
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -27,7 +27,7 @@ MakeCamera = Callable[..., Cameras]
 TrainingOf = Callable[[SundaeModel], Any]
 
 N = 60
-"""Primitives of a model that is built without a count."""
+"""Gaussians of a model that is built without a count."""
 VIEWER_KEYS = {"rgb": 3, "base_rgb": 3, "depth": 1, "accumulation": 1, "features": 3, "response": 1, "background": 3}
 
 
@@ -60,7 +60,7 @@ def test_depth_is_splatted_when_it_is_looked_at(
     """The same depth as in one pass with the colours, of what was drawn: in a box, of what lies in the box."""
     model = perturb(build(head={"mode": "residual"})).eval()
     box = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, 0.0]), torch.tensor([1.0, 1.0, 1.0]))
-    view, background = model.view_of(camera()), model._get_background_color()
+    cam, background = model.camera_of(camera()), model._get_background_color()
     rasterise, passes = model.backend.rasterize, []
     monkeypatch.setattr(model.backend, "rasterize", lambda inputs: passes.append(inputs) or rasterise(inputs))
     found = []
@@ -69,8 +69,8 @@ def test_depth_is_splatted_when_it_is_looked_at(
         assert outputs["rgb"].shape[-1] == 3
         assert [p.render_depth for p in passes] == [False]
         inside = slice(None) if crop is None else crop.within(model.means).squeeze(-1)
-        part = LocalField(Field({k: v[inside] for k, v in model.state.field.items()}))
-        images, _ = render_view(part, view, background, model.render_settings(training=False))
+        part = GaussianSource(Gaussians({k: v[inside] for k, v in model.state.gaussians.items()}))
+        images, _ = render_view(part, cam, background, model.render_settings(training=False))
         seen = images["accumulation"] > 0
         passes.clear()
         found.append(outputs["depth"])
@@ -102,7 +102,7 @@ def test_without_the_head_the_picture_is_the_base_exactly(build: Build, perturb:
     on = model.get_outputs_for_camera(camera())
     assert (on["rgb"] - on["base_rgb"]).abs().max() > 1e-3
     settings = model.render_settings(training=False).without_head()
-    off, _ = render_view(model.source, model.view_of(camera()), on["background"], settings)
+    off, _ = render_view(model.source, model.camera_of(camera()), on["background"], settings)
     assert torch.equal(off["rgb"], off["base_rgb"])
     # With features in the same pass the sums are taken in another order.
     torch.testing.assert_close(off["base_rgb"], on["base_rgb"], atol=1e-6, rtol=0)
@@ -119,13 +119,13 @@ def test_a_mirrored_window_shows_the_mirror_image(
     """Camera and truth agree: off-centre, without symmetry, at an odd width."""
     model = perturb(build(rasterizer=backend)).eval()
     model.step = 10
-    view = model.view_of(camera(47, 31))
-    view.K[0, 2] += 2.5
-    part = Window(5, 3, 33, 20)
+    cam = model.camera_of(camera(47, 31))
+    cam.K[0, 2] += 2.5
+    part = Crop(5, 3, 33, 20)
     settings = model.render_settings(training=False).without_head()
-    for window in (Window(0, 0, 47, 31), part):
+    for crop in (Crop(0, 0, 47, 31), part):
         plain, mirrored = (
-            render_view(model.source, view.cut(window._replace(mirrored=one)), torch.zeros(3), settings)[0]
+            render_view(model.source, cam.cut(crop._replace(mirrored=one)), torch.zeros(3), settings)[0]
             for one in (False, True)
         )
         for name in ("rgb", "depth", "accumulation"):
@@ -244,12 +244,12 @@ def test_full_memory_says_how_much_and_what_to_try(build: Build, camera: MakeCam
     model = build().train(training)
     model.backend = FullBackend()  # type: ignore[assignment]
     with pytest.raises(
-        MemoryExhaustedError, match=rf"cannot allocate 2\.50 GiB more with {N} primitives; try"
+        MemoryExhaustedError, match=rf"cannot allocate 2\.50 GiB more with {N} Gaussians; try"
     ) as caught:
         model.get_outputs_for_camera(camera())
     text = str(caught.value)
     assert "\n" not in text
-    for option in ("cache-images cpu", "camera-res-scale-factor", f"max-primitives {N // 2}"):
+    for option in ("cache-images cpu", "camera-res-scale-factor", f"max-gaussians {N // 2}"):
         assert option in text
 
 

@@ -16,16 +16,16 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.cuda.cuda_graphs import RECORD_AT
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.scene import frames
 from sundae_ns.scene.frames import FrameReplay
-from sundae_ns.scene.render import LocalField, RenderSettings, render_view
+from sundae_ns.scene.render import GaussianSource, RenderSettings, render_view
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -43,8 +43,8 @@ class Recorder:
 
     def record(
         self,
-        source: LocalField,
-        view: View,
+        source: GaussianSource,
+        camera: Camera,
         background: Tensor,
         settings: RenderSettings,
         capacity: int | None = None,
@@ -54,15 +54,15 @@ class Recorder:
         self.recorded.append(capacity)
         shown = {}
 
-        def show(view: View, background: Tensor) -> dict[str, Tensor]:
-            shown.update(render_view(source, view, background, settings, depth=False)[0])
+        def show(camera: Camera, background: Tensor) -> dict[str, Tensor]:
+            shown.update(render_view(source, camera, background, settings, depth=False)[0])
             return {name: shown[name] for name in frames.REPLAYED}
 
         return SimpleNamespace(show=show, capacity=capacity or 120)
 
-    def play(self, recording: Any, view: View, background: Tensor) -> tuple[dict[str, Tensor], int]:
+    def play(self, recording: Any, camera: Camera, background: Tensor) -> tuple[dict[str, Tensor], int]:
         self.played += 1
-        return recording.show(view, background), self.needed
+        return recording.show(camera, background), self.needed
 
 
 @pytest.fixture
@@ -180,7 +180,7 @@ def test_a_part_of_a_field_is_never_recorded(
     for _ in range(2 * RECORD_AT):
         cropped = model.get_outputs_for_camera(camera(), obb_box=box)["rgb"]
     mask = torch.arange(60) % 2 == 0
-    half = SimpleNamespace(field=model.state.field.rows(mask), decision=SimpleNamespace(mask=mask))
+    half = SimpleNamespace(gaussians=model.state.gaussians.rows(mask), decision=SimpleNamespace(mask=mask))
     monkeypatch.setattr(model.viewer_controls, "preview", lambda: half)
     for _ in range(2 * RECORD_AT):
         previewed = model.get_outputs_for_camera(camera())["rgb"]
@@ -201,14 +201,14 @@ def test_nothing_is_recorded_on_a_cpu_or_in_training(
     model = perturb(build()).eval()
     for _ in range(2 * RECORD_AT):
         model.get_outputs_for_camera(camera())
-    source, empty = (LocalField(Field({"means": torch.zeros(n, 3)})) for n in (1, 0))
+    source, empty = (GaussianSource(Gaussians({"means": torch.zeros(n, 3)})) for n in (1, 0))
     settings = model.render_settings(training=False)
     settings = replace(settings, backend=SimpleNamespace(name="gsplat"))  # type: ignore[arg-type]
     with torch.no_grad():
         assert frames._recordable(source, settings)
         assert not frames._recordable(empty, settings)
         assert not frames._recordable(source, replace(settings, training=True))
-        assert not frames._recordable(LocalField(source.field, whole=False), settings)
+        assert not frames._recordable(GaussianSource(source.gaussians, whole=False), settings)
     assert not frames._recordable(source, settings)  # with gradients
 
 
@@ -232,12 +232,12 @@ def test_what_is_played_back_is_what_would_be_rendered(
     model.step = 10_000
     if focal is not None:
         model.state.trained_focal = (focal, focal)
-    views = [camera(width=150, height=101, shift=shift) for shift in (0.0, 0.3, -0.6, 0.1)]
-    expected = [eager(model, view) for view in views]
+    cameras = [camera(width=150, height=101, shift=shift) for shift in (0.0, 0.3, -0.6, 0.1)]
+    expected = [eager(model, cam) for cam in cameras]
     replayed = model._replay = FrameReplay()
     for _ in range(RECORD_AT):
-        model.get_outputs_for_camera(views[0])
-    shown = [model.get_outputs_for_camera(view) for view in views]
+        model.get_outputs_for_camera(cameras[0])
+    shown = [model.get_outputs_for_camera(cam) for cam in cameras]
     assert len(replayed._frames) == 1
     assert replayed._can_record
     for found, truth in zip(shown, expected, strict=True):
@@ -290,11 +290,11 @@ def test_a_view_of_many_more_pairs(build: Build, perturb: Perturb, camera: MakeC
 def test_shorter_lists_make_the_same_picture(build: Build, camera: MakeCamera, size: tuple[int, int]) -> None:
     model = build(n=5000).cuda().eval()
     model.gauss_params["scales"] += 2 * torch.randn_like(model.gauss_params["scales"])
-    view, background = model.view_of(camera(width=size[0], height=size[1])), torch.zeros(3, device="cuda")
+    cam, background = model.camera_of(camera(width=size[0], height=size[1])), torch.zeros(3, device="cuda")
     settings = model.render_settings(training=False)
-    theirs = render_view(model.source, view, background, settings)[0]
+    theirs = render_view(model.source, cam, background, settings)[0]
     capacity = Capacity()
-    ours = render_view(model.source, view, background, replace(settings, backend=RecordableGsplat(capacity)))[0]
+    ours = render_view(model.source, cam, background, replace(settings, backend=RecordableGsplat(capacity)))[0]
     assert int(capacity.needed[0]) > 0
     for name in ("depth", "accumulation"):
         assert torch.equal(ours[name], theirs[name])

@@ -13,17 +13,17 @@ from packed_scenes import KINDS, write_kind
 
 import sundae_ns as sn
 from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, PackError
-from sundae_ns.core.gaussians import Field
+from sundae_ns.core.gaussians import Gaussians
 
 
 def scene(n: int = 200, degree: int = 2) -> sn.Scene:
-    field = random_field(n, degree=degree, features=0)
-    field["scales"] += 2
-    return sn.Scene(Field(field))
+    gaussians = random_field(n, degree=degree, features=0)
+    gaussians["scales"] += 2
+    return sn.Scene(Gaussians(gaussians))
 
 
-def views(n: int = 3) -> list[sn.View]:
-    return sn.virtual_views(scene(), n, size=32)
+def cameras(n: int = 3) -> list[sn.Camera]:
+    return sn.virtual_cameras(scene(), n, size=32)
 
 
 # --------------------------------------------------------------------------------------------------------------- files
@@ -38,30 +38,30 @@ def test_a_file_gives_the_scene_back(suffix: str, least: float, degree: int, tmp
     truth = scene(degree=degree)
     sn.save(truth, tmp_path / f"a{suffix}")
     found = sn.load(tmp_path / f"a{suffix}")
-    assert found.num_primitives == 200
-    assert found.field.sh_degree == degree
+    assert found.num_gaussians == 200
+    assert found.gaussians.sh_degree == degree
     assert not found.in_model_frame
-    assert sn.measure(found, truth, views()).psnr > least
+    assert sn.measure(found, truth, cameras()).psnr > least
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".glb", ".sundae"])
 def test_files_say_that_a_scene_is_antialiased(suffix: str, tmp_path: Path) -> None:
     for antialiased in (True, False):
         path = tmp_path / f"{antialiased}{suffix}"
-        sn.save(sn.Scene(scene().field, antialiased=antialiased), path)
+        sn.save(sn.Scene(scene().gaussians, antialiased=antialiased), path)
         assert sn.load(path).antialiased == antialiased
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_packed_scenes_are_packed_again(name: str, tmp_path: Path) -> None:
     found = sn.load(write_kind(tmp_path / "a.sundae", KINDS[name]))
-    assert len(found.views) == 2
+    assert len(found.cameras) == 2
     sn.save(found, tmp_path / "b.sundae")
     again = sn.load(tmp_path / "b.sundae")
     assert (again.head is None) == (found.head is None)
     assert (again.background_color, again.trained_focal) == (found.background_color, found.trained_focal)
-    torch.testing.assert_close(again.views[0].viewmat, found.views[0].viewmat)
-    assert sn.measure(again, found, found.views, head=False).psnr > 30
+    torch.testing.assert_close(again.cameras[0].viewmat, found.cameras[0].viewmat)
+    assert sn.measure(again, found, found.cameras, head=False).psnr > 30
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_packed_scenes_are_packed_again(name: str, tmp_path: Path) -> None:
         ("gone", None, CheckpointError, "does not exist"),
         ("a.txt", b"a text", CheckpointError, "is no run"),
         ("a.spz", b"\x1f\x8b\x08\x00", DataError, "is no"),
-        ("a.spz", b"NGSP" + bytes(40), DataError, "states 0 primitives"),
+        ("a.spz", b"NGSP" + bytes(40), DataError, "states 0 Gaussians"),
         ("a.sog", b"PK\x03\x04", DataError, "is not a complete .sog"),
         ("a.ply", b"ply\nformat ascii 1.0\nend_header\n", DataError, "a.ply"),
     ],
@@ -108,7 +108,7 @@ def test_a_sog_that_would_grow_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_field_without_a_finite_primitive_is_refused(tmp_path: Path) -> None:
-    broken = {name: torch.full_like(value, torch.nan) for name, value in scene().field.items()}
+    broken = {name: torch.full_like(value, torch.nan) for name, value in scene().gaussians.items()}
     sn.save(scene(), tmp_path / "a.ply")
     from sundae_ns.io.ply import write_ply
 
@@ -126,7 +126,7 @@ def test_saving_refuses_what_it_cannot(tmp_path: Path) -> None:
     with pytest.raises(sn.SundaeError, match="a file stands where a folder should be"):
         sn.save(scene(), tmp_path / "file" / "a.ply")
     sn.save(scene(), tmp_path / "new" / "folder" / "a.ply")
-    assert sn.load(tmp_path / "new" / "folder" / "a.ply").num_primitives == scene().num_primitives
+    assert sn.load(tmp_path / "new" / "folder" / "a.ply").num_gaussians == scene().num_gaussians
 
 
 # -------------------------------------------------------------------------------------------------------------- images
@@ -134,7 +134,7 @@ def test_saving_refuses_what_it_cannot(tmp_path: Path) -> None:
 
 def test_a_head_corrects_images_unless_it_is_left_out(tmp_path: Path) -> None:
     found = sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
-    images, without = (sn.render(found, found.views[0], head=head) for head in (True, False))
+    images, without = (sn.render(found, found.cameras[0], head=head) for head in (True, False))
     assert (images.rgb - images.base_rgb).abs().max() > 1e-3
     assert torch.equal(without.rgb, images.base_rgb)
     assert [tuple(image.shape) for image in images] == [(37, 50, 3), (37, 50, 3), (37, 50, 1), (37, 50, 1)]
@@ -157,8 +157,8 @@ def test_a_head_moves_to_another_device(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kept", [{"keep": 0.25}, {"count": 50}])
 def test_a_prune_keeps_exactly_what_was_asked_for(kept: dict[str, float]) -> None:
-    small = sn.prune(scene(), views=views(), **kept)  # type: ignore[arg-type]
-    assert small.num_primitives == 50
+    small = sn.prune(scene(), cameras=cameras(), **kept)  # type: ignore[arg-type]
+    assert small.num_gaussians == 50
 
 
 def test_a_prune_merges_what_it_drops() -> None:
@@ -166,49 +166,49 @@ def test_a_prune_merges_what_it_drops() -> None:
     across = torch.linspace(-1, 1, 40)
     points = torch.stack([*torch.meshgrid(across, across, indexing="ij"), torch.zeros(40, 40)], dim=-1).reshape(-1, 3)
     truth = sn.Scene.from_points(points, 0.5 + 0.4 * points.sin())
-    truth.field["opacities"] += 4
-    seen = [sn.View.look_at((0.3, 0.2, 2.0), (0.0, 0.0, 0.0), (0, 1, 0), width=48, height=48)]
+    truth.gaussians["opacities"] += 4
+    seen = [sn.Camera.look_at((0.3, 0.2, 2.0), (0.0, 0.0, 0.0), (0, 1, 0), width=48, height=48)]
     merged, dropped = (
-        sn.prune(truth, keep=0.5, views=seen, rule=sn.PruneRule(redistribution=way)) for way in ("merge", "none")
+        sn.prune(truth, keep=0.5, cameras=seen, rule=sn.PruneRule(redistribution=way)) for way in ("merge", "none")
     )
-    assert merged.num_primitives == dropped.num_primitives == 800
+    assert merged.num_gaussians == dropped.num_gaussians == 800
     assert sn.measure(merged, truth, seen).psnr > sn.measure(dropped, truth, seen).psnr + 1
 
 
 def test_views_choose_what_stays() -> None:
     """What no view sees goes first."""
     truth = scene(400)
-    truth.field["means"][:200, 0] += 50
+    truth.gaussians["means"][:200, 0] += 50
     eye = (0.0, -6.0, 0.0)
-    view = sn.View.look_at(eye, (0.0, 0.0, 0.0), width=64, height=64)
-    small = sn.prune(truth, keep=0.4, views=[view], rule=sn.PruneRule(redistribution="none"))
-    assert (small.field["means"][:, 0] < 25).all()
+    camera = sn.Camera.look_at(eye, (0.0, 0.0, 0.0), width=64, height=64)
+    small = sn.prune(truth, keep=0.4, cameras=[camera], rule=sn.PruneRule(redistribution="none"))
+    assert (small.gaussians["means"][:, 0] < 25).all()
 
 
 def test_primitives_that_are_not_finite_are_dropped() -> None:
     truth = scene()
-    truth.field["means"][:100] = torch.nan
-    assert sn.prune(truth, keep=1.0, views=views()).num_primitives == 100
-    assert torch.isfinite(sn.prune(truth, keep=0.5, views=views()).field["means"]).all()
-    assert len(sn.virtual_views(truth, 4)) == 4
+    truth.gaussians["means"][:100] = torch.nan
+    assert sn.prune(truth, keep=1.0, cameras=cameras()).num_gaussians == 100
+    assert torch.isfinite(sn.prune(truth, keep=0.5, cameras=cameras()).gaussians["means"]).all()
+    assert len(sn.virtual_cameras(truth, 4)) == 4
 
 
 @pytest.mark.parametrize("kind", [".ply", ".spz", ".sog", ".glb", ".sundae", ".html"])
 def test_a_scene_of_opaque_and_flat_primitives_is_saved_whole(tmp_path: Path, kind: str) -> None:
     """One that was made in memory: files are mended when they are opened."""
     truth = scene()
-    truth.field["opacities"][:90], truth.field["scales"][80:, 1] = torch.inf, -torch.inf
-    truth.field["means"][5] = torch.nan
-    truth = dataclasses.replace(truth, views=tuple(sn.virtual_views(truth, 2, size=32)))
+    truth.gaussians["opacities"][:90], truth.gaussians["scales"][80:, 1] = torch.inf, -torch.inf
+    truth.gaussians["means"][5] = torch.nan
+    truth = dataclasses.replace(truth, cameras=tuple(sn.virtual_cameras(truth, 2, size=32)))
     sn.save(truth, tmp_path / f"a{kind}")
     if kind != ".html":
         found = sn.load(tmp_path / f"a{kind}")
-        assert found.num_primitives == truth.num_primitives - 1
-        assert all(value.isfinite().all() for value in found.field.values())
-        assert int((found.field["opacities"].sigmoid() > 0.999).sum()) == 89
+        assert found.num_gaussians == truth.num_gaussians - 1
+        assert all(value.isfinite().all() for value in found.gaussians.values())
+        assert int((found.gaussians["opacities"].sigmoid() > 0.999).sum()) == 89
     if kind == ".ply":
-        small = sn.prune(truth, keep=0.5, views=truth.views)
-        assert all(value.isfinite().all() for value in small.field.values())
+        small = sn.prune(truth, keep=0.5, cameras=truth.cameras)
+        assert all(value.isfinite().all() for value in small.gaussians.values())
 
 
 @pytest.mark.parametrize(
@@ -223,16 +223,16 @@ def test_a_scene_of_opaque_and_flat_primitives_is_saved_whole(tmp_path: Path, ki
 )
 def test_a_prune_without_a_meaning_is_refused(options: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        sn.prune(scene(), views=views(), **options)  # type: ignore[arg-type]
+        sn.prune(scene(), cameras=cameras(), **options)  # type: ignore[arg-type]
 
 
 # ------------------------------------------------------------------------------------------------------------- quality
 
 
 def test_quality_against_images_and_against_a_scene() -> None:
-    truth, seen = scene(), views()
-    small = sn.prune(truth, keep=0.5, views=seen)
-    images = [sn.render(truth, view).rgb for view in seen]
+    truth, seen = scene(), cameras()
+    small = sn.prune(truth, keep=0.5, cameras=seen)
+    images = [sn.render(truth, camera).rgb for camera in seen]
     found = sn.measure(small, images, seen)
     assert found == sn.measure(small, truth, seen)
     assert found.psnr == pytest.approx(sum(found.psnrs) / 3)
@@ -244,5 +244,5 @@ def test_quality_against_images_and_against_a_scene() -> None:
 
 
 def test_both_scenes_have_the_background_of_the_reference() -> None:
-    truth, seen = sn.Scene(scene().field, background_color="white"), views()
+    truth, seen = sn.Scene(scene().gaussians, background_color="white"), cameras()
     assert sn.measure(scene(), truth, seen).psnr > 80

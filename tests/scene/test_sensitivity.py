@@ -9,11 +9,11 @@ import torch
 from fields import random_field
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.pack.packed_scene import PackedScene
-from sundae_ns.scene.packing import scene_of, sensitivity_of, views_of_arrays
-from sundae_ns.scene.render import LocalField, render_view
+from sundae_ns.scene.packing import cameras_of_arrays, scene_of, sensitivity_of
+from sundae_ns.scene.render import GaussianSource, render_view
 from sundae_ns.scene.scene import Scene
 
 
@@ -24,7 +24,7 @@ def head() -> dict[str, Tensor]:
     return state
 
 
-def cameras(n: int, *, turn: float, away: float = 0.0) -> tuple[View, ...]:
+def cameras(n: int, *, turn: float, away: float = 0.0) -> tuple[Camera, ...]:
     """Cameras on a circle around the origin, or on a part of it, which look at its centre."""
     angles = torch.arange(n) * (turn / n)
     zero, one = torch.zeros(n), torch.ones(n)
@@ -37,34 +37,38 @@ def cameras(n: int, *, turn: float, away: float = 0.0) -> tuple[View, ...]:
     poses[:, :, 3] += away * poses[:, :, 2].roll(1, dims=1)
     sizes = torch.tensor([[48, 32]]).expand(n, 2)
     intrinsics = torch.tensor([[40.0, 40, 24, 16]]).double().expand(n, 4)
-    return views_of_arrays({"poses": poses, "intrinsics": intrinsics, "sizes": sizes})
+    return cameras_of_arrays({"poses": poses, "intrinsics": intrinsics, "sizes": sizes})
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     kind = {"mode": "residual", "size": "tiny", "pixel_unshuffle": 2, "num_features": 5, "precision": "fp32"}
     stated = {"sh_degree": 2, "rasterize_mode": "classic", "background_color": "black", "head": kind}
-    field = random_field(300)
-    field["scales"] += 2
-    return scene_of(PackedScene(field, head(), None, {"model": {**stated, "trained_focal": [40.0, 40.0]}}))
+    gaussians = random_field(300)
+    gaussians["scales"] += 2
+    return scene_of(PackedScene(gaussians, head(), None, {"model": {**stated, "trained_focal": [40.0, 40.0]}}))
 
 
 @torch.no_grad()
-def image(scene: Scene, view: View) -> Tensor:
+def image(scene: Scene, camera: Camera) -> Tensor:
     settings = dataclasses.replace(scene.settings(), training=True)
-    found: Tensor = render_view(LocalField(scene.field), view, scene.background, settings, depth=False)[0]["rgb"]
+    found: Tensor = render_view(GaussianSource(scene.gaussians), camera, scene.background, settings, depth=False)[0][
+        "rgb"
+    ]
     return found.double()
 
 
-def changed(scene: Scene, views: tuple[View, ...], parameters: list[Tensor], size: float) -> float:
+def changed(scene: Scene, cameras: tuple[Camera, ...], parameters: list[Tensor], size: float) -> float:
     """Mean squared change of images by random changes of parameters, for a change of length 1 of each number."""
     before = [value.detach().clone() for value in parameters]
-    images = [image(scene, view) for view in views]
+    images = [image(scene, camera) for camera in cameras]
     total, tries = 0.0, 8
     for _ in range(tries):
         for value, old in zip(parameters, before, strict=True):
             value.data = old + size * torch.randn_like(old)
-        total += sum(float((image(scene, view) - old).square().sum()) for view, old in zip(views, images, strict=True))
+        total += sum(
+            float((image(scene, camera) - old).square().sum()) for camera, old in zip(cameras, images, strict=True)
+        )
     for value, old in zip(parameters, before, strict=True):
         value.data = old
     return total / tries / size**2
@@ -74,7 +78,7 @@ def test_predicted_changes_are_those_of_images(scene: Scene) -> None:
     torch.manual_seed(1)
     seen = cameras(8, turn=6.28)
     found = sensitivity_of(scene, seen)
-    measured = changed(scene, seen, [scene.field["features"]], 1e-3)
+    measured = changed(scene, seen, [scene.gaussians["features"]], 1e-3)
     assert float(found.rows["features"].trace()) == pytest.approx(measured, rel=0.35)
     assert scene.head is not None
     weights = dict(scene.head.named_parameters())

@@ -19,7 +19,7 @@ import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.io.pack import container
 from sundae_ns.plugin.distill import distill
-from sundae_ns.scene.cameras import view_in_front, with_start
+from sundae_ns.scene.cameras import camera_in_front, with_start
 from sundae_ns.scene.packing import start_of, stated_start
 from sundae_ns.scene.page import render_first
 from sundae_ns.scene.scene import image_of
@@ -30,12 +30,12 @@ UP = (0.6, 0.0, -0.8)
 def scene(**options: Any) -> sn.Scene:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(80, 3, generator=generator)
-    views = tuple(sn.View.look_at((0.5 + dx, -2.0, 0.5), (0.5, 0.5, 0.5), width=40, height=30) for dx in (0.0, 0.8))
-    return dataclasses.replace(sn.Scene.from_points(points, points), views=views, **options)
+    cameras = tuple(sn.Camera.look_at((0.5 + dx, -2.0, 0.5), (0.5, 0.5, 0.5), width=40, height=30) for dx in (0.0, 0.8))
+    return dataclasses.replace(sn.Scene.from_points(points, points), cameras=cameras, **options)
 
 
 def started() -> sn.Scene:
-    return scene(up=UP, start=sn.View.look_at((3, 0.5, 0.5), (0.5, 0.5, 0.5), UP, fov=70, width=64, height=48))
+    return scene(up=UP, start=sn.Camera.look_at((3, 0.5, 0.5), (0.5, 0.5, 0.5), UP, fov=70, width=64, height=48))
 
 
 def same(one: sn.Scene, other: sn.Scene) -> bool:
@@ -78,11 +78,11 @@ def test_the_first_image_is_that_of_the_start_view() -> None:
 
 @pytest.mark.parametrize("up", [None, UP, (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-0.95, 0.3122499, 0.0)])
 def test_the_camera_in_front_stands_upright(up: Any) -> None:
-    view = view_in_front(scene(up=up))
+    camera = camera_in_front(scene(up=up))
     wanted = torch.tensor(up or (0.0, 0.0, 1.0))
-    assert torch.allclose(view.pose[:, 1], wanted, atol=1e-5)
+    assert torch.allclose(camera.pose[:, 1], wanted, atol=1e-5)
     if up is None:
-        assert torch.allclose(view.pose[:, 2], torch.tensor([0.0, -1.0, 0.0]), atol=1e-6)
+        assert torch.allclose(camera.pose[:, 2], torch.tensor([0.0, -1.0, 0.0]), atol=1e-6)
 
 
 def camera_file(path: Path) -> Path:
@@ -95,7 +95,7 @@ def camera_file(path: Path) -> Path:
 def test_options_name_a_view_or_a_file(tmp_path: Path) -> None:
     plain = scene()
     assert with_start(plain, None, None) is plain
-    assert with_start(plain, "1", None).start is plain.views[1]
+    assert with_start(plain, "1", None).start is plain.cameras[1]
     found = with_start(plain, str(camera_file(tmp_path / "camera.json")), (0, 0, -5))
     assert found.start is not None
     assert found.start.center.tolist() == [0, 0, 3]
@@ -112,12 +112,12 @@ def test_options_name_a_view_or_a_file(tmp_path: Path) -> None:
     with pytest.raises(DataError):
         with_start(plain, str(tmp_path / "none.json"), None)
     with pytest.raises(ConfigError, match="no stored cameras"):
-        with_start(dataclasses.replace(plain, views=()), "0", None)
+        with_start(dataclasses.replace(plain, cameras=()), "0", None)
 
 
 def test_values_that_readers_refuse_are_not_written(tmp_path: Path) -> None:
-    far = sn.View.look_at((2e9, 0, 0), (0, 0, 0))
-    flat = sn.View.from_pose(torch.zeros(3, 4), (1, 1, 1, 1), 9, 9)
+    far = sn.Camera.look_at((2e9, 0, 0), (0, 0, 0))
+    flat = sn.Camera.from_pose(torch.zeros(3, 4), (1, 1, 1, 1), 9, 9)
     for wrong in (scene(up=(0.0, 0.0, 0.5)), scene(up=(0.0, 0.0, float("nan"))), scene(start=far), scene(start=flat)):
         with pytest.raises(ConfigError, match="has values that readers refuse"):
             sn.save(wrong, tmp_path / "a.sundae")
@@ -133,7 +133,7 @@ def test_commands_state_them_without_coding_the_scene_again(tmp_path: Path, caps
     found = sn.load(after)
     assert found.up == (0, -1, 0)
     assert found.start is not None
-    assert torch.allclose(found.start.viewmat, scene().views[1].viewmat, atol=1e-6)
+    assert torch.allclose(found.start.viewmat, scene().cameras[1].viewmat, atol=1e-6)
     one, other = (container.read_sections(path, container.read_header(path)) for path in (before, after))
     assert all(np.array_equal(one[name], other[name]) for name in (*one, *other))
     assert run("export", after, "-o", tmp_path / "a.html") == 0

@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def random_field(n: int = 600, degree: int = 2, features: int = 5, seed: int = 0) -> dict[str, Tensor]:
-    """Parameters of ``n`` primitives, float32; quaternions are not normalised, and 0 leaves the features out."""
+    """Parameters of ``n`` Gaussians, float32; quaternions are not normalised, and 0 leaves the features out."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:

@@ -19,7 +19,7 @@ _STORED = Path(__file__).parents[1] / "storage" / "foreign"
 
 
 def small_field(n: int = 300, degree: int = 1) -> dict[str, Tensor]:
-    """A field of visible primitives within a unit cube."""
+    """A field of visible Gaussians within a unit cube."""
     generator = torch.Generator().manual_seed(0)
 
     def uniform(*shape: int, low: float, high: float) -> Tensor:
@@ -39,16 +39,16 @@ def _bytes(shares: Tensor) -> np.ndarray:
     return (shares * 255).round().clamp(0, 255).numpy().astype(np.uint8)
 
 
-def colors_of(field: Mapping[str, Tensor]) -> Tensor:
+def colors_of(gaussians: Mapping[str, Tensor]) -> Tensor:
     """View-independent colours ``[N, 3]``."""
-    return 0.5 + SH_C0 * field["features_dc"]
+    return 0.5 + SH_C0 * gaussians["features_dc"]
 
 
-def write_splat(path: Path, field: Mapping[str, Tensor]) -> None:
-    rows = np.zeros(len(field["means"]), [("m", "<f4", 3), ("s", "<f4", 3), ("c", "u1", 4), ("q", "u1", 4)])
-    rows["m"], rows["s"] = field["means"].numpy(), field["scales"].exp().numpy()
-    rows["c"] = _bytes(torch.cat([colors_of(field), field["opacities"].sigmoid()], dim=1))
-    rows["q"] = (field["quats"] * 128 + 128).round().clamp(0, 255).numpy().astype(np.uint8)
+def write_splat(path: Path, gaussians: Mapping[str, Tensor]) -> None:
+    rows = np.zeros(len(gaussians["means"]), [("m", "<f4", 3), ("s", "<f4", 3), ("c", "u1", 4), ("q", "u1", 4)])
+    rows["m"], rows["s"] = gaussians["means"].numpy(), gaussians["scales"].exp().numpy()
+    rows["c"] = _bytes(torch.cat([colors_of(gaussians), gaussians["opacities"].sigmoid()], dim=1))
+    rows["q"] = (gaussians["quats"] * 128 + 128).round().clamp(0, 255).numpy().astype(np.uint8)
     path.write_bytes(rows.tobytes())
 
 
@@ -60,14 +60,14 @@ def _word(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     return word
 
 
-def write_compressed_ply(path: Path, field: Mapping[str, Tensor], *, old: bool = False, comment: str = "") -> None:
+def write_compressed_ply(path: Path, gaussians: Mapping[str, Tensor], *, old: bool = False, comment: str = "") -> None:
     """As SuperSplat writes it; ``old`` ones have no bounds of colours."""
-    n, chunks = len(field["means"]), []
+    n, chunks = len(gaussians["means"]), []
     vertex = np.zeros(n, [(f"packed_{name}", "<u4") for name in ("position", "rotation", "scale", "color")])
-    colors = colors_of(field).numpy()
+    colors = colors_of(gaussians).numpy()
     for first in range(0, n, _CHUNK):
         rows, bounds = slice(first, first + _CHUNK), {}
-        blocks = {"": field["means"].numpy(), "scale_": field["scales"].numpy(), "color": colors}
+        blocks = {"": gaussians["means"].numpy(), "scale_": gaussians["scales"].numpy(), "color": colors}
         for kind, values in blocks.items():
             axes = "rgb" if kind == "color" else "xyz"
             low, high = values[rows].min(axis=0), values[rows].max(axis=0)
@@ -79,19 +79,19 @@ def write_compressed_ply(path: Path, field: Mapping[str, Tensor], *, old: bool =
                 bounds |= {f"max_{name}": value for name, value in zip(names, high, strict=True)}
             shares = (values[rows] - low) / np.where(high > low, high - low, 1)
             if kind == "color":
-                alphas = field["opacities"][rows].sigmoid().numpy()
+                alphas = gaussians["opacities"][rows].sigmoid().numpy()
                 vertex["packed_color"][rows] = _word(np.concatenate([shares, alphas], axis=1), (8, 8, 8, 8))
             else:
                 vertex["packed_position" if kind == "" else "packed_scale"][rows] = _word(shares, (11, 10, 11))
         chunks.append(bounds)
-    quats = field["quats"].numpy()
+    quats = gaussians["quats"].numpy()
     largest = np.abs(quats).argmax(axis=1)
     positive = quats * np.sign(quats[np.arange(n), largest])[:, None]
     others = positive[np.arange(4) != largest[:, None]].reshape(n, 3) * math.sqrt(0.5) + 0.5
     vertex["packed_rotation"] = _word(np.concatenate([largest[:, None] / 3, others], axis=1), (2, 10, 10, 10))
     table = np.array([tuple(chunk.values()) for chunk in chunks], [(name, "<f4") for name in chunks[0]])
     elements = [PlyElement.describe(table, "chunk"), PlyElement.describe(vertex, "vertex")]
-    rest = field["features_rest"].numpy()
+    rest = gaussians["features_rest"].numpy()
     if rest.shape[1]:
         levels = np.floor((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8).transpose(0, 2, 1).reshape(n, -1)
         sh = np.zeros(n, [(f"f_rest_{i}", "u1") for i in range(levels.shape[1])])
@@ -101,29 +101,29 @@ def write_compressed_ply(path: Path, field: Mapping[str, Tensor], *, old: bool =
     PlyData(elements, byte_order="<", comments=[comment] if comment else []).write(str(path))
 
 
-def write_colored_ply(path: Path, field: Mapping[str, Tensor], dtype: str = "u1", most: float = 255) -> None:
+def write_colored_ply(path: Path, gaussians: Mapping[str, Tensor], dtype: str = "u1", most: float = 255) -> None:
     """As ``ns-export gaussian-splat --ply-color-mode rgb``: colours in place of SH coefficients."""
-    values = {"x": field["means"][:, 0], "y": field["means"][:, 1], "z": field["means"][:, 2]}
-    values |= {"opacity": field["opacities"][:, 0], **{f"scale_{i}": field["scales"][:, i] for i in range(3)}}
-    values |= {f"rot_{i}": field["quats"][:, i] for i in range(4)}
+    values = {"x": gaussians["means"][:, 0], "y": gaussians["means"][:, 1], "z": gaussians["means"][:, 2]}
+    values |= {"opacity": gaussians["opacities"][:, 0], **{f"scale_{i}": gaussians["scales"][:, i] for i in range(3)}}
+    values |= {f"rot_{i}": gaussians["quats"][:, i] for i in range(4)}
     names = ("red", "green", "blue")
-    rows = np.zeros(len(field["means"]), [(name, "<f4") for name in values] + [(name, dtype) for name in names])
+    rows = np.zeros(len(gaussians["means"]), [(name, "<f4") for name in values] + [(name, dtype) for name in names])
     for name, value in values.items():
         rows[name] = value.numpy()
     for i, name in enumerate(names):
-        color = colors_of(field)[:, i].numpy() * most
+        color = colors_of(gaussians)[:, i].numpy() * most
         rows[name] = color if dtype.endswith(("f4", "f8")) else np.rint(color.clip(0, most))
     comments = ["Generated by Nerstudio 1.1.5"]
     PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments).write(str(path))
 
 
-def write_gsplat(path: Path, field: Mapping[str, Tensor], **others: object) -> None:
+def write_gsplat(path: Path, gaussians: Mapping[str, Tensor], **others: object) -> None:
     """As ``simple_trainer.py`` of gsplat."""
-    splats = {name: field[name] for name in ("means", "scales", "quats")}
+    splats = {name: gaussians[name] for name in ("means", "scales", "quats")}
     splats |= {
-        "opacities": field["opacities"][:, 0],
-        "sh0": field["features_dc"][:, None],
-        "shN": field["features_rest"],
+        "opacities": gaussians["opacities"][:, 0],
+        "sh0": gaussians["features_dc"][:, None],
+        "shN": gaussians["features_rest"],
     }
     torch.save({"step": 6999, "splats": splats, **others}, path)
 

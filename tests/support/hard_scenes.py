@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 NEAR = 2.0**-6
-"""A float32 number, so that a primitive can lie on the plane in both precisions."""
+"""A float32 number, so that a Gaussian can lie on the plane in both precisions."""
 Scene = dict[str, Tensor]
 
 
@@ -44,7 +44,7 @@ def with_opacities(logit: float) -> Scene:
 
 
 def around_the_near_plane() -> Scene:
-    """Primitives on the plane, one step of float32 before and behind it, on the camera, and behind it."""
+    """Gaussians on the plane, one step of float32 before and behind it, on the camera, and behind it."""
     made = scene()
     near = torch.tensor(NEAR)
     steps = [near, near.nextafter(torch.tensor(1.0)), near.nextafter(torch.tensor(0.0)), 0 * near, -near, -near * 100]

@@ -88,7 +88,7 @@ class FakeDatamanager:
     def cached_train(self) -> list[dict[str, Tensor]]:
         return [_batch() for _ in self.train_indices]
 
-    def views(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, Tensor]]]:
+    def cameras(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, Tensor]]]:
         yield from ((_camera(shift=(-0.5, 0.0, 0.5)[index]), _batch()) for index in indices)
 
     def training_views(self) -> Iterator[tuple[Cameras, Tensor | None]]:
@@ -116,15 +116,15 @@ class Training:
         )
 
     @property
-    def extensions(self) -> dict[str, Any]:
+    def train_callbacks(self) -> dict[str, Any]:
         """The extensions by name."""
-        return {extension.name: extension for extension in self.model.extensions}
+        return {callback.name: callback for callback in self.model.train_callbacks}
 
     def act(self, name: str, step: int) -> None:
         """Let one extension act after a step, and no other."""
         self.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step)
         run: NerfstudioRun = self.callbacks[0].func.__self__  # type: ignore[attr-defined]
-        run.act([self.extensions[name]])
+        run.act([self.train_callbacks[name]])
 
     def run_callbacks(self, location: TrainingCallbackLocation, step: int) -> None:
         for callback in self.callbacks:
@@ -161,7 +161,7 @@ def points() -> Callable[..., tuple[Tensor, Tensor]]:
 
 @pytest.fixture
 def build() -> Callable[..., SundaeModel]:
-    """Make a model of 60 primitives, or ``n``, that prunes half of them after step 3, with a tiny head."""
+    """Make a model of 60 Gaussians, or ``n``, that prunes half of them after step 3, with a tiny head."""
     return _build
 
 

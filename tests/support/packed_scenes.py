@@ -50,7 +50,7 @@ KINDS = {
     "trained at a larger scale": Kind(degree=1, head=_head("residual", 2, 4), focal=1.7 * FOCAL),
     "trained at a smaller scale": Kind(degree=1, head=_head("residual", 1, 4), focal=0.6 * FOCAL),
     # More than one workgroup sorts, and the lists of tiles outgrow their first buffers.
-    "many primitives": Kind(points=20_000, degree=0, head=_head("residual", 1, 1)),
+    "many Gaussians": Kind(points=20_000, degree=0, head=_head("residual", 1, 1)),
     "other precisions": Kind(
         head=_head("residual", 1, 6),
         config=PackConfig(
@@ -74,18 +74,18 @@ def write_kind(path: Path, kind: Kind) -> Path:
     n = kind.points
     points = torch.rand(n, 3) - 0.5
     features = kind.head.num_features if kind.head else 3
-    field = from_points(points, torch.rand(n, 3), sh_degree=kind.degree, num_features=features)
-    field = {name: value.detach().clone() for name, value in field.items()}
-    field["features_rest"] = 0.2 * torch.randn(n, (kind.degree + 1) ** 2 - 1, 3)
-    field["features"] = torch.randn(n, features)
-    field["quats"] = torch.randn(n, 4)
+    gaussians = from_points(points, torch.rand(n, 3), sh_degree=kind.degree, num_features=features)
+    gaussians = {name: value.detach().clone() for name, value in gaussians.items()}
+    gaussians["features_rest"] = 0.2 * torch.randn(n, (kind.degree + 1) ** 2 - 1, 3)
+    gaussians["features"] = torch.randn(n, features)
+    gaussians["quats"] = torch.randn(n, 4)
     # From specks below a pixel to a fifth of the image.
-    field["scales"] += 1.5 * torch.randn(n, 3) + (1.5 if n > 1000 else -0.5)
-    field["opacities"] = 3 * torch.randn(n, 1) + 1
+    gaussians["scales"] += 1.5 * torch.randn(n, 3) + (1.5 if n > 1000 else -0.5)
+    gaussians["opacities"] = 3 * torch.randn(n, 1) + 1
     head: dict[str, Tensor] = {}
     stated = None
     if kind.head is None:
-        field.pop("features")
+        gaussians.pop("features")
     else:
         head = {name: value.detach() for name, value in CompensationHead(kind.head).state_dict().items()}
         if kind.head.mode == "residual":
@@ -100,18 +100,18 @@ def write_kind(path: Path, kind: Kind) -> Path:
         "head": stated,
         "trained_focal": [kind.focal, kind.focal] if stated and kind.focal else None,
     }
-    sensitivity = _sensitivity(field, head) if kind.measured else None
-    write_scene(path, PackedScene(field, head, _cameras(), {"model": model}, sensitivity), kind.config)
+    sensitivity = _sensitivity(gaussians, head) if kind.measured else None
+    write_scene(path, PackedScene(gaussians, head, _cameras(), {"model": model}, sensitivity), kind.config)
     return path
 
 
 def write_bomb(path: Path, count: int = 20_000) -> Path:
-    """Write a small file of faint primitives, each of which covers the whole image of the first of two cameras.
+    """Write a small file of faint Gaussians, each of which covers the whole image of the first of two cameras.
 
     The second camera looks the other way.
     """
     one = torch.ones(count, 1)
-    field = {
+    gaussians = {
         "means": 0.01 * torch.rand(count, 3),
         "quats": one * torch.tensor([1.0, 0.0, 0.0, 0.0]),
         "scales": one * torch.full((3,), 3.0),
@@ -124,13 +124,13 @@ def write_bomb(path: Path, count: int = 20_000) -> Path:
     lens = torch.tensor([300.0, 300.0, 160.0, 120.0]).double().repeat(2, 1)
     cameras = {"poses": poses, "intrinsics": lens, "sizes": torch.tensor([[320, 240]]).repeat(2, 1)}
     model = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "white", "head": None}
-    write_scene(path, PackedScene(field, {}, cameras, {"model": model}))
+    write_scene(path, PackedScene(gaussians, {}, cameras, {"model": model}))
     return path
 
 
-def _sensitivity(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Sensitivity:
+def _sensitivity(gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Sensitivity:
     """Random positive definite forms, and weights that differ by some powers of ten."""
-    roots = {name: torch.randn(2 * [field[name][0].numel()]).double() for name in ("features_rest", "features")}
+    roots = {name: torch.randn(2 * [gaussians[name][0].numel()]).double() for name in ("features_rest", "features")}
     weights = {name: value for name, value in head.items() if value.ndim > 1}
     return Sensitivity(
         {name: root @ root.T + 0.1 * torch.eye(len(root)) for name, root in roots.items()},
@@ -142,7 +142,7 @@ def _cameras() -> dict[str, Tensor]:
     turn = torch.linalg.qr(torch.eye(3) + 0.1 * torch.randn(3, 3)).Q
     turn = turn * turn.diagonal().sign()
     poses = torch.stack([torch.cat([turn, 1.4 * turn[:, 2:]], dim=1), torch.eye(4)[:3]])
-    # The second camera is close: primitives are behind it, beside it and across the whole image.
+    # The second camera is close: Gaussians are behind it, beside it and across the whole image.
     poses[1, :, 3] = torch.tensor([0.1, 0.0, 0.55])
     lens = torch.tensor([FOCAL, FOCAL + 1, 24.0, 19.5]).double()
     return {"poses": poses, "intrinsics": lens.repeat(2, 1), "sizes": torch.tensor([[WIDTH, HEIGHT]]).repeat(2, 1)}

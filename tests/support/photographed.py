@@ -10,29 +10,29 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
-from sundae_ns.core.camera import View
-from sundae_ns.train.exposure import FIRST_STEPS, REFRESHED_EVERY, PhotoGains
+from sundae_ns.core.camera import Camera
+from sundae_ns.train.exposure import FIRST_STEPS, REFRESHED_EVERY, ExposureCompensation
 from sundae_ns.train.state import TrainingRun
 
 COUNT = 48
 ANGLES = torch.arange(COUNT) * 2 * math.pi / COUNT
 
 
-def ring(count: int = COUNT) -> list[View]:
+def ring(count: int = COUNT) -> list[Camera]:
     """Cameras on a circle that look at its middle."""
     angles = torch.arange(count) * 2 * math.pi / count
-    return [View.look_at((3 * math.cos(a), 3 * math.sin(a), 1.0), (0, 0, 0), width=64, height=48) for a in angles]
+    return [Camera.look_at((3 * math.cos(a), 3 * math.sin(a), 1.0), (0, 0, 0), width=64, height=48) for a in angles]
 
 
-def run_of(views: list[View], *, ranks: int = 1) -> TrainingRun:
-    indices = list(range(len(views)))
-    shown = [SimpleNamespace(view=view, mask=None) for view in views]
+def run_of(cameras: list[Camera], *, ranks: int = 1) -> TrainingRun:
+    indices = list(range(len(cameras)))
+    shown = [SimpleNamespace(camera=camera, mask=None) for camera in cameras]
     members = {"view_indices": lambda: indices, "training_views": lambda: shown, "images_per_step": ranks}
     return cast(TrainingRun, SimpleNamespace(state=SimpleNamespace(step=0), **members))
 
 
-def begin(mode: Literal["auto", "on", "off"] = "on") -> tuple[PhotoGains, TrainingRun]:
-    gains, run = PhotoGains(COUNT, mode), run_of(ring())
+def begin(mode: Literal["auto", "on", "off"] = "on") -> tuple[ExposureCompensation, TrainingRun]:
+    gains, run = ExposureCompensation(COUNT, mode), run_of(ring())
     gains.before_training(run)
     return gains, run
 
@@ -47,7 +47,12 @@ def batch_of(index: int, channels: int = 3) -> dict[str, Any]:
 
 
 def measure(
-    gains: PhotoGains, run: TrainingRun, photos: Callable[[int], Tensor], rounds: int = 12, *, late: bool = True
+    gains: ExposureCompensation,
+    run: TrainingRun,
+    photos: Callable[[int], Tensor],
+    rounds: int = 12,
+    *,
+    late: bool = True,
 ) -> None:
     """Steps that see each photo once between two updates. The field is right, and does not change.
 
@@ -61,7 +66,7 @@ def measure(
         update(gains, run, late=late)
 
 
-def update(gains: PhotoGains, run: TrainingRun, *, late: bool = True) -> None:
+def update(gains: ExposureCompensation, run: TrainingRun, *, late: bool = True) -> None:
     run.state.step = -(-(FIRST_STEPS if late else 1) // REFRESHED_EVERY) * REFRESHED_EVERY - 1
     gains.after_step(run)
     run.state.step = 0

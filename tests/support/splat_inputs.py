@@ -20,7 +20,7 @@ def geometry(
 
 
 def several_views(n: int = 50, channels: int = 4) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Primitives, and three views of them: colours, transforms and intrinsics as ``rasterize_views`` takes them."""
+    """Gaussians, and three views of them: colours, transforms and intrinsics as ``rasterize_cameras`` takes them."""
     generator = torch.Generator().manual_seed(0)
     shared = {
         "means": torch.rand(n, 3, generator=generator) - 0.5,

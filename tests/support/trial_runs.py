@@ -20,9 +20,9 @@ LENGTH = 5
 """Steps of a trial: a twentieth of so short a run. Views are held out from step 30 on."""
 
 
-def tiny_scene(folder: Path, views: int) -> Path:
+def tiny_scene(folder: Path, cameras: int) -> Path:
     return write_still_life(
-        folder / str(views), train_views=views, test_views=2, width=24, height=24, points=200, samples=1
+        folder / str(cameras), train_views=cameras, test_views=2, width=24, height=24, points=200, samples=1
     )
 
 

@@ -19,7 +19,7 @@ Build = Callable[..., SundaeModel]
 TrainingOf = Callable[..., Any]
 
 N = 60
-"""Primitives of a model that is built without a count."""
+"""Gaussians of a model that is built without a count."""
 
 
 def trainer_of(folder: Path | None = None) -> SimpleNamespace:
@@ -65,7 +65,7 @@ def test_primitives_that_are_not_finite_are_dropped_and_counted(
     assert all(torch.isfinite(value).all() for value in training.model.gauss_params.values())
     assert training.live()
     out = " ".join(capsys.readouterr().out.split())
-    assert "removed 4 primitives that were not finite" in out
+    assert "removed 4 Gaussians that were not finite" in out
     assert training.step(4)["main_loss"].isfinite()
 
 
@@ -107,7 +107,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
         (
             {"mode": "continuous", "start": 1, "every": 3, "stop": 5},
             {},
-            "4 (pruning.stop): more primitives are left than asked for, and the head stays disabled; train longer",
+            "4 (pruning.stop): more Gaussians are left than asked for, and the head stays disabled; train longer",
         ),
         (
             {"mode": "continuous", "start": 1, "every": 5, "stop": 5},
@@ -115,9 +115,9 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
             "6 (pruning.stop): it stays disabled; train longer, or prune earlier",
         ),
         (
-            {"mode": "continuous", "start": 1, "every": 5, "stop": 5, "max_primitives": 40},
+            {"mode": "continuous", "start": 1, "every": 5, "stop": 5, "max_gaussians": 40},
             {},
-            "5 (pruning.stop): more primitives are left than asked for, and the head stays disabled; train longer",
+            "5 (pruning.stop): more Gaussians are left than asked for, and the head stays disabled; train longer",
         ),
         ({"prune_at": 1}, {"start_at": 4}, "5 (head.start-at): it stays disabled; train longer, or enable it earlier"),
         ({"prune_at": 1}, {"start_at": 2}, "3 (head.start-at): it stays disabled; train longer, or enable it earlier"),

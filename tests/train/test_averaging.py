@@ -36,10 +36,10 @@ def train(
     for step in steps:
         state.step = step
         torch.manual_seed(step)
-        for value in state.field.values():
+        for value in state.gaussians.values():
             value.data += torch.randn_like(value)
         if seen is not None and step >= 90 and step % averaging.AVERAGED_EVERY == 0:
-            seen.append(state.field["means"].detach().clone())
+            seen.append(state.gaussians["means"].detach().clone())
         mean.after_step(run_of(state, last=last))
 
 
@@ -48,7 +48,7 @@ def test_the_last_weights_become_the_mean(state: Any, monkeypatch: pytest.Monkey
     seen: list[torch.Tensor] = []
     train(state, Averaging(0.09, settled_at=0), range(LAST + 1), seen=seen)
     assert len(seen) == 4
-    torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+    torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
 
 
 def test_a_mean_that_an_interruption_has_cut_short_is_dropped(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,7 +60,7 @@ def test_a_mean_that_an_interruption_has_cut_short_is_dropped(state: Any, monkey
     longer.load_state_dict(state, first.state_dict())
     seen: list[torch.Tensor] = []
     train(state, longer, range(80, LAST + 1), seen=seen)
-    torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+    torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
 
 
 def test_no_mean_of_fields_that_differ(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,21 +71,21 @@ def test_no_mean_of_fields_that_differ(state: Any, monkeypatch: pytest.MonkeyPat
         mean = Averaging(0.3, settled_at=0)
         train(state, mean, range(91))
         if change == "prune":
-            for value in state.field.values():
+            for value in state.gaussians.values():
                 value.data = value.data[:10].clone()
         else:
             state.restored += 1
         train(state, mean, range(91, LAST + 1), seen=seen)
         assert len(seen) == 3
-        torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+        torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
 
 
 def test_unfinished_schedules_and_growing_fields_keep_their_weights(state: Any) -> None:
     for mean, length in ((Averaging(0.1, settled_at=1000), LAST + 1), (Averaging(0.1, settled_at=0), 2 * LAST)):
         state.step = LAST
-        before = state.field["means"].detach().clone()
+        before = state.gaussians["means"].detach().clone()
         mean.after_step(cast(TrainingRun, SimpleNamespace(state=state, last_step=LAST, schedule_length=length)))
-        assert torch.equal(state.field["means"], before)
+        assert torch.equal(state.gaussians["means"], before)
 
 
 def test_a_longer_training_goes_on_from_the_last_weights(state: Any) -> None:
@@ -93,14 +93,14 @@ def test_a_longer_training_goes_on_from_the_last_weights(state: Any) -> None:
     mean, again = Averaging(0.5, settled_at=0), Averaging(0.5, settled_at=0)
     train(state, mean, range(LAST))
     state.step = LAST
-    last = {name: value.detach().clone() for name, value in state.field.items()}
+    last = {name: value.detach().clone() for name, value in state.gaussians.items()}
     mean.after_step(run_of(state))
-    assert not torch.equal(state.field["means"], last["means"])
-    shown = state.field["means"].detach().clone()
+    assert not torch.equal(state.gaussians["means"], last["means"])
+    shown = state.gaussians["means"].detach().clone()
     again.load_state_dict(state, mean.state_dict())
-    assert torch.equal(state.field["means"], shown)  # who only looks sees the mean
+    assert torch.equal(state.gaussians["means"], shown)  # who only looks sees the mean
     again.before_training(run_of(state))
-    assert all(torch.equal(value, last[name]) for name, value in state.field.items())
+    assert all(torch.equal(value, last[name]) for name, value in state.gaussians.items())
     assert not again.state_dict()["replaced"]
 
 
@@ -111,12 +111,12 @@ def test_a_first_part_ends_with_the_mean_of_its_last_steps(state: Any, monkeypat
     mean = Averaging(0.09, settled_at=0)
     train(state, mean, range(96), seen=seen, last=95)
     assert len(seen) == 3
-    torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+    torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
     assert mean.state_dict()["replaced"]
 
 
 def test_a_rank_without_primitives(state: Any) -> None:
-    for value in state.field.values():
+    for value in state.gaussians.values():
         value.data = value.data[:0].clone()
     train(state, Averaging(1.0, settled_at=0), range(LAST - 9, LAST))
 

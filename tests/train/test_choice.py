@@ -148,7 +148,7 @@ def test_a_head_gains_less_the_more_primitives_there_are() -> None:
 
 
 def test_a_head_must_be_worth_its_bytes_in_the_fields_that_would_be_kept() -> None:
-    """0.4 dB for each doubling of the bytes of the scene without one, by what it gains among as many primitives."""
+    """0.4 dB for each doubling of the bytes of the scene without one, by what it gains among as many Gaussians."""
     curve = [point(1000, size=10_000), point(400, size=4000), point(200, 0.5, 0.02, size=2000)]
     kept, plain = choose(with_head(curve, HeadGain(100, 0.3, 0.01)), Tolerance()), choose(curve, Tolerance())
     assert 200 < kept < plain <= 400
@@ -157,7 +157,7 @@ def test_a_head_must_be_worth_its_bytes_in_the_fields_that_would_be_kept() -> No
     def pays(features: int | None, psnr: float = 0.3, ssim: float = 0.01, ssim_db: float | None = 0.4) -> bool:
         return head_pays(curve, HeadGain(100, psnr, ssim, ssim_db, features, head=0), Tolerance())
 
-    # Bytes of the features of 100 primitives; of the field these take 1,000.
+    # Bytes of the features of 100 Gaussians; of the field these take 1,000.
     enough = round(1000 * (plain / kept * 2 ** (gained / 0.4) - 1))
     assert pays(enough - 20)
     assert not pays(enough + 20)
@@ -172,7 +172,7 @@ def test_a_head_must_be_worth_its_bytes_in_the_fields_that_would_be_kept() -> No
 
 
 def test_a_head_that_lets_the_scene_shrink_needs_to_gain_little() -> None:
-    """Where quality levels off at far fewer primitives with a head, the scene is smaller with one."""
+    """Where quality levels off at far fewer Gaussians with a head, the scene is smaller with one."""
     curve = [point(1000, size=10_000), point(400, 0.2, 0.006, size=4000), point(200, 0.8, 0.03, size=2000)]
     gain = HeadGain(100, 0.2, 0.02, 0.3, features=400, head=0)
     assert choose(with_head(curve, gain), Tolerance()) < 0.7 * choose(curve, Tolerance())

@@ -139,9 +139,9 @@ def test_photos_are_the_training_images_with_their_views(build: Build, training_
     training = training_of(build())
     run = training.callbacks[0].func.__self__
     photos = list(run.photos())
-    assert [float(photo.view.center[0]) for photo in photos] == pytest.approx([-0.5, 0.0, 0.5])
+    assert [float(photo.camera.center[0]) for photo in photos] == pytest.approx([-0.5, 0.0, 0.5])
     assert [photo.mask for photo in photos] == [None] * 3
-    (_, batch), *_ = run._datamanager.views([0])
+    (_, batch), *_ = run._datamanager.cameras([0])
     assert torch.allclose(photos[0].target, batch["image"].float() / 255)
 
 
@@ -155,7 +155,7 @@ def test_transparent_and_masked_pixels_are_masked(
     image["image"][..., 3] = 255
     image["image"][:, :7, 3] = 100
     run._pipeline.datamanager = SimpleNamespace(
-        train_indices=[0], cached_train=[image], views=lambda indices: [(camera(), image) for _ in indices]
+        train_indices=[0], cached_train=[image], cameras=lambda indices: [(camera(), image) for _ in indices]
     )
     (photo,) = run.photos()
     expected = torch.ones(32, 40, dtype=torch.bool)

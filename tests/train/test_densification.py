@@ -1,4 +1,4 @@
-"""Growing under a cap: which primitives grow, and that the count is never above it."""
+"""Growing under a cap: which Gaussians grow, and that the count is never above it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FIELD = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opa
 N = 40
 
 
-def field(n: int = N) -> tuple[dict[str, Parameter], dict[str, Adam]]:
+def gaussians(n: int = N) -> tuple[dict[str, Parameter], dict[str, Adam]]:
     params = {name: Parameter(torch.randn(n, *shape)) for name, shape in FIELD.items()}
     params["opacities"].data.fill_(1.0)
     return params, {name: Adam([value], lr=0.01) for name, value in params.items()}
@@ -49,7 +49,7 @@ def test_one_that_is_duplicated_and_split_takes_two_places() -> None:
 @pytest.mark.parametrize(("cap", "expected"), [(None, 2 * N), (N + 7, N + 7), (N, N), (N - 5, N)])
 def test_densification_stops_at_the_cap(cap: int | None, expected: int, wide: bool) -> None:
     """Also where small ones are wide on the screen, which gsplat duplicates and splits at once."""
-    params, optimizers = field()
+    params, optimizers = gaussians()
     params["scales"].data[: N // 2] = -9.0
     strategy = CappedStrategy(cap=cap, grow_grad2d=0.1, prune_opa=1e-9, refine_start_iter=0, refine_every=1)
     strategy.refine_scale2d_stop_iter, strategy.grow_scale2d = (100, 0.05) if wide else (0, 1.0)
@@ -71,7 +71,7 @@ def test_densification_stops_at_the_cap(cap: int | None, expected: int, wide: bo
 
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_statistics_are_those_of_gsplat(absgrad: bool) -> None:
-    """Of three views, with primitives that are not drawn."""
+    """Of three views, with Gaussians that are not drawn."""
     strategy = CappedStrategy(refine_scale2d_stop_iter=100, absgrad=absgrad)
     params = {"means": torch.zeros(50, 3)}
     theirs, ours = strategy.initialize_state(), strategy.initialize_state()

@@ -13,7 +13,7 @@ from sundae_ns.plugin.model import SundaeModel
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[..., Any]
 FLOATERS = [4, 50]
-"""Rows of a field of 60 primitives; the cameras are 3 away from its middle."""
+"""Rows of a field of 60 Gaussians; the cameras are 3 away from its middle."""
 
 
 def with_floaters(build: Build, **options: Any) -> SundaeModel:
@@ -69,9 +69,9 @@ def test_a_resumed_run_removes_them_only_if_that_was_still_due(
 
 def test_a_run_that_was_pruned_by_an_earlier_version_is_done(build: Build, training_of: TrainingOf) -> None:
     model = with_floaters(build)
-    extension = {one.name: one for one in model.extensions}["floaters"]
-    extension.load_state_dict(model.state, {})
-    assert extension.state_dict() == {"done": False}
+    callback = {one.name: one for one in model.train_callbacks}["floaters"]
+    callback.load_state_dict(model.state, {})
+    assert callback.state_dict() == {"done": False}
     model.state.pruning["num_prunes"] = 1
-    extension.load_state_dict(model.state, {})
-    assert extension.state_dict() == {"done": True}
+    callback.load_state_dict(model.state, {})
+    assert callback.state_dict() == {"done": True}

@@ -36,7 +36,7 @@ def count_choice(measured: Mapping[str, Any], options: Mapping[str, Any]) -> dic
         [Tried("count", n, "plain", 600, views, None if size is None else [size, 0]) for n, views, size in rows]
     )
     tolerance, pays, curve = Tolerance.of_drop(options.get("max_drop")), None, plain
-    limits = {"most": options.get("max_primitives"), "most_bytes": options.get("max_bytes")}
+    limits = {"most": options.get("max_gaussians"), "most_bytes": options.get("max_bytes")}
     tenth = round(0.1 * measured["full"])
     if "head" in measured:
         trials = zip(HEADS, measured["head"], measured["head_bytes"], strict=False)

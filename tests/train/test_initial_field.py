@@ -25,13 +25,13 @@ MakeCamera = Callable[..., Cameras]
 TrainingOf = Callable[[SundaeModel], Any]
 
 N = 60
-"""Primitives of a model that is built without a count."""
+"""Gaussians of a model that is built without a count."""
 
 
 def colors_of(model: SundaeModel, camera: Cameras) -> Tensor:
-    """Colours of the primitives as the camera sees them ``[N, 3]``."""
+    """Colours of the Gaussians as the camera sees them ``[N, 3]``."""
     settings = model.render_settings(training=False)
-    return model.source.primitives(model.view_of(camera), settings, features=False)["colors"].detach()
+    return model.source.primitives(model.camera_of(camera), settings, features=False)["colors"].detach()
 
 
 @pytest.mark.parametrize("seed_points", [None, (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))])
@@ -68,7 +68,7 @@ def test_a_finished_run_is_not_warned_of_what_it_did_not_start_from(
 def test_a_cloud_above_the_cap_is_cut_before_the_first_step(
     build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model = build(pruning={"mode": "continuous", "max_primitives": 25})
+    model = build(pruning={"mode": "continuous", "max_gaussians": 25})
     assert model.num_points == 25
     training_of(model)
     assert "starting from 25 of them" in " ".join(capsys.readouterr().out.split())
@@ -110,7 +110,7 @@ def test_files_of_other_programs_start_a_model(
 ) -> None:
     """gsplat's trainer normalises a capture in a way of its own, which its file does not state."""
     given = small_field(50)
-    given["scales"][3, 0] = -torch.inf  # a flat primitive
+    given["scales"][3, 0] = -torch.inf  # a flat Gaussian
     if name == "a.compressed.ply":  # its bounds are finite
         given["scales"][3, 0] = -20.0
     FOREIGN[name](tmp_path / name, given)
@@ -124,8 +124,8 @@ def test_files_of_other_programs_start_a_model(
     expected = similarity(given, *_frame())["means"]
     torch.testing.assert_close(model.means.detach(), expected, rtol=0, atol=0.001)
     assert model.gauss_params["scales"].isfinite().all()
-    mended = [message for message in caplog.messages if "clamped" in message]
-    assert len(mended) == (name != "a.compressed.ply")
+    sanitised = [message for message in caplog.messages if "clamped" in message]
+    assert len(sanitised) == (name != "a.compressed.ply")
 
 
 def test_a_finished_run_opens_without_what_it_started_from(

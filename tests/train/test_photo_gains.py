@@ -13,17 +13,17 @@ import torch
 from photographed import ANGLES, COUNT, batch_of, begin, image_of, measure, ring, run_of, update
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train import exposure
-from sundae_ns.train.exposure import LEAST_PHOTOS, PhotoGains, places
-from sundae_ns.train.state import FieldState, TrainingRun
+from sundae_ns.train.exposure import LEAST_PHOTOS, ExposureCompensation, places
+from sundae_ns.train.state import TrainingRun, TrainingState
 
 Build = Callable[..., SundaeModel]
-ON_CPU = cast(FieldState, SimpleNamespace(device=torch.device("cpu")))
+ON_CPU = cast(TrainingState, SimpleNamespace(device=torch.device("cpu")))
 
 
-def found(gains: PhotoGains) -> Tensor:
+def found(gains: ExposureCompensation) -> Tensor:
     """The gains that photos are divided by ``[COUNT, 3]``."""
     white = torch.ones(48, 64, 3)
     return torch.stack([(1 / gains.balanced(white, batch_of(index)))[0, 0] for index in range(COUNT)])
@@ -102,7 +102,11 @@ def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alo
     before = gains.state_dict()
     gains.observe(photo, photo, None, batch_of(0, channels=4))
     assert torch.equal(gains.state_dict()["sums"], before["sums"])
-    for few in (PhotoGains(LEAST_PHOTOS - 1, "on"), PhotoGains(LEAST_PHOTOS - 1, "auto"), PhotoGains(9, "off")):
+    for few in (
+        ExposureCompensation(LEAST_PHOTOS - 1, "on"),
+        ExposureCompensation(LEAST_PHOTOS - 1, "auto"),
+        ExposureCompensation(9, "off"),
+    ):
         few.before_training(run_of(ring(LEAST_PHOTOS - 1)))
         few.observe(photo, few.balanced(photo * 2, batch_of(0)), None, batch_of(0))
         update(few, run)
@@ -118,14 +122,14 @@ def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
     def photos(index: int) -> Tensor:
         return image_of(index) * true[index]
 
-    def half(gains: PhotoGains, run: TrainingRun) -> None:
+    def half(gains: ExposureCompensation, run: TrainingRun) -> None:
         measure(gains, run, photos, rounds=2)
         gains.observe(image_of(3), gains.balanced(photos(3), batch_of(3)), None, batch_of(3))
 
     gains, run = begin()
     half(gains, run)
     saved = gains.state_dict()
-    resumed = PhotoGains(COUNT, "on")
+    resumed = ExposureCompensation(COUNT, "on")
     resumed.load_state_dict(ON_CPU, saved)
     assert torch.equal(found(resumed), found(gains)), "a fine-tune has no run"
     resumed.before_training(run)
@@ -133,8 +137,8 @@ def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
     half(resumed, run)
     assert torch.equal(found(resumed), found(gains))
     assert saved["counts"].max() < gains.state_dict()["counts"].max(), "a saved state does not change"
-    for other in ({}, PhotoGains(COUNT + 1, "on").state_dict()):
-        fresh = PhotoGains(COUNT, "on")
+    for other in ({}, ExposureCompensation(COUNT + 1, "on").state_dict()):
+        fresh = ExposureCompensation(COUNT, "on")
         fresh.load_state_dict(ON_CPU, other)
         assert torch.equal(found(fresh), torch.ones(COUNT, 3))
 
@@ -151,9 +155,9 @@ def test_ranks_add_up_what_each_has_measured() -> None:
 
 def test_cameras_at_one_place_are_apart_by_what_they_see() -> None:
     eye = torch.zeros(3)
-    views = [View.look_at(eye, (math.cos(a), math.sin(a), 0.0)) for a in ANGLES]
-    views += [View.look_at((4.0, 0.0, 0.0), (9.0, 0.0, 0.0))]
-    points = places(views)[:-1]
+    cameras = [Camera.look_at(eye, (math.cos(a), math.sin(a), 0.0)) for a in ANGLES]
+    cameras += [Camera.look_at((4.0, 0.0, 0.0), (9.0, 0.0, 0.0))]
+    points = places(cameras)[:-1]
     apart = np.linalg.norm(points.diff(dim=0).numpy(), axis=1)
     assert apart == pytest.approx(apart[0], rel=1e-3)
     assert apart[0] > 0.01
@@ -162,10 +166,10 @@ def test_cameras_at_one_place_are_apart_by_what_they_see() -> None:
 def test_training_compares_with_the_balanced_photo_and_evaluation_with_the_true_one(
     build: Build, batch: Callable[..., dict[str, Any]], camera: Callable[..., Any]
 ) -> None:
-    model, photo = build(photo_gains="on"), {**batch(), "image_idx": 2}
-    gains = model.photo_gains.state_dict()
+    model, photo = build(exposure_compensation="on"), {**batch(), "image_idx": 2}
+    gains = model.exposure_compensation.state_dict()
     gains["gains"][2] = torch.tensor([0.5, 1.0, 2.0])
-    model.photo_gains.load_state_dict(model.state, gains)
+    model.exposure_compensation.load_state_dict(model.state, gains)
     background = {"background": torch.zeros(3)}
     true = photo["image"].float() / 255
     model.train()

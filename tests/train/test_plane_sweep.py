@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.train import plane_sweep
 from sundae_ns.train.plane_sweep import Sweep
 from sundae_ns.train.state import Photo
@@ -26,13 +26,13 @@ def paint(points: Tensor) -> Tensor:
 
 
 def photo(eye: tuple[float, float, float]) -> Photo:
-    view = View.look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), width=SIDE, height=SIDE)
-    view = view._replace(K=torch.tensor([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1.0]]))
+    camera = Camera.look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), width=SIDE, height=SIDE)
+    camera = camera._replace(K=torch.tensor([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1.0]]))
     y, x = torch.meshgrid(torch.arange(SIDE) + 0.5, torch.arange(SIDE) + 0.5, indexing="ij")
     rays = torch.stack([(x - SIDE / 2) / FOCAL, (y - SIDE / 2) / FOCAL, torch.ones_like(x)], dim=2).reshape(-1, 3)
-    rays = rays @ view.viewmat[:3, :3]
-    hits = view.center - rays * (view.center[1] / rays[:, 1])[:, None]
-    return Photo(view, paint(hits).reshape(SIDE, SIDE, 3), None)
+    rays = rays @ camera.viewmat[:3, :3]
+    hits = camera.center - rays * (camera.center[1] / rays[:, 1])[:, None]
+    return Photo(camera, paint(hits).reshape(SIDE, SIDE, 3), None)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def points_of(photos: list[Photo], sparse: Tensor, longest: int = SIDE, wanted: 
 
 def gaps(photos: list[Photo], points: Tensor) -> Tensor:
     """Distance of points to the wall along the rays from the three cameras, over their distance ``[N]``."""
-    eyes = torch.stack([photo.view.center for photo in photos])
+    eyes = torch.stack([photo.camera.center for photo in photos])
     return (points[:, 1] / (points[None, :, 1] - eyes[:, None, 1])).abs().amin(dim=0)
 
 
@@ -75,7 +75,7 @@ def test_colours_are_those_of_the_images(capture: tuple[list[Photo], Tensor], sw
     points, colours = swept
     errors = torch.full((len(points),), torch.inf)
     for photo in capture[0]:
-        x, y, z = plane_sweep._project(photo.view, points)
+        x, y, z = plane_sweep._project(photo.camera, points)
         inside = (z > 0) & (x > 0) & (y > 0) & (x < SIDE) & (y < SIDE)
         shown = photo.target[y[inside].long(), x[inside].long()]
         errors[inside] = torch.minimum(errors[inside], (shown - colours[inside]).abs().mean(dim=1))
@@ -137,6 +137,6 @@ def test_what_says_nothing_gives_no_points(
 
 def test_sums_of_patches_are_those_of_pooling() -> None:
     image = torch.rand(2, 1, 11, 9)
-    window = plane_sweep.WINDOW
-    pooled = torch.nn.functional.avg_pool2d(image, window, stride=1, padding=window // 2) * window**2
+    crop = plane_sweep.WINDOW
+    pooled = torch.nn.functional.avg_pool2d(image, crop, stride=1, padding=crop // 2) * crop**2
     assert torch.allclose(plane_sweep._box(image), pooled, atol=1e-5)

@@ -34,8 +34,8 @@ def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, caps
     made.write_stats_log(0)
     banner, first, line = capsys.readouterr().out.splitlines()
     assert banner == "Viewer at: somewhere"
-    assert first == "160 (40.00%)  PSNR 21.46 dB  12,345 primitives", "the first step compiles"
-    assert line == "200 (50.00%)  50 s left at 250 ms a step  PSNR 21.46 dB  12,345 primitives"
+    assert first == "160 (40.00%)  PSNR 21.46 dB  12,345 Gaussians", "the first step compiles"
+    assert line == "200 (50.00%)  50 s left at 250 ms a step  PSNR 21.46 dB  12,345 Gaussians"
     assert percent_of(line) == 50, "sundae demo reads it"
 
 
@@ -81,7 +81,7 @@ def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch: pytest.Mon
     made.write_stats_log(2)
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["2", "3"]
-    assert lines[1].endswith("PSNR 20.00 dB  7 primitives")
+    assert lines[1].endswith("PSNR 20.00 dB  7 Gaussians")
 
 
 @pytest.mark.parametrize(

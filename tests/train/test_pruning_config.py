@@ -16,8 +16,8 @@ from sundae_ns.train.pruning import PruningConfig
         ({"mode": "off", "prune_at": 7}, None, 7, 7),
         ({"mode": "continuous", "start": 4, "stop": 21, "every": 5}, 4, 19, 21),
         ({"mode": "continuous", "start": 4, "stop": 24, "every": 5}, 4, 24, 24),
-        ({"mode": "continuous", "start": 4, "stop": 21, "every": 5, "target_primitives": 9}, 4, 21, 21),
-        ({"mode": "continuous", "start": 4, "stop": 21, "every": 5, "max_primitives": 9}, 4, 21, 21),
+        ({"mode": "continuous", "start": 4, "stop": 21, "every": 5, "target_gaussians": 9}, 4, 21, 21),
+        ({"mode": "continuous", "start": 4, "stop": 21, "every": 5, "max_gaussians": 9}, 4, 21, 21),
     ],
 )
 def test_steps_of_the_prunes(options: dict[str, Any], first: int | None, last: int, settled: int) -> None:

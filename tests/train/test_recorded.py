@@ -77,7 +77,7 @@ def test_both_train_the_same_field(both: Callable[..., tuple[Any, Recorded]], op
     usual, recorded = both(**options)
     counts = []
     for step in range(16):
-        # Backgrounds, and places of split primitives; with some seeds features have gradients of the size of rounding.
+        # Backgrounds, and places of split Gaussians; with some seeds features have gradients of the size of rounding.
         torch.manual_seed(step + 100)
         expected = usual.step(step)
         torch.manual_seed(step + 100)
@@ -227,20 +227,20 @@ def test_buffers_are_new_only_when_the_field_does_not_fit(
     assert buffers.hold(state, trained, growing=True)
     assert not buffers.hold(state, trained, growing=True)
     places = {name: value.data_ptr() for name, value in buffers.tensors.items()}
-    values = {name: state.field[name].detach().clone() for name in trained}
+    values = {name: state.gaussians[name].detach().clone() for name in trained}
     for name in trained:  # surgery makes new tensors
-        parameter = state.field[name]
+        parameter = state.gaussians[name]
         parameter.data = torch.cat([parameter.data, parameter.data[:5]])
         for moment in ("exp_avg", "exp_avg_sq"):
             held = state.optimizers[name].state[parameter]
             held[moment] = torch.ones_like(parameter)
     assert not buffers.hold(state, trained, growing=True)
     assert places == {name: value.data_ptr() for name, value in buffers.tensors.items()}
-    assert all(torch.equal(state.field[name], torch.cat([values[name], values[name][:5]])) for name in trained)
+    assert all(torch.equal(state.gaussians[name], torch.cat([values[name], values[name][:5]])) for name in trained)
     assert int(buffers.tensors["means.exp_avg"].sum()) == 65 * 3
     assert buffers.hold(state, trained, growing=False)
     assert buffers.capacity == 65
     assert not buffers.hold(state, trained, growing=False)
-    narrow(state.field, state.optimizers, "features_rest", 2)
+    narrow(state.gaussians, state.optimizers, "features_rest", 2)
     assert buffers.hold(state, trained, growing=False)
     assert buffers.tensors["features_rest"].shape == buffers.tensors["features_rest.exp_avg"].shape == (65, 2, 3)

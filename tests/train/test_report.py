@@ -20,6 +20,6 @@ PLAIN = PruneReport(
 
 
 def test_it_says_what_happened_and_leaves_out_what_did_not() -> None:
-    assert PLAIN.summary() == "step 15000: kept 123,456 of 1,234,567 primitives in 1.3 s; peak 2,000,000"
+    assert PLAIN.summary() == "step 15000: kept 123,456 of 1,234,567 Gaussians in 1.3 s; peak 2,000,000"
     odd = replace(PLAIN, dropped_nonfinite=1200, tau=0.0090, sigma=0.0316227, isolated=1500)
     assert odd.summary().split("; ")[2:] == ["1,200 were NaN or infinite", "sigma 0.0316, tau 0.009, 1,500 isolated"]

@@ -12,13 +12,13 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.pruning.decision import FieldPruner
+from sundae_ns.pruning.decision import Pruner
 from sundae_ns.train.pruning import COUNT, PruneReport, PruningConfig, PruningSchedule
 
-Field = tuple[dict[str, Parameter], dict[str, Optimizer]]
+Gaussians = tuple[dict[str, Parameter], dict[str, Optimizer]]
 
 
-def field(n: int = 100, seed: int = 0) -> Field:
+def gaussians(n: int = 100, seed: int = 0) -> Gaussians:
     generator = torch.Generator().manual_seed(seed)
     shapes = {
         "means": (3,),
@@ -43,7 +43,7 @@ def train_step(params: dict[str, Parameter], optimizers: dict[str, Optimizer]) -
 
 
 def run(
-    policy: PruningSchedule, made: Field, steps: range, state: dict[str, Any] | None = None
+    policy: PruningSchedule, made: Gaussians, steps: range, state: dict[str, Any] | None = None
 ) -> tuple[list[PruneReport], dict[str, Any]]:
     params, optimizers = made
     state = policy.initialize_state() if state is None else state
@@ -51,7 +51,7 @@ def run(
     for step in steps:
         train_step(params, optimizers)
         report = policy.after_step(
-            FieldPruner(params, optimizers), state, step, lambda _: params["opacities"].detach().sigmoid().squeeze(1)
+            Pruner(params, optimizers), state, step, lambda _: params["opacities"].detach().sigmoid().squeeze(1)
         )
         if report is not None:
             reports.append(report)
@@ -59,7 +59,7 @@ def run(
 
 
 def test_one_shot_prunes_once_and_training_goes_on() -> None:
-    made = field()
+    made = gaussians()
     policy = PruningSchedule(PruningConfig(prune_at=3, keep_ratio=0.25))
     losses = []
     state = policy.initialize_state()
@@ -80,7 +80,7 @@ def test_continuous_keeps_a_share_on_schedule() -> None:
     policy = PruningSchedule(
         PruningConfig(mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, num_neighbors=4)
     )
-    reports, state = run(policy, field(), range(13))
+    reports, state = run(policy, gaussians(), range(13))
     assert [report.step for report in reports] == [2, 5, 8]
     assert [report.after for report in reports] == [70, 49, 34]
     assert {report.peak for report in reports} == {100}
@@ -90,14 +90,14 @@ def test_continuous_keeps_a_share_on_schedule() -> None:
 
 def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
     config = PruningConfig(
-        mode="continuous", start=0, every=2, stop=100, max_primitives=110, keep_ratio=1.0, num_neighbors=4
+        mode="continuous", start=0, every=2, stop=100, max_gaussians=110, keep_ratio=1.0, num_neighbors=4
     )
     policy = PruningSchedule(config)
     state = policy.initialize_state()
     counts, peaks = [], []
-    params, optimizers = field(100)
+    params, optimizers = gaussians(100)
     for step in range(6):
-        grown, _ = field(15, seed=step)
+        grown, _ = gaussians(15, seed=step)
         params = {name: Parameter(torch.cat([params[name].detach(), grown[name].detach()])) for name in params}
         optimizers = {name: Adam([value]) for name, value in params.items()}
         run(policy, (params, optimizers), range(step, step + 1), state)
@@ -110,16 +110,16 @@ def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
 @pytest.mark.parametrize("last", [60, 90])
 def test_continuous_ends_at_exactly_the_target(last: int) -> None:
     config = PruningConfig(
-        mode="continuous", start=0, every=2, stop=3, target_primitives=80, max_primitives=120, num_neighbors=4
+        mode="continuous", start=0, every=2, stop=3, target_gaussians=80, max_gaussians=120, num_neighbors=4
     )
     policy = PruningSchedule(config)
-    made = field()
+    made = gaussians()
     reports, state = run(policy, made, range(2))
     assert [report.after for report in reports] == [80]
-    params, optimizers = field(last)  # what densification has made of it meanwhile
+    params, optimizers = gaussians(last)  # what densification has made of it meanwhile
     densification = {"grad2d": torch.zeros(last), "count": torch.zeros(last), "scene_scale": 1.0}
     for step in (3, 4):
-        pruner = FieldPruner(params, optimizers, [densification])
+        pruner = Pruner(params, optimizers, [densification])
         policy.after_step(pruner, state, step, lambda _: torch.ones(last))
         assert {len(value) for value in params.values()} == {80}
         assert all(optimizers[name].param_groups[0]["params"] == [params[name]] for name in optimizers)
@@ -133,15 +133,15 @@ def test_continuous_draws_anew_each_time() -> None:
     policy = PruningSchedule(config)
     kept = []
     for step in (3, 3, 4):
-        made = field()
-        policy.after_step(FieldPruner(*made), policy.initialize_state(), step, lambda _: torch.linspace(0.1, 1, 100))
+        made = gaussians()
+        policy.after_step(Pruner(*made), policy.initialize_state(), step, lambda _: torch.linspace(0.1, 1, 100))
         kept.append(made[0]["means"].detach())
     assert torch.equal(kept[0], kept[1])
     assert not torch.equal(kept[0], kept[2])
 
 
 def test_broken_primitives_are_dropped_before_the_contribution_and_counted() -> None:
-    made = field()
+    made = gaussians()
     params, optimizers = made
     params["means"].data[5] = torch.nan
     params["means"].data[9] = torch.inf
@@ -153,7 +153,7 @@ def test_broken_primitives_are_dropped_before_the_contribution_and_counted() -> 
         return torch.ones(len(params["means"]))
 
     policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
-    report = policy.after_step(FieldPruner(params, optimizers), policy.initialize_state(), 0, contribute)
+    report = policy.after_step(Pruner(params, optimizers), policy.initialize_state(), 0, contribute)
     assert report is not None
     assert asked == [(49, 98)]
     assert (report.before, report.dropped_nonfinite, report.after) == (100, 2, 49)
@@ -162,14 +162,14 @@ def test_broken_primitives_are_dropped_before_the_contribution_and_counted() -> 
 
 
 def test_the_state_of_densification_is_sliced_along() -> None:
-    made = field()
+    made = gaussians()
     made[0]["means"].data[0] = torch.nan
     strategy_state = {"grad2d": torch.arange(100), "scene_scale": 2.0}
     config = PruningConfig(prune_at=0, redistribution="none", keep_ratio=0.1)
     means = made[0]["means"].detach().clone()
     policy = PruningSchedule(config)
     policy.after_step(
-        FieldPruner(*made, [strategy_state]), policy.initialize_state(), 0, lambda _: torch.rand(len(made[0]["means"]))
+        Pruner(*made, [strategy_state]), policy.initialize_state(), 0, lambda _: torch.rand(len(made[0]["means"]))
     )
     assert len(strategy_state["grad2d"]) == 10
     assert torch.equal(made[0]["means"], means[strategy_state["grad2d"]])
@@ -177,69 +177,71 @@ def test_the_state_of_densification_is_sliced_along() -> None:
 
 
 def test_off_never_prunes_but_counts() -> None:
-    reports, state = run(PruningSchedule(PruningConfig(mode="off", prune_at=0, start=0, every=1)), field(), range(4))
+    reports, state = run(
+        PruningSchedule(PruningConfig(mode="off", prune_at=0, start=0, every=1)), gaussians(), range(4)
+    )
     assert reports == []
     assert state == {"pruned_at": -1, "num_prunes": 0, "peak": 100}
 
 
 def test_a_failed_prune_leaves_field_and_state() -> None:
-    made = field(10)
+    made = gaussians(10)
     policy = PruningSchedule(PruningConfig(prune_at=0))
     state = policy.initialize_state()
-    with pytest.raises(DataError, match=r"contribution has shape \[9\] for 10 primitives"):
-        policy.after_step(FieldPruner(*made), state, 0, lambda _: torch.ones(9))
+    with pytest.raises(DataError, match=r"contribution has shape \[9\] for 10 Gaussians"):
+        policy.after_step(Pruner(*made), state, 0, lambda _: torch.ones(9))
     assert len(made[0]["means"]) == 10
     assert state["pruned_at"] == -1
 
 
 def test_a_field_that_the_optimizers_do_not_hold_is_not_pruned() -> None:
     policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
-    params, optimizers = field()
+    params, optimizers = gaussians()
     foreign = {**params, "means": Parameter(torch.zeros(100, 3))}
     with pytest.raises(DataError, match="optimizer of 'means'"):
-        policy.after_step(FieldPruner(foreign, optimizers), policy.initialize_state(), 0, lambda _: torch.ones(100))
+        policy.after_step(Pruner(foreign, optimizers), policy.initialize_state(), 0, lambda _: torch.ones(100))
     assert len(foreign["means"]) == 100
 
 
 def test_a_field_without_a_primitive_has_not_diverged() -> None:
     policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
-    params, optimizers = field(0)
-    with pytest.raises(DataError, match="no primitive is left: all became transparent"):
-        policy.after_step(FieldPruner(params, optimizers), policy.initialize_state(), 0, lambda _: torch.ones(0))
+    params, optimizers = gaussians(0)
+    with pytest.raises(DataError, match="no Gaussian is left: all became transparent"):
+        policy.after_step(Pruner(params, optimizers), policy.initialize_state(), 0, lambda _: torch.ones(0))
 
 
 def test_a_field_without_a_finite_primitive_names_the_cause() -> None:
     policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
-    params, optimizers = field(10)
+    params, optimizers = gaussians(10)
     params["opacities"].data[:] = torch.nan
-    with pytest.raises(DataError, match="none of 10 primitives is finite: the training has diverged"):
-        policy.after_step(FieldPruner(params, optimizers), policy.initialize_state(), 0)
+    with pytest.raises(DataError, match="none of 10 Gaussians is finite: the training has diverged"):
+        policy.after_step(Pruner(params, optimizers), policy.initialize_state(), 0)
 
 
 def test_report_is_one_line_of_plain_numbers() -> None:
-    (report,), _ = run(PruningSchedule(PruningConfig(prune_at=0)), field(), range(1))
+    (report,), _ = run(PruningSchedule(PruningConfig(prune_at=0)), gaussians(), range(1))
     assert all(type(getattr(report, f.name)) in (int, float) for f in fields(report))
     summary = report.summary()
     assert "\n" not in summary
-    assert summary.startswith("step 0: kept 10 of 100 primitives in ")
+    assert summary.startswith("step 0: kept 10 of 100 Gaussians in ")
     assert f"sigma {report.sigma:.3g}, tau {report.tau:.3g}, {report.isolated:,} isolated" in summary
-    (unscored,), _ = run(PruningSchedule(PruningConfig(prune_at=0, redistribution="none")), field(), range(1))
+    (unscored,), _ = run(PruningSchedule(PruningConfig(prune_at=0, redistribution="none")), gaussians(), range(1))
     assert "sigma" not in unscored.summary()
 
 
 @pytest.mark.parametrize(("cap", "expected"), [(200, [70, 49, 34]), (70, [70, 49, 34]), (60, [60, 42, 29])])
 def test_continuous_under_a_cap_keeps_the_share_too(cap: int, expected: list[int]) -> None:
     config = PruningConfig(
-        mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, max_primitives=cap, num_neighbors=4
+        mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, max_gaussians=cap, num_neighbors=4
     )
-    reports, _ = run(PruningSchedule(config), field(), range(13))
+    reports, _ = run(PruningSchedule(config), gaussians(), range(13))
     assert [report.step for report in reports] == [2, 5, 8]
     assert [report.after for report in reports] == expected
 
 
 def test_a_field_above_the_cap_is_pruned_when_continuous_pruning_has_ended() -> None:
     """As after a resume under a lower cap."""
-    policy = PruningSchedule(PruningConfig(mode="continuous", start=0, stop=10, every=20, max_primitives=100))
+    policy = PruningSchedule(PruningConfig(mode="continuous", start=0, stop=10, every=20, max_gaussians=100))
     state = policy.initialize_state()
     assert [policy.due(state, step, 101) for step in (9, 10, 30)] == [False, True, True]
     assert not policy.due(state, 30, 100)
@@ -266,15 +268,15 @@ def test_continuous_prunes_a_step_once() -> None:
         ({"every": 0}, "every"),
         ({"prune_at": -1}, "prune_at"),
         ({"start": 5, "stop": 4, "mode": "continuous"}, "start"),
-        ({"max_primitives": 0, "mode": "continuous"}, "max_primitives"),
-        ({"max_primitives": 0}, "max_primitives"),
+        ({"max_gaussians": 0, "mode": "continuous"}, "max_gaussians"),
+        ({"max_gaussians": 0}, "max_gaussians"),
         ({"keep_ratio": None, "max_drop": 0.0}, "max_drop is 0.0"),
         ({"max_bytes": 5}, "max_bytes is set, and trials do not decide .*: set keep_ratio to None"),
-        ({"keep_ratio": None, "target_primitives": 5, "max_drop": 0.1}, "max_drop is set, and trials do not decide"),
+        ({"keep_ratio": None, "target_gaussians": 5, "max_drop": 0.1}, "max_drop is set, and trials do not decide"),
         ({"mode": "continuous", "max_drop": 0.1}, "max_drop is set, and trials do not decide"),
         ({"mode": "continuous", "keep_ratio": None}, "keep_ratio is None and mode is continuous"),
-        ({"mode": "off", "max_primitives": 4}, "mode is off, which prunes nothing"),
-        ({"mode": "continuous", "max_primitives": 4, "target_primitives": 5}, "is more than max_primitives"),
+        ({"mode": "off", "max_gaussians": 4}, "mode is off, which prunes nothing"),
+        ({"mode": "continuous", "max_gaussians": 4, "target_gaussians": 5}, "is more than max_primitives"),
     ],
 )
 def test_impossible_options_are_refused_in_one_line(options: dict[str, Any], words: str) -> None:
@@ -288,11 +290,11 @@ def test_impossible_options_are_refused_in_one_line(options: dict[str, Any], wor
     [
         ({"keep_ratio": 0.2}, 12, 2),
         ({"keep_ratio": 0.01}, 1, 1),
-        ({"max_primitives": 5}, 5, 1),
-        ({"target_primitives": 30}, 30, 10),
-        ({"keep_ratio": None, "target_primitives": 30}, 30, 10),
-        ({"mode": "continuous", "target_primitives": 30}, 30, 10),
-        ({"mode": "continuous", "max_primitives": 30, "keep_ratio": 0.6}, 30, 6),
+        ({"max_gaussians": 5}, 5, 1),
+        ({"target_gaussians": 30}, 30, 10),
+        ({"keep_ratio": None, "target_gaussians": 30}, 30, 10),
+        ({"mode": "continuous", "target_gaussians": 30}, 30, 10),
+        ({"mode": "continuous", "max_gaussians": 30, "keep_ratio": 0.6}, 30, 6),
         ({"mode": "continuous", "keep_ratio": 0.6}, 36, 6),
     ],
 )
@@ -302,7 +304,7 @@ def test_the_schedule_decides_how_many_stay(options: dict[str, Any], of_60: int,
 
 
 def test_trials_decide_how_many_stay_and_the_schedule_waits_for_them() -> None:
-    schedule = PruningSchedule(PruningConfig(keep_ratio=None, prune_at=3, max_primitives=40))
+    schedule = PruningSchedule(PruningConfig(keep_ratio=None, prune_at=3, max_gaussians=40))
     state = schedule.initialize_state()
     assert not schedule.due(state, 3, 60)
     for chosen, kept in ((7, 7), (50, 40), (0, 6)):  # 0 for the usual share

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.core.camera import View
+from sundae_ns.core.camera import Camera
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train.step import StepInputs
 
@@ -49,10 +49,10 @@ def test_both_halves_are_the_whole_step(
 @pytest.mark.parametrize("rates", [None, torch.rand(7)], ids=["no-rates", "rates"])
 def test_inputs_of_a_recording_take_those_of_a_step(mask: Tensor | None, rates: Tensor | None) -> None:
     def made(shift: float) -> StepInputs:
-        view = View(torch.eye(4) + shift, torch.eye(3) + shift, 5, 4, 30.0)
+        camera = Camera(torch.eye(4) + shift, torch.eye(3) + shift, 5, 4, 30.0)
         target = torch.rand(5, 4, 3).transpose(0, 1) + shift  # not contiguous
         moved = [None if one is None else one + shift for one in (mask, rates)]
-        return StepInputs(view, target, moved[0], torch.rand(3) + shift, rates=moved[1])
+        return StepInputs(camera, target, moved[0], torch.rand(3) + shift, rates=moved[1])
 
     first, later = made(0.0), made(1.0)
     held = first.clone()
@@ -72,27 +72,27 @@ def test_the_view_of_a_training_camera_is_made_once(
     """At each resolution; a camera that the datamanager does not know, or that is optimised, is read anew."""
     model = build(num_downscales=1, resolution_schedule=5).train()
     made: list[int] = []
-    view_of = SundaeModel.view_of
+    camera_of = SundaeModel.camera_of
 
-    def counted(self: SundaeModel, seen: Any, downscale: int = 1) -> View:
+    def counted(self: SundaeModel, seen: Any, downscale: int = 1) -> Camera:
         made.append(downscale)
-        return view_of(self, seen, downscale)
+        return camera_of(self, seen, downscale)
 
-    monkeypatch.setattr(SundaeModel, "view_of", counted)
+    monkeypatch.setattr(SundaeModel, "camera_of", counted)
     known, other = camera(), camera(shift=0.3)
     known.metadata, other.metadata = {"cam_idx": 0}, {"cam_idx": 1}
     for step in (0, 1, 5, 6):
         model.step = step
-        views = [model.step_inputs(seen, batch()).view for seen in (known, other)]
-        assert views[0].width == model.get_outputs(known)["rgb"].shape[1] == (40 if step >= 5 else 20)
-        assert not torch.equal(views[0].viewmat, views[1].viewmat)
+        cameras = [model.step_inputs(seen, batch()).camera for seen in (known, other)]
+        assert cameras[0].width == model.get_outputs(known)["rgb"].shape[1] == (40 if step >= 5 else 20)
+        assert not torch.equal(cameras[0].viewmat, cameras[1].viewmat)
     assert made == [2, 2, 1, 1]
     model.get_outputs(camera())
     model.get_outputs(camera())
     assert made == [2, 2, 1, 1, 1, 1]
     model.camera_optimizer.config = replace(model.camera_optimizer.config, mode="SO3xR3")
     monkeypatch.setattr(model.camera_optimizer, "apply_to_camera", lambda seen: seen.camera_to_worlds)
-    model._views.clear()
+    model._cameras.clear()
     for _ in range(2):
         model.get_outputs(known)
     assert made == [2, 2, 1, 1, 1, 1, 1, 1]

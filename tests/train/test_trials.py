@@ -44,7 +44,7 @@ class FakeRun:
         """Train to the end of the trial, or ``most`` steps; returns their number."""
         for number in range(1, most + 1):
             self.state.step += 1
-            self.state.field["means"].data += 1
+            self.state.gaussians["means"].data += 1
             if trials.after_step(self):  # type: ignore[arg-type]
                 return number
         return most
@@ -55,14 +55,14 @@ def run(build: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> FakeRun:
     monkeypatch.setattr(trials_module, "AVERAGED_EVERY", 1)
     state = build(n=20).state
     state.head_starts_at = math.inf
-    state.field["means"].data.zero_()
-    state.optimizers = {name: Adam([value]) for name, value in state.field.items()}
+    state.gaussians["means"].data.zero_()
+    state.optimizers = {name: Adam([value]) for name, value in state.gaussians.items()}
     state.optimizers["compensation"] = Adam(state.head.parameters())
     return FakeRun(state)
 
 
 def height(run: FakeRun) -> float:
-    return float(run.state.field["means"].detach()[0, 0])
+    return float(run.state.gaussians["means"].detach()[0, 0])
 
 
 def test_trials_of_several_lengths_go_back_to_any_kept_field(run: FakeRun) -> None:
@@ -128,11 +128,11 @@ def test_another_width_begins_with_a_fresh_head_and_a_kept_one_comes_back(run: F
     weights = {name: value.clone() for name, value in state.head.named_parameters()}
     trials.keep("start", state, head=True)
     trials.start(run, Trial(2, num_features=29))  # type: ignore[arg-type]
-    assert (state.head.config.num_features, state.field["features"].shape) == (29, (20, 29))
+    assert (state.head.config.num_features, state.gaussians["features"].shape) == (29, (20, 29))
     trials.go_back("start", state)
     trials.start(run, Trial(2, num_features=0))  # type: ignore[arg-type]
     assert not state.head_enabled
-    assert (state.head.config.num_features, state.field["features"].shape) == (5, (20, 5))
+    assert (state.head.config.num_features, state.gaussians["features"].shape) == (5, (20, 5))
     assert all(torch.equal(value, weights[name]) for name, value in state.head.named_parameters())
 
 
@@ -156,10 +156,10 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun) -> None:
 
 
 def test_the_mode_auto_adds_a_trial_and_the_others_do_not(build: Build) -> None:
-    assert "trials" in {extension.name for extension in build(head={"mode": "auto"}).extensions}
+    assert "trials" in {callback.name for callback in build(head={"mode": "auto"}).train_callbacks}
     for mode in ("residual", "features", "off"):
-        assert "trials" not in {extension.name for extension in build(head={"mode": mode}).extensions}
-    names = [extension.name for extension in build(head={"mode": "off"}, pruning={"keep_ratio": None}).extensions]
+        assert "trials" not in {callback.name for callback in build(head={"mode": mode}).train_callbacks}
+    names = [callback.name for callback in build(head={"mode": "off"}, pruning={"keep_ratio": None}).train_callbacks]
     assert names.index("trials") < names.index("pruning") < names.index("after-prune")
 
 
@@ -200,7 +200,7 @@ def test_a_removed_head_leaves_no_values_and_no_moments(build: Build) -> None:
 def undecided(build: Build) -> tuple[SundaeModel, Trials]:
     """A model whose head is to be decided about, and its trials."""
     model = build(head={"mode": "auto"})
-    return model, next(one for one in model.extensions if isinstance(one, Trials))
+    return model, next(one for one in model.train_callbacks if isinstance(one, Trials))
 
 
 def saved(stage: str = "", kept: tuple[str, ...] = (), **progress: Any) -> dict[str, Any]:
@@ -243,14 +243,14 @@ def test_a_part_of_a_field_tells_the_size_of_all_of_it(with_head: bool) -> None:
     n, generator = 20_000, torch.Generator().manual_seed(0)
     shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}
     shapes |= {"features_rest": (3, 3), FEATURES: (5,)}
-    field = {name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()}
+    gaussians = {name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()}
     head = CompensationHead(HeadConfig(mode="residual", size="tiny", num_features=5)) if with_head else None
-    found = packed_size(field, head)
+    found = packed_size(gaussians, head)
     assert found is not None
-    packed = {name: value for name, value in field.items() if with_head or name != FEATURES}
+    packed = {name: value for name, value in gaussians.items() if with_head or name != FEATURES}
     data, sections = pack_bytes(*fit_scene(PackedScene(packed, {} if head is None else dict(head.state_dict()))))
     of_head = sum(size for name, size in sections.items() if name.startswith("head/"))
     assert found[1] == pytest.approx(of_head, rel=0.01)
     assert (found[1] > 0) == with_head
     assert found[0] == pytest.approx(len(data) - of_head, rel=0.1)
-    assert packed_size({**field, "means": torch.full((n, 3), torch.nan)}) is None
+    assert packed_size({**gaussians, "means": torch.full((n, 3), torch.nan)}) is None

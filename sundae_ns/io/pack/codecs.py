@@ -107,7 +107,7 @@ class Codecs:
     config: PackConfig
     blocks: Blocks
     """The positions in their stored form."""
-    field: dict[str, Rotations | Transform]
+    gaussians: dict[str, Rotations | Transform]
     """Codecs of all other attributes."""
     head: HeadCodec | None
 
@@ -115,34 +115,34 @@ class Codecs:
         """Return a copy on another device."""
         return _moved(self, device)  # type: ignore[no-any-return]
 
-    def with_steps(self, config: PackConfig, field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Codecs:
+    def with_steps(self, config: PackConfig, gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Codecs:
         """The same grids and bases with the steps of other options; their bits and blocks of positions have no effect.
 
         With the present options, these are the same steps.
 
         Args:
             config: valid options.
-            field: primitives in the order of these codecs, which the steps have to suit.
+            gaussians: Gaussians in the order of these codecs, which the steps have to suit.
             head: its head; {} for none.
         """
         ratios = {name: getattr(config, name) / getattr(self.config, name) for name in STEPS}
         codecs: dict[str, Rotations | Transform] = {}
-        for name, codec in self.field.items():
+        for name, codec in self.gaussians.items():
             step = codec.step * ratios[_STEPS[name]]
             if isinstance(codec, Rotations):
                 codecs[name] = Rotations(step)
             else:
-                codecs[name] = codec.with_step(step, as_matrix(field[name]))
+                codecs[name] = codec.with_step(step, as_matrix(gaussians[name]))
         kept = {"position_bits": self.config.position_bits, "block": self.config.block}
         of_head = None if self.head is None else self.head.scaled(ratios["head_step"], head)
         return Codecs(replace(config, **kept), self.blocks, codecs, of_head)  # type: ignore[arg-type]
 
     @torch.no_grad()
-    def rounded(self, field: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The field that a reader decodes, for primitives in the order of these codecs; positions are unchanged."""
-        result = dict(field)
-        for name, codec in self.field.items():
-            values = field[name]
+    def rounded(self, gaussians: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The field that a reader decodes, for Gaussians in the order of these codecs; positions are unchanged."""
+        result = dict(gaussians)
+        for name, codec in self.gaussians.items():
+            values = gaussians[name]
             result[name] = codec.rounded(values.reshape(len(values), -1)).reshape(values.shape)
         return result
 
@@ -159,19 +159,21 @@ def _moved(value: Any, device: torch.device) -> Any:
     if isinstance(value, dict):
         return {name: _moved(inner, device) for name, inner in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{field.name: _moved(getattr(value, field.name), device) for field in fields(value)})
+        return replace(
+            value, **{gaussians.name: _moved(getattr(value, gaussians.name), device) for gaussians in fields(value)}
+        )
     return value
 
 
 def fit_codecs(
-    field: Mapping[str, Tensor],
+    gaussians: Mapping[str, Tensor],
     head: Mapping[str, Tensor],
     config: PackConfig,
     sensitivity: Sensitivity | None = None,
 ) -> tuple[dict[str, Tensor], Codecs]:
     """The field in the stored order, with rounded positions, and codecs fitted to it and to a head; {} for none."""
-    names = [name for name in (*SPLAT_NAMES, FEATURES) if name in field]
-    values = {name: as_matrix(field[name]) for name in names}
+    names = [name for name in (*SPLAT_NAMES, FEATURES) if name in gaussians]
+    values = {name: as_matrix(gaussians[name]) for name in names}
     order = scene_order(values["means"])
     blocks, within = quantize.quantize_positions(values["means"][order], config.position_bits, config.block)
     order = order[within]
@@ -187,7 +189,7 @@ def fit_codecs(
             codecs[name] = Rotations(step)
         elif name in values and values[name].size:
             codecs[name] = fit_transform(values[name], step, centred=name != "features_rest", form=forms.get(name))
-    ordered = {name: torch.from_numpy(values[name]).reshape(field[name].shape) for name in names}
+    ordered = {name: torch.from_numpy(values[name]).reshape(gaussians[name].shape) for name in names}
     of_head = {} if sensitivity is None else sensitivity.head
     return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, of_head))
 
@@ -232,16 +234,16 @@ def as_matrix(values: Tensor) -> Floats:
     return np.ascontiguousarray(values.detach().to("cpu", torch.float32).numpy().reshape(len(values), -1))
 
 
-def estimated_bits(codecs: Codecs, field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def estimated_bits(codecs: Codecs, gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Estimate, with gradients, the bits of each attribute of a field, without positions, and of a head; {} for none.
 
     A rounded number of the distribution of Laplace with mean magnitude m takes about log2(1 + 2 e m) bits. The entropy
     coder's contexts know the magnitude nearby, so m is measured in runs along the curve. The codecs are on the device
-    of the field, whose primitives are in their order.
+    of the field, whose Gaussians are in their order.
     """
     bits = {}
-    for name, codec in codecs.field.items():
-        values = field[name]
+    for name, codec in codecs.gaussians.items():
+        values = gaussians[name]
         bits[name] = _of_rows(codec.coefficients(values.reshape(len(values), -1)))
     if codecs.head is not None and head:
         levels = [codecs.head.coefficients(name, value) for name, value in head.items() if value.ndim > 1]

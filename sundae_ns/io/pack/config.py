@@ -14,7 +14,7 @@ class PackConfig:
     position_bits: int = 13
     """Bits of each coordinate within a block, 4 to 16."""
     block: int = 1024
-    """Primitives per block of positions; smaller blocks are more exact and take more bytes."""
+    """Gaussians per block of positions; smaller blocks are more exact and take more bytes."""
     scale_step: float = 0.05
     """Step of log-scales."""
     rotation_step: float = 0.008

@@ -19,14 +19,14 @@ from torch import Tensor
 
 from sundae_ns.core.errors import PackError
 from sundae_ns.core.files import replacing
-from sundae_ns.core.gaussians import FEATURES, SPLAT_NAMES, finite_mask, num_primitives
+from sundae_ns.core.gaussians import FEATURES, SPLAT_NAMES, finite_mask, num_gaussians
 from sundae_ns.io.pack import container, entropy, quantize
 from sundae_ns.io.pack.codecs import Codecs, Sensitivity, as_matrix, fit_codecs
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.container import FORMAT, Array, DamagedError, Levels, fits, in_range
 from sundae_ns.io.pack.entropy import Near
 from sundae_ns.io.pack.quantize import Blocks
-from sundae_ns.io.ply import check_field
+from sundae_ns.io.ply import check_gaussians
 
 CAMERAS: dict[str, dict[str, Any]] = FORMAT["sections"]["cameras"]
 """dtype, shape and range of the arrays of M cameras: ``poses`` ``[M, 3, 4]``, camera-to-world with OpenGL axes in the
@@ -39,7 +39,7 @@ Decoded = TypeVar("Decoded")
 class PackedScene:
     """All that is needed to render a scene."""
 
-    field: dict[str, Tensor]
+    gaussians: dict[str, Tensor]
     """See :mod:`sundae_ns.core.gaussians`; float32 on the CPU."""
     head: dict[str, Tensor] = default(default_factory=dict)
     """State of the head; empty without a head."""
@@ -62,7 +62,7 @@ class PackReport(NamedTuple):
 
     @property
     def bits(self) -> dict[str, float]:
-        """Bits per primitive of each attribute, and of ``head``, ``cameras`` and ``header``."""
+        """Bits per Gaussian of each attribute, and of ``head``, ``cameras`` and ``header``."""
         sums: dict[str, float] = {}
         for name, count in self.sections.items():
             attribute = name.partition("/")[0]
@@ -70,17 +70,17 @@ class PackReport(NamedTuple):
         return sums
 
     def summary(self) -> dict[str, Any]:
-        """JSON values: primitives, bytes, and the bits per primitive of each attribute and of all."""
+        """JSON values: Gaussians, bytes, and the bits per Gaussian of each attribute and of all."""
         bits = {**self.bits, "all": 8 * self.bytes / self.primitives}
         rounded = {name: round(value, 2) for name, value in bits.items()}
         return {"primitives": self.primitives, "bytes": self.bytes, "bits": rounded}
 
 
 def _check(params: Mapping[str, Tensor]) -> None:
-    check_field(params, PackError)
-    n = num_primitives(params)
+    check_gaussians(params, PackError)
+    n = num_gaussians(params)
     if n == 0:
-        raise PackError("the field has no primitives; there is nothing to pack")
+        raise PackError("the field has no Gaussians; there is nothing to pack")
     features = params.get(FEATURES)
     if features is not None and not (
         features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MAX_WIDTH
@@ -89,7 +89,7 @@ def _check(params: Mapping[str, Tensor]) -> None:
     known = {name: params[name].float() for name in (*SPLAT_NAMES, FEATURES) if name in params}
     broken = n - int(finite_mask(known).sum())
     if broken:
-        raise PackError(f"{broken} of {n} primitives are not finite (NaN or infinite); prune the field first")
+        raise PackError(f"{broken} of {n} Gaussians are not finite (NaN or infinite); prune the field first")
 
 
 # ------------------------------------------------------------------------------------------------------------- encoding
@@ -99,17 +99,17 @@ def fit_scene(scene: PackedScene, config: PackConfig | None = None) -> tuple[Pac
     """Fit codecs to a scene.
 
     Returns:
-        The scene with its primitives in the stored order and with rounded positions, and the codecs.
+        The scene with its Gaussians in the stored order and with rounded positions, and the codecs.
 
     Raises:
         ConfigError: an option is invalid.
-        PackError: the field has no primitives, wrong shapes or values that are not finite.
+        PackError: the field has no Gaussians, wrong shapes or values that are not finite.
     """
     config = config or PackConfig()
     config.validate()
-    _check(scene.field)
-    field, codecs = fit_codecs(scene.field, scene.head, config, scene.sensitivity)
-    return replace(scene, field=field), codecs
+    _check(scene.gaussians)
+    gaussians, codecs = fit_codecs(scene.gaussians, scene.head, config, scene.sensitivity)
+    return replace(scene, gaussians=gaussians), codecs
 
 
 def write_scene(path: Path, scene: PackedScene, config: PackConfig | None = None) -> PackReport:
@@ -120,7 +120,7 @@ def write_scene(path: Path, scene: PackedScene, config: PackConfig | None = None
 def write_fitted(path: Path, scene: PackedScene, codecs: Codecs) -> PackReport:
     """Pack a scene, atomically, with codecs that were fitted to it before or after training with rounding.
 
-    Primitives are in the order of :func:`fit_scene`. Their positions are ignored; the codecs hold them.
+    Gaussians are in the order of :func:`fit_scene`. Their positions are ignored; the codecs hold them.
 
     Raises:
         PackError: values are not finite, or the codecs do not fit the scene.
@@ -130,22 +130,22 @@ def write_fitted(path: Path, scene: PackedScene, codecs: Codecs) -> PackReport:
     with replacing(path) as partial:
         partial.write_bytes(packed)
     sections["header"] = len(packed) - sum(sections.values())
-    return PackReport(num_primitives(scene.field), len(packed), sections)
+    return PackReport(num_gaussians(scene.gaussians), len(packed), sections)
 
 
 def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int]]:
     """The bytes of the file that :func:`write_fitted` writes, and the number of bytes of each section."""
-    _check(scene.field)
+    _check(scene.gaussians)
     config, blocks = codecs.config, codecs.blocks
-    n = num_primitives(scene.field)
-    wanted = {"means", "features_rest", *codecs.field}
-    if n != len(blocks.codes) or set(scene.field) != wanted or bool(scene.head) != (codecs.head is not None):
+    n = num_gaussians(scene.gaussians)
+    wanted = {"means", "features_rest", *codecs.gaussians}
+    if n != len(blocks.codes) or set(scene.gaussians) != wanted or bool(scene.head) != (codecs.head is not None):
         raise PackError("the codecs were fitted to another scene; fit them again")
     arrays: dict[str, Array] = {"means/low": blocks.low, "means/high": blocks.high}
     arrays["means/gaps"] = entropy.encode_gaps(blocks.codes, config.block, config.position_bits)
     about: dict[str, Any] = {"means": {"codec": "blocks", "bits": config.position_bits, "block": config.block}}
     near = entropy.neighbours_of(blocks.cells, config.block)
-    coded = {name: (codec.encode(as_matrix(scene.field[name])), near) for name, codec in codecs.field.items()}
+    coded = {name: (codec.encode(as_matrix(scene.gaussians[name])), near) for name, codec in codecs.gaussians.items()}
     if codecs.head is not None:
         head = codecs.head.encode(scene.head)
         coded["head"] = head, entropy.predecessors(len(head[1]))
@@ -162,7 +162,7 @@ def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int
             arrays[f"cameras/{name}"] = array
 
     meta = {**scene.meta, "primitives": n, "attributes": about}
-    unpacked = 4 * sum(value.numel() for value in (*scene.field.values(), *scene.head.values()))
+    unpacked = 4 * sum(value.numel() for value in (*scene.gaussians.values(), *scene.head.values()))
     return container.encode(meta, arrays, unpacked=unpacked)
 
 
@@ -290,16 +290,16 @@ def _decoded(reader: _Reader, n: int, width: int, features: int) -> PackedScene:
         jobs["quats"] = pool.submit(quats)
         jobs |= {name: pool.submit(rows, name, channels) for name, channels in narrow.items()}
         jobs["means"] = pool.submit(means)
-        field = {name: torch.from_numpy(job.result()) for name, job in jobs.items()}
-    rest = field.get("features_rest")
-    field["features_rest"] = torch.zeros(n, 0, 3) if rest is None else rest.reshape(n, width // 3, 3)
-    ordered = {name: field[name] for name in (*SPLAT_NAMES, FEATURES) if name in field}
+        gaussians = {name: torch.from_numpy(job.result()) for name, job in jobs.items()}
+    rest = gaussians.get("features_rest")
+    gaussians["features_rest"] = torch.zeros(n, 0, 3) if rest is None else rest.reshape(n, width // 3, 3)
+    ordered = {name: gaussians[name] for name in (*SPLAT_NAMES, FEATURES) if name in gaussians}
     meta = {name: value for name, value in reader.meta.items() if name not in ("sections", "attributes", "primitives")}
     return PackedScene(ordered, head.result(), _decode_cameras(reader), meta)
 
 
 def _shape(meta: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Numbers of primitives, of SH values of degrees 1 and up, and of features, from the header alone."""
+    """Numbers of Gaussians, of SH values of degrees 1 and up, and of features, from the header alone."""
     container.check(meta, "header")
     width, features = (int(meta["attributes"].get(name, {"width": 0})["width"]) for name in ("features_rest", FEATURES))
     return int(meta["primitives"]), width, features

@@ -49,7 +49,7 @@ def quantize_positions(means: Floats, bits: int, size: int) -> tuple[Blocks, NDA
     Args:
         means: ``[N, 3]``, finite, in the order of ``morton.scene_order``.
         bits: bits of each coordinate of a cell.
-        size: primitives per block.
+        size: Gaussians per block.
 
     Returns:
         The blocks, and the permutation ``[N]`` from their order to rows of ``means``.

@@ -76,12 +76,12 @@ def project(inputs: Inputs) -> Projection:
     if torch.is_grad_enabled() and (inputs.viewmat.requires_grad or inputs.K.requires_grad):
         return reference.project(inputs)
     means = inputs.means
-    view = as_array(inputs.viewmat.double())
+    matrix = as_array(inputs.viewmat.double())
     lens = as_array(inputs.K)[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float64)
     size = np.array([inputs.width, inputs.height], dtype=np.float64)
     # Round the planes to the tensors' dtype, as torch does when it compares a tensor with a number.
     planes = np.array([inputs.near_plane, inputs.far_plane], np.float32 if means.dtype == torch.float32 else np.float64)
-    camera = (view, lens, size, planes.astype(np.float64))
+    camera = (matrix, lens, size, planes.astype(np.float64))
     outputs = _Project.apply(means, inputs.quats, inputs.scales, camera)
     means2d, conics, depths, compensations, covars2d, radii = outputs
     return Projection(means2d, covars2d, conics, depths, compensations, radii)
@@ -141,20 +141,20 @@ def _slope_limits(lens: Any, size: Any) -> tuple[float, float, float, float]:
 
 
 @compiled
-def _to_camera(view: Any, means: Any, i: int) -> tuple[float, float, float]:
+def _to_camera(camera: Any, means: Any, i: int) -> tuple[float, float, float]:
     """Camera coordinates of a centre; z is rounded to the dtype of the centres, in which it is compared."""
-    x = view[0, 0] * means[i, 0] + view[0, 1] * means[i, 1] + view[0, 2] * means[i, 2] + view[0, 3]
-    y = view[1, 0] * means[i, 0] + view[1, 1] * means[i, 1] + view[1, 2] * means[i, 2] + view[1, 3]
-    z = view[2, 0] * means[i, 0] + view[2, 1] * means[i, 1] + view[2, 2] * means[i, 2] + view[2, 3]
+    x = camera[0, 0] * means[i, 0] + camera[0, 1] * means[i, 1] + camera[0, 2] * means[i, 2] + camera[0, 3]
+    y = camera[1, 0] * means[i, 0] + camera[1, 1] * means[i, 1] + camera[1, 2] * means[i, 2] + camera[1, 3]
+    z = camera[2, 0] * means[i, 0] + camera[2, 1] * means[i, 1] + camera[2, 2] * means[i, 2] + camera[2, 3]
     return x, y, float(means.dtype.type(z))
 
 
 @compiled
-def _to_view(view: Any, rotation: Any, out: Any) -> None:
-    """Write a primitive's axes in camera coordinates ``[3, 3]``."""
+def _to_view(camera: Any, rotation: Any, out: Any) -> None:
+    """Write a Gaussian's axes in camera coordinates ``[3, 3]``."""
     for r in range(3):
         for c in range(3):
-            out[r, c] = view[r, 0] * rotation[0, c] + view[r, 1] * rotation[1, c] + view[r, 2] * rotation[2, c]
+            out[r, c] = camera[r, 0] * rotation[0, c] + camera[r, 1] * rotation[1, c] + camera[r, 2] * rotation[2, c]
 
 
 @compiled
@@ -175,19 +175,19 @@ def _footprint(row_x: Any, row_y: Any, normal: Any) -> tuple[float, float, float
 
 @compiled
 def _project(begin: int, end: int, means: Any, quats: Any, scales: Any, camera: Any, outputs: Any) -> None:
-    view, lens, size, planes = camera
+    matrix, lens, size, planes = camera
     means2d, conics, depths, compensations, covars2d, radii = outputs
     rotation, root, row_x, row_y, normal = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     min_x, max_x, min_y, max_y = _slope_limits(lens, size)
     for i in range(begin, end):
-        x, y, z = _to_camera(view, means, i)
+        x, y, z = _to_camera(matrix, means, i)
         if not (z >= planes[0] and z <= planes[1] and z > 0):
             means2d[i], conics[i], covars2d[i] = 0, 0, 0
             depths[i], compensations[i], radii[i] = 0, 0, 0
             continue
         centre_x, centre_y = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
         _rotation(quats, i, rotation)
-        _to_view(view, rotation, root)
+        _to_view(matrix, rotation, root)
         slope_x, slope_y = min(max(x / z, min_x), max_x), min(max(y / z, min_y), max_y)
         for c in range(3):
             across, down, along = root[0, c] * scales[i, c], root[1, c] * scales[i, c], root[2, c] * scales[i, c]
@@ -210,7 +210,7 @@ def _project(begin: int, end: int, means: Any, quats: Any, scales: Any, camera: 
 def _project_backward(
     begin: int, end: int, means: Any, quats: Any, scales: Any, gradients: Any, camera: Any, outputs: Any
 ) -> None:
-    view, lens, size, planes = camera
+    matrix, lens, size, planes = camera
     grad_means2d, grad_conics, grad_depths, grad_compensations = gradients
     grad_means, grad_quats, grad_scales = outputs
     rotation, root, row_x, row_y = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -220,7 +220,7 @@ def _project_backward(
     for i in range(begin, end):
         u, v, depth, blur = grad_means2d[i, 0], grad_means2d[i, 1], grad_depths[i], grad_compensations[i]
         a, b, c = float(grad_conics[i, 0]), float(grad_conics[i, 1]), float(grad_conics[i, 2])
-        x, y, z = _to_camera(view, means, i)
+        x, y, z = _to_camera(matrix, means, i)
         culled = not (z >= planes[0] and z <= planes[1] and z > 0)
         no_gradient = u == 0 and v == 0 and depth == 0 and blur == 0 and a == 0 and b == 0 and c == 0
         if culled or no_gradient:
@@ -229,7 +229,7 @@ def _project_backward(
 
         # Recompute the forward pass ...
         length = _rotation(quats, i, rotation)
-        _to_view(view, rotation, root)
+        _to_view(matrix, rotation, root)
         slope_x, slope_y = min(max(x / z, min_x), max_x), min(max(y / z, min_y), max_y)
         zoom_x, zoom_y = lens[0] / z, lens[1] / z
         for k in range(3):
@@ -270,7 +270,9 @@ def _project_backward(
             grad_root[0, k], grad_root[1, k], grad_root[2, k] = inner_x, inner_y, inner_z
         for r in range(3):
             for k in range(3):
-                grad_axis = view[0, r] * grad_root[0, k] + view[1, r] * grad_root[1, k] + view[2, r] * grad_root[2, k]
+                grad_axis = (
+                    matrix[0, r] * grad_root[0, k] + matrix[1, r] * grad_root[1, k] + matrix[2, r] * grad_root[2, k]
+                )
                 grad_rotation[r, k] = grad_axis * scales[i, k]
         # to the centre in camera and world coordinates,
         cam_x, cam_y = zoom_x * u, zoom_y * v
@@ -282,7 +284,7 @@ def _project_backward(
             cam_y += grad_slope_y / z
             cam_z -= grad_slope_y * y / (z * z)
         for k in range(3):
-            grad_means[i, k] = view[0, k] * cam_x + view[1, k] * cam_y + view[2, k] * cam_z
+            grad_means[i, k] = matrix[0, k] * cam_x + matrix[1, k] * cam_y + matrix[2, k] * cam_z
         # and to the quaternion, through its unit form.
         w, p, q, s = rotation[3, 0], rotation[3, 1], rotation[3, 2], rotation[3, 3]
         g = grad_rotation

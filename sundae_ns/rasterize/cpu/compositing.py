@@ -6,7 +6,7 @@ For pixel p and list entry m, with g the gradient of the loss with respect to th
 - T_m = prod over k < m of (1 - alpha_k), w_m = alpha_m T_m, and the image is sum_m w_m c_m;
 - -dL/de_m = w_m <g, c_m> - alpha_m / (1 - alpha_m) * sum over k > m of w_k <g, c_k>, and 0 where alpha is clamped.
 
-A loop over the pixels of a tile handles one primitive at a time, many pixels in SIMD lanes, without branches. The
+A loop over the pixels of a tile handles one Gaussian at a time, many pixels in SIMD lanes, without branches. The
 backward pass starts from the final transmittance and divides by (1 - alpha) where the forward pass multiplied; the
 position of the last blended entry of each pixel tells which entries were blended.
 """
@@ -44,8 +44,8 @@ _CHECK_EVERY = 8  # list entries between two checks for opaque tiles
 _FAINTEST = 20.0  # upper bound of negated exponents, far beyond log(255)
 _MIN_PER_THREAD = 8  # tiles
 _CHANNEL_GROUP = 8  # channels whose gradients are summed together
-_MOMENTS = 8  # sums per primitive and tile after the channels: six moments, two absolute gradients
-_MIN_PER_THREAD_TO_SUM = 5_000  # primitives
+_MOMENTS = 8  # sums per Gaussian and tile after the channels: six moments, two absolute gradients
+_MIN_PER_THREAD_TO_SUM = 5_000  # Gaussians
 
 
 class _Composite(torch.autograd.Function):
@@ -281,7 +281,7 @@ def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: in
 def _sum_slots(
     begin: int, end: int, ids: Any, first_slots: Any, table: Any, parts: Any, outputs: Any, absolute_grads: Any
 ) -> None:
-    """Sum the slots of each primitive in float64, and convert moments to gradients."""
+    """Sum the slots of each Gaussian in float64, and convert moments to gradients."""
     grad_means2d, grad_conics, grad_opacities, grad_colors = outputs
     channels, width = parts.shape[1] - _MOMENTS, parts.shape[1]
     sums = np.empty(width)

@@ -1,13 +1,13 @@
-"""Depth-ordered lists of the primitives of each tile.
+"""Depth-ordered lists of the Gaussians of each tile.
 
-gsplat 1.4 bins primitives into 16-pixel tiles by their three-sigma square and blends them in every pixel of those
-tiles. So its images depend on that grid. The lists here use a finer grid and leave out only primitives that cannot
+gsplat 1.4 bins Gaussians into 16-pixel tiles by their three-sigma square and blends them in every pixel of those
+tiles. So its images depend on that grid. The lists here use a finer grid and leave out only Gaussians that cannot
 reach an alpha of 1/255 in a tile: the image is that of the 16-pixel grid, with fewer evaluations. (gsplat 1.5 fits the
-bins to the opacity instead, which also keeps the rim of opaque primitives from 3 to 3.33 sigma.)
+bins to the opacity instead, which also keeps the rim of opaque Gaussians from 3 to 3.33 sigma.)
 
-Primitives are sorted by depth once and are then identified by their rank. A rank owns consecutive slots, one per tile
+Gaussians are sorted by depth once and are then identified by their rank. A rank owns consecutive slots, one per tile
 that it can touch; the list of a tile is a list of slots. The backward pass writes its sums per tile into the slots. The
-sum over the tiles of a primitive then reads adjacent memory in a fixed order.
+sum over the tiles of a Gaussian then reads adjacent memory in a fixed order.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ STEP = WIDTH // TILE
 """Rows of pixels of a tile that are blended in one step."""
 
 ROUNDING = 1e-3
-"""Slack on exponents, so that rounding never drops a primitive that is blended."""
+"""Slack on exponents, so that rounding never drops a Gaussian that is blended."""
 
 _PAIR_BYTES = 10
-_MIN_PER_THREAD = 2_500  # primitives: below 0.1 ms of work, waking a thread costs more than it saves
+_MIN_PER_THREAD = 2_500  # Gaussians: below 0.1 ms of work, waking a thread costs more than it saves
 _DIGIT_BITS = 11  # bits per pass of the radix sort
 
 
 @dataclass(frozen=True)
 class Lists:
-    """V visible primitives in T tiles, row by row; L slots."""
+    """V visible Gaussians in T tiles, row by row; L slots."""
 
     width: int  # of the image, pixels
     height: int
     columns: int
     rows: int
-    ids: Any  # [V], int32: primitive of each rank
+    ids: Any  # [V], int32: Gaussian of each rank
     table: Any  # [V, 9]: see the column names above
     first_slots: Any  # [V + 1], int64: first slot of each rank
     starts: Any  # [T + 1], int64: start of each tile's list
@@ -66,7 +66,7 @@ class Lists:
 
 @torch.no_grad()
 def build_lists(projection: Projection, opacities: Tensor, width: int, height: int) -> Lists:
-    """List the primitives of each tile; ``opacities`` ``[N]`` are those to blend.
+    """List the Gaussians of each tile; ``opacities`` ``[N]`` are those to blend.
 
     Raises:
         MemoryExhaustedError: the lists would be too long.
@@ -84,7 +84,7 @@ def build_lists(projection: Projection, opacities: Tensor, width: int, height: i
     measured = (ids, splats, (columns, rows), table, boxes, first_intervals)
     parallel_for(_measure, count, *measured, min_per_thread=_MIN_PER_THREAD)
     np.cumsum(first_intervals, out=first_intervals)
-    # A primitive touches at least one tile in each of its columns.
+    # A Gaussian touches at least one tile in each of its columns.
     check_pairs(int(first_intervals[-1]), count, columns * rows, _PAIR_BYTES, training=training)
     intervals = np.empty((first_intervals[-1], 2), np.int32)
     found = (table, boxes, first_intervals, intervals, first_slots)
@@ -99,7 +99,7 @@ def build_lists(projection: Projection, opacities: Tensor, width: int, height: i
 
 @compiled
 def _visible_by_depth(keys: Any, radii: Any, opacities: Any) -> Any:
-    """Visible primitives, nearest first, ties by index: a radix sort from the last digit to the first."""
+    """Visible Gaussians, nearest first, ties by index: a radix sort from the last digit to the first."""
     smallest = opacities.dtype.type(MIN_ALPHA)
     ids = np.empty(len(keys), np.int32)
     count = 0

@@ -88,15 +88,15 @@ def scene(n: int = 700) -> PackedScene:
 def test_a_file_holds_the_values_rounded_in_training(tmp_path: Path, config: PackConfig) -> None:
     fitted, codecs = fit_scene(scene(), config)
     g = torch.Generator().manual_seed(1)
-    moved = {name: value + 0.02 * torch.randn(value.shape, generator=g) for name, value in fitted.field.items()}
+    moved = {name: value + 0.02 * torch.randn(value.shape, generator=g) for name, value in fitted.gaussians.items()}
     assert codecs.head is not None
     head = {name: 1.1 * value for name, value in fitted.head.items()}
     write_fitted(tmp_path / "a.sundae", PackedScene(moved, head), codecs)
     found = read_scene(tmp_path / "a.sundae")
     rounded, rounded_head = codecs.rounded(moved), codecs.rounded_head(head)
-    assert torch.equal(found.field["means"], fitted.field["means"])
-    for name in codecs.field:
-        assert torch.equal(found.field[name], rounded[name]), name
+    assert torch.equal(found.gaussians["means"], fitted.gaussians["means"])
+    for name in codecs.gaussians:
+        assert torch.equal(found.gaussians[name], rounded[name]), name
         assert not torch.equal(rounded[name], moved[name]), name
     assert found.head.keys() == head.keys()
     for name, value in found.head.items():
@@ -111,10 +111,10 @@ def test_packing_is_fitting_and_writing(tmp_path: Path) -> None:
 
 def without(name: str) -> PackedScene:
     whole = scene()
-    return PackedScene({key: value for key, value in whole.field.items() if key != name}, whole.head)
+    return PackedScene({key: value for key, value in whole.gaussians.items() if key != name}, whole.head)
 
 
-@pytest.mark.parametrize("other", [scene(650), without("features"), PackedScene(scene().field)])
+@pytest.mark.parametrize("other", [scene(650), without("features"), PackedScene(scene().gaussians)])
 def test_codecs_of_another_scene_are_refused(tmp_path: Path, other: PackedScene) -> None:
     _, codecs = fit_scene(scene())
     with pytest.raises(PackError, match="another scene"):
@@ -126,14 +126,14 @@ def test_other_steps_keep_grids_and_bases(tmp_path: Path) -> None:
     """Of a scene that has moved since, whose own bases would be others."""
     present = PackConfig(block=100, position_bits=11, head_step=0.1)
     fitted, codecs = fit_scene(scene(), present)
-    moved = replace(fitted, field={name: drifted_tensor(value) for name, value in fitted.field.items()})
+    moved = replace(fitted, gaussians={name: drifted_tensor(value) for name, value in fitted.gaussians.items()})
     wanted = replace(present, scale_step=0.2, rotation_step=0.002, head_step=0.8, position_bits=16, block=1024)
-    other = codecs.with_steps(wanted, moved.field, moved.head)
+    other = codecs.with_steps(wanted, moved.gaussians, moved.head)
     assert other.blocks is codecs.blocks
     assert other.config == replace(wanted, position_bits=11, block=100)
-    for name, codec in codecs.field.items():
+    for name, codec in codecs.gaussians.items():
         factor = {"scales": 0.2 / 0.05, "quats": 0.002 / 0.008}.get(name, 1.0)
-        found = other.field[name]
+        found = other.gaussians[name]
         assert found.step == pytest.approx(factor * codec.step), name
         if isinstance(codec, quantize.Transform):
             assert isinstance(found, quantize.Transform)
@@ -143,12 +143,12 @@ def test_other_steps_keep_grids_and_bases(tmp_path: Path) -> None:
     assert other.head is not None
     # Half of the largest weight, not eight tenths.
     torch.testing.assert_close(other.head.rows["a.weight"], 5 * codecs.head.rows["a.weight"])
-    same = codecs.with_steps(present, moved.field, moved.head)
+    same = codecs.with_steps(present, moved.gaussians, moved.head)
     for number, these in enumerate((codecs, same, other)):
         write_fitted(tmp_path / f"{number}.sundae", moved, these)
     assert (tmp_path / "0.sundae").read_bytes() == (tmp_path / "1.sundae").read_bytes()
-    found, shown = read_scene(tmp_path / "2.sundae").field, other.rounded(moved.field)
-    assert all(torch.equal(found[name], shown[name]) for name in other.field)
+    found, shown = read_scene(tmp_path / "2.sundae").gaussians, other.rounded(moved.gaussians)
+    assert all(torch.equal(found[name], shown[name]) for name in other.gaussians)
 
 
 def test_steps_that_are_too_fine_for_a_row_become_larger() -> None:
@@ -166,7 +166,7 @@ def drifted_tensor(values: Tensor) -> Tensor:
 
 def test_larger_steps_of_the_head_are_fewer_bytes(tmp_path: Path) -> None:
     big = {"a.weight": torch.randn(64, 64, 3, 3, generator=torch.Generator().manual_seed(0))}
-    whole = PackedScene(scene().field, big)
+    whole = PackedScene(scene().gaussians, big)
     sizes = {}
     for step in (0.008, 0.03, 0.14):
         report = write_scene(tmp_path / "a.sundae", whole, PackConfig(head_step=step))
@@ -183,8 +183,8 @@ def test_rounding_is_the_same_on_a_gpu() -> None:
     """Levels are equal; values differ in the last bits, because a GPU rounds roots, quotients and sums differently."""
     fitted, codecs = fit_scene(scene(), PackConfig(feature_step=0.3))
     cuda = torch.device("cuda")
-    on_cpu, on_gpu = codecs.rounded(fitted.field), codecs.to(cuda).rounded(_moved(fitted.field, cuda))
-    for name in codecs.field:
+    on_cpu, on_gpu = codecs.rounded(fitted.gaussians), codecs.to(cuda).rounded(_moved(fitted.gaussians, cuda))
+    for name in codecs.gaussians:
         torch.testing.assert_close(on_gpu[name].cpu(), on_cpu[name], rtol=1e-6, atol=1e-6, msg=name)
     head = codecs.to(cuda).rounded_head(_moved(fitted.head, cuda))
     for name, value in codecs.rounded_head(fitted.head).items():
@@ -231,11 +231,15 @@ def test_a_head_that_does_nothing_yet_is_packed(tmp_path: Path, seen: list[str])
     g = torch.Generator().manual_seed(0)
     head = {name: torch.randn(8, 8, 3, 3, generator=g) for name in ("a.weight", "b.weight")}
     shown = {name: torch.full((8, 8), float(name in seen), dtype=torch.float64) for name in head}
-    field = random_field(50)
-    sensitivity = Sensitivity({"features": torch.zeros(2 * field["features"].shape[1:], dtype=torch.float64)}, shown)
-    write_scene(tmp_path / "a.sundae", PackedScene(field, head, sensitivity=sensitivity), PackConfig(head_step=0.02))
+    gaussians = random_field(50)
+    sensitivity = Sensitivity(
+        {"features": torch.zeros(2 * gaussians["features"].shape[1:], dtype=torch.float64)}, shown
+    )
+    write_scene(
+        tmp_path / "a.sundae", PackedScene(gaussians, head, sensitivity=sensitivity), PackConfig(head_step=0.02)
+    )
     found = read_scene(tmp_path / "a.sundae")
-    assert (found.field["features"].std(dim=0) > 0).all()
+    assert (found.gaussians["features"].std(dim=0) > 0).all()
     for name, value in head.items():
         most = value.flatten(1).abs().amax(dim=1)[:, None, None, None]
         assert ((found.head[name] - value).abs() <= 0.6 * most / 2).all()

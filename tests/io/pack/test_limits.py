@@ -53,8 +53,8 @@ def test_options_are_accepted_up_to_their_limits(tmp_path: Path, name: str) -> N
         path = tmp_path / f"{value}.sundae"
         write_scene(path, scene(), PackConfig(**{name: value}))
         found = read_scene(path)
-        assert {k: v.shape for k, v in found.field.items()} == {k: v.shape for k, v in scene().field.items()}
-        assert all(torch.isfinite(value).all() for value in found.field.values())
+        assert {k: v.shape for k, v in found.gaussians.items()} == {k: v.shape for k, v in scene().gaussians.items()}
+        assert all(torch.isfinite(value).all() for value in found.gaussians.values())
         sizes.append(path.stat().st_size)
     if name != "block":
         assert (sizes[0] < sizes[1]) == name.endswith("bits")
@@ -184,7 +184,7 @@ def test_whole_numbers_may_be_written_as_real_ones(tmp_path: Path) -> None:
 
     restated(path, real)
     found = read_scene(path)
-    assert all(torch.equal(found.field[name], value) for name, value in truth.field.items())
+    assert all(torch.equal(found.gaussians[name], value) for name, value in truth.gaussians.items())
     assert all(torch.equal(found.head[name], value) for name, value in truth.head.items())
 
 
@@ -208,7 +208,7 @@ def test_a_file_removed_after_its_header_was_read_is_reported(tmp_path: Path) ->
 def test_a_head_that_compresses_too_well_is_padded(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     head = {"a.weight": torch.zeros(1000, 3500)}
-    report = write_scene(path, PackedScene(scene().field, head))
+    report = write_scene(path, PackedScene(scene().gaussians, head))
     unpacked = 4 * head["a.weight"].numel()
     assert report.sections["padding"] > 0
     assert container.SPARE + container.MAX_RATIO * report.bytes >= unpacked

@@ -24,9 +24,9 @@ def scene(n: int = 5000) -> PackedScene:
 def test_the_estimate_is_near_the_size(tmp_path: Path, factor: float) -> None:
     options = {name: factor * getattr(PackConfig(), name) for name in ("scale_step", "harmonics_step", "feature_step")}
     fitted, codecs = fit_scene(scene(), replace(PackConfig(), **options))
-    found = estimated_bits(codecs, fitted.field, fitted.head)
+    found = estimated_bits(codecs, fitted.gaussians, fitted.head)
     sections = write_fitted(tmp_path / "a.sundae", fitted, codecs).sections
-    assert set(found) == {*codecs.field, "head"}
+    assert set(found) == {*codecs.gaussians, "head"}
     for name, bits in found.items():
         assert 0.8 < float(bits) / (8 * sections[f"{name}/levels"]) < 1.4, name
 
@@ -34,21 +34,23 @@ def test_the_estimate_is_near_the_size(tmp_path: Path, factor: float) -> None:
 def test_steps_against_the_gradient_make_a_smaller_file(tmp_path: Path) -> None:
     fitted, codecs = fit_scene(scene(), PackConfig())
     before = write_fitted(tmp_path / "a.sundae", fitted, codecs)
-    leaves = {name: value.clone().requires_grad_() for name, value in fitted.field.items() if name in codecs.field}
+    leaves = {
+        name: value.clone().requires_grad_() for name, value in fitted.gaussians.items() if name in codecs.gaussians
+    }
     optimizer = torch.optim.Adam(leaves.values(), lr=0.003)
     for _ in range(30):
         optimizer.zero_grad()
         torch.stack(list(estimated_bits(codecs, leaves, {}).values())).sum().backward()
         optimizer.step()
-    moved = {name: leaves.get(name, value).detach() for name, value in fitted.field.items()}
-    after = write_fitted(tmp_path / "b.sundae", replace(fitted, field=moved), codecs)
+    moved = {name: leaves.get(name, value).detach() for name, value in fitted.gaussians.items()}
+    after = write_fitted(tmp_path / "b.sundae", replace(fitted, gaussians=moved), codecs)
     for name in ("features_rest", "features", "scales"):
         assert after.sections[f"{name}/levels"] < 0.999 * before.sections[f"{name}/levels"], name
 
 
 def test_one_primitive_and_no_head() -> None:
     fitted, codecs = fit_scene(PackedScene(random_field(1)))
-    assert all(torch.isfinite(bits) for bits in estimated_bits(codecs, fitted.field, {}).values())
+    assert all(torch.isfinite(bits) for bits in estimated_bits(codecs, fitted.gaussians, {}).values())
 
 
 def test_runs_pay_for_their_mean_and_for_deviations() -> None:

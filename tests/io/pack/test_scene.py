@@ -52,7 +52,7 @@ def test_everything_is_decoded_within_the_stated_bounds(tmp_path: Path, config: 
     for name, value in cameras().items():
         assert torch.equal(scene.cameras[name], value), name
     about = read_header(path).meta["attributes"]
-    found = matched(scene.field, truth)
+    found = matched(scene.gaussians, truth)
     # The axes of ellipsoids come in another order.
     quats, scales = quantize.aligned(truth["quats"].numpy(), truth["scales"].numpy())
     truth["scales"] = torch.from_numpy(scales)
@@ -83,7 +83,7 @@ def test_small_fields(tmp_path: Path, n: int, degree: int, features: int) -> Non
     truth = random_field(n, degree, features)
     report = write_scene(tmp_path / "a.sundae", PackedScene(truth))
     scene = read_scene(tmp_path / "a.sundae")
-    assert {name: value.shape for name, value in scene.field.items()} == {k: v.shape for k, v in truth.items()}
+    assert {name: value.shape for name, value in scene.gaussians.items()} == {k: v.shape for k, v in truth.items()}
     assert (scene.head, scene.cameras, scene.meta) == ({}, None, {})
     assert report.bytes == (tmp_path / "a.sundae").stat().st_size
     assert sum(report.bits.values()) * n / 8 == pytest.approx(report.bytes)
@@ -93,7 +93,7 @@ def test_constant_attributes_are_exact(tmp_path: Path) -> None:
     one = random_field(1)
     truth = {name: value.repeat(40, *([1] * (value.ndim - 1))) for name, value in one.items()}
     write_scene(tmp_path / "a.sundae", PackedScene(truth))
-    found = read_scene(tmp_path / "a.sundae").field
+    found = read_scene(tmp_path / "a.sundae").gaussians
     for name in ("means", "opacities", "features"):
         assert torch.equal(found[name], truth[name]), name
 
@@ -107,11 +107,11 @@ def test_a_scene_that_compresses_too_well_is_padded(tmp_path: Path) -> None:
     assert unpacked > container.SPARE
     assert report.sections["padding"] > 0
     assert report.bytes < 1.05 * (unpacked - container.SPARE) / container.MAX_RATIO
-    assert torch.equal(read_scene(path).field["means"], truth["means"])
+    assert torch.equal(read_scene(path).gaussians["means"], truth["means"])
 
 
 def test_packing_takes_few_bytes(tmp_path: Path) -> None:
-    """This field takes 25 bytes per primitive instead of 272."""
+    """This field takes 25 bytes per Gaussian instead of 272."""
     g = torch.Generator().manual_seed(0)
     truth = random_field(20_000, 3, 9)
     truth["features_rest"] = (
@@ -133,14 +133,14 @@ def test_packing_is_deterministic(tmp_path: Path) -> None:
 def test_values_that_are_not_finite_are_refused(tmp_path: Path, name: str, value: float) -> None:
     broken = random_field()
     broken[name][5, 1] = value
-    with pytest.raises(PackError, match="1 of 600 primitives are not finite"):
+    with pytest.raises(PackError, match="1 of 600 Gaussians are not finite"):
         write_scene(tmp_path / "a.sundae", PackedScene(broken))
     assert not list(tmp_path.iterdir())
 
 
 def test_invalid_fields_heads_and_options_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
-    with pytest.raises(PackError, match="no primitives"):
+    with pytest.raises(PackError, match="no Gaussians"):
         write_scene(path, PackedScene(random_field(0)))
     with pytest.raises(PackError, match="no quats"):
         write_scene(path, PackedScene({k: v for k, v in random_field().items() if k != "quats"}))
@@ -235,4 +235,4 @@ def test_the_file_follows_its_documentation(tmp_path: Path) -> None:
     assert offset == len(content)
     section, planes = arrays["means/low"]
     low = np.stack([np.frombuffer(plane, np.uint8) for plane in planes], axis=1).view("<f4").reshape(section["shape"])
-    assert np.array_equal(low.min(axis=0), read_scene(path).field["means"].numpy().min(axis=0))
+    assert np.array_equal(low.min(axis=0), read_scene(path).gaussians["means"].numpy().min(axis=0))
