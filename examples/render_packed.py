@@ -1,6 +1,6 @@
 """Render a packed scene with its head, without it, and the difference of both, side by side.
 
-python examples/render_packed.py scene.sundae image.png --view 0
+python examples/render_packed.py scene.sundae image.png --camera 0
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def test_every_example_is_tested() -> None:
 
 
 def test_prune_ply(run: Run, cloud: Path, tmp_path: Path) -> None:
-    text = run("prune_ply.py", cloud, tmp_path / "a.spz", "--keep", 0.5, "--views", 8)
+    text = run("prune_ply.py", cloud, tmp_path / "a.spz", "--keep", 0.5, "--cameras", 8)
     assert "300 of 600 Gaussians" in text
     assert float(re.findall(r"PSNR ([\d.]+) dB", text)[0]) > 20
     assert sn.load(tmp_path / "a.spz").num_gaussians == 300
@@ -58,13 +58,13 @@ def test_prune_ply(run: Run, cloud: Path, tmp_path: Path) -> None:
 
 def test_render_packed(run: Run, tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    assert "tiny head" in run("render_packed.py", packed, tmp_path / "a.png", "--view", 1)
+    assert "tiny head" in run("render_packed.py", packed, tmp_path / "a.png", "--camera", 1)
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.size == (3 * 50, 37)
 
 
 def test_plot_curve(run: Run, cloud: Path, tmp_path: Path) -> None:
-    text = run("plot_curve.py", cloud, tmp_path / "a.png", "--views", 4)
+    text = run("plot_curve.py", cloud, tmp_path / "a.png", "--cameras", 4)
     quality = [float(value) for value in re.findall(r"merged: [\d,]+ Gaussians, ([\d.]+) dB", text)]
     assert len(quality) == 10
     assert quality[4] > quality[0]
