@@ -97,12 +97,12 @@ def reading(
     kind: str,
     failure: type[SundaeError] = DataError,
     *,
-    sanitise: str = "export it again",
+    remedy: str = "export it again",
     missing: str = "check the path",
 ) -> Iterator[None]:
     """Turn every error of reading an untrusted file into a ``failure``; decoders raise errors of many kinds.
 
-    ``kind`` names what the file should be, ``"a complete .spz"``. ``sanitise`` says what to do if it is damaged,
+    ``kind`` names what the file should be, ``"a complete .spz"``. ``remedy`` says what to do if it is damaged,
     ``missing`` if it cannot be opened.
     """
     try:
@@ -112,7 +112,7 @@ def reading(
     except OSError as error:
         raise failure(f"{path} cannot be read ({error.strerror or one_line(error)}); {missing}") from error
     except Exception as error:
-        raise failure(f"{path} is not {kind} ({one_line(error)}); {sanitise}") from error
+        raise failure(f"{path} is not {kind} ({one_line(error)}); {remedy}") from error
 
 
 def _reason(error: Exception) -> str | None:

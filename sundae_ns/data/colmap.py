@@ -144,7 +144,7 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
 @contextmanager
 def _content(path: Path) -> Iterator[bytes]:
     """The bytes of a file; whatever fails while they are parsed becomes one line."""
-    with reading(path, f"a complete {path.name} of COLMAP", sanitise="copy or export it again"):
+    with reading(path, f"a complete {path.name} of COLMAP", remedy="copy or export it again"):
         yield regular(path).read_bytes()
 
 

@@ -145,7 +145,7 @@ def photo_of(path: Path) -> Photo:
     """A photo, after a check of its header; ``DataError`` if the file is none, or of a format that is not read."""
     if path.suffix.lower() == RAW:
         with (
-            reading(path, "a photo", sanitise="remove it", missing="repair or remove it"),
+            reading(path, "a photo", remedy="remove it", missing="repair or remove it"),
             regular(path).open("rb") as file,
         ):
             if file.read(10)[8:] != b"CR":

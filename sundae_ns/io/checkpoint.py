@@ -252,18 +252,18 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
     Raises:
         CheckpointError: a tensor is missing or has another shape, or the running states do not fit.
     """
-    sanitise = "load it with the options that it was trained with"
+    remedy = "load it with the options that it was trained with"
     for name, value in expected.items():
         if not isinstance(value, Tensor) or name == EXTRA_STATE:
             continue
         if not isinstance(state.get(name), Tensor):
-            raise CheckpointError(f"the checkpoint has no {name}; {sanitise}")
+            raise CheckpointError(f"the checkpoint has no {name}; {remedy}")
         per_gaussian = name.startswith(_PREFIX)
         theirs, ours = state[name].shape, value.shape
         if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_gaussian else (theirs != ours):
             hint = ", such as its --pipeline.model.head.size" if name.startswith("networks.head.") else ""
             raise CheckpointError(
-                f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {sanitise}{hint}"
+                f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {remedy}{hint}"
             )
     rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
     if len(rows) != 1 or rows[0] == 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from enum import Enum
 from functools import cache
@@ -122,15 +122,15 @@ def load_config(path: Path) -> Any:
     Raises:
         CheckpointError: it cannot be read, is no configuration, or asks for something else.
     """
-    config = _load(path, _ConfigLoader)
+    config = _read(path, lambda text: yaml.load(text, Loader=_ConfigLoader))
     find_capture(config, path.absolute().parent)
     return config
 
 
-def _load(path: Path, loader: type[yaml.SafeLoader]) -> Any:
+def _read(path: Path, parse: Callable[[str], Any]) -> Any:
     kind = "a run's config.yml, or of another version"
-    with reading(path, kind, CheckpointError, sanitise=_REMEDY, missing=_REMEDY):
-        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
+    with reading(path, kind, CheckpointError, remedy=_REMEDY, missing=_REMEDY):
+        return parse(regular(path).read_text(encoding="utf-8"))
 
 
 # --------------------------------------------------------------------------------- plain values, which import no class
@@ -151,7 +151,7 @@ _ValueLoader.add_multi_constructor(_PYTHON, _make_plain)
 
 def _value(path: Path, *keys: str) -> Any:
     """A plain value of a ``config.yml``, or None; ``CheckpointError`` if the file cannot be read."""
-    value = _load(path, _ValueLoader)
+    value = _read(path, lambda text: yaml.load(text, Loader=_ValueLoader))
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
     return value

@@ -144,7 +144,7 @@ def read_glb(path: Path) -> GltfScene:
     Raises:
         DataError: the file is missing, damaged, no .glb, or holds no Gaussians in a form that this module reads.
     """
-    with reading(path, "a complete .glb with Gaussians", sanitise="export it again, or as .ply"):
+    with reading(path, "a complete .glb with Gaussians", remedy="export it again, or as .ply"):
         document, binary = _chunks(path)
         try:
             return _scene_of(document, binary)

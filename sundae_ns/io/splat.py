@@ -90,7 +90,7 @@ def read_ksplat(path: Path) -> dict[str, Tensor]:
     Raises:
         DataError: the file is missing, cut or damaged, of another version, or its sections have different SH degrees.
     """
-    with reading(path, "a complete .ksplat", sanitise="export it again, or convert it to .ply with splat-transform"):
+    with reading(path, "a complete .ksplat", remedy="export it again, or convert it to .ply with splat-transform"):
         data = memoryview(regular(path).read_bytes())
         if len(data) < _HEADER_BYTES:
             raise ValueError(f"{len(data):,} bytes are shorter than its header")
@@ -181,7 +181,7 @@ def read_gsplat(path: Path) -> dict[str, Tensor]:
 
 def _rank(path: Path) -> dict[str, Tensor]:
     """The Gaussians of one file."""
-    with reading(path, "a checkpoint of gsplat", sanitise="give another file"), regular(path).open("rb") as file:
+    with reading(path, "a checkpoint of gsplat", remedy="give another file"), regular(path).open("rb") as file:
         damage = damage_of(file)
         if damage is not None:
             raise ValueError(damage)

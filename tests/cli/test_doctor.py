@@ -75,9 +75,7 @@ def test_kernels_of_gsplat(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "auto selects gsplat" in check("rasteriser")[1]
 
 
-@pytest.mark.parametrize(
-    "kernel", ["graphs.neighbors.Kernel", "compensation.fused.head_kernels", "gpu.loss.loss_kernels"]
-)
+@pytest.mark.parametrize("kernel", ["graph.neighbors.Kernel", "head.fused.head_kernels", "cuda.loss.loss_kernels"])
 def test_our_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch, kernel: str) -> None:
     assert check("our kernels")[:2] == (True, "working")
 

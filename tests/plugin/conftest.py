@@ -1,14 +1,21 @@
-"""Starts the ranks that run the checks of a file, and reads their results."""
+"""Ranks that run the checks of a file, models of Gaussians made in memory, and a small capture to parse."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from forked import run
 from models import *  # noqa: F403
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+from harness.still_life import write_still_life
+from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 
 RANKS = 2
 LIMIT = 600
@@ -38,3 +45,43 @@ def run_ranks() -> Callable[[str, Path], None]:
 def passed() -> Callable[[Path, str], None]:
     """Assert that every rank has passed a check."""
     return _passed
+
+
+Load = Callable[..., SundaeDatamanager]
+
+
+@pytest.fixture(scope="session")
+def still_life(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("still_life") / "scene"
+    return write_still_life(out, train_views=10, test_views=2, width=24, height=24, points=80, samples=1)
+
+
+@pytest.fixture
+def capture(still_life: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(still_life, tmp_path / "capture"))
+
+
+@pytest.fixture
+def load() -> Load:
+    """Parses a capture as ``ns-train`` does, with nerfstudio's parser replaced by ours."""
+
+    def parse(data: Path, *, colmap: str | None = None, robust: bool = True, **options: Any) -> SundaeDatamanager:
+        if colmap is None:
+            parser: Any = NerfstudioDataParserConfig(load_3D_points=True, **options)
+        else:
+            parser = ColmapDataParserConfig(colmap_path=Path(colmap), downscale_factor=1, **options)
+        config = SundaeDatamanagerConfig(data=data, dataparser=parser, cache_images_type="uint8", robust_frame=robust)
+        return config.setup(device="cpu", test_mode="val")
+
+    return parse
+
+
+@pytest.fixture
+def edit() -> Callable[..., None]:
+    """Changes entries of a ``transforms.json``; None removes one."""
+
+    def change(data: Path, **changes: Any) -> None:
+        meta = {**json.loads((data / "transforms.json").read_text()), **changes}
+        (data / "transforms.json").write_text(json.dumps({k: v for k, v in meta.items() if v is not None}))
+
+    return change

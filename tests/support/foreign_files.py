@@ -15,7 +15,7 @@ from sundae_ns.core.gaussians import SH_C0
 from sundae_ns.io.ply import write_ply
 
 _CHUNK = 256
-_STORED = Path(__file__).parents[1] / "storage" / "foreign"
+_STORED = Path(__file__).parents[1] / "io" / "foreign"
 
 
 def small_field(n: int = 300, degree: int = 1) -> dict[str, Tensor]:
