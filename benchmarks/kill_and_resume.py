@@ -216,8 +216,8 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
 def commands(run: Path, ply: Path) -> dict[str, list[str]]:
     """Commands that write, without their output, by its name."""
     return {
-        "pruned.ply": ["prune", str(ply), "--views", "8"],
-        "pruned.sundae": ["prune", str(run), "--views", "8"],
+        "pruned.ply": ["prune", str(ply), "--num-cameras", "8"],
+        "pruned.sundae": ["prune", str(run), "--num-cameras", "8"],
         "packed.sundae": ["pack", str(run)],
         "tuned.sundae": ["pack", str(run), "--finetune", "10"],
         "page.html": ["export", str(run)],

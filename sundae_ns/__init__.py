@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from sundae_ns.scene.scene import render as render
     from sundae_ns.scene.virtual_cameras import virtual_cameras as virtual_cameras
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "PruneRule": "sundae_ns.pruning.rule",
@@ -48,7 +48,7 @@ _HOMES = {
     "Rendering": "sundae_ns.scene.scene",
     "Scene": "sundae_ns.scene.scene",
     "SundaeError": "sundae_ns.core.errors",
-    "View": "sundae_ns.core.camera",
+    "Camera": "sundae_ns.core.camera",
     "crop": "sundae_ns.scene.cleaning",
     "distill": "sundae_ns.plugin.distill",
     "load": "sundae_ns.scene.load_save",
@@ -58,8 +58,8 @@ _HOMES = {
     "render": "sundae_ns.scene.scene",
     "save": "sundae_ns.scene.load_save",
     "show": "sundae_ns.scene.page",
-    "views_of": "sundae_ns.scene.cameras",
-    "virtual_views": "sundae_ns.scene.virtual_cameras",
+    "cameras_of": "sundae_ns.scene.cameras",
+    "virtual_cameras": "sundae_ns.scene.virtual_cameras",
 }
 """Public names and the modules that hold them."""
 

@@ -75,7 +75,7 @@ def _hosts(port: int) -> set[str]:
     return {f"{name}:{port}" for name in names} | (set(names) if port == 80 else set())
 
 
-def camera(scene: Scene, port: int = 0, open_browser: bool = True, data: Path | None = None) -> int:
+def view(scene: Scene, port: int = 0, open_browser: bool = True, data: Path | None = None) -> int:
     """Show a scene with its head in the browser, until Ctrl-C.
 
     Serves the page of sundae export on 127.0.0.1 and opens it. From another machine, forward the port to the same

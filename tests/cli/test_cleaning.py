@@ -78,7 +78,7 @@ def test_export_to_a_page_and_to_other_formats(folder: Path, tmp_path: Path) -> 
 
 def test_prune_keeps_a_share_of_what_remains(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     inside = int((vertices(folder / "a.ply")["x"] <= 0.5).sum())
-    words = ("--keep", 0.5, "--views", 4, *INSIDE)
+    words = ("--keep", 0.5, "--num-cameras", 4, *INSIDE)
     assert run("prune", folder / "a.ply", "-o", tmp_path / "a.ply", *words) == 0
     found = vertices(tmp_path / "a.ply")
     assert len(found) == round(0.5 * inside)

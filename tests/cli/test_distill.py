@@ -36,8 +36,8 @@ def test_an_interrupted_distillation_goes_on(
     words = (source, "-o", out, "--keep", "0.5", "--steps", "6", "--no-head")
     train_step = Distillation._train_step
 
-    def interrupted(self: Distillation, i: int, steps: int) -> None:
-        train_step(self, i, steps)
+    def interrupted(self: Distillation, i: int) -> None:
+        train_step(self, i)
         if i == 3:
             os.kill(os.getpid(), signal.SIGINT)
 

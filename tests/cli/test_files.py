@@ -122,7 +122,7 @@ def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [["--views", "4"], ["--score", "response", "--selection", "band"]],
+    [["--num-cameras", "4"], ["--score", "response", "--selection", "band"]],
 )
 def test_prune_does_not_change_kept_rows(
     tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
@@ -162,7 +162,10 @@ def test_prune_does_not_change_kept_rows(
         (["prune", "in.ply", "-o", "a.ply", "--keep", "0.1", "--count", "5"], "--keep and --count exclude each other"),
         (["prune", "in.ply", "-o", "a.ply", "--keep", "0.1", "--target-drop", "1"], "--keep and --target-drop exclude"),
         (["prune", "in.ply", "-o", "a.ply", "--target-drop", "0"], "target-drop is 0.0; give a positive number of dB"),
-        (["prune", "in.ply", "-o", "a.ply", "--target-drop", "1", "--views", "1"], "a target needs two views or more"),
+        (
+            ["prune", "in.ply", "-o", "a.ply", "--target-drop", "1", "--num-cameras", "1"],
+            "a target needs two views or more",
+        ),
         (["prune", "in.ply", "-o", "a.ply", "--count", "0"], "count is 0; give 1 or more"),
         (["prune", "none.ply", "-o", "a.ply"], "none.ply has 5 Gaussians, and none is finite; export it again"),
         (["prune", "empty.ply", "-o", "a.ply"], "empty.ply has 0 Gaussians, and none is finite; export it again"),
@@ -231,9 +234,9 @@ def test_every_command_reads_files_of_other_programs(
     truth = KSPLAT if name == "a.ksplat" else small_field()
     FOREIGN[name](Path(name), truth)
     colors = read_gaussian_file(Path(name)).sanitised.gaussians["features_dc"]
-    assert run("prune", name, "-o", "pruned/a/b.ply", "--keep", "0.5", "--views", "4") == 0
+    assert run("prune", name, "-o", "pruned/a/b.ply", "--keep", "0.5", "--num-cameras", "4") == 0
     assert len(read_ply(Path("pruned/a/b.ply"))["means"]) == len(truth["means"]) // 2
-    assert run("prune", name, "-o", "same/a.ply", "--keep", "1", "--views", "4") == 0
+    assert run("prune", name, "-o", "same/a.ply", "--keep", "1", "--num-cameras", "4") == 0
     torch.testing.assert_close(read_gaussian_file(Path("same/a.ply")).sanitised.gaussians["features_dc"], colors)
     assert run("export", name, "-o", "exported/a.spz") == 0
     assert run("export", name, "-o", "pages/a.html") == 0
@@ -282,8 +285,8 @@ def test_files_are_exported_pruned_and_refused_without_nerfstudio(tmp_path: Path
     commands = [
         ["export", "a.sundae", "-o", "a.ply"],
         ["export", "a.ply", "-o", "a.spz"],
-        ["prune", "a.ply", "-o", "pruned.ply", "--views", "4"],
-        ["prune", "a.spz", "-o", "pruned.sundae", "--count", "20", "--views", "4"],
+        ["prune", "a.ply", "-o", "pruned.ply", "--num-cameras", "4"],
+        ["prune", "a.spz", "-o", "pruned.sundae", "--count", "20", "--num-cameras", "4"],
         ["export", "a.ply", "-o", "page.html"],
         ["export", "head.sundae", "-o", "head.html"],
         ["pack", "a.ply", "-o", "packed.sundae"],
@@ -300,7 +303,7 @@ def test_files_are_exported_pruned_and_refused_without_nerfstudio(tmp_path: Path
 
 def test_fields_are_pruned_without_a_compiler(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", gaussians())
-    codes, errors = without("numba", [["prune", "a.ply", "-o", "pruned.ply", "--views", "2"]], tmp_path)
+    codes, errors = without("numba", [["prune", "a.ply", "-o", "pruned.ply", "--num-cameras", "2"]], tmp_path)
     assert codes == [0], errors
 
 
@@ -337,6 +340,6 @@ def test_prune_uses_the_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(pruning, "prune_with_mask", noted)
     sn.save(sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3)), tmp_path / "a.ply")
     for name in ("out.ply", "out.sundae"):
-        assert run("prune", tmp_path / "a.ply", "-o", tmp_path / name, "--count", "50", "--views", "8") == 0
+        assert run("prune", tmp_path / "a.ply", "-o", tmp_path / name, "--count", "50", "--num-cameras", "8") == 0
         assert sn.load(tmp_path / name).num_gaussians == 50
     assert devices == ["cuda", "cuda"]

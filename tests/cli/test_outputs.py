@@ -66,7 +66,7 @@ def test_no_command_writes_onto_its_input(
         out = "b.ply"
         link("a.ply", out)
     if link is os.link and more:  # the other name stays
-        done("prune", "a.ply", "-o", out, "--views", "2", *more)
+        done("prune", "a.ply", "-o", out, "--num-cameras", "2", *more)
     else:
         assert out in refused("prune", "a.ply", "-o", out, *more)
     assert (here / "a.ply").read_bytes() == before
@@ -75,7 +75,7 @@ def test_no_command_writes_onto_its_input(
 @pytest.mark.parametrize(
     ("words", "out"),
     [
-        (["prune", "a.ply", "--keep", "0.5", "--views", "2"], "out.ply"),
+        (["prune", "a.ply", "--keep", "0.5", "--num-cameras", "2"], "out.ply"),
         (["export", "a.ply"], "out.spz"),
         (["export", "a.sundae"], "out.ply"),
     ],
@@ -183,7 +183,7 @@ def full(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk_is_one_line(here: Path, full: Path, refused: Refused) -> None:
     for words in (
         ["demo", full / "demo"],
-        ["prune", "a.ply", "--keep", "0.9", "-o", full / "a.ply", "--views", "2"],
+        ["prune", "a.ply", "--keep", "0.9", "-o", full / "a.ply", "--num-cameras", "2"],
     ):
         line = refused(*words)
         assert "disk is full" in line

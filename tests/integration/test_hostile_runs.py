@@ -25,7 +25,7 @@ WORDS: dict[str, list[str]] = {
     "run": ["CAPTURE", "-o", "PROJECT", "--method", "sundae-tiny"],
     "poses": ["RUN", "-o", "capture"],
     "train": ["CAPTURE", "-o", "runs"],
-    "prune": ["RUN", "-o", "out.ply", "--views", "2"],
+    "prune": ["RUN", "-o", "out.ply", "--num-cameras", "2"],
     "distill": ["RUN", "-o", "out.sundae", "--steps", "2"],
     "pack": ["RUN", "-o", "out.sundae"],
     "export": ["RUN", "-o", "out.html"],

@@ -36,7 +36,7 @@ ELSEWHERE = {
 NAMES = {"$RUN": "RUN", "capture": "CAPTURE", "RUN_OR_PACK_OR_PLY": "other.ply", "FILE": "other.ply", "...": ""}
 SHORTER = {"--finetune": "2", "--view": "2", "--width": "32", "--height": "24", "--train-views": "6"}
 """Values that suit a small run and a small scene."""
-MORE = {"prune": ["--views", "4"], "distill": ["--steps", "4"], "render": ["--width", "32"]}
+MORE = {"prune": ["--num-cameras", "4"], "distill": ["--steps", "4"], "render": ["--width", "32"]}
 """Options that shorten commands of ``sundae`` further."""
 
 
