@@ -1,4 +1,4 @@
-"""``sundae camera``: show a scene in the browser."""
+"""``sundae view``: show a scene in the browser."""
 
 from __future__ import annotations
 
