@@ -1,4 +1,4 @@
-"""nerfstudio's training callbacks: they call the extensions, which know nothing of nerfstudio's trainer."""
+"""nerfstudio's training callbacks: they call ours, which know nothing of nerfstudio."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sundae_ns.train.state import Callback, Photo, TrainingState
 
 
 class NerfstudioRun:
-    """A training by nerfstudio's trainer; see :class:`sundae_ns.train.state.TrainingRun` for the members.
+    """A training by nerfstudio's trainer, as its callbacks see it.
 
     Args:
         model: a ``SundaeModel``, which imports this module.
@@ -51,22 +51,22 @@ class NerfstudioRun:
 
     @property
     def last_step(self) -> int | None:
-        """Step at which training ends."""
+        """Step at which training ends; None without a trainer."""
         return None if self._trainer is None else self._trainer.last_step
 
     @property
     def schedule_length(self) -> int | None:
-        """Number of steps for which the schedule is made."""
+        """Number of steps for which the schedule is made, at least those of the run; None without a trainer."""
         return None if self._trainer is None else self._trainer.config.schedule_length or self._trainer.last_step + 1
 
     @property
     def images_per_step(self) -> int:
-        """Number of images in a batch."""
+        """Number of images in a batch: the number of ranks. Each counts as a step."""
         return self._ranks.count
 
     @property
     def folder(self) -> Path | None:
-        """Folder for records, on the first rank."""
+        """Folder for records; None without a trainer, and on every rank but the first."""
         return None if self._trainer is None or self._ranks.rank > 0 else self._trainer.base_dir
 
     @property
@@ -87,7 +87,7 @@ class NerfstudioRun:
         return training_views(self.model, self._datamanager)
 
     def hold_out(self, indices: Iterable[int]) -> None:
-        """Hold out these training views from the next step on."""
+        """Hold out these training views from the next step on, until the next call."""
         self._datamanager.hold_back(indices)
 
     def heldout_views(self) -> Iterator[Photo]:
@@ -96,7 +96,7 @@ class NerfstudioRun:
             yield self._photo(camera, batch)
 
     def photos(self) -> Iterator[Photo]:
-        """All training views; transparent pixels are masked."""
+        """All training views in full size; transparent pixels are masked."""
         for camera, batch in self._datamanager.cameras(self.view_indices()):
             photo, image = self._photo(camera, batch), batch["image"]
             if image.shape[-1] == 4:
@@ -111,7 +111,7 @@ class NerfstudioRun:
         return Photo(self.model.camera_of(camera), target, mask)
 
     def evaluate(self) -> dict[str, float]:
-        """Mean ``psnr`` and ``ssim`` over all test views."""
+        """Mean ``psnr`` (dB) and ``ssim`` over all test views; empty without any."""
         if not self._datamanager.eval_dataset:
             return {}
         results = self._pipeline.get_average_eval_image_metrics(step=self.state.step)
@@ -129,7 +129,7 @@ class NerfstudioRun:
     # -------------------------------------------------------------------------------------------------------- callbacks
 
     def callbacks(self) -> list[TrainingCallback]:
-        """Callbacks that set the step, call the extensions after each step, and let them report at the end."""
+        """Callbacks that set the step, call ours after each step, and let them report at the end."""
         places = TrainingCallbackLocation
         return [
             TrainingCallback([places.BEFORE_TRAIN_ITERATION], self._begin_step),
@@ -138,7 +138,7 @@ class NerfstudioRun:
         ]
 
     def start(self) -> None:
-        """Hand the optimizers to the state, take over records, and let the extensions check the run."""
+        """Hand the optimizers to the state, take over records, and let the callbacks check the run."""
         assert self._optimizers is not None
         self.state.optimizers, self.state.schedulers = self._optimizers.optimizers, self._optimizers.schedulers
         if self.folder is not None:
@@ -153,7 +153,7 @@ class NerfstudioRun:
         self.state.step = step
 
     def act(self, train_callbacks: Sequence[Callback]) -> None:
-        """Let extensions act after a step, in their order."""
+        """Let callbacks act after a step, in their order."""
         for callback in train_callbacks:
             self._ranks.after_step(callback, self)
         self._hand_over()

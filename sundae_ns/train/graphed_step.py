@@ -8,7 +8,7 @@ field lies in buffers with memory for more.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,7 +19,6 @@ from torch import Tensor
 from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.cuda.adam import Update, adam_step
 from sundae_ns.cuda.cuda_graphs import record, warm_up
-from sundae_ns.head.head import CompensationHead
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.scene.render import GaussianSource, RenderSettings, degree_in_use
@@ -35,54 +34,62 @@ _UNSEEN = {"means": 1e15, "scales": -30.0, "opacities": -30.0}
 """Values of the rows beyond: behind the far plane, without width, transparent. Others are zero."""
 
 
-class _Rows(NamedTuple):
-    """A tensor of the state with a row for each Gaussian."""
+class _Row(NamedTuple):
+    """A tensor of the state with a row for each Gaussian, and where it lies."""
 
-    name: str
-    value: Tensor
-    replace: Callable[[Tensor], object]  # Puts another tensor in its place
+    name: str  # Of the parameter, NAME.exp_avg or the like for moments, and of statistics
+    mapping: MutableMapping[Any, Any]  # Holds the tensor
+    key: Any
+
+    def replace(self, value: Tensor) -> None:
+        """Put another tensor in its place; a parameter stays the same object."""
+        if isinstance(self.mapping[self.key], torch.nn.Parameter):
+            self.mapping[self.key].data = value
+        else:
+            self.mapping[self.key] = value
 
 
 class Buffers:
-    """Tensors of one field at a capacity."""
+    """Tensors of the Gaussians at a capacity."""
 
     def __init__(self) -> None:
-        self.tensors: dict[str, Tensor] = {}
-        """By parameter name, ``NAME.exp_avg`` or the like for moments, and name for statistics ``[capacity, ...]``."""
+        self.tensors: dict[str, Tensor] = {}  # By name of the row, [capacity, ...]
         self.capacity = 0
-        self._rows = 0
+        self._num_rows = 0
 
     def hold(self, state: TrainingState, trained: tuple[str, ...], *, growing: bool) -> bool:
-        """Let the tensors of a field be the first rows of the buffers; what was replaced since the last call is copied.
+        """Let the tensors of a state be the first rows of the buffers; those replaced since the last call are copied.
 
         Args:
-            state: the field; its optimizers have states for the trained parameters.
+            state: its optimizers have states for the trained parameters.
             trained: names of the parameters that are trained.
             growing: whether the number of Gaussians will change.
 
         Returns:
             Whether the buffers are new, so that work on the older ones is void.
         """
-        n, rows = state.gaussians.num_gaussians, list(_rows_of(state, trained))
-        shapes = {row.name: row.value.shape[1:] for row in rows}
+        n, rows = state.gaussians.num_gaussians, list(_rows(state, trained))
+        shapes = {row.name: row.mapping[row.key].shape[1:] for row in rows}
         fits = n <= self.capacity <= 2 * n if growing else n == self.capacity
         # Trials widen and narrow features.
-        renewed = not fits or shapes != {name: held.shape[1:] for name, held in self.tensors.items()}
+        renewed = not fits or shapes != {name: buffer.shape[1:] for name, buffer in self.tensors.items()}
         if renewed:
             self.capacity = int(SPARE * n) if growing else n
             for name in self.tensors.keys() - shapes.keys():
                 del self.tensors[name]
         for row in rows:
-            held = self.tensors.get(row.name)
-            if renewed or held is None:
+            value, buffer = row.mapping[row.key], self.tensors.get(row.name)
+            if renewed or buffer is None:
                 # One at a time: each replaces the older memory before the next is made.
-                held = self.tensors[row.name] = _filled(row, self.capacity)
-            elif row.value.data_ptr() == held.data_ptr() and n == self._rows:
+                buffer = value.detach().new_empty(self.capacity, *value.shape[1:]).requires_grad_(value.requires_grad)
+                self.tensors[row.name] = buffer
+            elif value.data_ptr() == buffer.data_ptr() and n == self._num_rows:
                 continue
-            else:
-                _fill(held, row)
-            row.replace(held.detach()[:n])
-        self._rows = n
+            with torch.no_grad():
+                buffer[:n].copy_(value)
+                buffer[n:].fill_(_UNSEEN.get(row.name, 0.0))
+            row.replace(buffer.detach()[:n])
+        self._num_rows = n
         return renewed
 
 
@@ -91,10 +98,10 @@ def start_moments(state: TrainingState, trained: tuple[str, ...]) -> None:
     for name in trained:
         for group in state.optimizers[name].param_groups:
             for value in group["params"]:
-                held = state.optimizers[name].state[value]
-                if not held:
-                    held["step"] = torch.zeros((), dtype=torch.float32, device=value.device)
-                    held.update({moment: torch.zeros_like(value) for moment in MOMENTS})
+                moments = state.optimizers[name].state[value]
+                if not moments:
+                    moments["step"] = torch.zeros((), dtype=torch.float32, device=value.device)
+                    moments.update({moment: torch.zeros_like(value) for moment in MOMENTS})
 
 
 def trained_parameters(state: TrainingState) -> tuple[str, ...]:
@@ -103,34 +110,18 @@ def trained_parameters(state: TrainingState) -> tuple[str, ...]:
     return tuple(name for name in used if state.gaussians[name].numel() > 0)
 
 
-def _rows_of(state: TrainingState, trained: tuple[str, ...]) -> Iterator[_Rows]:
+def _rows(state: TrainingState, trained: tuple[str, ...]) -> Iterator[_Row]:
+    gaussians: Any = state.gaussians
     for name in trained:
-        value = state.gaussians[name]
-        yield _Rows(name, value, partial(setattr, value, "data"))
-        moments: dict[str, Any] = state.optimizers[name].state[value]
-        for moment in MOMENTS:
-            yield _Rows(f"{name}.{moment}", moments[moment], partial(moments.__setitem__, moment))
+        yield _Row(name, gaussians, name)
+        moments = state.optimizers[name].state[gaussians[name]]
+        yield from (_Row(f"{name}.{moment}", moments, moment) for moment in MOMENTS)
     if state.densifying:
-        for name in STATISTICS:
-            value = state.densification.get(name)
-            if value is not None:
-                yield _Rows(name, value, partial(state.densification.__setitem__, name))
+        running = state.densification
+        yield from (_Row(name, running, name) for name in STATISTICS if running.get(name) is not None)
 
 
-def _filled(row: _Rows, capacity: int) -> Tensor:
-    held = row.value.detach().new_empty(capacity, *row.value.shape[1:])
-    _fill(held, row)
-    return held.requires_grad_(row.value.requires_grad)
-
-
-@torch.no_grad()
-def _fill(held: Tensor, row: _Rows) -> None:
-    n = len(row.value)
-    held[:n].copy_(row.value)
-    held[n:].fill_(_UNSEEN.get(row.name, 0.0))
-
-
-SPARE_PAIRS = 2.0  # Capacity for tile/primitive pairs, as a multiple of the most that a view has needed
+SPARE_PAIRS = 2.0  # Capacity for tile/Gaussian pairs, as a multiple of the most that a view has needed
 
 MAX_RECORDINGS = 8  # Recordings kept at a time: one for each image size and SH degree in use
 
@@ -153,7 +144,7 @@ class _Recording:
 class StepRecordings:
     """Runs training steps. The first of a kind runs kernel by kernel, because libraries choose and load kernels then.
 
-    Later ones replay. A step whose view has more tile/primitive pairs than fit changes nothing, and the next recording
+    Later ones replay. A step whose view has more tile/Gaussian pairs than fit changes nothing, and the next recording
     has room for them.
 
     Args:
@@ -166,7 +157,7 @@ class StepRecordings:
         self._used: dict[Hashable, int] = {}  # Step at which a recording was last replayed
         self._steps = 0
         self._warm: set[Hashable] = set()  # Kinds of steps that have run kernel by kernel
-        self._most: Tensor | None = None  # Most tile/primitive pairs that a view has needed, on the device, int64 []
+        self._most: Tensor | None = None  # Most tile/Gaussian pairs that a view has needed, on the device, int64 []
         self._most_on_host: Tensor | None = None  # Its pinned copy, some steps late
 
     def forget(self, *, pairs: bool = False) -> None:
@@ -182,8 +173,7 @@ class StepRecordings:
         """Run a step, by a recording where there is one.
 
         Args:
-            work: of the step.
-            inputs: of this step.
+            work, inputs: of this step.
             settings: of training images, with the backend gsplat for recording.
             kind: decides on the kernels of the step.
             addresses: of what a recording reads beside its inputs, where they may change.
@@ -215,8 +205,14 @@ class StepRecordings:
         self._most_on_host.copy_(self._most, non_blocking=True)
         return (needed > capacity.pairs).float()
 
-    def _count(self, capacity: Capacity, device: torch.device) -> None:
-        """Count the pairs of a step that ran kernel by kernel, which waits for the GPU."""
+    def _kernel_by_kernel(self, work: StepWork, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+        """Run a step on the stream of the recordings, and count its pairs, which waits for the GPU."""
+        device = inputs.target.device
+        if device.type != "cuda":
+            return work(inputs, settings, None)
+        capacity = Capacity()
+        with warm_up(device):
+            result = work(inputs, replace(settings, backend=RecordableGsplat(capacity)), capacity)
         most = max(int(number) for number in capacity.needed)
         if self._most is None or self._most_on_host is None:
             self._most = torch.zeros((), dtype=torch.int64, device=device)
@@ -225,16 +221,6 @@ class StepRecordings:
             most = max(most, int(self._most))
         self._most.fill_(most)
         self._most_on_host.fill_(most)
-
-    def _kernel_by_kernel(self, work: StepWork, inputs: StepInputs, settings: RenderSettings) -> StepResult:
-        """Run a step on the stream of the recordings."""
-        device = inputs.target.device
-        if device.type != "cuda":
-            return work(inputs, settings, None)
-        capacity = Capacity()
-        with warm_up(device):
-            result = work(inputs, replace(settings, backend=RecordableGsplat(capacity)), capacity)
-        self._count(capacity, device)
         return result
 
     def _recording(
@@ -259,16 +245,16 @@ class StepRecordings:
         return recording
 
     def _recorded(self, work: StepWork, inputs: StepInputs, settings: RenderSettings, pairs: int) -> _Recording:
-        own = inputs.clone()
+        copied = inputs.clone()
 
         def step() -> StepResult:
             capacity = Capacity(pairs)
-            return work(own, replace(settings, backend=RecordableGsplat(capacity)), capacity)
+            return work(copied, replace(settings, backend=RecordableGsplat(capacity)), capacity)
 
         last = next(reversed(self._recordings.values()), None)
         # Results are read before the next replay, so all recordings can work in the same memory.
-        graph, result = record(step, own.target.device, share_memory_with=None if last is None else last.graph)
-        return _Recording(graph, own, result, pairs)
+        graph, result = record(step, copied.target.device, share_memory_with=None if last is None else last.graph)
+        return _Recording(graph, copied, result, pairs)
 
 
 HEAD = "compensation"  # Name of the head's optimizer
@@ -276,31 +262,15 @@ HEAD = "compensation"  # Name of the head's optimizer
 
 @dataclass(frozen=True)
 class _Held:
-    """The tensors of a state whose field lies in the buffers, to notice cheaply when one is replaced."""
+    """The tensors of a state whose Gaussians lie in the buffers, to notice cheaply when one is replaced."""
 
-    trained: tuple[str, ...]  # Names of the parameters of the field that are trained
+    trained: tuple[str, ...]  # Names of the parameters of the Gaussians that are trained
     growing: bool  # Whether the buffers have spare rows
     groups: list[tuple[str, torch.optim.Optimizer, dict[str, Any]]]
     """Groups of parameters that a step trains: name of the optimizer, optimizer, group."""
     tensors: list[tuple[Mapping[Any, Any], Any, Any]]
     """Mapping, key and value of everything that surgery and restored snapshots replace."""
     addresses: Hashable  # What a recording reads beside the buffers: the head's weights, and the counts of steps
-
-    @classmethod
-    def of(cls, state: TrainingState, trained: tuple[str, ...], head: CompensationHead | None) -> _Held:
-        names = trained if head is None else (*trained, HEAD)
-        groups = [
-            (name, state.optimizers[name], group) for name in names for group in state.optimizers[name].param_groups
-        ]
-        members = [(optimizer.state, value) for _, optimizer, group in groups for value in group["params"]]
-        states = [(held, value, held[value]) for held, value in members]
-        tensors: list[tuple[Mapping[Any, Any], Any, Any]] = [
-            *states,
-            *((state.gaussians, name, state.gaussians[name]) for name in trained),
-            *((state.densification, *item) for item in state.densification.items() if isinstance(item[1], Tensor)),
-        ]
-        addresses = tuple(own[name].data_ptr() for _, _, own in states for name in (*MOMENTS, "step"))
-        return cls(trained, state.densifying, groups, tensors, (addresses, None if head is None else head.addresses()))
 
     def unchanged(self, state: TrainingState, settings: RenderSettings) -> bool:
         """Whether the state still consists of these tensors."""
@@ -361,14 +331,24 @@ class RecordedStep:
         return result
 
     def _hold(self, state: TrainingState, settings: RenderSettings) -> _Held:
-        """Let the field be rows of the buffers, with all states that its optimizers need."""
-        trained = trained_parameters(state)
-        start_moments(state, trained if settings.head is None else (*trained, HEAD))
+        """Let the Gaussians be rows of the buffers, with all states that their optimizers need."""
+        trained, head = trained_parameters(state), settings.head
+        names = trained if head is None else (*trained, HEAD)
+        start_moments(state, names)
         if state.densifying:
             start_counting(state.densification, state.gaussians["means"])
         if self._buffers.hold(state, trained, growing=state.densifying):
-            self._recordings.forget(pairs=not state.densifying)  # a pruned field needs far fewer pairs
-        return _Held.of(state, trained, settings.head)
+            self._recordings.forget(pairs=not state.densifying)  # after a prune a view needs far fewer pairs
+        optimizers = [(name, state.optimizers[name]) for name in names]
+        groups = [(name, optimizer, group) for name, optimizer in optimizers for group in optimizer.param_groups]
+        moments = [(optimizer.state, value) for _, optimizer, group in groups for value in group["params"]]
+        tensors: list[tuple[Mapping[Any, Any], Any, Any]] = [(mapping, key, mapping[key]) for mapping, key in moments]
+        addresses = tuple(own[name].data_ptr() for _, _, own in tensors for name in (*MOMENTS, "step"))
+        tensors += [(state.gaussians, name, state.gaussians[name]) for name in trained]
+        running = state.densification
+        tensors += [(running, name, value) for name, value in running.items() if isinstance(value, Tensor)]
+        of_head = None if head is None else head.addresses()
+        return _Held(trained, state.densifying, groups, tensors, (addresses, of_head))
 
     def _step(
         self, state: TrainingState, held: _Held, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None
@@ -406,14 +386,14 @@ class RecordedStep:
         for name, optimizer, group in held.groups:
             updates = []
             for value in group["params"]:
-                whole, own = tensors.get(name, value), optimizer.state[value]
-                grad = grads.get(whole)
+                buffer, moments = tensors.get(name, value), optimizer.state[value]
+                grad = grads.get(buffer)
                 if grad is None:
                     continue
-                if grad.stride() != whole.stride():  # kernels walk through all tensors in the order of memory
-                    grad = torch.empty_like(whole).copy_(grad)
-                mean, square = (tensors.get(f"{name}.{moment}", own[moment]) for moment in MOMENTS)
-                updates.append(Update(whole, grad, mean, square, own["step"]))
+                if grad.stride() != buffer.stride():  # kernels walk through all tensors in the order of memory
+                    grad = torch.empty_like(buffer).copy_(grad)
+                mean, square = (tensors.get(f"{name}.{moment}", moments[moment]) for moment in MOMENTS)
+                updates.append(Update(buffer, grad, mean, square, moments["step"]))
             groups.append((group, updates))
         return groups
 

@@ -1,4 +1,4 @@
-"""Pruning in training: its options, its schedule, the extensions that prune and remove floaters, and their records.
+"""Pruning in training: its options, its schedule, the callbacks that prune and remove floaters, and their records.
 
 A schedule decides, a :class:`sundae_ns.pruning.decision.Pruner` prunes. The running state is a dict of integers,
 which checkpoints carry: a resumed run neither prunes twice nor forgets its peak.
@@ -10,7 +10,7 @@ import json
 import logging
 import math
 from collections.abc import Callable, Mapping, MutableMapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -82,11 +82,6 @@ class PruningConfig(PruneRule):
         return self.prune_at if self.mode == "one-shot" else None
 
     @property
-    def first_prune(self) -> int | None:
-        """Step of the first prune; None if the mode is off."""
-        return self.start if self.mode == "continuous" else self.ends_growth_at
-
-    @property
     def last_due(self) -> int:
         """Step of the last scheduled prune; later ones happen only if the field exceeds a target or a cap."""
         if self.mode != "continuous":
@@ -110,50 +105,33 @@ class PruningConfig(PruneRule):
         if self.keep_ratio is not None:
             check_share(self.keep_ratio)
         self.check_at_least(every=1, prune_at=0, start=0, max_gaussians=1, target_gaussians=1, max_bytes=1)
-        if self.mode == "continuous" and self.stop < self.start:
-            raise ConfigError(f"start ({self.start}) lies after stop ({self.stop}): swap them")
-        if self.mode == "continuous" and self.keep_ratio is None and self.target_gaussians is None:
-            raise ConfigError(
-                "keep_ratio is None and mode is continuous, without trials: give 0.5, or target_primitives"
-            )
-        if self.mode == "off" and (self.max_gaussians is not None or self.target_gaussians is not None):
-            raise ConfigError("mode is off, which prunes nothing: set mode to one-shot, or drop the number")
-        for name in ("max_drop", "max_bytes"):
-            if getattr(self, name) is not None and not self.decides:
-                raise ConfigError(
-                    f"{name} is set, and trials do not decide the number of Gaussians: set keep_ratio to None and "
-                    "mode to one-shot, as sundae does"
-                )
-        if self.max_drop is not None and not 0 < self.max_drop < float("inf"):
-            raise ConfigError(f"max_drop is {self.max_drop}: use a positive number of dB, 0.1 for one")
         cap, target = self.max_gaussians, self.target_gaussians
-        if cap is not None and target is not None and target > cap:
-            raise ConfigError(f"target_primitives ({target}) is more than max_primitives ({cap}): swap them")
-
-
-@dataclass(frozen=True)
-class PruneReport:
-    """Numbers of one prune."""
-
-    step: int  # Training step after which it happened
-    before: int  # Number of Gaussians before it, including those that are not finite
-    after: int  # Number of Gaussians after it
-    dropped_nonfinite: int  # Gaussians removed because a parameter was NaN or infinite
-    peak: int  # Highest number of Gaussians at any step so far
-    seconds: float  # Wall-clock time of decision and surgery, synchronised
-    tau: float | None = None  # Threshold of the graph on squared distances, squared scene units; None without a graph
-    sigma: float | None = None  # Width of the edge weights, scene units; None without a graph
-    isolated: int | None = None  # Gaussians without a neighbour within the threshold; None without a graph
-
-    def summary(self) -> str:
-        """One line for the log."""
-        parts = [f"step {self.step}: kept {self.after:,} of {self.before:,} Gaussians in {self.seconds:.1f} s"]
-        parts.append(f"peak {self.peak:,}")
-        if self.dropped_nonfinite:
-            parts.append(f"{self.dropped_nonfinite:,} were NaN or infinite")
-        if self.sigma is not None and self.tau is not None:
-            parts.append(f"sigma {self.sigma:.3g}, tau {self.tau:.3g}, {self.isolated:,} isolated")
-        return "; ".join(parts)
+        continuous = self.mode == "continuous"
+        tried = "is set, and trials do not decide the number of Gaussians: set keep_ratio to None and mode to one-shot"
+        refusals = [
+            (continuous and self.stop < self.start, f"start ({self.start}) lies after stop ({self.stop}): swap them"),
+            (
+                continuous and self.keep_ratio is None and target is None,
+                "keep_ratio is None and mode is continuous, without trials: give 0.5, or target_gaussians",
+            ),
+            (
+                self.mode == "off" and (cap is not None or target is not None),
+                "mode is off, which prunes nothing: set mode to one-shot, or drop the number",
+            ),
+            (self.max_drop is not None and not self.decides, f"max_drop {tried}, as sundae does"),
+            (self.max_bytes is not None and not self.decides, f"max_bytes {tried}, as sundae does"),
+            (
+                self.max_drop is not None and not 0 < self.max_drop < float("inf"),
+                f"max_drop is {self.max_drop}: use a positive number of dB, 0.1 for one",
+            ),
+            (
+                cap is not None and target is not None and target > cap,
+                f"target_gaussians ({target}) is more than max_gaussians ({cap}): swap them",
+            ),
+        ]
+        for refused, message in refusals:
+            if refused:
+                raise ConfigError(message)
 
 
 def write_record(run: TrainingRun, name: str, record: Mapping[str, Any]) -> None:
@@ -161,30 +139,6 @@ def write_record(run: TrainingRun, name: str, record: Mapping[str, Any]) -> None
     if run.folder is not None:
         run.folder.mkdir(parents=True, exist_ok=True)
         write_text(run.folder / name, json.dumps(without_nan(record), indent=2, allow_nan=False) + "\n")
-
-
-def write_report(
-    run: TrainingRun, report: PruneReport, *, before: Mapping[str, float], after: Mapping[str, float]
-) -> None:
-    """Write a report to the event file and to ``prune.json``.
-
-    Args:
-        run: the run.
-        report: numbers of the prune.
-        before, after: metrics of the test views on both sides of the prune; empty if they were not evaluated.
-
-    Raises:
-        StorageError: no space or no right to write.
-    """
-    scalars = {"before": report.before, "after": report.after, "seconds": report.seconds, "peak": report.peak}
-    run.log_scalars("Prune", scalars)
-    if run.folder is not None:
-        path = run.folder / "prune.json"
-        # A run that was killed between a prune and the next save repeats that prune.
-        reports = prunes_before(path, report.step)
-        reports.append({**asdict(report), "warm_up": dict(before), "pruned": dict(after)})
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, json.dumps(reports, indent=2))
 
 
 NEVER = -1  # Value of state["pruned_at"] before the first prune
@@ -199,16 +153,7 @@ of :func:`sundae_ns.scene.render.contribution`."""
 
 @dataclass(frozen=True)
 class PruningSchedule:
-    """The schedule of a pruning mode.
-
-    ``one-shot`` is the paper's main strategy: training, one prune that keeps ``keep_ratio`` or, once trials have chosen
-    it, their number, then fine-tuning.
-    ``continuous`` is the paper's alternative: periodic pruning during densification, for a lower peak of memory. Each
-    prune keeps ``keep_ratio``, so the final number is only roughly known; with ``target_gaussians`` it is exact,
-    because the last prune comes after densification. ``max_gaussians`` caps every prune, and every step in between
-    through :class:`sundae_ns.train.densification.CappedStrategy`. ``off`` only
-    records the peak.
-    """
+    """When a field is pruned, and to how many Gaussians."""
 
     config: PruningConfig  # Valid options; not changed
 
@@ -232,11 +177,7 @@ class PruningSchedule:
         return ((scheduled and target is None) or by_count) and step > state["pruned_at"]
 
     def target(self, n: int, state: Mapping[str, Any]) -> int:
-        """Number of Gaussians that a prune keeps of ``n`` finite ones. The one place that decides this number.
-
-        ``target_gaussians``, the number that trials have chosen, or ``round(keep_ratio * n)``, at least 1, under the
-        cap.
-        """
+        """Number of Gaussians that a prune keeps of ``n`` finite ones; at least 1, and under the cap."""
         config = self.config
         if config.target_gaussians is not None:
             return min(config.target_gaussians, n)
@@ -251,8 +192,8 @@ class PruningSchedule:
 
     def after_step(
         self, pruner: Pruner, state: MutableMapping[str, Any], step: int, contribute: Contribute | None = None
-    ) -> PruneReport | None:
-        """Prune if it is due; add the Gaussians that lack to the target. Call it after optimizers and densification.
+    ) -> dict[str, Any] | None:
+        """Prune if it is due; add Gaussians that lack to the target. Call it after optimizers and densification.
 
         Args:
             pruner: of the field.
@@ -261,7 +202,7 @@ class PruningSchedule:
             contribute: called only if the rule needs it, after Gaussians that are not finite have been removed.
 
         Returns:
-            A report, or None if no prune was due.
+            The report of :func:`prune_to`, or None if no prune was due.
 
         Raises:
             ConfigError: the rule needs a contribution and there is none.
@@ -287,13 +228,18 @@ def prune_to(
     state: MutableMapping[str, Any],
     step: int,
     contribute: Contribute | None,
-) -> PruneReport:
-    """Prune a field in training now: drop what is not finite, decide the count, render, cut, and record the step.
+) -> dict[str, Any]:
+    """Prune in training: drop what is not finite, decide the count, render, cut, and record the step.
 
     Args:
         target: maps the number of finite Gaussians to the number to keep.
         rule: which Gaussians stay.
         pruner, state, step, contribute: see :meth:`PruningSchedule.after_step`, also for errors.
+
+    Returns:
+        ``step``; numbers of Gaussians: ``before`` (with those that are not finite), ``after``, ``dropped_nonfinite``,
+        and the ``peak`` of all steps; ``seconds``, synchronised; and of the graph, None without one: ``tau``, the
+        threshold on squared distances, ``sigma``, the width of the edge weights, and the number of ``isolated``.
     """
     device = pruner.params["means"].device
     before, started = pruner.total, now(device)
@@ -303,17 +249,19 @@ def prune_to(
         weights = contribute(count if rule.uses_detail else None)
     decision = pruner.cut(rule, count, weights)
     state.update(pruned_at=step, num_prunes=state["num_prunes"] + 1)
-    return PruneReport(
-        step=step,
-        before=before,
-        after=decision.kept,
-        dropped_nonfinite=dropped,
-        peak=state["peak"],
-        seconds=now(device) - started,
-        tau=decision.tau,
-        sigma=decision.sigma,
-        isolated=decision.isolated,
-    )
+    report: dict[str, Any] = {"step": step, "before": before, "after": decision.kept, "dropped_nonfinite": dropped}
+    report |= {"peak": state["peak"], "seconds": now(device) - started}
+    return {**report, "tau": decision.tau, "sigma": decision.sigma, "isolated": decision.isolated}
+
+
+def summary(report: Mapping[str, Any]) -> str:
+    """The report of a prune as one line for the log."""
+    line = "step {step}: kept {after:,} of {before:,} Gaussians in {seconds:.1f} s; peak {peak:,}".format(**report)
+    if report["dropped_nonfinite"]:
+        line += f"; {report['dropped_nonfinite']:,} were NaN or infinite"
+    if report["sigma"] is not None:
+        line += "; sigma {sigma:.3g}, tau {tau:.3g}, {isolated:,} isolated".format(**report)
+    return line
 
 
 class ScheduledPruning(Callback):
@@ -321,7 +269,7 @@ class ScheduledPruning(Callback):
 
     Args:
         schedule: when, and to how many Gaussians.
-        evaluate: whether to evaluate all test views right before and right after the one-shot prune.
+        evaluate: whether to evaluate all test views before and after the one-shot prune.
     """
 
     name = "pruning"
@@ -372,11 +320,17 @@ class ScheduledPruning(Callback):
             notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
             return
-        log.info(report.summary())
-        if report.dropped_nonfinite:
-            log.warning(f"removed {report.dropped_nonfinite} Gaussians that were not finite")
+        log.info(summary(report))
+        if report["dropped_nonfinite"]:
+            log.warning(f"removed {report['dropped_nonfinite']} Gaussians that were not finite")
         after = _evaluated(run, "pruned") if evaluate else {}
-        write_report(run, report, before=before, after=after)
+        run.log_scalars("Prune", {name: report[name] for name in ("before", "after", "seconds", "peak")})
+        if run.folder is not None:
+            path = run.folder / "prune.json"
+            # A run that was killed between a prune and the next save repeats that prune.
+            reports = [*prunes_before(path, report["step"]), {**report, "warm_up": before, "pruned": after}]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_text(path, json.dumps(reports, indent=2))
 
     def finish(self, run: TrainingRun) -> None:
         """Report the peak, and warn if nothing was pruned."""
@@ -389,30 +343,38 @@ class ScheduledPruning(Callback):
 
 def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int) -> None:
     """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""
-    state, target, pruned = run.state, pruning.target_gaussians, run.state.pruning["num_prunes"]
-    # A warm start is pruned at once.
-    first = pruning.first_prune if state.offset == 0 else None
+    state, target = run.state, pruning.target_gaussians
+    pruned = state.pruning["num_prunes"] > 0
     begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "prune-at")
+    prunes = pruning.mode != "off" and state.offset == 0  # a warm start is pruned at once
+    first = pruning.start if pruning.mode == "continuous" else pruning.prune_at
     # A head whose start is not known yet is decided upon elsewhere.
     scheduled = state.head is not None and math.isfinite(state.head_starts_at)
     idle = scheduled and last_step + state.offset <= state.head_starts_at
-    and_head = ", and the head stays disabled" if idle else ""
     reached = pruned and target is not None and run.source.total <= target
-    if first is not None and last_step < first and not pruned:
-        event, step, option, found = "first prune", first, f"pruning.{begins}", "nothing is pruned" + and_head
-    elif first is not None and last_step < pruning.last_due and not reached:
-        event, step, option = "last prune", pruning.last_due, f"pruning.{ends}"
-        found = "more Gaussians are left than asked for" + and_head
-    elif idle:
-        # The head is enabled in the steps after that one.
-        event, step, found = "head", int(state.head_starts_at) + 1 - state.offset, "it stays disabled"
-        option = "head.start-at" if state.head_starts_at != pruning.settled_at else f"pruning.{ends}"
-    else:
-        return
-    log.warning(
-        f"training ends after {last_step + 1:,} steps, and the {event} needs more than {step:,} "
-        f"({option}): {found}; train longer, or {'enable it' if option.startswith('head') else 'prune'} earlier"
-    )
+    and_head = ", and the head stays disabled" if idle else ""
+    # The head is enabled in the steps after that one.
+    head_at = int(state.head_starts_at) + 1 - state.offset if idle else 0
+    head_option = "head.start-at" if state.head_starts_at != pruning.settled_at else f"pruning.{ends}"
+    rows = [
+        (prunes and last_step < first and not pruned, "first prune", first, f"pruning.{begins}", "nothing is pruned"),
+        (
+            prunes and last_step < pruning.last_due and not reached,
+            "last prune",
+            pruning.last_due,
+            f"pruning.{ends}",
+            "more Gaussians are left than asked for",
+        ),
+        (idle, "head", head_at, head_option, "it stays disabled"),
+    ]
+    for missed, event, step, option, result in rows:
+        if missed:
+            log.warning(
+                f"training ends after {last_step + 1:,} steps, and the {event} needs more than {step:,} ({option}): "
+                f"{result}{'' if event == 'head' else and_head}; train longer, or "
+                f"{'enable it' if option.startswith('head') else 'prune'} earlier"
+            )
+            return
 
 
 def _evaluated(run: TrainingRun, label: str) -> dict[str, float]:
@@ -437,11 +399,11 @@ class FloaterRemoval(Callback):
         self._points, self._done = points, points is None
 
     def state_dict(self) -> dict[str, Any]:
-        """Whether it is done."""
+        """Whether floaters were removed."""
         return {"done": self._done}
 
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
-        """Counterpart of :meth:`state_dict`; a run that was pruned before this extension existed is done."""
+        """Counterpart of :meth:`state_dict`; of a run without points, there is nothing to do."""
         self._done = self._points is None or bool(saved.get("done", state.pruning["num_prunes"] > 0))
 
     def needs_all(self, run: TrainingRun) -> bool:
@@ -455,7 +417,7 @@ class FloaterRemoval(Callback):
             return
         self._done = True
         assert self._points is not None
-        cameras = [own.camera for own in run.training_views()]
+        cameras = [view.camera for view in run.training_views()]
         if not cameras:
             return
         eyes = torch.stack([camera.center for camera in cameras])

@@ -1,4 +1,4 @@
-"""The state of a field in training, and what extensions of a training (densification, pruning, trials) may do.
+"""The state of a field in training, and what its callbacks (densification, pruning, trials) may do.
 
 Nothing here knows nerfstudio.
 """
@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -22,7 +21,7 @@ from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.core.surgery import Snapshot, module_snapshot, restore, restore_module, snapshot
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.rasterize.types import Backend
-from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamera
+from sundae_ns.scene.render import RenderSettings
 
 _HEAD = "head"
 
@@ -115,14 +114,7 @@ class TrainingState:
     def render_settings(
         self, backend: Backend, *, antialiased: bool, training: bool = False, absgrad: bool = False
     ) -> RenderSettings:
-        """Settings that render the field at this step.
-
-        Args:
-            backend: the rasteriser.
-            antialiased: see :class:`RenderSettings`.
-            training: whether gradients are needed.
-            absgrad: whether densification reads absolute gradients.
-        """
+        """Render settings at this step; ``absgrad`` says whether densification reads absolute gradients."""
         return RenderSettings(
             backend=backend,
             active_sh_degree=self.active_sh_degree,
@@ -158,77 +150,25 @@ class TrainingState:
 
     def load_running_states(self, saved: Mapping[str, Mapping[str, Any]]) -> None:
         """Counterpart of :meth:`running_states`; tensors move to the device of the field."""
-        for own, theirs in ((self.densification, saved["densification"]), (self.pruning, saved["pruning"])):
-            own.clear()
-            own.update({k: v.to(self.device) if isinstance(v, Tensor) else v for k, v in theirs.items()})
+        for name, running in (("densification", self.densification), ("pruning", self.pruning)):
+            running.clear()
+            running |= {k: v.to(self.device) if isinstance(v, Tensor) else v for k, v in saved[name].items()}
 
 
 class Photo(NamedTuple):
     """A training view with its image."""
 
     camera: Camera
-    target: Tensor  # The image over the background of TrainingRun.background, in [0, 1] [H, W, 3]
+    target: Tensor  # The image over the background of the run, in [0, 1] [H, W, 3]
     mask: Tensor | None  # Pixels that count, bool [H, W]; None for all
 
 
-class TrainingRun(Protocol):
-    """What an extension may ask of the program that trains. nerfstudio's trainer stands behind it in ``ns-train``."""
-
-    state: TrainingState  # The field in training
-    source: GaussianSource  # Where views get their Gaussians from
-    background: Tensor  # Background of images that are not trained on [3]
-
-    @property
-    def settings(self) -> RenderSettings:
-        """Settings of images that are not trained on, at this step."""
-
-    @property
-    def last_step(self) -> int | None:
-        """Step at which training ends; None if no trainer says so."""
-
-    @property
-    def schedule_length(self) -> int | None:
-        """Number of steps for which the schedule is made: at least those of the run; None if no trainer says so."""
-
-    @property
-    def images_per_step(self) -> int:
-        """Number of images in a batch: the number of ranks. Each counts as a step."""
-
-    @property
-    def folder(self) -> Path | None:
-        """Folder for records; None without one, and on every rank but the first."""
-
-    @property
-    def num_heldout(self) -> int:
-        """Number of held-out training views."""
-
-    def training_views(self) -> list[TrainingCamera]:
-        """All training views."""
-
-    def view_indices(self) -> list[int]:
-        """Indices of these views."""
-
-    def hold_out(self, indices: Iterable[int]) -> None:
-        """Hold out these training views too, from the next step on, until the next call."""
-
-    def heldout_views(self) -> Iterator[Photo]:
-        """The held-out training views, loaded one at a time."""
-
-    def photos(self) -> Iterator[Photo]:
-        """All training views in full size; transparent pixels are masked."""
-
-    def evaluate(self) -> dict[str, float]:
-        """Mean ``psnr`` (dB) and ``ssim`` over all test views; empty without any."""
-
-    def save(self) -> None:
-        """Save a checkpoint, if there is a trainer."""
-
-    def log_scalars(self, name: str, values: Mapping[str, float | int]) -> None:
-        """Write numbers to the run's event file."""
+TrainingRun: TypeAlias = Any
+"""What callbacks act on: :class:`sundae_ns.plugin.callbacks.NerfstudioRun`, which this floor cannot import."""
 
 
 class Callback:
-    """Base of the extensions: every verb does nothing. The model calls each verb on all extensions in their order."""
+    """Base of the callbacks: every method does nothing. The model calls each on all callbacks in their order."""
 
     name: str  # Key of its state in checkpoints
 
@@ -236,7 +176,7 @@ class Callback:
         """Check options and warn, before the first step and after a checkpoint has been loaded."""
 
     def trains(self, state: TrainingState) -> bool:
-        """Whether this step trains; training is paused if one extension answers no."""
+        """Whether this step trains; training is paused if one callback answers no."""
         return True
 
     def before_backward(self, state: TrainingState) -> None:
@@ -257,7 +197,7 @@ class Callback:
         return {}
 
     def prepare_loading(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
-        """Give field and head the shapes that they have in a checkpoint with this state of the extension."""
+        """Give field and head the shapes that they have in a checkpoint with this state of the callback."""
 
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
-        """Take over the state of a checkpoint, after field and head were loaded."""
+        """Load the state of a checkpoint, after Gaussians and head were loaded."""

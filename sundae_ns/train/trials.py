@@ -22,7 +22,6 @@ last images best. Test views are never used. :mod:`sundae_ns.train.choice` has t
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from collections.abc import Mapping
@@ -33,11 +32,9 @@ import torch
 from torch import Tensor
 
 from sundae_ns.core.errors import CheckpointError, PackError
-from sundae_ns.core.files import write_text
 from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.core.metrics import MOST_PSNR, SSIM_WINDOW, fitted_psnr, psnr, ssim
 from sundae_ns.core.surgery import replace_parameter
-from sundae_ns.core.tables import without_nan
 from sundae_ns.head.head import HeadConfig
 from sundae_ns.io.accounting import megabytes, stored_bytes
 from sundae_ns.io.coordinates import scene_order
@@ -51,7 +48,7 @@ from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.train.choice import HEADS, HeadGain, HeldOutQuality, Tolerance, Tried, mean_quality
 from sundae_ns.train.curve import RECORD, CurvePoint, curve_table
 from sundae_ns.train.densification import Densification
-from sundae_ns.train.pruning import COUNT, USUAL_SHARE, PruningConfig, prune_to
+from sundae_ns.train.pruning import COUNT, USUAL_SHARE, PruningConfig, prune_to, write_record
 from sundae_ns.train.schedules import limit_rise, notify_pruned, put_restarts, restarts
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
@@ -82,15 +79,10 @@ _DISABLED = "so it stays disabled; train longer, or force it with --pipeline.mod
 
 @torch.no_grad()
 def measure_heldout(run: TrainingRun, *, with_fitted: bool = False) -> list[HeldOutQuality]:
-    """Quality of the held-out views as the field is now, with the head if it is enabled; without fully masked views.
-
-    Args:
-        run: the training.
-        with_fitted: whether to fit colours, too.
-    """
+    """Quality of the held-out views, with the head if it is enabled; fully masked views are left out."""
     qualities = []
-    for view, target, mask in run.heldout_views():
-        images, _ = render_view(run.source, view, run.background, run.settings, depth=False)
+    for camera, target, mask in run.heldout_views():
+        images, _ = render_view(run.source, camera, run.background, run.settings, depth=False)
         quality = view_quality(images["rgb"], target, mask)
         if quality.pixels:
             fitted = float(fitted_psnr(images["rgb"], target, mask)) if with_fitted else math.nan
@@ -100,13 +92,12 @@ def measure_heldout(run: TrainingRun, *, with_fitted: bool = False) -> list[Held
 
 def view_quality(image: Tensor, target: Tensor, mask: Tensor | None) -> HeldOutQuality:
     """Quality of an image ``[H, W, 3]`` under a mask, bool ``[H, W]``; None for all pixels."""
-    total = target[..., 0].numel()
-    pixels = total if mask is None else int(mask.sum())
+    pixels = target[..., 0].numel() if mask is None else int(mask.sum())
     if not pixels:
         return HeldOutQuality(0, 0.0, 0.0)
     # Outside of the mask the compared image is exact, so all of its error belongs to the pixels that count.
     compared = image if mask is None else torch.where(mask[..., None], image, target)
-    share = pixels / total
+    share = pixels / target[..., 0].numel()
     decibels = float(psnr(compared, target)) + 10 * math.log10(share)
     similarity = 0.0
     if min(target.shape[:2]) >= SSIM_WINDOW:
@@ -146,16 +137,15 @@ class Trial:
 
     length: int  # Training steps
     held_out: list[int] = field(default_factory=list)  # Indices of the training views that are held out
-    averaged: float = 0
-    """Steps at its end over which weights are averaged; the mean is measured. 0 measures the last weights."""
+    averaged: float = 0  # Steps at its end over which weights are averaged; 0 measures the last weights
     num_features: int | None = None
     """Width of the features: 0 disables the head, another width begins with a fresh one. None changes nothing."""
-    counts: bool = True  # Whether its field goes on in any case; that of others is TrainingState.provisional
+    counts: bool = True  # Whether its Gaussians are kept in any case; those of others are TrainingState.provisional
     began: int = 0  # Step of the schedule at which it began; the engine sets it
 
 
 class TrialEngine:
-    """Trains trials on the field of a run, one after another, and keeps copies of the field to go back to.
+    """Runs trials on the Gaussians of a run, one after another, and keeps copies to go back to.
 
     Args:
         head_starts_at: step of the schedule after which an enabled head corrects images.
@@ -165,7 +155,7 @@ class TrialEngine:
         self.trial: Trial | None = None  # The current trial
         self.kept: dict[str, dict[str, Any]] = {}
         """Copies of the Gaussians by name: a :meth:`TrainingState.snapshot`, and the ``counted`` steps before it."""
-        self.taken_back = 0  # Steps after which the field went back to before them
+        self.taken_back = 0  # Steps of trials whose Gaussians were dropped
         self.coming: dict[str, list[int]] = {}
         """Views that are held out for the trials to come of a stage. In a trial its own views are, and no others."""
         self._head_starts_at = head_starts_at
@@ -182,22 +172,24 @@ class TrialEngine:
         self.trial = None if saved["trial"] is None else Trial(**saved["trial"])
         self.kept, self.taken_back, self.coming = dict(saved["kept"]), saved["taken_back"], dict(saved["coming"])
         self._mean = RunningMean.of(saved, state.device)
-        if self.trial is not None and self.trial.num_features is not None:
-            self.enable_head(state, self.trial.num_features > 0)
-        self._mark(state)
+        self._apply(state)
 
     def start(self, run: TrainingRun, trial: Trial) -> None:
-        """Start a trial from the present field."""
+        """Start a trial from the present Gaussians."""
         state = run.state
         self.trial, self._mean = replace(trial, began=state.schedule_step), RunningMean()
         self.hold_out(run)
-        if trial.num_features is not None:
-            self.enable_head(state, trial.num_features > 0)
+        self._apply(state)
         if trial.num_features:
             _widen(state, trial.num_features)
-            # Now: the extension that prunes acts before, so it would be a step later.
+            # Now: the callback that prunes acts before, so it would be a step later.
             notify_pruned(state.schedulers, state.step, run.source.total)
-        self._mark(state)
+
+    def _apply(self, state: TrainingState) -> None:
+        """Enable the head as the trial has it, and say whether the Gaussians may be dropped."""
+        if self.trial is not None and self.trial.num_features is not None:
+            self.enable_head(state, self.trial.num_features > 0)
+        state.provisional = self.trial is not None and not self.trial.counts
 
     def hold_out(self, run: TrainingRun) -> None:
         """Hold out the views of the current trial, or else those of the trials to come."""
@@ -205,20 +197,20 @@ class TrialEngine:
         run.hold_out(sorted(coming) if self.trial is None else self.trial.held_out)
 
     def after_step(self, run: TrainingRun) -> bool:
-        """Average the weights if it is due; returns whether the current trial has been trained."""
+        """Average the weights if it is due; returns whether the current trial has ended."""
         trial, state = self.trial, run.state
         assert trial is not None
         left = trial.began + trial.length - state.schedule_step
         if left < trial.averaged and state.step % AVERAGED_EVERY == 0:
             self._mean.count_in(weights_of(state))
-        return left <= 0
+        return bool(left <= 0)
 
     def measure(self, run: TrainingRun, *, with_fitted: bool = False) -> list[HeldOutQuality]:
         """Quality of the held-out views with the mean of the weights, if there is one; the next mean begins anew."""
         with self._mean.shown(weights_of(run.state)):
-            views = measure_heldout(run, with_fitted=with_fitted)
+            qualities = measure_heldout(run, with_fitted=with_fitted)
         self._mean = RunningMean()
-        return views
+        return qualities
 
     def take_mean(self, state: TrainingState) -> None:
         """Continue with the mean of the weights, if there is one."""
@@ -227,7 +219,7 @@ class TrialEngine:
         state.restored += 1  # another mean must not contain the weights before it
 
     def keep(self, name: str, state: TrainingState, *, head: bool) -> None:
-        """Keep a copy of the field, and of the head if asked for, until the stage ends."""
+        """Keep a copy of the Gaussians, and of the head if asked for, until the stage ends."""
         self.kept[name] = {
             "counted": state.schedule_step - self.taken_back,
             "taken_back": self.taken_back,
@@ -237,10 +229,10 @@ class TrialEngine:
         }
 
     def go_back(self, name: str, state: TrainingState) -> None:
-        """Continue with a kept copy of the field, its learning rates and its counted steps."""
+        """Continue with a kept copy, its learning rates and its counted steps."""
         kept = self.kept[name]
         state.restore(kept)
-        peak = {name: value for name, value in state.pruning.items() if name == "peak"}  # goes on through all trials
+        peak = {name: value for name, value in state.pruning.items() if name == "peak"}  # of all trials
         state.pruning.update({**kept["pruning"], **peak})
         self.taken_back = state.schedule_step - kept["counted"]
         put_restarts(state.schedulers, kept["restarts"], self.taken_back - kept["taken_back"])
@@ -250,19 +242,16 @@ class TrialEngine:
         self.trial, self.kept, self._mean = None, {}, RunningMean()
         self.coming.pop(stage, None)
         self.hold_out(run)
-        self._mark(run.state)
+        self._apply(run.state)
 
     def enable_head(self, state: TrainingState, enabled: bool) -> None:
         """Enable or disable the head."""
         # Not from this step on: a run that is resumed on several GPUs counts other steps.
         state.head_starts_at = self._head_starts_at if enabled else math.inf
 
-    def _mark(self, state: TrainingState) -> None:
-        state.provisional = self.trial is not None and not self.trial.counts
-
 
 def _widen(state: TrainingState, num_features: int) -> None:
-    """Give the field fresh features and a fresh head of a width that they do not have."""
+    """Start with fresh features and a fresh head if their width is another."""
     assert state.head is not None
     if state.head.config.num_features == num_features:
         return
@@ -297,12 +286,10 @@ class Progress:
         """The candidates of a stage."""
         return [row for row in self.tried if row.stage == stage]
 
-    def curve(self, *, plain: bool = False) -> list[CurvePoint]:
-        """Expected quality over the counts that were tried, largest first, with a head if it pays or if not plain."""
+    def curve(self) -> list[CurvePoint]:
+        """Expected quality over the counts that were tried, largest first, with a head if trials say that it pays."""
         curve = choice.curve_of(self.of("count"))
-        return (
-            choice.with_head(curve, HeadGain.of(*self.of("tenth"))) if self.chosen.get("tenth") and not plain else curve
-        )
+        return choice.with_head(curve, HeadGain.of(*self.of("tenth"))) if self.chosen.get("tenth") else curve
 
 
 class Trials(Callback):
@@ -312,7 +299,7 @@ class Trials(Callback):
 
     Args:
         config: options of pruning; trials decide about the count if its options leave it to them.
-        state: the field. A head that is to be decided about stays disabled until its trial.
+        state: of the training. A head that is to be decided about stays disabled until its trial.
         densification: its running state starts anew when the trials of counts begin.
         begins_at: step of the schedule after which a head is tried: the number of Gaussians is settled.
         decides_head: whether trials decide about the head.
@@ -337,6 +324,7 @@ class Trials(Callback):
         self._densification = densification
         self._head = HeadConfig(mode="off") if state.head is None else state.head.config
         self._heads = HEADS if self._head.num_features < MORE_FEATURES else HEADS[:2]
+        self._widths = dict(zip(HEADS, (0, self._head.num_features, MORE_FEATURES), strict=True))
         if decides_head:
             self.engine.enable_head(state, False)
 
@@ -367,7 +355,7 @@ class Trials(Callback):
         """Counterpart of :meth:`state_dict`.
 
         Raises:
-            CheckpointError: the checkpoint lacks a field to which its trials may return.
+            CheckpointError: the checkpoint lacks Gaussians to which its trials may return.
         """
         if not saved:
             return
@@ -376,10 +364,10 @@ class Trials(Callback):
         if self.decides_head:
             self.engine.enable_head(state, progress.chosen.get("head", "plain") != "plain")
         self.engine.load_state_dict(state, saved["engine"])
-        names = {"head": ["start", *(row.head for row in progress.of("head"))], "count": ["start"], "tenth": ["start"]}
-        names["length"] = ["start"]
-        kept, in_trial = self.engine.kept, progress.stage in (*names, "repeat")
-        if in_trial and not all(isinstance(kept.get(name), Mapping) for name in names.get(progress.stage, [])):
+        needed = ["start"] if progress.stage in ("count", "tenth", "head", "length") else []
+        if progress.stage == "head":
+            needed += [row.head for row in progress.of("head")]
+        if not all(isinstance(self.engine.kept.get(name), Mapping) for name in needed):
             raise CheckpointError("the checkpoint lacks a field that its trials would return to; give another")
 
     def trains(self, state: TrainingState) -> bool:
@@ -388,18 +376,18 @@ class Trials(Callback):
 
     def before_training(self, run: TrainingRun) -> None:
         """Hold views out; decide at once where trials cannot."""
-        progress, state, views = self.progress, run.state, len(run.view_indices())
+        progress, state, num_views = self.progress, run.state, len(run.view_indices())
         several = run.images_per_step > 1
         # A warm start skips the steps before the prune.
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
         if self.config.decides and "count" not in progress.chosen:
-            reasons = {
+            obstacles = {
                 "trials of counts need a single GPU": several,
                 "a warm start has seen all training views before": state.offset > 0,
-                f"{views} training views are too few to compare counts": views < MANY_VIEWS,
+                f"{num_views} training views are too few to compare counts": num_views < MANY_VIEWS,
                 "the steps after the prune are too few to compare counts": not self._counts_fit(run),
             }
-            reason = next((reason for reason, holds in reasons.items() if holds), None)
+            reason = next((reason for reason, holds in obstacles.items() if holds), None)
             if state.pruning["num_prunes"] and not progress.stage:  # by a share that was given
                 progress.chosen["count"] = 0
             elif reason is not None:
@@ -410,13 +398,13 @@ class Trials(Callback):
             if several:  # also if one GPU has begun them: its copies are of all Gaussians
                 wide = state.head is not None and state.head.config.num_features == MORE_FEATURES
                 self._finish_with(run, "features" if wide else "head", "trials need a single GPU")
-            elif views < FEWEST_VIEWS:
-                self._finish_with(run, "plain", f"{views} training views are too few to tell whether a head helps")
+            elif num_views < FEWEST_VIEWS:
+                self._finish_with(run, "plain", f"{num_views} training views are too few to tell whether a head helps")
             elif progress.stage != "head" and "head" not in self.engine.coming and not self._heads_fit(run):
                 if run.last_step is not None:
                     log.warning("training ends before the head can be tried, %s", _DISABLED)
         elif several and progress.stage in ("length", "repeat", "paused"):  # a length counts steps of one image
-            self._train_on(run)
+            self._end_length(run, "", None)
         self.engine.hold_out(run)
         self._write(run)
 
@@ -450,39 +438,53 @@ class Trials(Callback):
 
     def finish(self, run: TrainingRun) -> None:
         """Warn if training ended before a decision."""
-        last = run.last_step
         undecided = self.decides_head and "head" not in self.progress.chosen
-        if undecided and last is not None and last + 1 >= (run.schedule_length or 0):
+        if undecided and run.last_step is not None and run.last_step + 1 >= (run.schedule_length or 0):
             log.warning("training ended before the head could be tried, %s", _DISABLED)
 
     # ---------------------------------------------------------------------------------------------------- the one loop
+
+    def _start(self, run: TrainingRun, stage: str, length: int, views: list[int], width: int | None = None) -> None:
+        """Start the trial of a candidate; with a width of the features, its Gaussians may be dropped."""
+        self.progress.stage = stage
+        averaged = self._window if width is None else MEAN_SHARE * length
+        self.engine.start(run, Trial(length, views, averaged, width, counts=width is None))
 
     def _end_trial(self, run: TrainingRun) -> None:
         """Measure the current trial; try the next candidate of the stage, or choose."""
         progress, state, stage = self.progress, run.state, self.progress.stage
         if stage == "repeat":
-            self._pause(run)
+            # The mean of the last window stays to the end of the schedule.
+            self.engine.take_mean(state)
+            self._end_length(run, "paused", progress.chosen["length"])
+            log.info(f"step {state.step}: more training would harm other views; the remaining steps change nothing")
             return
-        trial, name = self.engine.trial, self._present_head(state)
-        assert trial is not None
+        assert self.engine.trial is not None
+        enabled, wide = state.head if state.head_enabled else None, len(self._heads) == 3
+        name = "plain" if enabled is None else "head"
+        if enabled is not None and wide and enabled.config.num_features == MORE_FEATURES:
+            name = "features"
         views = [list(view) for view in self.engine.measure(run, with_fitted=stage == "count")]
-        row = Tried(stage, run.source.total, name, trial.length, views)
+        row = Tried(stage, run.source.total, name, self.engine.trial.length, views)
         progress.tried.append(row)
         if stage in ("count", "tenth"):
-            row.bytes = packed_size(state.gaussians, state.head if state.head_enabled else None)
+            row.bytes = packed_size(state.gaussians, enabled)
             self.engine.go_back("start", state)
             self.engine.enable_head(state, False)
             self._try_count(run)
         elif stage == "head":
-            row.bytes = self._stored_bytes(state, name)
+            params = {name: value for name, value in state.gaussians.items() if enabled is not None or name != FEATURES}
+            size = stored_bytes(params, None)
+            row.bytes = [size, stored_bytes(params, enabled and enabled.config) - size]
             self._try_head(run, name)
         else:
             self._try_length(run)
 
-    def _present_head(self, state: TrainingState) -> str:
-        if state.head is None or not state.head_enabled:
-            return "plain"
-        return "features" if state.head.config.num_features == MORE_FEATURES and len(self._heads) == 3 else "head"
+    def _announce(self, run: TrainingRun, question: str, trials: int, length: int, views: list[int]) -> None:
+        log.info(
+            f"step {run.state.step}: {question} Up to {trials} trials of {length:,} steps; {len(views)} of "
+            f"{len(run.view_indices())} training views are held out"
+        )
 
     # ---------------------------------------------------------------------------------------------------------- counts
 
@@ -491,8 +493,8 @@ class Trials(Callback):
         return Tolerance.of_drop(self.config.max_drop)
 
     @property
-    def _short(self) -> int:
-        """Steps of a trial of a count, and of a window of a length."""
+    def _window(self) -> int:
+        """Steps of a trial of a count, and between two measurements of a length."""
         return max(round(COUNT_SHARE * self.progress.steps), 1)
 
     def _count_views(self, run: TrainingRun) -> list[int]:
@@ -508,55 +510,45 @@ class Trials(Callback):
     def _counts_fit(self, run: TrainingRun) -> bool:
         """Whether the trials leave enough of the steps after the prune."""
         heads = 2 * self._plan(run)[1] if self.decides_head else 0
-        return len(SHARES) * self._short + heads <= MOST_TRIALS * (_steps_of(run) - self.config.prune_at)
+        return len(SHARES) * self._window + heads <= MOST_TRIALS * (_steps_of(run) - self.config.prune_at)
 
     def _begin_counts(self, run: TrainingRun) -> None:
-        progress, state = self.progress, run.state
+        state = run.state
         Pruner(state.gaussians, state.optimizers, [state.densification]).drop_nonfinite()
-        self._densification.initialize(state)  # its statistics would not match the field that comes back
-        progress.full = run.source.total
-        log.info(
-            f"step {state.step}: how many Gaussians does the scene need? Up to {len(SHARES)} trials of "
-            f"{self._short:,} steps; {len(self._count_views(run))} of {len(run.view_indices())} training views "
-            "are held out"
-        )
+        self._densification.initialize(state)  # its statistics would not match the Gaussians that come back
+        self.progress.full = run.source.total
+        views = self._count_views(run)
+        self._announce(run, "how many Gaussians does the scene need?", len(SHARES), self._window, views)
         self.engine.enable_head(state, False)
         self.engine.keep("start", state, head=self.decides_head)
         self._try_count(run)
 
     def _try_count(self, run: TrainingRun) -> None:
         """Try the next count or, on the usual share, no head and then a head; or choose."""
-        progress, state, number, tenth = (
-            self.progress,
-            run.state,
-            len(self.progress.of("count")),
-            self.progress.of("tenth"),
-        )
+        progress, state = self.progress, run.state
+        number, tenth, curve = len(progress.of("count")), progress.of("tenth"), progress.curve()
         if len(tenth) == 2:
-            pays = choice.head_pays(progress.curve(plain=True), HeadGain.of(*tenth), self._tolerance)
-            progress.chosen["tenth"] = pays
-        curve, usual = progress.curve(), kept_count(USUAL_SHARE, progress.full)
-        more = number < len(SHARES) and (number == 0 or (curve and not choice.is_lost(curve[-1], self._tolerance)))
-        if more and progress.stage != "tenth":
-            progress.stage, length = "count", self._short
-            count = kept_count(SHARES[number], progress.full)
+            progress.chosen["tenth"] = choice.head_pays(curve, HeadGain.of(*tenth), self._tolerance)
+            curve = progress.curve()
+        usual = kept_count(USUAL_SHARE, progress.full)
+        promising = number == 0 or (curve and not choice.is_lost(curve[-1], self._tolerance))
+        if progress.stage != "tenth" and number < len(SHARES) and promising:
+            count, length = kept_count(SHARES[number], progress.full), self._window
             self._prune(run, count)
             notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + length)
-            trial = Trial(length, self._count_views(run), num_features=0)
+            self._start(run, "count", length, self._count_views(run), width=0)
         elif self.decides_head and curve and len(tenth) < 2 and self._count_of(curve)[0] > usual:
-            progress.stage, length = "tenth", self._plan(run)[1]
+            length = self._plan(run)[1]
             self._prune(run, usual)
             limit_rise(state.schedulers, round(RISE_SHARE * length))
             notify_pruned(state.schedulers, state.step, usual, last=False)
             # On the views that it would hold out for trials of its own.
-            trial = Trial(length, self._head_views(run), num_features=self._head.num_features if tenth else 0)
+            self._start(run, "tenth", length, self._head_views(run), self._widths["head" if tenth else "plain"])
         else:
             self._choose_count(run, curve)
-            return
-        self.engine.start(run, replace(trial, averaged=MEAN_SHARE * length, counts=False))
 
     def _prune(self, run: TrainingRun, count: int) -> None:
-        """Prune the field as the schedule would, by fewer views."""
+        """Prune as the schedule would, by fewer views."""
         state = run.state
 
         def contribute(kept: int | None) -> Tensor:
@@ -586,14 +578,20 @@ class Trials(Callback):
                 "quality still grows at the full count: the scene may need more Gaussians than densification made; "
                 "a lower --pipeline.model.densify-grad-thresh makes more"
             )
-        points = [
-            {**asdict(point), "measured": [view._asdict() for view in row.qualities]}
-            for point, row in zip(curve, progress.of("count"), strict=True)
-        ]
         run.log_scalars("Curve", {"chosen": count, "full": progress.full})
-        record: dict[str, Any] = {"chosen": count, "full": progress.full, "reason": reason, "step": run.state.step}
-        record |= {"tolerance": self._tolerance._asdict(), "held_out_views": self._count_views(run)}
-        record |= {"steps_per_trial": self._short, "curve": points}
+        record: dict[str, Any] = {
+            "chosen": count,
+            "full": progress.full,
+            "reason": reason,
+            "step": run.state.step,
+            "tolerance": self._tolerance._asdict(),
+            "held_out_views": self._count_views(run),
+            "steps_per_trial": self._window,
+            "curve": [
+                {**asdict(point), "measured": [view._asdict() for view in row.qualities]}
+                for point, row in zip(curve, progress.of("count"), strict=True)
+            ],
+        }
         if "tenth" in progress.chosen:
             length, figures = self._plan(run)[1], _figures(progress.of("tenth"))
             log.info(f"a tenth of the Gaussians after {length:,} steps: {_in_words(figures)}")
@@ -628,11 +626,8 @@ class Trials(Callback):
             head = "head" if progress.chosen["tenth"] else "plain"
             self._finish_with(run, head, "the trials of counts have shown what it gains")
             return
-        log.info(
-            f"step {state.step}: is the head worth it? Up to {len(self._heads) * len(folds)} trials of "
-            f"{length:,} steps; {len(self._head_views(run))} of {len(run.view_indices())} training views are held out"
-        )
-        progress.stage = "head"
+        trials = len(self._heads) * len(folds)
+        self._announce(run, "is the head worth it?", trials, length, self._head_views(run))
         limit_rise(state.schedulers, round(RISE_SHARE * length))
         self.engine.keep("start", state, head=True)
         self._start_head(run)
@@ -640,13 +635,10 @@ class Trials(Callback):
     def _start_head(self, run: TrainingRun) -> None:
         (folds, length), number = self._plan(run), len(self.progress.of("head"))
         head = self._heads[number // len(folds)]
-        width = {"plain": 0, "head": self._head.num_features, "features": MORE_FEATURES}[head]
-        # A trial is too short for what helps in the long run, so its steps do not count yet.
-        trial = Trial(length, folds[number % len(folds)], MEAN_SHARE * length, num_features=width, counts=False)
-        self.engine.start(run, trial)
+        self._start(run, "head", length, folds[number % len(folds)], self._widths[head])
 
     def _try_head(self, run: TrainingRun, head: str) -> None:
-        """Try the next head from the same field, unless the last one does not pay; or choose."""
+        """Try the next head from the same Gaussians, unless the last one does not pay; or choose."""
         tried, folds = self.progress.of("head"), len(self._plan(run)[0])
         complete = len(tried) % folds == 0 and head != "plain"
         if complete and (head == self._heads[-1] or choice.best_head(tried, folds) != head):
@@ -657,14 +649,14 @@ class Trials(Callback):
         self._start_head(run)
 
     def _choose_head(self, run: TrainingRun, trained: str) -> None:
-        """Continue with the best candidate; ``trained`` is the one that the field is."""
+        """Continue with the best candidate; ``trained`` is the last one."""
         tried, (folds, length) = self.progress.of("head"), self._plan(run)
         head, figures = choice.best_head(tried, len(folds)), _figures(tried)
         reason = "" if all(row.views for row in tried) else "masks leave no pixel of the held-out training views"
         record: dict[str, Any] = {}
         if not reason:
             log.info(f"step {run.state.step}: held-out training views: {_in_words(figures)}. Continuing: {NAMES[head]}")
-            run.log_scalars("Trials", {f"psnr_{name}": found["psnr"] for name, found in figures.items()})
+            run.log_scalars("Trials", {f"psnr_{name}": figure["psnr"] for name, figure in figures.items()})
             record = {"held_out_views": self._head_views(run), "steps_per_trial": length, "arms": figures}
         if head != trained:
             self.engine.go_back(head, run.state)
@@ -682,29 +674,22 @@ class Trials(Callback):
             state.remove_head()
         self._record(run, "head", {"decision": head, "reason": reason, "step": state.step, **(record or {})})
 
-    def _stored_bytes(self, state: TrainingState, head: str) -> list[int]:
-        params = {name: value for name, value in state.gaussians.items() if head != "plain" or name != FEATURES}
-        size = stored_bytes(params, None)
-        config = None if head == "plain" or state.head is None else state.head.config
-        return [size, stored_bytes(params, config) - size]
-
     # ---------------------------------------------------------------------------------------------------------- length
 
     def _length_views(self, run: TrainingRun) -> list[int]:
-        """Views that the chosen field has not seen since before its trial; none without trials."""
+        """Views that the chosen candidate has not seen since before its trial; none without trials."""
         return [] if self.progress.reason else self._plan(run)[0][-1]
 
     def _begin_length(self, run: TrainingRun) -> None:
         progress, state, views = self.progress, run.state, self._length_views(run)
-        step = state.schedule_step
-        watched, num_views = int(WATCHED_SHARE * (progress.steps - step)), len(run.view_indices())
-        # A field that comes from elsewhere has learnt all views: what it forgets of them is no overfitting.
-        if state.offset > 0 or not views or num_views >= MANY_VIEWS or watched < self._short:
+        watched, num_views = int(WATCHED_SHARE * (progress.steps - state.schedule_step)), len(run.view_indices())
+        # A warm start has learnt all views: what it forgets of them is no overfitting.
+        if state.offset > 0 or not views or num_views >= MANY_VIEWS or watched < self._window:
             progress.chosen["length"] = None
             return
-        progress.stage, progress.watched_until = "length", step + watched
+        progress.watched_until = state.schedule_step + watched
         self.engine.keep("start", state, head=state.head_enabled)
-        self.engine.start(run, Trial(self._short, views, averaged=self._short))
+        self._start(run, "length", self._window, views)
         log.info(
             f"step {state.step}: {num_views} training views are few; {len(views)} stay held out, to see when training "
             "stops helping"
@@ -712,50 +697,37 @@ class Trials(Callback):
 
     def _try_length(self, run: TrainingRun) -> None:
         """Train another window; or go back, to train on all views for as many steps as were best."""
-        progress, state, tried = self.progress, run.state, self.progress.of("length")
-        run.log_scalars("Stopping", dict(zip(("psnr", "ssim"), mean_quality(tried[-1].qualities), strict=True)))
-        best, lost = choice.best_length([choice.loss_of(row.qualities, self.ssim_weight) for row in tried])
-        if lost:
-            figures, length = [mean_quality(row.qualities) for row in (tried[best - 1], tried[-1])], best * self._short
-            then, now = (f"{decibels:.2f} dB, SSIM {similarity:.4f}" for decibels, similarity in figures)
+        progress, state, views = self.progress, run.state, self._length_views(run)
+        measured = []
+        for row in progress.of("length"):
+            psnr, ssim = mean_quality(row.qualities)
+            measured.append({"loss": choice.loss_of(row.qualities, self.ssim_weight), "psnr": psnr, "ssim": ssim})
+        run.log_scalars("Stopping", {name: measured[-1][name] for name in ("psnr", "ssim")})
+        best, lost = choice.best_length([window["loss"] for window in measured])
+        length = best * self._window if lost else None
+        if length is not None:
+            then, now = (f"{row['psnr']:.2f} dB, SSIM {row['ssim']:.4f}" for row in (measured[best - 1], measured[-1]))
             log.info(
                 f"step {state.step}: the held-out views were best after {length:,} steps, {then}; now {now}. "
                 "Going back, to train as long on all views"
             )
             self.engine.go_back("start", state)
-            self.engine.end(run, "length")
-            progress.stage, progress.chosen["length"] = "repeat", length
-            self.engine.start(run, Trial(length, averaged=self._short))
-            self._record_length(run, length)
-        elif state.schedule_step + self._short > progress.watched_until:
+            self._end_length(run, "repeat", length)
+            self._start(run, "repeat", length, [])
+        elif state.schedule_step + self._window > progress.watched_until:
             log.info(f"step {state.step}: the held-out views lose nothing; training goes on, on all views")
-            self._train_on(run)
-            self._record_length(run, None)
+            self._end_length(run, "", None)
         else:
-            self.engine.start(run, Trial(self._short, self._length_views(run), averaged=self._short))
+            self._start(run, "length", self._window, views)
+            return
+        record = {"held_out_views": views, "steps_per_measurement": self._window, "measured": measured}
+        self._record(run, "length", {**record, "steps_on_all_views": length, "step": state.step})
 
-    def _train_on(self, run: TrainingRun) -> None:
-        self.progress.stage, self.progress.chosen["length"] = "", None
+    def _end_length(self, run: TrainingRun, stage: str, length: int | None) -> None:
+        self.progress.stage, self.progress.chosen["length"] = stage, length
         self.engine.end(run, "length")
-
-    def _pause(self, run: TrainingRun) -> None:
-        """Take the mean of the last window, and keep it to the end of the schedule."""
-        self.engine.take_mean(run.state)
-        self.engine.end(run, "length")
-        self.progress.stage = "paused"
-        log.info(f"step {run.state.step}: more training would harm other views; the remaining steps change nothing")
 
     # --------------------------------------------------------------------------------------------------------- records
-
-    def _record_length(self, run: TrainingRun, length: int | None) -> None:
-        """Record the watch, and the number of steps on all views that follow it; None for all that are left."""
-        rows = [row.qualities for row in self.progress.of("length")]
-        measured = [
-            {"loss": choice.loss_of(views, self.ssim_weight), **dict(zip(("psnr", "ssim"), mean_quality(views)))}
-            for views in rows
-        ]
-        record = {"held_out_views": self._length_views(run), "steps_per_measurement": self._short, "measured": measured}
-        self._record(run, "length", {**record, "steps_on_all_views": length, "step": run.state.step})
 
     def _record(self, run: TrainingRun, stage: str, record: Mapping[str, Any]) -> None:
         """Add the record of a decision to ``trials.json``."""
@@ -763,14 +735,12 @@ class Trials(Callback):
         self._write(run)
 
     def _write(self, run: TrainingRun) -> None:
-        if run.folder is not None and self.progress.records:
-            run.folder.mkdir(parents=True, exist_ok=True)
-            text = json.dumps(without_nan(self.progress.records), indent=2, allow_nan=False)
-            write_text(run.folder / RECORD, text + "\n")
+        if self.progress.records:
+            write_record(run, RECORD, self.progress.records)
 
 
 class AfterPrune(Callback):
-    """Calls trials again after the schedule's prune, because extensions act in their order."""
+    """Calls trials again after the schedule's prune, because callbacks act in their order."""
 
     name = "after-prune"
 
@@ -801,7 +771,7 @@ def _figures(tried: list[Tried]) -> dict[str, dict[str, Any]]:
 
 def _in_words(figures: Mapping[str, Mapping[str, Any]]) -> str:
     return "; ".join(
-        f"{NAMES[name]} {found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}"
-        + ("" if found["bytes"] is None else f", {megabytes(found['bytes'])}")
-        for name, found in figures.items()
+        f"{NAMES[name]} {figure['psnr']:.2f} dB, SSIM {figure['ssim']:.4f}"
+        + ("" if figure["bytes"] is None else f", {megabytes(figure['bytes'])}")
+        for name, figure in figures.items()
     )

@@ -43,7 +43,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("views", "keep_ratio", "stops"),
+    ("cameras", "keep_ratio", "stops"),
     [
         # Before, in trials of counts and of a head on a tenth, after the decision, and while weights are averaged.
         (40, None, (11, 45, 57, 68, 95)),

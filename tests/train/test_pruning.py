@@ -1,8 +1,8 @@
-"""Policies: at the right step only, once, resumable, and with training going on afterwards."""
+"""Pruning in training: its options, its schedule, its reports, and the removal of floaters."""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -13,7 +13,7 @@ from torch.optim import Adam, Optimizer
 
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.pruning.decision import Pruner
-from sundae_ns.train.pruning import COUNT, PruneReport, PruningConfig, PruningSchedule
+from sundae_ns.train.pruning import COUNT, PruningConfig, PruningSchedule, summary
 
 Gaussians = tuple[dict[str, Parameter], dict[str, Optimizer]]
 
@@ -44,7 +44,7 @@ def train_step(params: dict[str, Parameter], optimizers: dict[str, Optimizer]) -
 
 def run(
     policy: PruningSchedule, made: Gaussians, steps: range, state: dict[str, Any] | None = None
-) -> tuple[list[PruneReport], dict[str, Any]]:
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     params, optimizers = made
     state = policy.initialize_state() if state is None else state
     reports = []
@@ -69,8 +69,8 @@ def test_one_shot_prunes_once_and_training_goes_on() -> None:
         if step > 3:
             losses.append(train_step(*made))
         if reports:
-            assert (reports[0].before, reports[0].after, reports[0].peak) == (100, 25, 100)
-            assert reports[0].sigma is not None
+            assert tuple(reports[0][name] for name in ("before", "after", "peak")) == (100, 25, 100)
+            assert reports[0]["sigma"] is not None
     assert losses == sorted(losses, reverse=True)
     assert {len(value) for value in made[0].values()} == {25}
     assert made[1]["means"].state[made[0]["means"]]["exp_avg"].shape == (25, 3)
@@ -81,11 +81,11 @@ def test_continuous_keeps_a_share_on_schedule() -> None:
         PruningConfig(mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, num_neighbors=4)
     )
     reports, state = run(policy, gaussians(), range(13))
-    assert [report.step for report in reports] == [2, 5, 8]
-    assert [report.after for report in reports] == [70, 49, 34]
-    assert {report.peak for report in reports} == {100}
+    assert [report["step"] for report in reports] == [2, 5, 8]
+    assert [report["after"] for report in reports] == [70, 49, 34]
+    assert {report["peak"] for report in reports} == {100}
     assert state["num_prunes"] == 3
-    assert reports[0].sigma != reports[1].sigma
+    assert reports[0]["sigma"] != reports[1]["sigma"]
 
 
 def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
@@ -115,7 +115,7 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
     policy = PruningSchedule(config)
     made = gaussians()
     reports, state = run(policy, made, range(2))
-    assert [report.after for report in reports] == [80]
+    assert [report["after"] for report in reports] == [80]
     params, optimizers = gaussians(last)  # what densification has made of it meanwhile
     densification = {"grad2d": torch.zeros(last), "count": torch.zeros(last), "scene_scale": 1.0}
     for step in (3, 4):
@@ -140,7 +140,7 @@ def test_continuous_draws_anew_each_time() -> None:
     assert not torch.equal(kept[0], kept[2])
 
 
-def test_broken_primitives_are_dropped_before_the_contribution_and_counted() -> None:
+def test_broken_gaussians_are_dropped_before_the_contribution_and_counted() -> None:
     made = gaussians()
     params, optimizers = made
     params["means"].data[5] = torch.nan
@@ -156,8 +156,8 @@ def test_broken_primitives_are_dropped_before_the_contribution_and_counted() -> 
     report = policy.after_step(Pruner(params, optimizers), policy.initialize_state(), 0, contribute)
     assert report is not None
     assert asked == [(49, 98)]
-    assert (report.before, report.dropped_nonfinite, report.after) == (100, 2, 49)
-    assert "2 were NaN or infinite" in report.summary()
+    assert (report["before"], report["dropped_nonfinite"], report["after"]) == (100, 2, 49)
+    assert "2 were NaN or infinite" in summary(report)
     assert all(value.isfinite().all() for value in params.values())
 
 
@@ -194,39 +194,38 @@ def test_a_failed_prune_leaves_field_and_state() -> None:
     assert state["pruned_at"] == -1
 
 
-def test_a_field_that_the_optimizers_do_not_hold_is_not_pruned() -> None:
+@pytest.mark.parametrize(
+    ("n", "opacity", "foreign", "words"),
+    [
+        (10, 0.0, True, "optimizer of 'means'"),
+        (0, 0.0, False, "no Gaussian is left: all became transparent"),
+        (10, torch.nan, False, "none of 10 Gaussians is finite: the training has diverged"),
+    ],
+)
+def test_what_cannot_be_pruned_names_the_cause(n: int, opacity: float, foreign: bool, words: str) -> None:
     policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
-    params, optimizers = gaussians()
-    foreign = {**params, "means": Parameter(torch.zeros(100, 3))}
-    with pytest.raises(DataError, match="optimizer of 'means'"):
-        policy.after_step(Pruner(foreign, optimizers), policy.initialize_state(), 0, lambda _: torch.ones(100))
-    assert len(foreign["means"]) == 100
+    params, optimizers = gaussians(n)
+    params["opacities"].data[:] = opacity
+    if foreign:
+        params = {**params, "means": Parameter(torch.zeros(n, 3))}
+    with pytest.raises(DataError, match=words):
+        policy.after_step(Pruner(params, optimizers), policy.initialize_state(), 0, lambda _: torch.ones(n))
+    assert len(params["means"]) == n
 
 
-def test_a_field_without_a_primitive_has_not_diverged() -> None:
-    policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
-    params, optimizers = gaussians(0)
-    with pytest.raises(DataError, match="no Gaussian is left: all became transparent"):
-        policy.after_step(Pruner(params, optimizers), policy.initialize_state(), 0, lambda _: torch.ones(0))
-
-
-def test_a_field_without_a_finite_primitive_names_the_cause() -> None:
-    policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
-    params, optimizers = gaussians(10)
-    params["opacities"].data[:] = torch.nan
-    with pytest.raises(DataError, match="none of 10 Gaussians is finite: the training has diverged"):
-        policy.after_step(Pruner(params, optimizers), policy.initialize_state(), 0)
-
-
-def test_report_is_one_line_of_plain_numbers() -> None:
+def test_a_report_says_in_one_line_what_happened_and_leaves_out_what_did_not() -> None:
     (report,), _ = run(PruningSchedule(PruningConfig(prune_at=0)), gaussians(), range(1))
-    assert all(type(getattr(report, f.name)) in (int, float) for f in fields(report))
-    summary = report.summary()
-    assert "\n" not in summary
-    assert summary.startswith("step 0: kept 10 of 100 Gaussians in ")
-    assert f"sigma {report.sigma:.3g}, tau {report.tau:.3g}, {report.isolated:,} isolated" in summary
+    assert all(type(value) in (int, float) for value in report.values())
+    line = summary(report)
+    assert line.startswith("step 0: kept 10 of 100 Gaussians in ")
+    assert line.endswith("sigma {sigma:.3g}, tau {tau:.3g}, {isolated:,} isolated".format(**report))
     (unscored,), _ = run(PruningSchedule(PruningConfig(prune_at=0, redistribution="none")), gaussians(), range(1))
-    assert "sigma" not in unscored.summary()
+    assert "sigma" not in summary(unscored)
+    plain = {"step": 15000, "before": 1_234_567, "after": 123_456, "dropped_nonfinite": 0, "peak": 2_000_000}
+    plain |= {"seconds": 1.26, "sigma": None}
+    assert summary(plain) == "step 15000: kept 123,456 of 1,234,567 Gaussians in 1.3 s; peak 2,000,000"
+    odd = {**plain, "dropped_nonfinite": 1200, "tau": 0.0090, "sigma": 0.0316227, "isolated": 1500}
+    assert summary(odd).split("; ")[2:] == ["1,200 were NaN or infinite", "sigma 0.0316, tau 0.009, 1,500 isolated"]
 
 
 @pytest.mark.parametrize(("cap", "expected"), [(200, [70, 49, 34]), (70, [70, 49, 34]), (60, [60, 42, 29])])
@@ -235,8 +234,8 @@ def test_continuous_under_a_cap_keeps_the_share_too(cap: int, expected: list[int
         mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, max_gaussians=cap, num_neighbors=4
     )
     reports, _ = run(PruningSchedule(config), gaussians(), range(13))
-    assert [report.step for report in reports] == [2, 5, 8]
-    assert [report.after for report in reports] == expected
+    assert [report["step"] for report in reports] == [2, 5, 8]
+    assert [report["after"] for report in reports] == expected
 
 
 def test_a_field_above_the_cap_is_pruned_when_continuous_pruning_has_ended() -> None:
@@ -276,7 +275,7 @@ def test_continuous_prunes_a_step_once() -> None:
         ({"mode": "continuous", "max_drop": 0.1}, "max_drop is set, and trials do not decide"),
         ({"mode": "continuous", "keep_ratio": None}, "keep_ratio is None and mode is continuous"),
         ({"mode": "off", "max_gaussians": 4}, "mode is off, which prunes nothing"),
-        ({"mode": "continuous", "max_gaussians": 4, "target_gaussians": 5}, "is more than max_primitives"),
+        ({"mode": "continuous", "max_gaussians": 4, "target_gaussians": 5}, "is more than max_gaussians"),
     ],
 )
 def test_impossible_options_are_refused_in_one_line(options: dict[str, Any], words: str) -> None:
@@ -312,3 +311,19 @@ def test_trials_decide_how_many_stay_and_the_schedule_waits_for_them() -> None:
         assert schedule.due(decided, 3, 60)
         assert schedule.target(60, decided) == kept
     assert schedule.target(5, {**state, COUNT: 7}) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "last", "settled"),
+    [
+        ({"prune_at": 7}, 7, 7),
+        ({"mode": "off", "prune_at": 7}, 7, 7),
+        ({"mode": "continuous", "start": 4, "stop": 21, "every": 5}, 19, 21),
+        ({"mode": "continuous", "start": 4, "stop": 24, "every": 5}, 24, 24),
+        ({"mode": "continuous", "start": 4, "stop": 21, "every": 5, "target_gaussians": 9}, 21, 21),
+        ({"mode": "continuous", "start": 4, "stop": 21, "every": 5, "max_gaussians": 9}, 21, 21),
+    ],
+)
+def test_steps_of_the_prunes(options: dict[str, Any], last: int, settled: int) -> None:
+    config = PruningConfig(**options)
+    assert (config.last_due, config.settled_at) == (last, settled)
