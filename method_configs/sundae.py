@@ -28,8 +28,7 @@ def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
         steps: length of the run, at which decaying rates reach their final value.
         plain: leave out what is not in the paper: this restart, and weight decay of the head.
     """
-    rates = {"means": 1.6e-4, "features_dc": 0.0025, "features_rest": 0.0025 / 20, "opacities": 0.05, "scales": 0.005}
-    rates |= {"quats": 0.001, "features": 0.0025, "camera_opt": 1e-4}
+    rates = {**configs.RATES, "camera_opt": 1e-4}
     groups: dict[str, Any] = {
         name: {"optimizer": configs.FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None}
         for name, rate in rates.items()

@@ -109,14 +109,11 @@ def pack(
             packs.append(tune(run, source, config, finetune, data=data, progress=lambda _: progress.advance(task)))
         progress.update(task, description="Packing")
         if target_bytes is not None or target_drop is not None:
-            from sundae_ns.plugin.targets import Search, fewest_bytes, least_drop
+            from sundae_ns.plugin.targets import Search, best_pack
 
             # Not what is fitted already without a fine-tune: its positions are rounded.
             searches = [Search(source, precision, judge), *(Search(*each, judge) for each in packs)]
-            if target_bytes is not None:
-                found = least_drop(searches, target_bytes)
-            else:
-                found = fewest_bytes(searches[::-1], target_drop or 0.0)
+            found = best_pack(searches, most_bytes=target_bytes, most_drop=target_drop or 0.0)
             if packs and found.scene is not packs[0][0]:
                 notes.append("the fine-tune loses too much for the target; packed without it, try more steps")
                 finetune = 0

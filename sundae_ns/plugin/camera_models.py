@@ -33,25 +33,24 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     """
     kinds = cameras.camera_type.flatten()
     other = ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype))
-    if other.any():
-        at = _first(other)
-        raise DataError(
-            f"the camera of {names[at].name} is of type {CameraType(int(kinds[at])).name}, which no perspective image "
-            "can be made of; cut its images into perspective ones, such as cube faces"
-        )
     mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
+    ratios = cameras.fx / cameras.width.clamp_min(1)
+    no_lens = ((ratios < 0.01) | (ratios > 1000)).flatten()  # views of 178 and of 0.06 degrees
+    if other.any():
+        raise DataError(
+            f"the camera of {names[_first(other)].name} is of type {CameraType(int(kinds[_first(other)])).name}, which "
+            "no perspective image can be made of; cut its images into perspective ones, such as cube faces"
+        )
     if mirrored.any():
         raise DataError(
             f"the pose of {names[_first(mirrored)].name} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses "
             "do); negate one column of its rotation"
         )
-    shares = cameras.fx / cameras.width.clamp_min(1)
-    wrong = ((shares < 0.01) | (shares > 1000)).flatten()  # views of 178 and of 0.06 degrees
-    if wrong.any():
-        at = _first(wrong)
+    if no_lens.any():
+        i = _first(no_lens)
         raise DataError(
-            f"the focal length of {names[at].name} is {float(cameras.fx[at]):.3g} px and the image is "
-            f"{int(cameras.width[at])} px wide, which no lens has; give the focal length in pixels"
+            f"the focal length of {names[i].name} is {float(cameras.fx[i]):.3g} px and the image is "
+            f"{int(cameras.width[i])} px wide, which no lens has; give the focal length in pixels"
         )
     centres = cameras.camera_to_worlds[:, :, 3]
     middle = centres.median(dim=0).values
@@ -59,21 +58,20 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     if len(names) > 1 and distances.max() == 0:
         return "all cameras stand at one place, so nothing says how far things are; check the poses"
     usual = distances.median()
-    known = None if points is None or not len(points) else points.double().cpu().numpy()
-    far = torch.from_numpy(stray_cameras(centres.double().numpy(), lambda: known))
+    cloud = None if points is None or not len(points) else points
+    far = torch.from_numpy(
+        stray_cameras(centres.double().numpy(), lambda: None if cloud is None else cloud.double().cpu().numpy())
+    )
     if not far.any() and usual > 0:
-        reach = 0.0 if points is None or not len(points) else float((points - middle).norm(dim=1).median())
+        reach = 0.0 if cloud is None else float((cloud - middle).norm(dim=1).median())
         far = (distances > 20 * usual) & (distances > STRAY * reach)
-    if far.any():
-        first = _first(far)
-        times = (
-            f"{float(distances[first] / usual):,.0f} times as far away as most" if usual > 0 else "far from all others"
-        )
-        return (
-            f"the camera of {names[first].name} is {times} ({int(far.sum())} of {len(names)} are); check its pose, or "
-            "remove the view"
-        )
-    return None
+    if not far.any():
+        return None
+    times = f"{float(distances[_first(far)] / usual):,.0f} times as far away as most"
+    return (
+        f"the camera of {names[_first(far)].name} is {times if usual > 0 else 'far from all others'} "
+        f"({int(far.sum())} of {len(names)} are); check its pose, or remove the view"
+    )
 
 
 def stray_tests(train: Cameras, test: Cameras, names: Sequence[Path]) -> str | None:
@@ -104,33 +102,25 @@ def check_projection(camera: Cameras) -> None:
 
 
 @torch.no_grad()
-def cameras_of_points(points: Tensor, cameras: Cameras) -> Tensor:
-    """For cameras ``[M]``, whether each sees one of points ``[N, 3]`` or more, bool ``[M]``.
+def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
+    """Warn of a cloud ``[N, 3]`` that most cameras do not see: it and the cameras are in different coordinates.
 
-    2,000 of the points are looked for. Distortion is left out; images count with a margin of a tenth of their size on
-    each side.
+    Looks for 2,000 of the points, without distortion, with a margin of a tenth of the image's size on each side.
     """
-    points, margin = points[torch.isfinite(points).all(dim=1)].cpu(), 0.1
-    chosen = torch.linspace(0, max(len(points) - 1, 0), min(2000, len(points))).long()
-    seen = []
+    points = points[torch.isfinite(points).all(dim=1)].cpu()
+    points = points[torch.linspace(0, max(len(points) - 1, 0), min(2000, len(points))).long()]
+    empty = 0
     parts = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
     lenses = torch.cat([part.float() for part in parts], dim=-1).cpu()
     for pose, (fx, fy, cx, cy, width, height) in zip(cameras.camera_to_worlds.cpu(), lenses.tolist(), strict=True):
-        x, y, z = ((points[chosen] - pose[:, 3]) @ pose[:, :3]).unbind(dim=1)
-        across = (x * fx / -z + cx) / width
-        down = (-y * fy / -z + cy) / height
-        inside = (across > -margin) & (across < 1 + margin) & (down > -margin) & (down < 1 + margin)
-        seen.append(((z < 0) & inside).any())
-    return torch.stack(seen)
-
-
-def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
-    """Warn of a cloud ``[N, 3]`` that most views do not show: it and the cameras are in different coordinates."""
-    seen = cameras_of_points(points, cameras)
-    if seen.float().mean() < 0.5:
+        x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).unbind(dim=1)
+        across, down = (x * fx / -z + cx) / width, (-y * fy / -z + cy) / height
+        inside = (across > -0.1) & (across < 1.1) & (down > -0.1) & (down < 1.1)
+        empty += not ((z < 0) & inside).any()
+    if empty > 0.5 * len(cameras):
         warn(
-            f"{int((~seen).sum())} of {len(seen)} views show no point of the sparse cloud, so cloud and cameras are "
-            "probably in different coordinates; export both together, or train without the cloud (remove ply_file_path)"
+            f"{empty} of {len(cameras)} views show no point of the sparse cloud, so cloud and cameras are probably in "
+            "different coordinates; export both together, or train without the cloud (remove ply_file_path)"
         )
 
 
@@ -145,10 +135,9 @@ def other_frame(run: Path, transform: Tensor, scale: float) -> str | None:
     try:
         stated = read_json(run / FRAME_FILE)
         before, size = torch.tensor(stated["transform"], dtype=torch.float64), float(stated["scale"])
-        same = torch.allclose(before * size, transform.double() * scale, rtol=1e-3, atol=1e-3)
+        if torch.allclose(before * size, transform.double() * scale, rtol=1e-3, atol=1e-3):
+            return None
     except (DataError, KeyError, TypeError, ValueError, RuntimeError):
-        return None
-    if same:
         return None
     return (
         f"{run} was trained in other coordinates: its capture has changed, or another version scaled it; if cameras "

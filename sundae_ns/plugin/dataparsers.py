@@ -71,22 +71,16 @@ def set_parser(config: DataParserConfig, robust: bool) -> None:
         config: of the parser, changed in place.
         robust: see :class:`sundae_ns.plugin.placing.Placing`.
     """
-    for parsers in (
-        (Nerfstudio, LightNerfstudioParser, RobustNerfstudioParser),
-        (ColmapDataParser, CarefulColmapParser, RobustColmapParser),
-    ):
-        if config._target in parsers:
-            config._target = parsers[2 if robust else 1]
+    target: Any = config._target
+    config._target = {Nerfstudio: LightNerfstudioParser, ColmapDataParser: CarefulColmapParser}.get(target, target)
+    config.robust = robust  # type: ignore[attr-defined]
 
 
 class LightNerfstudioParser(Nerfstudio):
     """The ``nerfstudio-data`` parser; it takes the cloud of an old capture from COLMAP's model without a question."""
 
-    robust = False
-    """See :class:`sundae_ns.plugin.placing.Placing`."""
-
     def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
-        self.placing = Placing(self.robust)
+        self.placing = Placing(getattr(self.config, "robust", False))
         self.applied_scale = 1.0
         """Scale from the original coordinates of a capture to those of its file."""
         generate = rebound(
@@ -132,7 +126,7 @@ class LightNerfstudioParser(Nerfstudio):
         self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float
     ) -> dict[str, Tensor] | None:
         if not ply_file_path.exists():
-            raise DataError(f"{ply_file_path} does not exist; mend ply_file_path in transforms.json, or remove it")
+            raise DataError(f"{ply_file_path} does not exist; correct ply_file_path in transforms.json, or remove it")
         far = self.placing.offset is not None
         if ply_file_path.is_dir():
             if not any(ply_file_path.glob("points3D.*")):
@@ -157,11 +151,8 @@ class LightNerfstudioParser(Nerfstudio):
 class CarefulColmapParser(ColmapDataParser):
     """The ``colmap`` parser."""
 
-    robust = False
-    """See :class:`sundae_ns.plugin.placing.Placing`."""
-
     def _generate_dataparser_outputs(self, split: str = "train", **options: Any) -> DataparserOutputs:
-        self.placing = Placing(self.robust)
+        self.placing = Placing(getattr(self.config, "robust", False))
         generate = rebound(ColmapDataParser._generate_dataparser_outputs, camera_utils=self.placing.camera_utils)
         outputs = generate(self, split, **options)
         return self.placing.finish(outputs, scaled=self.config.auto_scale_poses)
@@ -169,19 +160,13 @@ class CarefulColmapParser(ColmapDataParser):
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
         images = read_images(recon_dir)
 
-        def cameras(_: Path) -> dict[int, ColmapImage]:
-            return {image.camera_id: image for image in images.values()}
-
-        def posed(_: Path) -> dict[int, SimpleNamespace]:
-            return {
-                number: SimpleNamespace(
-                    name=image.name,
-                    camera_id=image.camera_id,
-                    qvec=np.array(image.pose[:4]),
-                    tvec=np.array(image.pose[4:]),
-                )
-                for number, image in images.items()
-            }
+        cameras = {image.camera_id: image for image in images.values()}
+        posed = {
+            number: SimpleNamespace(
+                name=image.name, camera_id=image.camera_id, qvec=np.array(image.pose[:4]), tvec=np.array(image.pose[4:])
+            )
+            for number, image in images.items()
+        }
 
         def stated(image: ColmapImage) -> dict[str, Any]:
             camera = image.camera
@@ -190,8 +175,8 @@ class CarefulColmapParser(ColmapDataParser):
             return {**dict(zip(INTRINSICS, values, strict=True)), "camera_model": PERSPECTIVE, "lens": camera.lens}
 
         readers = {
-            f"read_{what}_{kind}": read
-            for what, read in (("cameras", cameras), ("images", posed))
+            f"read_{name}_{kind}": lambda _, rows=rows: rows
+            for name, rows in (("cameras", cameras), ("images", posed))
             for kind in ("text", "binary")
         }
         read = rebound(
@@ -212,9 +197,9 @@ class CarefulColmapParser(ColmapDataParser):
         return meta
 
     def _setup_downscale_factor(self, image_filenames: list[Path], *others: list[Path]) -> Any:
-        found = super()._setup_downscale_factor(image_filenames, *others)
-        self.placing.lenses = {new: self._lenses[old] for new, old in zip(found[0], image_filenames, strict=True)}
-        return found
+        paths = super()._setup_downscale_factor(image_filenames, *others)
+        self.placing.lenses = {new: self._lenses[old] for new, old in zip(paths[0], image_filenames, strict=True)}
+        return paths
 
     def _load_3D_points(self, colmap_path: Path, transform_matrix: Tensor, scale_factor: float) -> dict[str, Any]:
         positions, colours = read_points(colmap_path)
@@ -224,18 +209,6 @@ class CarefulColmapParser(ColmapDataParser):
         points = torch.from_numpy(positions).float()
         points = torch.cat([points, torch.ones_like(points[:, :1])], dim=1) @ transform_matrix.T * scale_factor
         return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(colours)}
-
-
-class RobustNerfstudioParser(LightNerfstudioParser):
-    """The parser that centres and scales by the cameras that stand near each other."""
-
-    robust = True
-
-
-class RobustColmapParser(CarefulColmapParser):
-    """The parser that centres and scales by the cameras that stand near each other."""
-
-    robust = True
 
 
 def _warn_of_rounded_cloud(points: Tensor, offset: Array | None, name: str) -> None:

@@ -1,7 +1,7 @@
 """A small scene trained on the images of a full one: a prune, then steps on fresh virtual views. No photo is needed.
 
-The full field is the teacher: it renders the truth for any camera. So each step has a camera of its own, the chosen
-ones moved and turned a little, and nothing is learnt by heart.
+The full scene is the teacher: it renders the truth for any camera. So each step has a camera of its own, a given one
+moved and turned a little, and the images of no camera are overfitted.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from pytorch_msssim import SSIM
@@ -25,6 +25,7 @@ from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.accounting import stored_bytes
 from sundae_ns.plugin.model import SundaeModelConfig
+from sundae_ns.plugin.optimizer_configs import RATES
 from sundae_ns.scene.initialization import initial_features
 from sundae_ns.scene.optimise import optimise, rate_factor
 from sundae_ns.scene.prune_scene import prune_with_mask
@@ -40,28 +41,12 @@ from sundae_ns.train.step import StepInputs, StepLosses, TrainingStep
 
 _log = logging.getLogger(__name__)
 
-RATES = {
-    "means": 1.6e-4,
-    "features_dc": 0.0025,
-    "features_rest": 0.0025 / 20,
-    "opacities": 0.05,
-    "scales": 0.005,
-    "quats": 0.001,
-    FEATURES: 0.0025,
-}
-"""Rates of Adam: those of a run right after its prune."""
 STEPS = {"cpu": 3000, "cuda": 8000}
 """Steps by the device."""
-CAMERAS, HELD_OUT = 256, 16
-"""Virtual cameras that the steps begin from, and most cameras that no step sees."""
-SHIFT, TURN = 0.05, 0.1
-"""How far a camera of a step is from one of these: as a share of its distance from the middle of all, and radians."""
-TRIAL = 0.1
-"""Share of the steps in each of both trials, without and with a head."""
-AVERAGED = 0.1
-"""Share of the steps, at the end, over which weights are averaged."""
 SIDES = {"cpu": 128, "cuda": 512}
 """Sides of the images by the device, pixels."""
+CAMERAS, HELD_OUT = 256, 16
+"""Virtual cameras that the steps begin from, and most held-out cameras."""
 
 
 class Distillation:
@@ -98,26 +83,22 @@ class Distillation:
         teacher = dataclasses.replace(teacher, gaussians=sanitise(teacher.gaussians).gaussians)
         side = size or by_device(SIDES, teacher.device)
         if cameras:
-            shown, held_out = split(cameras)
-            given = shown or cameras
+            trained, held_out = split(cameras)
+            trained = trained or list(cameras)
         else:
-            given = virtual_cameras(teacher, CAMERAS, seed=seed, size=side)
+            trained = virtual_cameras(teacher, CAMERAS, seed=seed, size=side)
             held_out = virtual_cameras(teacher, HELD_OUT, seed=seed + 1, size=side)
         self._size = size_of(teacher)
-        self._teacher, seen = of_unit_size(teacher, [*given, *held_out])
-        self.cameras = [camera.to(teacher.device) for camera in seen[: len(given)]]
-        self.held_out = [camera.to(teacher.device) for camera in seen[len(given) :]][:HELD_OUT]
+        self._teacher, scaled = of_unit_size(teacher, [*trained, *held_out])
+        scaled = [camera.to(teacher.device) for camera in scaled]
+        self.cameras, self.held_out = scaled[: len(trained)], scaled[len(trained) :][:HELD_OUT]
         self.steps, self._seed = steps, seed
         """Number of steps to train."""
-        seen = self.cameras[: by_device(VIEWS, teacher.device)]
-        cut = prune_with_mask(self._teacher, keep, count, seen, None, progress=progress, fit=False)
+        scored_by = self.cameras[: by_device(VIEWS, teacher.device)]
+        cut = prune_with_mask(self._teacher, keep, count, scored_by, None, progress=progress, fit=False)
         config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
-        self._head_config = None
-        if head:
-            on_cpu = teacher.device.type == "cpu"
-            tiny = {"size": "tiny", "pixel_unshuffle": 1, "num_features": 5} if on_cpu else {}
-            self._head_config = HeadConfig(mode="residual", **tiny)  # type: ignore[arg-type]
-        self.state = self._start(cut.scene.gaussians)
+        tiny = {"size": "tiny", "pixel_unshuffle": 1, "num_features": 5} if teacher.device.type == "cpu" else {}
+        self.state = self._start(cut.scene.gaussians, HeadConfig(mode="residual", **cast(Any, tiny)) if head else None)
         self.step = 0
         """Number of steps that were trained."""
         self.gain: float | None = None
@@ -127,27 +108,31 @@ class Distillation:
         self._settings = self._teacher.settings(head=False)
         self._recorded = RecordedStep(self._losses) if self._settings.backend.name == "gsplat" else None
 
-    def _start(self, gaussians: Gaussians) -> TrainingState:
+    def _start(self, gaussians: Gaussians, head: HeadConfig | None) -> TrainingState:
         params = {name: value.detach().clone() for name, value in gaussians.items() if name != FEATURES}
         networks = torch.nn.ModuleDict()
-        if self._head_config is not None:
+        if head is not None:
             generator = torch.Generator().manual_seed(self._seed)
-            width = self._head_config.num_features
-            params[FEATURES] = initial_features(params["features_dc"], width, generator)
+            params[FEATURES] = initial_features(params["features_dc"], head.num_features, generator)
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(self._seed)
-                networks["head"] = CompensationHead(self._head_config).to(params["means"].device)
-        trained = {name: Parameter(value) for name, value in params.items()}
+                networks["head"] = CompensationHead(head).to(params["means"].device)
+        trained = torch.nn.ParameterDict({name: Parameter(value) for name, value in params.items()})
+        self._modules = torch.nn.ModuleDict({"gaussians": trained, "networks": networks})
         optimizers: dict[str, torch.optim.Optimizer] = {
             name: fused_adam([{"params": [value], "lr": RATES[name]}], eps=1e-15) for name, value in trained.items()
         }
-        if self._head_config is not None:
+        if head is not None:
             groups = network_groups(networks["head"].parameters(), 1e-3, weight_decay=0.15)
             optimizers["compensation"] = fused_adam(groups, eps=1e-8, betas=NETWORK_BETAS, decoupled_weight_decay=True)
-        state = TrainingState(Gaussians(trained, gaussians.encoding), networks, optimizers, pruning={"num_prunes": 1})
         focals = [camera.focal for camera in self.cameras]
-        state.trained_focal = (min(focals), max(focals))
-        return state
+        return TrainingState(
+            Gaussians(cast(Any, trained), gaussians.encoding),
+            networks,
+            optimizers,
+            pruning={"num_prunes": 1},
+            trained_focal=(min(focals), max(focals)),
+        )
 
     def train(self, after_step: Callable[[int, int], bool]) -> bool:
         """Decide on the head, if that is due, and train the steps that are left.
@@ -161,12 +146,13 @@ class Distillation:
         Raises:
             MemoryExhaustedError: the GPU's memory is full.
         """
-        trial = max(round(TRIAL * self.steps), 1) if self._head_config is not None and self.gain is None else 0
+        # Each of both trials, without and with a head, takes a tenth of the steps.
+        trial = max(round(0.1 * self.steps), 1) if self.state.head is not None and self.gain is None else 0
         total = self.steps + 2 * trial
 
         def on_step(done: int) -> bool:
             self.step = done
-            if self.steps - done < AVERAGED * self.steps and done % AVERAGED_EVERY == 0:
+            if self.steps - done < 0.1 * self.steps and done % AVERAGED_EVERY == 0:
                 self._mean.count_in(weights_of(self.state))
             return after_step(2 * trial + done, total) or done == self.steps
 
@@ -191,8 +177,8 @@ class Distillation:
 
     def _try_head(self, steps: int, on_step: Callable[[int], bool]) -> bool:
         """Train without and with the head from the same start, and keep the head if it pays; False if interrupted."""
-        assert self._head_config is not None
-        state, quality = self.state, []
+        state, quality = self.state, list[float]()
+        assert state.head is not None
         start = state.snapshot(head=True)
         for trial, starts_at in enumerate((math.inf, -math.inf)):
             state.head_starts_at = starts_at
@@ -206,14 +192,10 @@ class Distillation:
             state.restore(start)
         self.gain = quality[1] - quality[0]
         plain = {name: value for name, value in state.gaussians.items() if name != FEATURES}
-        ratio = stored_bytes(state.gaussians, self._head_config) / stored_bytes(plain, None)
+        ratio = stored_bytes(state.gaussians, state.head.config) / stored_bytes(plain, None)
         if not self.gain >= least_gain(math.log2(ratio)):
-            self._remove_head()
+            state.remove_head()
         return True
-
-    def _remove_head(self) -> None:
-        self.state.remove_head()
-        self._head_config = None
 
     def _train_step(self, i: int) -> None:
         state = self.state
@@ -239,11 +221,11 @@ class Distillation:
             optimizer.zero_grad()
 
     def _camera(self, i: int) -> Camera:
-        """A camera near one of those to begin from."""
+        """A camera near a given one: 5% of its distance from the middle of all away, and turned by 0.1 radians."""
         generator = torch.Generator().manual_seed((self._seed + 1) * 1_000_003 + i)
         camera = self.cameras[int(torch.randint(len(self.cameras), (1,), generator=generator))]
-        shift = SHIFT * torch.randn(3, generator=generator) * float(camera.viewmat[:3, 3].norm())
-        x, y, z = (TURN * torch.randn(3, generator=generator) / 3).tolist()
+        shift = 0.05 * torch.randn(3, generator=generator) * float(camera.viewmat[:3, 3].norm())
+        x, y, z = (0.1 * torch.randn(3, generator=generator) / 3).tolist()
         turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
         viewmat = camera.viewmat.clone()
         viewmat[:3] = turn.to(viewmat) @ viewmat[:3]
@@ -265,7 +247,7 @@ class Distillation:
         )
 
     def quality(self) -> float:
-        """PSNR of the held-out views against the full field's images, dB."""
+        """PSNR of the held-out views against the full scene's images, dB."""
         return measure(self.scene(), self._teacher, self.held_out).psnr
 
     def result(self) -> Scene:
@@ -274,21 +256,19 @@ class Distillation:
 
     def save(self, path: Path) -> None:
         """Write what a resumed training needs, atomically."""
-        state = self.state
         content = {
             "options": self._options(),
             "step": self.step,
             "gain": self.gain,
-            "head": None if state.head is None else dict(state.head.state_dict()),
-            "field": {name: value.detach() for name, value in state.gaussians.items()},
-            "optimizers": {name: optimizer.state_dict() for name, optimizer in state.optimizers.items()},
+            "model": self._modules.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.state.optimizers.items()},
             "mean": self._mean.state_dict(),
         }
         with replacing(path) as partial:
             torch.save(content, partial)
 
     def load(self, path: Path) -> None:
-        """Go on from a file of :meth:`save`.
+        """Continue from a file of :meth:`save`.
 
         Raises:
             CheckpointError: it is damaged, or was written with other options or for another scene.
@@ -300,14 +280,9 @@ class Distillation:
             if saved["options"] != self._options():
                 raise ValueError("other options")
             self.step, self.gain = int(saved["step"]), saved["gain"]
-            if saved["head"] is None:
-                self._remove_head()
-            elif state.head is not None:
-                state.head.load_state_dict(saved["head"])
-            for name, value in state.gaussians.items():
-                if value.shape != saved["field"][name].shape:
-                    raise ValueError("another scene")
-                value.data.copy_(saved["field"][name])
+            if not any(name.startswith("networks.") for name in saved["model"]):
+                state.remove_head()
+            self._modules.load_state_dict(saved["model"])
             for name, optimizer in state.optimizers.items():
                 optimizer.load_state_dict(saved["optimizers"][name])
             self._mean = RunningMean.of(saved["mean"], state.device)
@@ -318,7 +293,7 @@ class Distillation:
         if state.head is not None:
             state.head_starts_at = -math.inf
 
-    def _options(self) -> Mapping[str, Any]:
+    def _options(self) -> dict[str, Any]:
         """What a resumed training must share."""
         counts = [self._teacher.num_gaussians, self.state.gaussians.num_gaussians, len(self.cameras)]
         return {"steps": self.steps, "seed": self._seed, "counts": counts}
@@ -345,7 +320,7 @@ def distill(
         steps: number of training steps, by default 8,000 on a GPU, 3,000 on a CPU; the trials of the head come before
             them.
         seed: of all random draws.
-        head: whether to add a compensation head if held-out views show that it pays.
+        head: whether to add a compensation head if the held-out views show that it pays.
         size: sides of the images of virtual cameras, pixels; by default 512 on a GPU, 128 on a CPU.
 
     Returns:

@@ -8,14 +8,13 @@ straight-through estimator of Bengio, Leonard and Courville, 2013). So losses an
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.optim import Optimizer
 
 from sundae_ns.core.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.cuda.kernels import naming_full_memory
@@ -58,19 +57,19 @@ def finetune(
     data: Path | None = None,
     progress: Callable[[Tensor], object] | None = None,
 ) -> tuple[PackedScene, Codecs]:
-    """Train the field and head of a run with the rounding of its pack in the loop. The run is only read.
+    """Train the Gaussians and head of a run with the rounding of its pack in the loop. The run is only read.
 
     Args:
         run: folder of a run of sundae or splatfacto, or its ``config.yml``.
-        scene: the same run, from ``api.packing.contents_of``.
+        scene: the same run, from ``scene.packing.contents_of``.
         config: bits of the pack.
         steps: number of steps, at least 1.
-        rate: added to the loss for each bit per stored number, of the field and of the head.
+        rate: added to the loss for each bit per stored number.
         data: the capture, if it has moved.
         progress: called after each step with its loss ``[]``, which the next step overwrites.
 
     Returns:
-        The trained scene, and its codecs for ``storage.pack.write_fitted``.
+        The trained scene, and its codecs for ``write_fitted``.
 
     Raises:
         ConfigError: an option cannot work.
@@ -94,98 +93,66 @@ def finetune(
         value.requires_grad_(name in codecs.gaussians)
     codecs = codecs.to(model.device)
     pipeline.train()
-    weights = dict(model.head.named_parameters()) if model.head is not None and scene.head else {}
-    gaussians = Through.of({name: model.gauss_params[name] for name in codecs.gaussians}, codecs.rounded)
-    head = Through.of(weights, codecs.rounded_head)
-    numbers = sum(value.numel() for value in (*gaussians.exact.values(), *head.exact.values()))
-    optimizer = _optimizer(gaussians.exact, head.exact)
-    tuned = TunedStep(model, codecs, (gaussians, head), optimizer, rate / numbers)
+    training = RoundedTraining(model, codecs, rate, head=bool(scene.head))
 
     def step(i: int) -> None:
         at = opened.steps + i
-        if weights:
-            model.step = at  # chooses the window of a large image
+        if training.head:
+            model.step = at  # chooses the crop of a large image
         camera, batch = pipeline.datamanager.next_train(at)
-        result = tuned(model.step_inputs(camera, batch), model.render_settings(training=True))
+        result = training.step(model.step_inputs(camera, batch), model.render_settings(training=True))
         if progress is not None:
             progress(result.loss)
 
     generators = [torch.cuda.current_device()] if model.device.type == "cuda" else []
     with naming_full_memory(lambda: model.num_points), torch.random.fork_rng(generators):
         torch.manual_seed(opened.seed or 0)  # of random backgrounds
-        optimise(step, {"pack": optimizer}, steps, lambda _, i: rate_factor(i, steps))
+        optimise(step, {"pack": training.optimizer}, steps, lambda _, i: rate_factor(i, steps))
     source = {**scene.meta.get("source", {}), "finetuned": steps}
+    exact = {name: value.detach().cpu() for name, value in training.exact.items()}
     trained = replace(
         scene,
-        gaussians={name: gaussians.exact.get(name, value).detach().cpu() for name, value in scene.gaussians.items()},
-        head={name: value.detach().cpu() for name, value in head.exact.items()},
+        gaussians={name: exact.get(name, value.detach().cpu()) for name, value in scene.gaussians.items()},
+        head={name: exact[name] for name in training.head},
         meta={**scene.meta, "source": source},
     )
     return trained, codecs.to(torch.device("cpu"))
 
 
-def _optimizer(gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Optimizer:
-    groups: list[dict[str, Any]] = [
-        {"params": [value], "lr": RATES[name], "eps": 1e-15} for name, value in gaussians.items()
-    ]
-    if head:
-        groups.append({"params": list(head.values()), "lr": RATES["head"], "eps": 1e-8, "betas": NETWORK_BETAS})
-    on_cuda = next(iter(gaussians.values())).is_cuda
-    if on_cuda:
-        for group in groups:
-            group["lr"] = torch.tensor(group["lr"], device=group["params"][0].device)
-    return torch.optim.Adam(groups, fused=on_cuda, capturable=on_cuda)
+class RoundedTraining:
+    """Adam on exact values, by gradients at the rounded values that the parameters of a model hold.
 
+    Args:
+        model: with the scene of the codecs.
+        codecs: on the device of the model.
+        rate: see :func:`finetune`.
+        head: whether the pack has a head.
+    """
 
-class Through(NamedTuple):
-    """Parameters of the model, which hold rounded values, and the exact values that are trained."""
-
-    shown: Mapping[str, Tensor]
-    exact: dict[str, Tensor]
-    rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
-
-    @classmethod
-    def of(
-        cls, shown: Mapping[str, Tensor], rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
-    ) -> Through:
-        """Start with the values of the parameters."""
-        return cls(shown, {name: value.detach().clone().requires_grad_() for name, value in shown.items()}, rounded)
-
-    @torch.no_grad()
-    def show(self) -> None:
-        """Round into the parameters in place, because recorded graphs read them there."""
-        rounded = self.rounded(self.exact)
-        for name, value in self.shown.items():
-            value.copy_(rounded[name])
-
-    @torch.no_grad()
-    def set_gradients(self, at_rounded: Mapping[str, Tensor | None], of_rate: Mapping[str, Tensor | None]) -> None:
-        """Set the gradients of the exact values: those at the rounded ones and those of the rate."""
-        for name, value in self.exact.items():
-            gradient, second = at_rounded.get(name), of_rate.get(name)
-            if gradient is not None and name == "quats":
-                # Rounding may have negated a quaternion, which is the same rotation.
-                gradient = gradient * (value * self.shown[name]).sum(dim=1, keepdim=True).sign()
-            if second is not None:
-                gradient = second if gradient is None else gradient + second
-            if gradient is not None and name == "features_rest":
-                # Keep view-independent colours so: their coefficients cost next to nothing in the pack.
-                gradient = gradient.masked_fill((value == 0).flatten(1).all(dim=1)[:, None, None], 0.0)
-            value.grad = gradient
-
-
-class TunedStep:
-    """Steps of a fine-tune of the parts of a model, by an optimizer of their exact values; ``rate`` is for each bit."""
-
-    def __init__(
-        self, model: SundaeModel, codecs: Codecs, parts: tuple[Through, Through], optimizer: Optimizer, rate: float
-    ) -> None:
-        self._model, self._codecs, self._parts = model, codecs, parts
-        self._optimizer, self._rate = optimizer, rate
-        self._can_record = model.device.type == "cuda" and model.backend.name == "gsplat"
+    def __init__(self, model: SundaeModel, codecs: Codecs, rate: float, *, head: bool) -> None:
+        self._model, self._codecs = model, codecs
+        self.head = dict(model.head.named_parameters()) if head and model.head is not None else {}
+        """Weights of the head by name; empty without one."""
+        self.rounded = {name: model.gauss_params[name] for name in codecs.gaussians} | self.head
+        """Parameters of the model by name."""
+        self.exact = {name: value.detach().clone().requires_grad_() for name, value in self.rounded.items()}
+        """The values that are trained, by the same names."""
+        self._rate = rate / sum(value.numel() for value in self.exact.values())
+        groups: list[dict[str, Any]] = [
+            {"params": [self.exact[name]], "lr": RATES[name], "eps": 1e-15} for name in codecs.gaussians
+        ]
+        if self.head:
+            weights = [self.exact[name] for name in self.head]
+            groups.append({"params": weights, "lr": RATES["head"], "eps": 1e-8, "betas": NETWORK_BETAS})
+        on_cuda = model.device.type == "cuda"
+        if on_cuda:
+            for group in groups:
+                group["lr"] = torch.tensor(group["lr"], device=model.device)
+        self.optimizer: Any = torch.optim.Adam(groups, fused=on_cuda, capturable=on_cuda)
+        self._can_record = on_cuda and model.backend.name == "gsplat"
         self._recordings = StepRecordings()
 
-    def __call__(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+    def step(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train on one image; ``torch.cuda.OutOfMemoryError`` if the GPU's memory is full."""
         if self._can_record:
             kind = (inputs.camera.width, inputs.camera.height, inputs.mask is not None)
@@ -198,29 +165,43 @@ class TunedStep:
 
     def _run(self, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None) -> StepResult:
         """One step; all of its work is recorded."""
-        for part in self._parts:
-            part.show()
+        self._round()
         loss, _, result = self._model.training_step(inputs, settings)
-        self._set_gradients(loss)
-        # torch's Adam reads this name: it changes nothing where it is 1.
-        self._optimizer.found_inf = self._recordings.overflow(capacity)  # type: ignore[attr-defined]
-        self._optimizer.step()
-        return result
-
-    def _set_gradients(self, loss: Tensor) -> None:
-        gaussians, head = self._parts
-        at_rounded = _gradients(loss, [part.shown for part in self._parts])
-        of_rate: list[dict[str, Tensor | None]] = [{}, {}]
+        gradients = torch.autograd.grad(loss, list(self.rounded.values()), allow_unused=True)
+        of_rate: tuple[Tensor | None, ...] = (None,) * len(self.exact)
         if self._rate > 0:
             with torch.enable_grad():
-                bits = estimated_bits(self._codecs, gaussians.exact, head.exact)
+                gaussians, head = (
+                    {name: self.exact[name] for name in names} for names in (self._codecs.gaussians, self.head)
+                )
+                bits = estimated_bits(self._codecs, gaussians, head)
                 total = self._rate * torch.stack(list(bits.values())).sum()
-            of_rate = _gradients(total, [part.exact for part in self._parts])
-        for part, gradients, others in zip(self._parts, at_rounded, of_rate, strict=True):
-            part.set_gradients(gradients, others)
+            of_rate = torch.autograd.grad(total, list(self.exact.values()), allow_unused=True)
+        for name, gradient, second in zip(self.exact, gradients, of_rate, strict=True):
+            self.set_gradient(name, gradient, second)
+        # torch's Adam reads this name: it changes nothing where it is 1.
+        self.optimizer.found_inf = self._recordings.overflow(capacity)
+        self.optimizer.step()
+        return result
 
+    @torch.no_grad()
+    def _round(self) -> None:
+        """Round into the parameters in place, because recorded graphs read them there."""
+        gaussians = self._codecs.rounded({name: self.exact[name] for name in self._codecs.gaussians})
+        head = self._codecs.rounded_head({name: self.exact[name] for name in self.head})
+        for name, value in {**gaussians, **head}.items():
+            self.rounded[name].copy_(value)
 
-def _gradients(loss: Tensor, groups: list[Mapping[str, Tensor]]) -> list[dict[str, Tensor | None]]:
-    """Gradients of a loss by the values of each group; None where it does not depend on them."""
-    found = iter(torch.autograd.grad(loss, [value for group in groups for value in group.values()], allow_unused=True))
-    return [{name: next(found) for name in group} for group in groups]
+    @torch.no_grad()
+    def set_gradient(self, name: str, gradient: Tensor | None, of_rate: Tensor | None) -> None:
+        """Set the gradient of an exact value: that at the rounded one and that of the rate."""
+        value = self.exact[name]
+        if gradient is not None and name == "quats":
+            # Rounding may have negated a quaternion, which is the same rotation.
+            gradient = gradient * (value * self.rounded[name]).sum(dim=1, keepdim=True).sign()
+        if of_rate is not None:
+            gradient = of_rate if gradient is None else gradient + of_rate
+        if gradient is not None and name == "features_rest":
+            # Keep view-independent colours so: their coefficients cost next to nothing in the pack.
+            gradient = gradient.masked_fill((value == 0).flatten(1).all(dim=1)[:, None, None], 0.0)
+        value.grad = gradient

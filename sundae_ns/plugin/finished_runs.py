@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
@@ -39,6 +39,7 @@ from sundae_ns.io.run_folder import prunes_of
 from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.plugin.dataparsers import check_capture
 from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
+from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.cameras import is_number, unit
 from sundae_ns.scene.load_save import load, scene_of_checkpoint
 from sundae_ns.scene.packing import refusal
@@ -61,31 +62,22 @@ passes paths of images to ffmpeg through one."""
 class Opened:
     """A finished scene as a model, and the facts in its files; None for what a packed scene does not state."""
 
-    model: SundaeModel
-    """In evaluation mode, on the GPU if there is one."""
-    cameras: list[Cameras]
-    """Test cameras, each of shape ``(1,)``, on the model's device."""
-    truths: list[Tensor]
-    """True images ``[H, W, 3]`` in [0, 1], over the model's background, on the model's device."""
-    datamanager: SundaeDatamanager
-    """The capture's views, training views too."""
-    source: Path
-    """The run's folder, or the packed scene."""
-    capture: Path
-    """The photographs: a folder, or its ``transforms.json``."""
+    model: SundaeModel  # In evaluation mode, on the GPU if there is one
+    datamanager: SundaeDatamanager  # The capture's views, training views too
+    source: Path  # The run's folder, or the packed scene
+    capture: Path  # The photographs: a folder, or its transforms.json
     method: str
     variant: str
-    steps: int
-    """Number of training steps."""
-    kept: float | None = None
-    """Share of the Gaussians that the prunes kept: the product over all prunes."""
+    steps: int  # Number of training steps
+    kept: float | None = None  # Ratio of Gaussians after all prunes to those before
     seed: int | None = None
-    prune_s: float | None = None
-    """Seconds of its prunes."""
-    packed_bytes: int | None = None
-    """Size of the packed file; None for a run."""
-    pipeline: Any = None
-    """nerfstudio's pipeline of a run."""
+    prune_s: float | None = None  # Seconds of its prunes
+    packed_bytes: int | None = None  # Size of the packed file; None for a run
+    pipeline: Any = None  # nerfstudio's pipeline of a run
+    cameras: list[Cameras] = field(default_factory=list)
+    """Test cameras, each of shape ``(1,)``, on the model's device."""
+    truths: list[Tensor] = field(default_factory=list)
+    """True images ``[H, W, 3]`` in [0, 1], over the model's background, on the model's device."""
 
     @property
     def scene(self) -> str:
@@ -96,7 +88,7 @@ class Opened:
 def load_model(path: Path, data: Path | None = None, *, split: Literal["test", "val"] = "test") -> Opened:
     """Open a finished scene as a model, with its test views. No code in its files runs, and they are only read.
 
-    A field of splatfacto becomes a model of ours without a head: one code path renders and times all methods.
+    A run of splatfacto becomes a model of ours without a head: one code path renders and times all methods.
 
     Args:
         path: folder of a run of sundae or splatfacto, its ``config.yml``, or a packed scene.
@@ -128,23 +120,17 @@ def load_model(path: Path, data: Path | None = None, *, split: Literal["test", "
     return opened
 
 
-def _device() -> torch.device:
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
 def _open_packed(path: Path, data: Path | None) -> Opened:
     if data is None:
         raise DataError(f"{path} is a packed scene, which does not name its capture; give the capture with --data")
     scene = load(path)
-    model = model_of(scene).to(_device())
+    model = model_of(scene).to(fastest_device())
     manager = datamanager_of(scene, data).setup(device=model.device, test_mode="test", world_size=1, local_rank=0)
-    stated = scene.meta.get("source")
-    source = stated if isinstance(stated, dict) else {}
+    source = scene.meta.get("source")
+    source = source if isinstance(source, dict) else {}
     step = source.get("step")
     return Opened(
         model,
-        [],
-        [],
         manager,
         source=path,
         capture=data,
@@ -156,9 +142,10 @@ def _open_packed(path: Path, data: Path | None) -> Opened:
 
 
 def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> Opened:
-    config, stock = _config_of(path)
+    config = _config_of(path)
     newest, loaded = checkpoint.read_newest(path.parent / config.relative_model_dir)
     manager = config.pipeline.datamanager = _datamanager_config(config.pipeline.datamanager)
+    stock = config.pipeline.model
     foreign = not isinstance(stock, SundaeModelConfig)
     if foreign:
         # The grid corrects training images only; test views are rendered without it.
@@ -171,7 +158,7 @@ def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> O
     if not capture.exists():
         raise DataError(f"the capture {capture} is missing; give its folder with --data")
     manager.data = capture
-    pipeline: Any = config.pipeline.setup(device=_device(), test_mode=split)
+    pipeline: Any = config.pipeline.setup(device=fastest_device(), test_mode=split)
     model, step = cast(SundaeModel, pipeline.model), int(loaded["step"])
     if foreign:
         put_scene(model, scene_of_checkpoint(newest, loaded, path))
@@ -180,31 +167,29 @@ def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> O
         pipeline.load_pipeline(loaded["pipeline"], step)
     if split == "test":
         pipeline.eval()
-    prunes, unpruned = prunes_of(path.parent), model.config.pruning.mode == "off"
+    kept, seconds = (1.0, 0.0) if model.config.pruning.mode == "off" else kept_and_seconds(prunes_of(path.parent))
     return Opened(
         model,
-        [],
-        [],
         pipeline.datamanager,
         source=path.parent,
         capture=capture,
         method=config.method_name or "",
         variant=config.experiment_name or "",
         steps=step + 1,
-        kept=1.0 if unpruned else _kept(prunes),
+        kept=kept,
         seed=config.machine.seed,
-        prune_s=0.0 if unpruned else _seconds(prunes),
+        prune_s=seconds,
         pipeline=pipeline,
     )
 
 
-def _config_of(path: Path) -> tuple[TrainerConfig, SplatfactoModelConfig]:
-    """Configuration of a run of sundae or splatfacto and of its model, from its ``config.yml``, which is not run."""
+def _config_of(path: Path) -> TrainerConfig:
+    """Configuration of a run of sundae or splatfacto, from its ``config.yml``, which is not run."""
     config = load_config(path)
     model = getattr(getattr(config, "pipeline", None), "model", None)
     if not isinstance(config, TrainerConfig) or not isinstance(model, SplatfactoModelConfig):
         raise CheckpointError(f"{path} is of a method without Gaussians; give a run of sundae or splatfacto")
-    return config, model
+    return config
 
 
 def _datamanager_config(stock: DataManagerConfig) -> SundaeDatamanagerConfig:
@@ -215,24 +200,20 @@ def _datamanager_config(stock: DataManagerConfig) -> SundaeDatamanagerConfig:
     return SundaeDatamanagerConfig(**{**shared, "train_cameras_sampling_strategy": "random"})
 
 
+def kept_and_seconds(prunes: list[dict[str, Any]]) -> tuple[float | None, float | None]:
+    """Ratio of Gaussians that all prunes kept, and their seconds; None where the record is not whole."""
+    kept: float | None = None
+    seconds: float | None = None
+    if prunes:
+        with suppress(KeyError, TypeError, ZeroDivisionError):
+            kept = math.prod(prune["after"] / prune["before"] for prune in prunes)
+        with suppress(KeyError, TypeError, ValueError):
+            seconds = sum(float(prune["seconds"]) for prune in prunes)
+    return kept, seconds
+
+
 def _shared(config: Any, kind: type[Any]) -> dict[str, Any]:
     return {known.name: getattr(config, known.name) for known in fields(kind) if known.init and known.name != "_target"}
-
-
-def _kept(prunes: list[dict[str, Any]]) -> float | None:
-    """Share of the Gaussians that these prunes kept; None without a whole record."""
-    try:
-        return math.prod(prune["after"] / prune["before"] for prune in prunes) if prunes else None
-    except (KeyError, TypeError, ZeroDivisionError):
-        return None
-
-
-def _seconds(prunes: list[dict[str, Any]]) -> float | None:
-    """Seconds of these prunes; None without a whole record."""
-    try:
-        return sum(float(prune["seconds"]) for prune in prunes) if prunes else None
-    except (KeyError, TypeError, ValueError):
-        return None
 
 
 def model_of(scene: Scene) -> SundaeModel:
@@ -257,7 +238,7 @@ def model_of(scene: Scene) -> SundaeModel:
 
 
 def put_scene(model: SundaeModel, scene: Scene) -> None:
-    """Put a scene in place of a model's field and head; the model has its SH degree or more, and a head of its kind."""
+    """Load a scene into a model in place; the model has its SH degree or more, and a head of its kind."""
     place(model, scene.gaussians)
     if model.head is not None and scene.head is not None:
         model.head.load_state_dict(scene.head.state_dict())
@@ -265,7 +246,7 @@ def put_scene(model: SundaeModel, scene: Scene) -> None:
 
 
 def place(model: SundaeModel, gaussians: Mapping[str, Tensor]) -> None:
-    """Load a field into a model in place; parameters and coefficients that the field lacks become 0."""
+    """Load Gaussians into a model in place; parameters and coefficients that they lack become 0."""
     for name, value in model.gauss_params.items():
         new = value.data.new_zeros(len(gaussians["means"]), *value.shape[1:])
         if name in gaussians:
@@ -287,8 +268,7 @@ def load_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> 
     """
     check_run(run)
     path = config_of(run)
-    config, _ = _config_of(path)
-    scene = load(path)
+    config, scene = _config_of(path), load(path)
     manager = _datamanager_config(copy.deepcopy(config.pipeline.datamanager))
     manager.data = data or manager.data or config.data
     source = {"method": config.method_name, **scene.meta["source"]}
@@ -332,9 +312,7 @@ def describe_capture(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
 def _parser_options(kind: type[DataParserConfig]) -> dict[str, Any]:
     """Options of a parser that a finished run needs, with their defaults."""
     left_out = {"_target", "data", "masks_path", "depths_path", "mask_color", "load_3D_points", "ply_path"}
-    return {
-        gaussians.name: getattr(kind(), gaussians.name) for gaussians in fields(kind) if gaussians.name not in left_out
-    }
+    return {option.name: getattr(kind(), option.name) for option in fields(kind) if option.name not in left_out}
 
 
 def datamanager_of(scene: Scene, data: Path) -> SundaeDatamanagerConfig:
@@ -358,11 +336,10 @@ def datamanager_of(scene: Scene, data: Path) -> SundaeDatamanagerConfig:
 
 def stated_capture(stated: Any) -> tuple[DataParserConfig, float]:
     """Counterpart of :func:`describe_capture`: the parser, and the scale of its images."""
-    kind = stated.get("parser") if isinstance(stated, dict) else None
-    options = stated.get("options") if isinstance(stated, dict) else None
+    stated = stated if isinstance(stated, dict) else {}
+    kind, options, scale = (stated.get(name) for name in ("parser", "options", "scale"))
     if kind not in _PARSERS or not isinstance(options, dict):
         raise PackError("the packed scene does not say how its capture is read; measure the run that was packed")
-    scale = stated.get("scale")
     if not is_number(scale) or not 0 < scale <= 1:
         raise refusal("an impossible scale of its images")
     parser: Any = _PARSERS[kind]()

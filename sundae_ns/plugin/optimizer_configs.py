@@ -19,6 +19,8 @@ from sundae_ns.train.schedules import FULL_RATE_INPUTS, NETWORK_BETAS, Decay, De
 
 show_log()  # all commands that train or open a run load these classes
 
+RATES = {"means": 1.6e-4, "features_dc": 0.0025, "features_rest": 0.0025 / 20, "opacities": 0.05, "scales": 0.005}
+RATES |= {"quats": 0.001, "features": 0.0025}  # Learning rates by parameter, splatfacto's
 METRICS_EVENT = "Train Metrics Dict"  # Event of nerfstudio's trainer with the metrics of a training image
 LINE_EVERY = 10.0  # Seconds between two lines
 

@@ -203,5 +203,5 @@ class Placing:
             return outputs
         transform = outputs.dataparser_transform.double()
         transform[:, 3] -= self.transform[:, :3].double() @ torch.from_numpy(self.offset)
-        known = {gaussians.name: getattr(outputs, gaussians.name) for gaussians in fields(outputs)}
+        known = {entry.name: getattr(outputs, entry.name) for entry in fields(outputs)}
         return _FarOutputs(**{**known, "dataparser_transform": transform})

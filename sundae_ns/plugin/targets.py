@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -64,7 +65,7 @@ def scaled(config: PackConfig, power: float, *, with_positions: bool = True) -> 
     return replace(config, **steps)  # type: ignore[arg-type]
 
 
-class Try(NamedTuple):
+class Candidate(NamedTuple):
     """One pack of the search."""
 
     scene: PackedScene
@@ -86,11 +87,11 @@ class Search:
         self.scene, self._fit, self._judge = scene, fit, judge
 
     @cached_property
-    def default(self) -> Try:
+    def default(self) -> Candidate:
         """The pack at the factor 1; of a fine-tuned scene, the one that was trained."""
         return self.at(0.0)
 
-    def at(self, power: float) -> Try:
+    def at(self, power: float) -> Candidate:
         """The pack at a factor of 2^power."""
         if isinstance(self._fit, PackConfig):
             scene, codecs = fit_scene(self.scene, scaled(self._fit, power))
@@ -99,38 +100,35 @@ class Search:
             if power:
                 config = scaled(codecs.config, power, with_positions=False)
                 codecs = codecs.with_steps(config, scene.gaussians, scene.head)
-        return Try(scene, codecs, len(pack_bytes(scene, codecs)[0]))
+        return Candidate(scene, codecs, len(pack_bytes(scene, codecs)[0]))
 
-    def drop(self, tried: Try) -> float:
+    def drop(self, candidate: Candidate) -> float:
         """PSNR of a pack below the run's on some test views, dB; infinite for images that are not finite."""
         judge = self._judge()
-        lost = judge.before.psnr - judge.quality(tried.scene, tried.codecs).psnr
-        return lost if math.isfinite(lost) else math.inf
+        drop = judge.before.psnr - judge.quality(candidate.scene, candidate.codecs).psnr
+        return drop if math.isfinite(drop) else math.inf
 
-    def smaller_than(self, limit: int) -> Try:
+    def smaller_than(self, limit: int) -> Candidate:
         """The finest pack of at most ``limit`` bytes; that at the factor 1 if it fits too and, by chance, loses less.
 
         Raises:
             PackError: even the coarsest is larger.
         """
-        least = self.at(COARSEST)
-        if least.bytes > limit:
-            try:
-                lost = f" and loses {self.drop(least):.2f} dB"
-            except SundaeError:  # sizes need no capture
-                lost = ""
+        coarsest = self.at(COARSEST)
+        if coarsest.bytes > limit:
+            drop = ""
+            with suppress(SundaeError):  # sizes need no capture
+                drop = f" and loses {self.drop(coarsest):.2f} dB"
             raise PackError(
-                f"the smallest pack has {least.bytes:,} bytes{lost}; give a larger --target-bytes, or prune the run"
+                f"the smallest pack has {coarsest.bytes:,} bytes{drop}; give a larger --target-bytes, or prune the run"
             )
-        finest = self._bisected(lambda tried: tried.bytes <= limit, least, COARSEST, FINEST)
-        try:
+        finest = self._bisected(lambda candidate: candidate.bytes <= limit, coarsest, COARSEST, FINEST)
+        with suppress(SundaeError):
             if self.default.bytes <= limit and self.drop(self.default) < self.drop(finest):
                 return self.default
-        except SundaeError:  # sizes need no capture
-            pass
         return finest
 
-    def better_than(self, limit: float) -> Try:
+    def better_than(self, limit: float) -> Candidate:
         """The coarsest pack that loses at most ``limit`` dB, no larger than that at the factor 1 if this one fits.
 
         Raises:
@@ -138,12 +136,12 @@ class Search:
             DataError: the capture is missing, or cannot be used.
         """
 
-        def fits(tried: Try) -> bool:
-            return self.drop(tried) <= limit
+        def fits(candidate: Candidate) -> bool:
+            return self.drop(candidate) <= limit
 
         if fits(self.default):
             coarsest = self._bisected(fits, self.default, 0.0, COARSEST)
-            return min(self.default, coarsest, key=lambda tried: tried.bytes)
+            return min(self.default, coarsest, key=lambda candidate: candidate.bytes)
         finest = self.at(FINEST)
         if fits(finest):
             return self._bisected(fits, finest, FINEST, 0.0)
@@ -151,41 +149,40 @@ class Search:
             f"the finest pack loses {self.drop(finest):.3f} dB at {finest.bytes:,} bytes; give a larger --target-drop"
         )
 
-    def _bisected(self, fits: Callable[[Try], bool], best: Try, first: float, last: float) -> Try:
+    def _bisected(self, fits: Callable[[Candidate], bool], best: Candidate, first: float, last: float) -> Candidate:
         """The fitting pack nearest to ``last``, from a fitting one at ``first``."""
         for _ in range(7):
             middle = (first + last) / 2
-            tried = self.at(middle)
-            if fits(tried):
-                first, best = middle, tried
+            candidate = self.at(middle)
+            if fits(candidate):
+                first, best = middle, candidate
             else:
                 last = middle
         return best
 
 
-def least_drop(searches: Sequence[Search], limit: int) -> Try:
-    """The pack of at most ``limit`` bytes that loses least, of searches of one run; without test views, the last's."""
-    found = _of_each(searches, lambda search: search.smaller_than(limit))
-    try:
-        return min(found, key=lambda pair: pair[0].drop(pair[1]))[1]
-    except SundaeError:  # sizes need no capture
-        return found[-1][1]
+def best_pack(searches: Sequence[Search], *, most_bytes: int | None = None, most_drop: float = 0.0) -> Candidate:
+    """The pack that loses least in at most ``most_bytes``, or else the smallest that loses at most ``most_drop`` dB.
 
+    Args:
+        searches: of one run, the preferred one last.
+        most_bytes: limit of the size; None for one of the quality.
+        most_drop: limit of the loss of PSNR on the test views.
 
-def fewest_bytes(searches: Sequence[Search], limit: float) -> Try:
-    """The smallest pack that loses at most ``limit`` dB on the test views, of searches of one run."""
-    found = _of_each(searches, lambda search: search.better_than(limit))
-    return min((tried for _, tried in found), key=lambda tried: tried.bytes)
-
-
-def _of_each(searches: Sequence[Search], look: Callable[[Search], Try]) -> list[tuple[Search, Try]]:
-    """The packs of the searches that find one; ``PackError`` of the last if none does."""
-    found, failure = [], None
-    for search in searches:
+    Raises:
+        PackError: no search meets the limit.
+    """
+    packs, failure = list[tuple[Search, Candidate]](), None
+    for search in searches if most_bytes is not None else reversed(searches):
         try:
-            found.append((search, look(search)))
+            pack = search.better_than(most_drop) if most_bytes is None else search.smaller_than(most_bytes)
+            packs.append((search, pack))
         except PackError as error:
             failure = error
-    if failure is not None and not found:
+    if failure is not None and not packs:
         raise failure
-    return found
+    if most_bytes is None:
+        return min((pack for _, pack in packs), key=lambda pack: pack.bytes)
+    with suppress(SundaeError):  # sizes need no capture
+        return min(packs, key=lambda pair: pair[0].drop(pair[1]))[1]
+    return packs[-1][1]

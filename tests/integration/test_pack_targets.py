@@ -19,7 +19,7 @@ from sundae_ns.io.pack.config import FINETUNED, PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes, read_scene
 from sundae_ns.io.pack.quantize import Transform
 from sundae_ns.plugin.finished_runs import load_run
-from sundae_ns.plugin.targets import COARSEST, Judge, Search, Try, fewest_bytes, least_drop, scaled
+from sundae_ns.plugin.targets import COARSEST, Candidate, Judge, Search, best_pack, scaled
 from sundae_ns.scene.packing import contents_of
 from sundae_ns.scene.scene import Quality
 
@@ -162,23 +162,28 @@ def test_a_fine_tune_that_does_not_help_is_left_out(tiny: Any, tuned: Tuned) -> 
     plain_default = plain.default.bytes
     assert tuned.bytes < plain_default
     good, bad = tuned.search(lambda _: 0.01), tuned.search(lambda _: 0.5)
-    found = fewest_bytes([plain, good], 0.02)
-    assert found.scene is tuned.scene
-    assert found.bytes <= tuned.bytes
-    assert fewest_bytes([bad, plain], 0.02).bytes <= plain_default
-    assert fewest_bytes([plain, bad], 0.02).scene is not tuned.scene
+    for searches in ([plain, good], [good, plain]):
+        found = best_pack(searches, most_drop=0.02)
+        assert found.scene is tuned.scene
+        assert found.bytes <= tuned.bytes
+        for limit in (tuned.bytes, plain_default):
+            assert best_pack(searches, most_bytes=limit).scene is tuned.scene
+    for searches in ([plain, bad], [bad, plain]):
+        found = best_pack(searches, most_drop=0.02)
+        assert found.scene is not tuned.scene
+        assert found.bytes <= plain_default
+        for limit in (tuned.bytes, plain_default):
+            found = best_pack(searches, most_bytes=limit)
+            assert found.bytes <= limit
+            assert found.scene is not tuned.scene
     with pytest.raises(PackError, match=r"the finest pack loses 0\.500 dB"):
-        fewest_bytes([plain, bad], 0.0001)
-    for limit in (tuned.bytes, plain_default):
-        assert least_drop([plain, good], limit).scene is tuned.scene
-        assert least_drop([plain, bad], limit).bytes <= limit
-        assert least_drop([plain, bad], limit).scene is not tuned.scene
+        best_pack([bad, plain], most_drop=0.0001)
 
 
 def test_coarser_steps_that_take_more_bytes_are_not_taken(tuned: Tuned) -> None:
     class Growing(Search):
-        def at(self, power: float) -> Try:
-            return Try(self.scene, tuned.codecs, round(100 + 10 * power))
+        def at(self, power: float) -> Candidate:
+            return Candidate(self.scene, tuned.codecs, round(100 + 10 * power))
 
     assert Growing(tuned.scene, tuned.codecs, lambda: Stated(lambda _: 0.0)).better_than(0.1).bytes == 100  # type: ignore[arg-type, return-value]
 

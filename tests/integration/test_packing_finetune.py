@@ -6,6 +6,7 @@ import copy
 import hashlib
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -23,8 +24,9 @@ from sundae_ns.io.pack.config import FINETUNED, PackConfig
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.io.pack.packed_scene import fit_scene, read_scene, write_fitted
 from sundae_ns.plugin import finetune as packing_finetune
-from sundae_ns.plugin.finetune import Through, TunedStep, finetune, rate_factor
+from sundae_ns.plugin.finetune import RoundedTraining, finetune
 from sundae_ns.plugin.finished_runs import load_model, load_run
+from sundae_ns.scene.optimise import rate_factor
 from sundae_ns.scene.packing import contents_of
 
 COARSE = PackConfig(
@@ -59,19 +61,19 @@ def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypat
     # Ten times the rates for a twentieth of the steps.
     monkeypatch.setattr(packing_finetune, "RATES", {name: 10 * rate for name, rate in packing_finetune.RATES.items()})
     seen: list[dict[str, Tensor]] = []
-    train = TunedStep.__call__
+    train = RoundedTraining.step
 
-    def watched(step: TunedStep, *arguments: Any) -> Any:
-        found = train(step, *arguments)
-        seen.append({name: value.detach().clone() for name, value in step._model.named_parameters()})
-        return found
+    def watched(training: RoundedTraining, *arguments: Any) -> Any:
+        result = train(training, *arguments)
+        seen.append({name: value.detach().clone() for name, value in training._model.named_parameters()})
+        return result
 
     before = digests(tiny.folder)
     scene = contents_of(load_run(tiny.folder))
     losses: list[Tensor] = []
-    monkeypatch.setattr(TunedStep, "__call__", watched)
-    trained, codecs = finetune(tiny.folder, scene, COARSE, 60, progress=losses.append)
-    monkeypatch.setattr(TunedStep, "__call__", train)
+    with monkeypatch.context() as patch:
+        patch.setattr(RoundedTraining, "step", watched)
+        trained, codecs = finetune(tiny.folder, scene, COARSE, 60, progress=losses.append)
     assert digests(tiny.folder) == before
     assert len(losses) == len(seen) == 60
     # Images are made of rounded values: rounding them again changes nothing.
@@ -207,9 +209,8 @@ def test_rates_rise_and_fall_to_nothing() -> None:
 
 def test_gradients_follow_a_quaternion_to_its_negative() -> None:
     exact = torch.nn.functional.normalize(torch.tensor([[-1.0, 0.2, 0.3, 0.1], [1.0, 0.2, 0.3, 0.1]]))
-    shown = exact * torch.tensor([[-1.0], [1.0]])
-    through = Through({"quats": shown}, {"quats": exact}, dict)
-    through.set_gradients({"quats": torch.ones(2, 4)}, {})
+    training: Any = SimpleNamespace(exact={"quats": exact}, rounded={"quats": exact * torch.tensor([[-1.0], [1.0]])})
+    RoundedTraining.set_gradient(training, "quats", torch.ones(2, 4), None)
     assert exact.grad is not None
     assert torch.equal(exact.grad, torch.tensor([[-1.0], [1.0]]).expand(2, 4))
 
@@ -218,22 +219,22 @@ def test_gradients_follow_a_quaternion_to_its_negative() -> None:
 def test_replayed_steps_train_the_same_scene(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """One training kernel by kernel, one by recordings: the same losses up to the order of sums."""
     scene = contents_of(load_run(tiny.folder))
-    steps: list[TunedStep] = []
-    train = TunedStep.__call__
+    steps: list[RoundedTraining] = []
+    train = RoundedTraining.step
 
-    def watched(step: TunedStep, *arguments: Any) -> Any:
-        steps.append(step)
-        return train(step, *arguments)
+    def watched(training: RoundedTraining, *arguments: Any) -> Any:
+        steps.append(training)
+        return train(training, *arguments)
 
     def losses() -> list[float]:
         found: list[float] = []
         finetune(tiny.folder, scene, COARSE, 30, progress=lambda loss: found.append(loss.item()))
         return found
 
-    monkeypatch.setattr(TunedStep, "__call__", watched)
+    monkeypatch.setattr(RoundedTraining, "step", watched)
     recorded = losses()
     assert len(steps) == 30
     assert steps[-1]._can_record
     assert steps[-1]._recordings._recordings
-    monkeypatch.setattr(TunedStep, "__call__", lambda step, *arguments: step._run(*arguments, None))
+    monkeypatch.setattr(RoundedTraining, "step", lambda training, *arguments: training._run(*arguments, None))
     assert recorded == pytest.approx(losses(), rel=0.05)

@@ -22,10 +22,9 @@ from sundae_ns.io import checkpoint
 from sundae_ns.io.pack.packed_scene import PackedScene
 from sundae_ns.plugin.datamanager import SundaeDatamanagerConfig
 from sundae_ns.plugin.finished_runs import (
-    _kept,
-    _seconds,
     datamanager_of,
     describe_capture,
+    kept_and_seconds,
     load_run,
     model_of,
     stated_capture,
@@ -177,38 +176,25 @@ def test_captures_that_are_not_described() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("parser", "name", "values"),
     [
-        ("images_path", "../../home"),
-        ("images_path", "/etc"),
-        ("images_path", "$(touch x)"),
-        ("images_path", "a;b"),
-        ("images_path", "a\n"),
-        ("images_path", 3),
-        ("eval_mode", "whatever"),
-        ("eval_mode", ["all"]),
-        ("downscale_factor", 0),
-        ("downscale_factor", True),
-        ("scale_factor", float("nan")),
-        ("scale_factor", "1"),
-        ("auto_scale_poses", 1),
-        ("eval_interval", 2.5),
-        ("_target", "os.system"),
-        ("data", "/etc"),
-        ("masks_path", None),
+        ("colmap", "images_path", ["../../home", "/etc", "$(touch x)", "a;b", "a\n", 3]),
+        ("colmap", "eval_mode", ["whatever", ["all"]]),
+        ("colmap", "downscale_factor", [0, True]),
+        ("colmap", "scale_factor", [float("nan"), "1"]),
+        ("colmap", "auto_scale_poses", [1]),
+        ("colmap", "eval_interval", [2.5]),
+        ("colmap", "_target", ["os.system"]),
+        ("colmap", "data", ["/etc"]),
+        ("colmap", "masks_path", [None]),
+        ("blender-data", "alpha_color", ["pink", ["white"]]),
+        ("blender-data", "ply_path", ["a.ply"]),
     ],
 )
-def test_impossible_options_of_a_capture(name: str, value: Any) -> None:
-    with pytest.raises(PackError, match="an impossible option"):
-        stated_capture({"parser": "colmap", "options": {name: value}, "scale": 1.0})
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("alpha_color", "pink"), ("alpha_color", ["white"]), ("ply_path", "a.ply")]
-)
-def test_impossible_options_of_a_capture_of_blender(name: str, value: Any) -> None:
-    with pytest.raises(PackError, match="an impossible option"):
-        stated_capture({"parser": "blender-data", "options": {name: value}, "scale": 1.0})
+def test_impossible_options_of_a_capture(parser: str, name: str, values: list[Any]) -> None:
+    for value in values:
+        with pytest.raises(PackError, match="an impossible option"):
+            stated_capture({"parser": parser, "options": {name: value}, "scale": 1.0})
 
 
 # ------------------------------------------------------------------------------------------------------- runs to pack
@@ -293,21 +279,16 @@ def test_runs_that_cannot_be_packed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("prunes", "kept"),
+    ("prunes", "figures"),
     [
-        ([{"before": 200, "after": 60}], 0.3),  # one-shot
-        ([{"before": 100, "after": 50}, {"before": 80, "after": 40}], 0.25),  # continuous: the field grows in between
-        ([], None),
-        ([{"before": 100, "after": 50}, {"after": 40}], None),
-        ([{"before": 0, "after": 0}], None),
-        ([{"before": "many", "after": 1}], None),
+        ([{"before": 200, "after": 60, "seconds": 1}], (0.3, 1)),  # one-shot
+        ([{"before": 100, "after": 50, "seconds": 1}, {"before": 80, "after": 40, "seconds": 0.5}], (0.25, 1.5)),
+        ([], (None, None)),
+        ([{"before": 100, "after": 50, "seconds": 1}, {"after": 40}], (None, None)),
+        ([{"before": 0, "after": 0, "seconds": 1}], (None, 1)),
+        ([{"before": "many", "after": 1, "seconds": "long"}], (None, None)),
     ],
 )
-def test_the_share_is_the_kept_over_all_prunes(prunes: list[dict[str, Any]], kept: float | None) -> None:
-    assert _kept(prunes) == (None if kept is None else pytest.approx(kept))
-
-
-def test_seconds_are_summed() -> None:
-    assert _seconds([{"seconds": 1}, {"seconds": 0.5}]) == 1.5
-    assert _seconds([{"seconds": 1}, {}]) is None
-    assert _seconds([]) is None
+def test_figures_are_those_of_all_prunes(prunes: list[dict[str, Any]], figures: tuple[float | None, ...]) -> None:
+    for value, expected in zip(kept_and_seconds(prunes), figures, strict=True):
+        assert value == (None if expected is None else pytest.approx(expected))
