@@ -31,7 +31,7 @@ def demo(
     """Write the embedded capture, train it with ns-train, evaluate it, and print the results.
 
     Args:
-        out: folder for the capture, the run and the images.
+        out: folder for the capture, the run, the packed scene and its page.
         steps: number of training steps; by default that of sundae-tiny.
     """
     check_folder(out, reads=[], overwrite=overwrite)

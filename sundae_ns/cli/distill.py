@@ -30,8 +30,8 @@ def distill(
 ) -> int:
     """Prune a scene of any program, and train the rest on the images of the full one; no photos are needed.
 
-    Each step has a virtual camera of its own, and the full field renders what it should see. A head is added if cameras
-    that no step sees show that it pays. Ctrl-C saves; the same command goes on.
+    Each step has a virtual camera of its own, and the full scene renders its target. A head is added if cameras that no
+    step sees show that it pays. Ctrl-C saves; the same command resumes.
 
     Args:
         out: file to write, in the format of its suffix: .sundae, or without a head .ply, .spz or .sog.
@@ -40,8 +40,8 @@ def distill(
         steps: number of training steps; by default 8,000 on a GPU, 3,000 on a CPU.
         head: whether a head may be added; without one the scene is complete in other viewers.
         seed: random seed.
-        cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, whose cameras the
-            steps begin from in place of virtual ones.
+        cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, whose cameras
+            replace virtual ones as the start of each step.
     """
     check_exclusive(keep=keep, count=count)
     if check_suffix(out, SUFFIXES) not in (".sundae", ".html") and head:
@@ -54,10 +54,12 @@ def distill(
     partial = out.with_name(f"{out.name}.partial")
     console = Console(stderr=True)
     given = None if cameras is None else chosen_cameras(scene, cameras, None) or virtual_cameras(scene, None, seed=seed)
-    made = Distillation(scene, keep=keep, count=count, cameras=given, steps=steps, seed=seed, head=head, progress=True)
+    training = Distillation(
+        scene, keep=keep, count=count, cameras=given, steps=steps, seed=seed, head=head, progress=True
+    )
     if partial.exists():
-        made.load(partial)
-        console.print(f"going on from step {made.step:,} of {made.steps:,}, with {partial}", highlight=False)
+        training.load(partial)
+        console.print(f"resuming after step {training.step:,} of {training.steps:,}, with {partial}", highlight=False)
     stopped: list[bool] = []
     columns = (TextColumn("Training"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Interruption(lambda: stopped.append(True)), Progress(*columns, console=console, transient=True) as progress:
@@ -67,23 +69,23 @@ def distill(
             progress.update(task, completed=done, total=total)
             return not stopped
 
-        whole = made.train(after_step)
-    if not whole:
-        if made.step == 0:
+        finished = training.train(after_step)
+    if not finished:
+        if training.step == 0:
             print("nothing is saved yet: the trial of the head had not ended", file=sys.stderr)
             return 130
         with writing(f"cannot write {partial}"):
-            made.save(partial)
-        print(f"saved step {made.step:,} of {made.steps:,} as {partial}; the same command goes on:", file=sys.stderr)
-        print(f"    {shlex.join(['sundae', *sys.argv[1:]])}", file=sys.stderr)
+            training.save(partial)
+        said = f"saved step {training.step:,} of {training.steps:,} as {partial}; the same command resumes:"
+        print(f"{said}\n    {shlex.join(['sundae', *sys.argv[1:]])}", file=sys.stderr)
         return 130
-    result = made.result()
+    result = training.result()
     save(result, out)
     partial.unlink(missing_ok=True)
     head_text = "with" if result.head else "without"
     print(f"{out}: {result.num_gaussians:,} of {scene.num_gaussians:,} Gaussians, {head_text} a head")
-    if made.gain is not None:
-        print(f"a head gained {made.gain:.2f} dB in its trial, on cameras that no step sees")
-    psnr = made.quality()
-    print(f"{psnr:.2f} dB against the full field on {len(made.held_out)} such cameras; {out.stat().st_size:,} bytes")
+    if training.gain is not None:
+        print(f"a head gained {training.gain:.2f} dB in its trial, on cameras that no step sees")
+    held_out = f"{len(training.held_out)} cameras that no step sees"
+    print(f"{training.quality():.2f} dB against the full scene on {held_out}; {out.stat().st_size:,} bytes")
     return 0

@@ -45,11 +45,6 @@ class Cleaning:
     def mask(self, scene: Scene, cameras: Sequence[Camera], *, progress: bool = True) -> Tensor:
         """True for Gaussians that stay, bool ``[N]``; prints their numbers to stderr.
 
-        Args:
-            scene: to clean.
-            cameras: cameras of the photographs; none if they are not known.
-            progress: show a progress bar on stderr.
-
         Raises:
             ConfigError: the box is empty.
             DataError: nothing is left.
@@ -69,7 +64,7 @@ class Cleaning:
         return mask
 
     def cleaned(self, scene: Scene, *, progress: bool = True) -> Scene:
-        """The scene without what :meth:`mask` cuts, by the views that are stored with it."""
+        """The scene without what :meth:`mask` cuts, by the cameras stored with it."""
         return kept(scene, self.mask(scene, scene.cameras, progress=progress)) if self.chosen else scene
 
 
@@ -87,13 +82,7 @@ def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
 
 
 def chosen_cameras(scene: Scene, cameras: Path | None, most: int | None) -> Sequence[Camera]:
-    """Cameras of a file or a run, else those stored with the scene; none if there are none.
-
-    Args:
-        scene: whose cameras are the default.
-        cameras: the file or the run.
-        most: largest number of cameras that are taken from a run.
-    """
+    """Cameras of a file, or at most ``most`` of a run; by default those stored with the scene, which may be none."""
     if cameras is None:
         return scene.cameras
     if kind_of(cameras) == "packed":
@@ -108,5 +97,5 @@ def chosen_cameras(scene: Scene, cameras: Path | None, most: int | None) -> Sequ
 
 
 def copies_rows(source: Path, out: Path) -> bool:
-    """Whether a .ply is written with the rows of another one, its properties and comments."""
+    """Whether a .ply keeps the rows, properties and comments of another one."""
     return kind_of(source) == "ply" and out.suffix.lower() == ".ply" and has_own_columns(source)

@@ -22,25 +22,20 @@ Scene = Annotated[
 ]
 """A scene that a command reads."""
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-"""The option ``--out`` or ``-o``: what a command writes."""
+"""What a command writes: ``--out`` or ``-o``."""
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 """An option without a ``--no-`` form."""
 Overwrite = Annotated[Flag, tyro.conf.arg(help="replace an earlier output, once the new one is complete.")]
-"""The option ``--overwrite`` of every command that writes."""
 Direction = tuple[float, float, float]
-"""The option ``--up``."""
 
 
 def check_file(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> None:
-    """Refuse an output file that exists, unless ``overwrite`` is set, and always one that the command reads.
+    """Raise ``StorageError`` for an output that is no file, that the command reads, or that exists.
 
     Args:
-        out: file to write; a missing folder of it is made when the file is written.
+        out: file to write.
         reads: files and folders that the command reads; None for an option that was not given.
         overwrite: whether a file that the command does not read may be replaced.
-
-    Raises:
-        StorageError: the file may not be written.
     """
     above = out.parent
     while not above.exists() and above != above.parent:
@@ -58,16 +53,7 @@ def check_file(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> N
 
 
 def check_folder(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> None:
-    """Refuse an output folder with files, unless ``overwrite`` is set, and always one that holds an input.
-
-    Args:
-        out: folder to write; files of other names in it stay.
-        reads: as in :func:`check_file`.
-        overwrite: whether files in it may be replaced.
-
-    Raises:
-        StorageError: the folder may not be written.
-    """
+    """Raise ``StorageError`` for an output that is a file, that holds an input, or, without ``overwrite``, files."""
     if not out.exists():
         return
     if not out.is_dir():
@@ -79,7 +65,7 @@ def check_folder(out: Path, *, reads: Iterable[Path | None], overwrite: bool) ->
 
 
 def _contains(outer: Path, inner: Path) -> bool:
-    """Whether a path is another one, or lies in that folder; links count as what they point to."""
+    """Whether a path is or holds another one; links count as what they point to."""
     return inner.resolve().is_relative_to(outer.resolve())
 
 

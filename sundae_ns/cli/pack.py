@@ -34,6 +34,8 @@ from sundae_ns.scene.packing import contents_of
 if TYPE_CHECKING:
     from sundae_ns.plugin.targets import Judge
 
+Pack = tuple[PackedScene, Codecs]
+
 
 def pack(
     run: Annotated[Path, tyro.conf.Positional],
@@ -87,14 +89,11 @@ def pack(
             raise ConfigError(f"{run} is a {PRIMITIVES[kind]} without photos; leave out {name}, or give a run")
     if kind is None:
         check_run(run)
-    judge, notes, tuned = _judge_of(run, data), list[str](), finetune > 0
-    packs: list[tuple[PackedScene, Codecs]] = []
-    # The bar writes to the real stdout while nerfstudio's messages are suppressed.
-    with (
-        Progress(console=Console(file=sys.stdout), transient=True, disable=json) as progress,
-        redirect_stdout(StringIO()),
-    ):
-        task = progress.add_task("Reading the run", total=3 + finetune)
+    judge, notes, tuned = cache(lambda: _judge(run, data)), list[str](), finetune > 0
+    packs: list[Pack] = []
+    bar = Progress(console=Console(file=sys.stdout), transient=True, disable=json)
+    with bar, redirect_stdout(StringIO()):  # suppresses nerfstudio's messages; the bar writes to the real stdout
+        task = bar.add_task("Reading the run", total=3 + finetune)
         if kind is None:
             from sundae_ns.plugin.finished_runs import load_run  # takes seconds
 
@@ -102,26 +101,26 @@ def pack(
         else:
             scene = load(run)
         source = contents_of(with_start(cleaning.cleaned(scene, progress=False), start_view, up))
-        progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
+        bar.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
         if finetune:
             from sundae_ns.plugin.finetune import finetune as tune
 
-            packs.append(tune(run, source, config, finetune, data=data, progress=lambda _: progress.advance(task)))
-        progress.update(task, description="Packing")
+            packs.append(tune(run, source, config, finetune, data=data, progress=lambda _: bar.advance(task)))
+        bar.update(task, description="Packing")
         if target_bytes is not None or target_drop is not None:
             from sundae_ns.plugin.targets import Search, best_pack
 
-            # Not what is fitted already without a fine-tune: its positions are rounded.
+            # Starts from the source, because positions of a fitted pack are rounded.
             searches = [Search(source, precision, judge), *(Search(*each, judge) for each in packs)]
-            found = best_pack(searches, most_bytes=target_bytes, most_drop=target_drop or 0.0)
-            if packs and found.scene is not packs[0][0]:
+            best = best_pack(searches, most_bytes=target_bytes, most_drop=target_drop or 0.0)
+            if packs and best.scene is not packs[0][0]:
                 notes.append("the fine-tune loses too much for the target; packed without it, try more steps")
                 finetune = 0
-            packs = [(found.scene, found.codecs)]  # both are compared already
+            packs = [(best.scene, best.codecs)]  # both are compared already
         else:
             packs.append(fit_scene(source, precision))
         report = write_fitted(out, *packs[0])
-        progress.update(task, advance=1, description="Measuring")
+        bar.update(task, advance=1, description="Measuring")
         quality, figures = "", dict[str, Any]()
         if kind is None and cleaning.crop is None:  # photos show what a box leaves out
             quality, figures = _measured(judge, packs, finetune, notes)
@@ -131,48 +130,41 @@ def pack(
         print(dumps({"file": str(out), **report.summary(), **figures}))
         return 0
     print(f"{out}: {report.primitives:,} Gaussians in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
-    print(f"{'':14}{'bytes':>12}{'bits per primitive':>20}")
-    for name, bits in report.bits.items():
+    print(f"{'':14}{'bytes':>12}{'bits per Gaussian':>20}")
+    for name, bits in {**report.bits, "all": 8 * report.bytes / report.primitives}.items():
         print(f"{name:14}{round(bits * report.primitives / 8):12,}{bits:20.2f}")
-    print(f"{'all':14}{report.bytes:12,}{8 * report.bytes / report.primitives:20.2f}")
     if quality:
         print(quality)
-    if quality and not tuned and not cleaning.chosen and has_gpu():
-        print(f"--finetune {FINETUNE_STEPS} makes it about 40% smaller")
+        if not tuned and not cleaning.chosen and has_gpu():
+            print(f"--finetune {FINETUNE_STEPS} makes it about 40% smaller")
     return 0
 
 
-def _judge_of(run: Path, data: Path | None) -> Callable[[], Judge]:
-    """Opens the test views of a run, once."""
+def _judge(run: Path, data: Path | None) -> Judge:
+    from sundae_ns.plugin.targets import Judge
 
-    @cache
-    def judge() -> Judge:
-        from sundae_ns.plugin.targets import Judge
-
-        return Judge(run, data)
-
-    return judge
+    return Judge(run, data)
 
 
 def _measured(
-    judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Codecs]], finetune: int, notes: list[str]
+    judge: Callable[[], Judge], packs: Sequence[Pack], finetune: int, notes: list[str]
 ) -> tuple[str, dict[str, Any]]:
-    """A line and figures of the quality of a pack; a second pack is that without the fine-tune. Adds to the notes."""
+    """A line and figures of the quality of the first pack; a second pack is that without the fine-tune."""
     from sundae_ns.plugin.targets import is_worth
 
     try:
-        opened = judge()
-        before, after = opened.before, opened.quality(*packs[0])
+        views = judge()
+        before, after = views.before, views.quality(*packs[0])
     except SundaeError as error:
         notes.append(f"the quality is not measured: {error}")
         return "", {}
-    figures: dict[str, Any] = {"psnr": [before.psnr, after.psnr], "views": opened.cameras}
+    figures: dict[str, Any] = {"psnr": [before.psnr, after.psnr], "views": views.cameras}
     line = f"PSNR {before.psnr:.2f} -> {after.psnr:.2f} dB"
     if math.isfinite(before.ssim + after.ssim):  # not for images smaller than its window
         figures["ssim"] = [before.ssim, after.ssim]
         line += f", SSIM {before.ssim:.4f} -> {after.ssim:.4f}"
     for plain in packs[1:]:
-        without = opened.quality(*plain).psnr
+        without = views.quality(*plain).psnr
         size, plain_size = (len(pack_bytes(*pack)[0]) for pack in (packs[0], plain))
         if not is_worth(after.psnr, size, without, plain_size):
             notes.append(
@@ -180,4 +172,4 @@ def _measured(
                 f"{plain_size:,} bytes and loses {before.psnr - without:.2f} dB, which is worth more: give more steps, "
                 "or leave out --finetune"
             )
-    return f"{line}, before and after, on {opened.cameras} of {opened.all_cameras} test views", figures
+    return f"{line}, before and after, on {views.cameras} of {views.all_cameras} test views", figures

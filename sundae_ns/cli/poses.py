@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -18,7 +18,8 @@ from sundae_ns.cli.options import Out, Source, check_least
 from sundae_ns.cli.process import quoted, word
 from sundae_ns.core.errors import ConfigError, DataError, StorageError, SundaeError, one_line
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from sundae_ns.data.reconstruct import Found
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class PoseOptions:
     beside the photos."""
 
     def words(self) -> list[str]:
-        """Words of the command for what is not the default."""
+        """Words of the command for options that differ from their defaults."""
         usual = PoseOptions()
         given = {name: value for name, value in vars(self).items() if value != getattr(usual, name)}
         return [text for name, value in given.items() for text in (f"--{name}", word(Path(str(value))))]
@@ -63,20 +64,18 @@ def poses(
 
     pycolmap()
     request = Request(photos, out, options.matching, options.frames, masks)
-    found = _interruptible(lambda: find_poses(request, _report), request.work)
-    placed = found.photos
-    cameras = "1 camera" if found.cameras == 1 else f"{found.cameras} cameras"
-    print(
-        f"{out}: {len(placed.placed):,} of {placed.total:,} photos have a pose, of {cameras}; mean reprojection error "
-        f"{found.error:.2f} px"
-    )
-    if len(found.models) > 1:
-        others = ", ".join(f"{count:,}" for count in found.models[1:])
-        print(f"# this is the largest of {len(found.models)} models that do not join; others have {others} photos")
-    if found.masks is not None:
-        print(f"# masks: {found.masks}")
+    result = _interruptible(lambda: find_poses(request, _report), request.work)
+    placed, models = result.photos, result.models
+    cameras = "1 camera" if result.cameras == 1 else f"{result.cameras} cameras"
+    counts = f"{len(placed.placed):,} of {placed.total:,} photos have a pose, of {cameras}"
+    print(f"{out}: {counts}; mean reprojection error {result.error:.2f} px")
+    if len(models) > 1:
+        others = ", ".join(f"{count:,}" for count in models[1:])
+        print(f"# this is the largest of {len(models)} models that do not join; others have {others} photos")
+    if result.masks is not None:
+        print(f"# masks: {result.masks}")
     if placed.left_out:
-        names = ", ".join([*placed.left_out[:3], *(["..."] if len(placed.left_out) > 3 else [])])
+        names = ", ".join(placed.left_out[:3]) + (", ..." if len(placed.left_out) > 3 else "")
         mark = "" if placed.enough else "warning: "
         print(f"# {mark}without a pose: {names}; to add them, {placed.again}", flush=True)
     return 0
@@ -86,7 +85,7 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
     """Check photos or a video, by headers, before anything starts; ``remarks`` prints what is left out.
 
     Returns:
-        The folder of masks: the given one, with ``remarks`` else one beside the photos that fits them; None without.
+        The folder of masks, with ``remarks`` by default one beside the photos that fits them.
 
     Raises:
         ConfigError: pycolmap is not installed, a number is out of range, or masks are given for a video.
@@ -109,20 +108,20 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
         return None
     if photos.is_file():
         raise DataError(f"{photos} is neither a folder of photos nor a video ({', '.join(SUFFIXES)})")
-    found = find_photos(photos)
+    files = find_photos(photos)
     if masks is not None:
-        masks_of(found, masks)
+        masks_of(files, masks)
     if not remarks:
         return masks
-    said = [left_out(photos)]
+    warnings = [left_out(photos)]
     if masks is None and (beside := masks_beside(photos)) is not None:
         try:
-            masks_of(found, beside)
+            masks_of(files, beside)
             masks = beside
         except DataError as error:
-            said.append(f"{beside} is left out: {error}")
-    for remark in filter(None, said):
-        print(f"# warning: {remark}", flush=True)
+            warnings.append(f"{beside} is left out: {error}")
+    for warning in filter(None, warnings):
+        print(f"# warning: {warning}", flush=True)
     return masks
 
 
@@ -146,29 +145,21 @@ def _report(stage: str, total: int) -> Iterator[Callable[[int], None]]:
     print(f"{stage}: {done:,} of {total:,}, {time.monotonic() - begun:.0f} s", flush=True)
 
 
-def _interruptible(work: Callable[[], T], folder: Path) -> T:
+def _interruptible(work: Callable[[], Found], folder: Path) -> Found:
     """Run in a thread: COLMAP's functions return to Python only after minutes, and an interrupt ends them at once."""
-    results: list[T] = []
-    errors: list[BaseException] = []
-
-    def run() -> None:
+    with ThreadPoolExecutor(1) as threads:
+        future = threads.submit(work)
         try:
-            results.append(work())
-        except BaseException as error:
-            errors.append(error)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
+            while not future.done():
+                wait([future], 0.2)
+        except KeyboardInterrupt:
+            cursor = "\x1b[?25h\x1b[2K\r" if sys.stderr.isatty() else ""  # a bar hides it
+            print(f"{cursor}sundae: interrupted; the same command continues here", file=sys.stderr, flush=True)
+            os._exit(130)
     try:
-        while thread.is_alive():
-            thread.join(0.2)
-    except KeyboardInterrupt:
-        cursor = "\x1b[?25h\x1b[2K\r" if sys.stderr.isatty() else ""  # a bar hides it
-        print(f"{cursor}sundae: interrupted; the same command continues here", file=sys.stderr, flush=True)
-        os._exit(130)
-    if results:
-        return results[0]
-    if isinstance(errors[0], (SundaeError, OSError)):
-        raise errors[0]
-    cause = one_line(errors[0])
-    raise DataError(f"COLMAP failed ({cause}); remove {quoted(folder)} and start again, or report it") from errors[0]
+        return future.result()
+    except (SundaeError, OSError):
+        raise
+    except BaseException as error:
+        cause = one_line(error)
+        raise DataError(f"COLMAP failed ({cause}); remove {quoted(folder)} and start again, or report it") from error

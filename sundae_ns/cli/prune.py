@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -11,12 +12,21 @@ from sundae_ns.cli.inputs import Cleaning, chosen_cameras, copies_rows
 from sundae_ns.cli.options import Out, Overwrite, Scene, check_exclusive, check_file, check_suffix
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.ply import keep_vertices
-from sundae_ns.pruning.rule import PruneRule
+from sundae_ns.pruning.rule import PruneRule, ScoreName
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene import prune_scene as pruning
 from sundae_ns.scene.cleaning import kept, within
 from sundae_ns.scene.load_save import SUFFIXES, load_with_mask, save
 from sundae_ns.scene.virtual_cameras import virtual_cameras
+
+
+@dataclass
+class RuleOptions(PruneRule):
+    """The rule, with scores that have a name."""
+
+    score: ScoreName = "detail-contribution"
+    """Importance of a Gaussian: its blending weight over the cameras, with pixels weighted by the detail that the kept
+    Gaussians cannot show (detail-contribution), or its high-pass response (response)."""
 
 
 def prune(
@@ -28,7 +38,7 @@ def prune(
     num_cameras: int | None = None,
     cameras: Path | None = None,
     overwrite: Overwrite = False,
-    rule: Annotated[PruneRule, tyro.conf.arg(name="")] = pruning.DEFAULT_RULE,
+    rule: Annotated[RuleOptions, tyro.conf.arg(name="")] = RuleOptions(selection="pairs"),  # noqa: B008
     cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
 ) -> int:
     """Prune a scene of any program, without its photos.
@@ -41,7 +51,7 @@ def prune(
             properties and comments.
         keep: share of the Gaussians to keep, of those that a box and the floaters leave, in (0, 1]; by default 0.1.
         count: number of Gaussians to keep, in place of a share.
-        target_drop: keep as few as lose at most this PSNR, in dB, of a full field that shows its photos at 30 dB; by
+        target_drop: keep as few as lose at most this PSNR, in dB, of a full scene that shows its photos at 30 dB; by
             the images of held-out cameras.
         num_cameras: number of virtual cameras, for scenes that come without cameras; by default 128, on a GPU 256.
         cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, in place of the
@@ -57,19 +67,19 @@ def prune(
     scene, usable = load_with_mask(source)
     total = scene.num_gaussians if usable is None else len(usable)
     with naming_full_memory(lambda: total):
-        scene, seen, clean = scene.to(fastest_device()), None, None
+        scene, used, clean = scene.to(fastest_device()), None, None
         looks_around = rule.uses_contribution or target_drop is not None
         given = chosen_cameras(scene, cameras, num_cameras) if looks_around or cleaning.remove_floaters else ()
         if cleaning.chosen:
             clean = cleaning.mask(scene, given)
             scene = kept(scene, clean)
         if looks_around:
-            seen = given or virtual_cameras(scene, num_cameras, seed=rule.seed)
-        if target_drop is not None and seen is not None:
-            count, curve = pruning.count_for_drop(scene, target_drop, seen, rule, progress=True)
+            used = given or virtual_cameras(scene, num_cameras, seed=rule.seed)
+        if target_drop is not None and used is not None:
+            count, curve = pruning.count_for_drop(scene, target_drop, used, rule, progress=True)
             for number, psnr in curve:
-                print(f"{number:12,} Gaussians: {psnr:.2f} dB against the full field, on held-out cameras")
-        pruned = pruning.prune_with_mask(scene, keep, count, seen, rule, progress=True)
+                print(f"{number:12,} Gaussians: {psnr:.2f} dB against the full scene, on held-out cameras")
+        pruned = pruning.prune_with_mask(scene, keep, count, used, rule, progress=True)
     small = pruned.scene.to("cpu")
     if copies_rows(source, out):
         rows = within(usable, within(clean, pruned.mask).cpu())
@@ -77,6 +87,6 @@ def prune(
     else:
         save(small, out)
     print(f"{out}: {small.num_gaussians:,} of {total:,} Gaussians")
-    if pruned.seen is not None and seen:
-        print(f"{len(seen)} cameras see {pruned.seen:.1%} of the Gaussians")
+    if pruned.seen is not None and used:
+        print(f"{len(used)} cameras see {pruned.seen:.1%} of the Gaussians")
     return 0

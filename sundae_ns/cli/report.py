@@ -6,7 +6,9 @@ import json
 import shlex
 from collections.abc import Collection
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
 from io import StringIO
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -58,11 +60,12 @@ def report(
     words = ["sundae", "report", *map(str, runs), "-o", str(out), "--lpips-net", lpips_net]
     words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
     command = shlex.join(words)
-    lpips, notes = Lpips(lpips_net) if lpips_weights(lpips_net)[1].is_file() else None, []
+    lpips, notes = Lpips(lpips_net) if lpips_weights(lpips_net)[1].is_file() else None, list[str]()
     if not flip_available():
         notes.append("FLIP: the package is not installed; run pip install flip-evaluator.")
     if lpips is None:
         notes.append(f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them.")
+    measure = partial(measure_scene, lpips=lpips, warmup=warmup, repeats=repeats, command=command)
     done: list[ShownRun] = []
     failures: list[SundaeError] = []
     columns = (*Progress.get_default_columns()[:-1], MofNCompleteColumn(), TimeRemainingColumn())
@@ -75,15 +78,8 @@ def report(
                     opened = load_model(path, data=data)
                 label = _label(opened, {run.measured.label for run in done})
                 progress.update(task, description=f"Measuring {escape(label)}", total=len(opened.cameras))
-                measured = measure_scene(
-                    opened,
-                    label=label,
-                    lpips=lpips,
-                    warmup=warmup,
-                    repeats=repeats,
-                    progress=lambda: progress.advance(task),  # noqa: B023
-                    command=command,
-                )
+                advance = partial(progress.advance, task)
+                measured = measure(opened, label=label, progress=advance)
                 with writing(f"cannot write to {out}"):
                     out.mkdir(parents=True, exist_ok=True)
                 progress.update(task, description=f"Encoding views of {escape(label)}")
@@ -101,45 +97,39 @@ def report(
         scenes.setdefault(run.measured.scene, []).append(run.measured)
     notes += [
         f"Comparison within {scene}: its runs have different test views, so their numbers do not compare."
-        for scene, own in scenes.items()
-        if len({(run.resolution, len(run.full.views)) for run in own}) > 1
+        for scene, measured_runs in scenes.items()
+        if len({(run.resolution, len(run.full.views)) for run in measured_runs}) > 1
     ]
-    rows = [run.measured.as_json() for run in done]
-    page = report_page(done, notes, command)
+    rows, page = [run.measured.as_json() for run in done], report_page(done, notes, command)
     files = {"json": json.dumps(rows, indent=1) + "\n", "csv": csv_text(rows), "md": markdown(scenes, notes)}
-    files["html"] = page
-    write_files({out / f"report.{kind}": content.encode() for kind, content in files.items()})
+    write_files({out / f"report.{kind}": content.encode() for kind, content in {**files, "html": page}.items()})
     for note in notes:
         console.print(f"[yellow]Left out: {escape(note)}", highlight=False)
     shown, total = sum(len(run.views) for run in done), sum(len(run.measured.full.views) for run in done)
-    about = f"{len(page) / 1e6:.1f} MB, {shown} of {total} views"
-    console.print(f"wrote {out / 'report.html'}, to look at in a browser: {about}", highlight=False)
+    size = f"{len(page) / 1e6:.1f} MB, {shown} of {total} views"
+    console.print(f"wrote {out / 'report.html'}, to look at in a browser: {size}", highlight=False)
     console.print(f"wrote {out / 'report.md'}, report.csv and report.json: its table", highlight=False)
     return 1 if failures else 0
 
 
 def _label(opened: Opened, taken: Collection[str]) -> str:
     """A short name for a run, different from those already taken."""
-    label = "/".join(dict.fromkeys(part for part in (opened.variant, opened.method) if part))
-    if label in taken:
-        label += f"/{opened.source.name}"
-    first, count = label, 1
-    while label in taken:  # the same path is given twice
-        count += 1
-        label = f"{first} ({count})"
-    return label
+    label = "/".join(dict.fromkeys(filter(None, (opened.variant, opened.method))))
+    longer = f"{label}/{opened.source.name}"
+    names = chain([label, longer], (f"{longer} ({number})" for number in count(2)))  # a path may be given twice
+    return next(name for name in names if name not in taken)
 
 
 @torch.no_grad()
 def _views(opened: Opened, measured: Measured, most: int) -> list[ShownView]:
-    """The views of a run that the page shows, ``most`` or fewer; memory holds one at a time at its full size."""
+    """At most ``most`` views of a run for the page; memory holds one at a time at its full size."""
     from sundae_ns.report.report_page import choose_cameras, shown_view
 
     full, base = measured.full.views, measured.base.views if measured.has_head else None
     names = [path.name for path in opened.datamanager.eval_dataset.image_filenames]
-    shown = []
+    views = []
     for index in choose_cameras([view.psnr for view in full], most):
         outputs, photo = opened.model.get_outputs_for_camera(opened.cameras[index]), opened.truths[index]
         quality = full[index], None if base is None else base[index]
-        shown.append(shown_view(index, names[index], photo, outputs["rgb"], outputs["base_rgb"], *quality))
-    return shown
+        views.append(shown_view(index, names[index], photo, outputs["rgb"], outputs["base_rgb"], *quality))
+    return views

@@ -17,7 +17,7 @@ import tyro
 from sundae_ns.cli.options import Out, Source, check_folder
 from sundae_ns.cli.poses import PoseOptions, check_poses
 from sundae_ns.cli.process import quoted, run_command, word
-from sundae_ns.cli.train import TrainOptions, finetune_words, has_gpu, pack_run
+from sundae_ns.cli.train import FINETUNE_WORDS, TrainOptions, has_gpu, pack_run
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 from sundae_ns.core.files import put_aside, write_text
 from sundae_ns.data.capture_files import placed_in
@@ -73,37 +73,30 @@ class Project:
 
     @cached_property
     def tunes(self) -> bool:
-        """Whether the pack is fine-tuned: where that takes seconds, and nobody asked for a draft."""
+        """Whether the pack is fine-tuned, which takes seconds on a GPU."""
         return self.quality != "draft" and has_gpu()
-
-    @property
-    def max_bytes(self) -> int | None:
-        """Most bytes of the packed scene."""
-        return None if self.max_mb is None else round(self.max_mb * 1e6)
 
     def check(self) -> None:
         """Raise ``ConfigError`` for options that contradict each other."""
         self.train.check(self.photos)
-        mb, draft, steps = self.max_mb, self.quality == "draft", self.train.steps
-        fixed = self.train.keep is not None or self.train.method != "sundae"
+        mb, draft, method = self.max_mb, self.quality == "draft", self.train.method
+        fixed = self.train.keep is not None or method != "sundae"
         decides = "needs a method that decides the number of Gaussians; leave out --keep and --method"
-        for wrong, words in (
+        masks = (
+            f"{self.photos} has poses already; give each frame of transforms.json its mask_path, or a COLMAP model its "
+            "masks with `sundae train CAPTURE -- colmap --masks-path`"
+        )
+        steps = f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality"
+        for wrong, message in (
             (mb is not None and not 0.01 <= mb <= 1e6, f"max-mb is {mb or 0:g}; give at least 0.01"),
-            (
-                self.poses.masks is not None and self.posed,
-                f"{self.photos} has poses already; give each frame of transforms.json its mask_path, or a COLMAP "
-                "model its masks with `sundae train CAPTURE -- colmap --masks-path`",
-            ),
-            (draft and steps is not None, f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality"),
-            (
-                draft and self.train.method == "sundae-tiny",
-                "sundae-tiny is shorter than a draft; leave out --quality",
-            ),
+            (self.poses.masks is not None and self.posed, masks),
+            (draft and self.train.steps is not None, steps),
+            (draft and method == "sundae-tiny", "sundae-tiny is shorter than a draft; leave out --quality"),
             (fixed and mb is not None, f"--max-mb {decides}"),
             (fixed and self.quality == "best", f"--quality best {decides}"),
         ):
             if wrong:
-                raise ConfigError(words)
+                raise ConfigError(message)
 
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
@@ -112,15 +105,14 @@ class Project:
         measure += ["-o", word(report.parent), "--overwrite"]
         export = ["sundae", "export", word(packed), "-o", word(page)]
         steps = [
-            Step("train", self.run_training, self.trained),
-            Step("pack", lambda: self.run_pack(packed), lambda: _is_packed(packed), packed),
+            Step("train", self._train, self._trained),
+            Step("pack", lambda: self._pack(packed), lambda: _is_packed(packed), packed),
             Step("report", lambda: run_command(measure), lambda: _is_page(report), report),
             Step("web page", lambda: run_command(export), lambda: _is_page(page), page),
         ]
-        return steps if self.posed else [Step("camera poses", self.find_poses, self.placed), *steps]
+        return steps if self.posed else [Step("camera poses", self._find_poses, self.placed), *steps]
 
-    def find_poses(self) -> int:
-        """Make the capture."""
+    def _find_poses(self) -> int:
         with writing(f"cannot replace {self.capture}"):
             put_aside(self.capture)  # damaged
         return run_command(["sundae", "poses", word(self.photos), "-o", word(self.capture), *self.poses.words()])
@@ -133,42 +125,41 @@ class Project:
             return False
         return True
 
-    def run_training(self) -> int:
+    def _train(self) -> int:
         """Train, or resume a training; ``DataError`` if too few photos have a pose."""
         if not self.posed and not (placed := placed_in(self.capture)).enough:
             raise DataError(
                 f"COLMAP placed {len(placed.placed)} of {placed.total} photos; {placed.again}, and start in another "
                 f"folder, or train on these with `sundae run {quoted(self.capture)} -o OTHER`"
             )
-        saved, resumes = self.run / "nerfstudio_models", steps_left(self.run) is not None
-        if not resumes and any(saved.glob("*.ckpt")):
-            with writing(f"cannot replace {self.run}"):
-                put_aside(self.run)
+        saved, options = self.run / "nerfstudio_models", self.train
         # The name may begin with a dash.
         more = [f"--experiment-name={self.run.parent.parent.name}", "--timestamp", self.run.name]
-        more += ["--vis", "viewer+tensorboard", *(finetune_words() if self.tunes else [])]
-        options = self.train
-        if resumes:  # trains the steps that are left
-            options = replace(options, steps=None)
+        more += ["--vis", "viewer+tensorboard", *(FINETUNE_WORDS if self.tunes else [])]
+        if steps_left(self.run) is not None:
             more += ["--load-dir", word(saved)]
-        else:
-            options = replace(options, steps=DRAFT_STEPS) if self.quality == "draft" else options
-            more += ["--pipeline.model.pruning.max-drop", "0.03"] if self.quality == "best" else []
-            if self.max_bytes is not None:  # trials count the bytes of packs without a fine-tune
-                most = round(self.max_bytes / FINETUNED_SIZE) if self.tunes else self.max_bytes
-                more += ["--pipeline.model.pruning.max-bytes", str(most)]
+            return run_command(replace(options, steps=None).words(self.capture, self.out / "runs", more))
+        if any(saved.glob("*.ckpt")):
+            with writing(f"cannot replace {self.run}"):
+                put_aside(self.run)
+        if self.quality == "draft":
+            options = replace(options, steps=DRAFT_STEPS)
+        if self.quality == "best":
+            more += ["--pipeline.model.pruning.max-drop", "0.03"]
+        if self.max_mb is not None:  # trials count the bytes of packs without a fine-tune
+            most = round(_bytes(self.max_mb) / (FINETUNED_SIZE if self.tunes else 1))
+            more += ["--pipeline.model.pruning.max-bytes", str(most)]
         return run_command(options.words(self.capture, self.out / "runs", more))
 
-    def trained(self) -> bool:
+    def _trained(self) -> bool:
         """Whether the last step is saved, of those before the pack's fine-tune."""
         left = steps_left(self.run)
         if left is None or left <= 0:
             return left is not None
         return self.tunes and left <= tuned_steps(schedule_length(self.run / "config.yml"))
 
-    def run_pack(self, packed: Path) -> int:
-        """Pack the run."""
-        more = [] if self.max_bytes is None else ["--target-bytes", str(self.max_bytes)]
+    def _pack(self, packed: Path) -> int:
+        more = [] if self.max_mb is None else ["--target-bytes", str(_bytes(self.max_mb))]
         return pack_run(self.run, packed, "--data", word(self.capture), *more, finetune=self.tunes)
 
     def claim(self) -> None:
@@ -178,14 +169,10 @@ class Project:
             ConfigError: its settings were others.
             StorageError: another process works in the folder, it holds other files, or it cannot be written.
         """
-        path, masks = self.out / SETTINGS, self.poses.masks
-        settings: dict[str, object] = {
-            "photos": str(self.photos.resolve()),
-            "quality": self.quality,
-            "max_mb": self.max_mb,
-        }
+        path, photos, masks = self.out / SETTINGS, self.photos.resolve(), self.poses.masks
+        settings = {"photos": str(photos), "quality": self.quality, "max_mb": self.max_mb}
         settings |= {**asdict(self.train), **asdict(self.poses), "masks": str(masks.resolve()) if masks else None}
-        if self.out.resolve().is_relative_to(self.photos.resolve()):
+        if self.out.resolve().is_relative_to(photos):
             raise StorageError(f"{self.out} lies in {self.photos}, which the command reads; choose another folder")
         # An earlier command may have been killed after it made the lock.
         begun = self.out.is_dir() and all(name.startswith((LOCK, SETTINGS)) for name in os.listdir(self.out))
@@ -203,10 +190,8 @@ class Project:
             raise StorageError(f"{path} is damaged; choose another folder") from error
         for name, *values in changed:
             first, now = ("left out" if value is None else value for value in values)
-            raise ConfigError(
-                f"{self.out} was made with {name} {first}, not {now}; "
-                "repeat the first command, or choose another folder"
-            )
+            again = "repeat the first command, or choose another folder"
+            raise ConfigError(f"{self.out} was made with {name} {first}, not {now}; {again}")
 
 
 def run(
@@ -245,11 +230,10 @@ def run(
                 later.result.unlink(missing_ok=True)
         print(f"{heading}:", flush=True)
         code = step.run()
-        if code in STOPPED:
-            print("sundae: interrupted; the same command continues here", file=sys.stderr)
-            return code
         if code:
-            print(f"sundae: {step.name} ended with {code}; the same command tries it again", file=sys.stderr)
+            failed = f"{step.name} ended with {code}; the same command tries it again"
+            stopped = "interrupted; the same command continues here"
+            print(f"sundae: {stopped if code in STOPPED else failed}", file=sys.stderr)
             return code
         if not step.done():
             raise SundaeError(f"{step.name} ended without its result; the output above says why")
@@ -260,7 +244,7 @@ def run(
 
 
 def _check_input(photos: Path) -> None:
-    """Raise ``DataError`` for a path that is neither a capture nor a folder that may hold photos, or a video."""
+    """Raise ``DataError`` for a path that can be neither a capture, a folder of photos nor a video."""
     if not photos.exists():
         raise DataError(f"{photos} does not exist; give a folder of photos, a video, or a capture")
     if is_posed(photos):
@@ -269,6 +253,10 @@ def _check_input(photos: Path) -> None:
             print(f"# capture in {layout.program} layout: {layout.description}", flush=True)
     elif (photos / "sparse").is_dir() or is_model(photos):
         raise no_transforms(photos)  # says how to use a capture in another layout
+
+
+def _bytes(megabytes: float) -> int:
+    return round(megabytes * 1e6)
 
 
 def _is_packed(path: Path) -> bool:
@@ -281,5 +269,5 @@ def _is_packed(path: Path) -> bool:
 
 
 def _is_page(path: Path) -> bool:
-    """Whether a web page has its end, which comes after the scene; a full disk or a copy may have left a part."""
+    """Whether a web page has its end; a full disk or a copy may have cut it off."""
     return path.is_file() and path.read_bytes()[-16:].rstrip().endswith((b"</html>", b"-->"))

@@ -16,15 +16,17 @@ from sundae_ns.cli.options import Flag, Out, Source, check_least
 from sundae_ns.cli.process import run_command, word
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError
 from sundae_ns.data.layouts import posed_layout
+from sundae_ns.io.pack.config import FINETUNE_STEPS
 from sundae_ns.io.run_folder import new_name, unfinished_run
 
 PACKED = "scene.sundae"
-"""Name of the packed scene in the folder of its run."""
+FINETUNE_WORDS = ("--finetune-steps", str(FINETUNE_STEPS))
+"""Words of ns-train that leave the last steps to the fine-tune of :func:`pack_run`."""
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """What is trained."""
+    """Options of a training that everyone sets."""
 
     method: str = "sundae"
     """one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU."""
@@ -34,12 +36,7 @@ class TrainOptions:
     """number of training steps; by default that of the method."""
 
     def check(self, capture: Path) -> None:
-        """Check the options; of the capture, only that it exists.
-
-        Raises:
-            ConfigError: there is no such method, or a number is out of range.
-            DataError: the capture does not exist.
-        """
+        """Raise ``DataError`` if the capture does not exist, and ``ConfigError`` for a wrong option."""
         if not capture.exists():
             raise DataError(f"{capture} does not exist; give the folder of a capture")
         if self.method not in methods():
@@ -49,12 +46,7 @@ class TrainOptions:
         check_least(steps=(self.steps, 1))
 
     def words(self, capture: Path, out: Path, more: Sequence[str] = ()) -> list[str]:
-        """The words of ``ns-train``.
-
-        Args:
-            capture: its folder.
-            out: folder of runs.
-            more: further words of ns-train; a parser of captures may stand among them.
+        """The command of ``ns-train``, with ``more`` options and perhaps a parser of captures among them.
 
         Raises:
             DataError: the capture is in COLMAP's or Blender's layout and damaged.
@@ -112,15 +104,15 @@ def train(
     tunes = has_gpu()
     lengths = ("--max-num-iterations", "--schedule-length", "--finetune-steps")
     if tunes and not any(_value_of(option, further) for option in lengths):
-        more[:0] = finetune_words()
-    words = options.words(capture, out, more)  # refuses a damaged capture before it speaks of runs
+        more[:0] = FINETUNE_WORDS
+    words = options.words(capture, out, more)  # refuses a damaged capture before runs are mentioned
     if not resume and unfinished is not None and not (unfinished.folder / PACKED).exists():
-        again = ["sundae", "train", word(capture), "--resume"]
-        again += ["-o", word(out)] if out != Path("outputs") else []
-        again += ["--method", options.method] if options.method != "sundae" else []
+        resuming = ["sundae", "train", word(capture), "--resume"]
+        resuming += ["-o", word(out)] if out != Path("outputs") else []
+        resuming += ["--method", options.method] if options.method != "sundae" else []
         steps = f"{unfinished.step:,} of {unfinished.length:,} steps"
         print(f"# {unfinished.folder} ended after {steps}; this is a new run. To resume the other:")
-        print(f"#     {shlex.join(again)}")
+        print(f"#     {shlex.join(resuming)}")
     code = run_command(words)
     # Options of ns-train may have put the run elsewhere; then its last line names the command that packs it.
     run = next((path.parent for path in out.glob(f"*/{options.method}/{name}/config.yml")), None)
@@ -131,16 +123,10 @@ def train(
 
 
 def pack_run(run: Path, out: Path, *more: str, finetune: bool) -> int:
-    """Pack a finished run, with further words of ``sundae pack``; the exit code.
+    """Pack a finished run with ``more`` options; returns the exit code.
 
-    Args:
-        run: its folder.
-        out: file to write.
-        more: further words.
-        finetune: fine-tune the pack; one that fails, for example because the GPU's memory is full, is left out.
+    A fine-tune that fails, for example because the GPU's memory is full, is left out.
     """
-    from sundae_ns.io.pack.config import FINETUNE_STEPS
-
     words = ["sundae", "pack", word(run), "-o", word(out), *more]
     if finetune:
         code = run_command([*words, "--finetune", str(FINETUNE_STEPS)])
@@ -150,28 +136,17 @@ def pack_run(run: Path, out: Path, *more: str, finetune: bool) -> int:
     return run_command(words)
 
 
-def finetune_words() -> list[str]:
-    """Words of ns-train that leave the last steps to the fine-tune of :func:`pack_run`."""
-    from sundae_ns.io.pack.config import FINETUNE_STEPS
-
-    return ["--finetune-steps", str(FINETUNE_STEPS)]
-
-
 def has_gpu() -> bool:
-    """Whether a GPU trains; imports torch, which takes a second, so ask only where it matters."""
+    """Whether a GPU trains; imports torch, which takes a second."""
     import torch
 
     return torch.cuda.is_available()
 
 
 def _value_of(option: str, words: Sequence[str]) -> str | None:
-    """What follows an option of ns-train, after a space or ``=``; None without it."""
-    for given, following in pairwise([*words, None]):
-        if given == option:
-            return following
-        if given is not None and given.startswith(f"{option}="):
-            return given.partition("=")[2]
-    return None
+    """The value of an option of ns-train, after a space or ``=``; None without it."""
+    split = [part for text in words for part in (text.split("=", 1) if text.startswith("--") else [text])]
+    return next((value for name, value in pairwise(split) if name == option), None)
 
 
 def _is_parser(word: str) -> bool:

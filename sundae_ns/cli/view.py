@@ -14,25 +14,20 @@ from sundae_ns.core.errors import ConfigError
 from sundae_ns.scene.page import page_of
 
 IDLE_SECONDS = 15.0
-"""A connection that sends or takes nothing for so long is closed."""
+"""A connection that sends or takes nothing for this time is closed."""
 
 
 class _Server(ThreadingHTTPServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Report faults only: a browser may leave early."""
-        if not isinstance(sys.exc_info()[1], OSError):
+        if not isinstance(sys.exc_info()[1], OSError):  # a browser may leave early
             super().handle_error(request, client_address)
 
 
 def serve(page: str, port: int) -> ThreadingHTTPServer:
-    """A server of one page on 127.0.0.1, not yet started.
+    """A server of one page on 127.0.0.1, not yet started; ``ConfigError`` if the port is in use or not allowed.
 
-    It answers only requests for this machine by name (``127.0.0.1``, ``localhost`` or ``[::1]``) and its port: another
-    site whose name resolves to 127.0.0.1 (DNS rebinding) could read the scene otherwise. It closes connections that
-    send or take nothing for :data:`IDLE_SECONDS`.
-
-    Raises:
-        ConfigError: the port is in use or not allowed.
+    It answers only requests that name this machine (``127.0.0.1``, ``localhost`` or ``[::1]``) and its port: else a
+    site whose name resolves to 127.0.0.1 (DNS rebinding) could read the scene.
     """
     content = page.encode()
 
@@ -40,7 +35,6 @@ def serve(page: str, port: int) -> ThreadingHTTPServer:
         timeout = IDLE_SECONDS
 
         def do_GET(self) -> None:
-            """Answer with the page."""
             port = self.connection.getsockname()[1]
             named = [name.strip().lower() for name in self.headers.get_all("Host", [])]
             if len(named) != 1 or named[0] not in _hosts(port):
@@ -59,8 +53,8 @@ def serve(page: str, port: int) -> ThreadingHTTPServer:
             for start in range(0, len(body), 1 << 16):
                 self.wfile.write(body[start : start + (1 << 16)])
 
-        def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-            """Stay silent."""
+        def log_message(self, *_: object) -> None:
+            """Print nothing."""
 
     try:
         return _Server(("127.0.0.1", port), Handler)
@@ -69,10 +63,9 @@ def serve(page: str, port: int) -> ThreadingHTTPServer:
 
 
 def _hosts(port: int) -> set[str]:
-    """Values of the header ``Host`` that name this machine."""
-    names = ("127.0.0.1", "localhost", "[::1]")
-    # Browsers leave out the port of the protocol.
-    return {f"{name}:{port}" for name in names} | (set(names) if port == 80 else set())
+    """Values of the header ``Host`` that name this machine; browsers leave out port 80."""
+    names = {"127.0.0.1", "localhost", "[::1]"}
+    return {f"{name}:{port}" for name in names} | (names if port == 80 else set())
 
 
 def view(scene: Scene, port: int = 0, open_browser: bool = True, data: Path | None = None) -> int:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.core.metrics import Lpips, ViewQuality, quality_of
@@ -22,9 +20,8 @@ from sundae_ns.report.measured import HEAD_OFF, HEAD_ON, Configuration, Measured
 from sundae_ns.scene.render import compensate, draw, scale_plan
 
 
-@dataclass(frozen=True)
-class FrameTimes:
-    """Synchronised milliseconds of a frame, median over the cameras."""
+class FrameTimes(NamedTuple):
+    """Synchronised milliseconds of a frame, median over repeated renders."""
 
     frame: float
     """The whole image as nerfstudio's commands request it: camera, colours, splatting of colours and features, head."""
@@ -36,7 +33,7 @@ class FrameTimes:
 
 @contextmanager
 def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
-    """Enable or disable the head's correction inside a block, except in a viewer, which has its own check box."""
+    """Enable or disable the head's correction inside a block."""
     before, model.compensated = model.compensated, on
     try:
         yield
@@ -45,42 +42,28 @@ def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
 
 
 @torch.no_grad()
-def frame_times(model: SundaeModel, cameras: Sequence[Any], *, warmup: int = 3, repeats: int = 5) -> FrameTimes:
-    """Time the rendering of cameras at their own resolution.
+def frame_times(model: SundaeModel, camera: Any, *, warmup: int = 3, repeats: int = 5) -> FrameTimes:
+    """Time the rendering of a camera of shape ``(1,)`` at its own resolution.
 
     Args:
         model: in evaluation mode, on the device to time.
-        cameras: each of shape ``(1,)``.
-        warmup: untimed renders of each camera.
-        repeats: timed renders of each camera.
+        warmup: number of untimed renders.
+        repeats: number of timed renders.
     """
-    background = model._get_background_color()
-
-    def milliseconds(fn: Callable[[], object]) -> float:
-        return median_ms(fn, device=model.device, warmup=warmup, repeats=repeats)
-
-    def show(camera: Any) -> Tensor:
-        return model.get_outputs_for_camera(camera)["rgb"]
-
-    frames: list[float] = []
-    splats: list[float] = []
-    heads: list[float] = []
-    for camera in cameras:
-        for on, times in ((True, frames), (False, splats)):
-            with compensation(model, on):
-                times.append(milliseconds(partial(show, camera)))
-        settings = model.render_settings(training=False)
-        zoom, weight = scale_plan(model.camera_of(camera), settings.trained_focal)
-        if settings.head is None or weight == 0:
-            heads.append(0.0)
-            continue
-        at_scale = model.camera_of(camera).zoomed(zoom)
-        images, splatted = draw(
-            model.source.primitives(at_scale, settings, features=True), at_scale, background, settings, depth=False
-        )
-        run_head = partial(compensate, settings.head, images["base_rgb"], splatted, background)
-        heads.append(milliseconds(run_head))
-    return FrameTimes(median(frames), median(splats), median(heads))
+    milliseconds = partial(median_ms, device=model.device, warmup=warmup, repeats=repeats)
+    with compensation(model, True):
+        frame = milliseconds(lambda: model.get_outputs_for_camera(camera)["rgb"])
+    with compensation(model, False):
+        splat = milliseconds(lambda: model.get_outputs_for_camera(camera)["rgb"])
+    settings, background = model.render_settings(training=False), model._get_background_color()
+    zoom, weight = scale_plan(model.camera_of(camera), settings.trained_focal)
+    if settings.head is None or weight == 0:
+        return FrameTimes(frame, splat, 0.0)
+    scaled = model.camera_of(camera).zoomed(zoom)
+    primitives = model.source.primitives(scaled, settings, features=True)
+    images, splatted = draw(primitives, scaled, background, settings, depth=False)
+    run_head = partial(compensate, settings.head, images["base_rgb"], splatted, background)
+    return FrameTimes(frame, splat, milliseconds(run_head))
 
 
 def sizes(model: SundaeModel) -> Sizes:
@@ -101,8 +84,6 @@ def measure_scene(
     command: str = "",
 ) -> Measured:
     """Evaluate and time a scene on its test views, with the head and without.
-
-    The timed call is the one whose image is evaluated, view by view.
 
     Args:
         opened: the scene.
@@ -125,19 +106,21 @@ def measure_scene(
                 image = model.get_outputs_for_camera(camera)["rgb"]
             views[name].append(quality_of(image, truth, lpips, visible=visible))
         if repeats:
-            found = frame_times(model, [camera], warmup=warmup, repeats=repeats)
+            frame, splat, head = frame_times(model, camera, warmup=warmup, repeats=repeats)
             for name, on in ways.items():
-                times[name].append(found.frame if on else found.splat)
-            times["head"].append(found.head)
+                times[name].append(frame if on else splat)
+            times["head"].append(head)
         if progress is not None:
             progress()
     bare = {name: value for name, value in model.gauss_params.items() if name != FEATURES}
-    # A head that is there but disabled is not needed, and neither are its features.
+    # A disabled head is not needed, and neither are its features.
     stored = sizes(model) if has_head else Sizes(bytes_of(bare), 0)
     needed = {HEAD_ON: stored.total, HEAD_OFF: bytes_of(bare)}
     if opened.packed_bytes is not None:
-        # A packed file is read as a whole, with the head enabled or disabled.
+        # A packed file is read completely, with the head enabled or disabled.
         stored, needed = Sizes(opened.packed_bytes), dict.fromkeys(needed, opened.packed_bytes)
+    resolutions = [f"{int(camera.width)}x{int(camera.height)}" for camera in opened.cameras]
+    precision = "" if model.head is None or not has_head else model.head.config.precision
     return Measured(
         label=label,
         source=str(opened.source),
@@ -150,27 +133,16 @@ def measure_scene(
         primitives=model.num_points,
         bytes_primitives=stored.primitives,
         bytes_head=stored.head,
-        resolution=_resolution(opened.cameras),
+        resolution=resolutions[0] + (" and others" if len(set(resolutions)) > 1 else ""),
         configurations=tuple(
             Configuration(name, median(times[name]) if repeats else None, needed[name], tuple(views[name]))
             for name in ways
         ),
         ms_head=median(times["head"]) if repeats else None,
-        precision=_precision(model) if has_head else "",
+        precision="fp32" if precision and model.device.type == "cpu" else precision,
         lpips_net=lpips.net if lpips is not None else "",
         prune_s=opened.prune_s,
         peak_primitives=model.state.pruning["peak"] or None,
         gpu=torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "",
         command=command,
     )
-
-
-def _precision(model: SundaeModel) -> str:
-    """Arithmetic of the head on the model's device."""
-    return "fp32" if model.head is None or model.device.type == "cpu" else model.head.config.precision
-
-
-def _resolution(cameras: Sequence[Any]) -> str:
-    """Width x height of the first camera, and a note if others differ."""
-    found = [f"{int(camera.width)}x{int(camera.height)}" for camera in cameras]
-    return found[0] + (" and others" if len(set(found)) > 1 else "")

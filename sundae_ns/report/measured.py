@@ -1,4 +1,4 @@
-"""The measurements of finished fields, and the table of a report: on the terminal, as Markdown and as CSV."""
+"""The measurements of finished scenes, and the table of a report: as Markdown and as CSV."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HEAD_ON, HEAD_OFF = "head on", "head off"
 METRICS = (("psnr", 2), ("ssim", 4), ("psnr_fitted", 2), ("flip", 4), ("lpips", 4))
 """Metrics in the order of a table's columns, with their number of decimals."""
 EXPLANATIONS = (
-    "Each row is one configuration of rendering a field. Its time and its metrics come from the same calls.",
+    "Each row is one configuration of rendering a scene. Its time and its metrics come from the same calls.",
     "Metrics are means over the test views. PSNR is over all pixels and channels; fitted, it is taken after the "
     "affine map of colours that brings the image nearest to its photo, so that changing light counts less. SSIM is "
     "pytorch_msssim's (11 x 11 window, no padding), FLIP is LDR-FLIP at 67 pixels per degree, and LPIPS names its net.",
@@ -25,8 +25,8 @@ EXPLANATIONS = (
     "ms per frame is the median over the test views, synchronised with the device.",
     "MB are 1e6 bytes in fp32 of all that the configuration needs: no network or features if the head is off. "
     "For a packed scene it is the whole file.",
-    "With the head off, the same field shows its base colours, although it was trained with a head. To train a field "
-    "without a head is another run, with --pipeline.model.head.mode off.",
+    "With the head off, the same scene shows its base colours, although it was trained with a head. Training without a "
+    "head is another run, with --pipeline.model.head.mode off.",
 )
 """Sentences on the figures of a report's table."""
 COLUMNS = (
@@ -42,17 +42,17 @@ training, MiB."""
 
 @dataclass(frozen=True)
 class Configuration:
-    """One configuration of rendering a field. ``ms`` and ``views`` come from the same calls with the same arguments."""
+    """One configuration of rendering a scene. ``ms`` and ``views`` come from the same calls with the same arguments."""
 
     name: str
-    """``head on`` or ``head off``; a field without a head has only the latter."""
+    """``head on`` or ``head off``; a scene without a head has only the latter."""
     ms: float | None
     """Synchronised milliseconds per frame, median over the test views; None if not timed."""
     bytes: int
-    """Bytes on disk in fp32 that this configuration needs: without the head, neither network nor features. For a packed
-    scene, the size of the file."""
+    """Bytes in fp32 that this configuration needs: without the head, neither network nor features. For a packed scene,
+    the size of the file."""
     views: tuple[ViewQuality, ...]
-    """Metrics by test view, in the order of the views."""
+    """Metrics by test view."""
 
     def mean(self, metric: str) -> float | None:
         """Mean of a metric over the test views; None unless every view has it."""
@@ -63,7 +63,7 @@ class Configuration:
 
 @dataclass(frozen=True)
 class Measured:
-    """A finished field with its measurements."""
+    """A finished scene with its measurements."""
 
     label: str
     """Name in tables and plots, unique in a report."""
@@ -82,7 +82,7 @@ class Measured:
     resolution: str
     """Width x height, pixels."""
     configurations: tuple[Configuration, ...]
-    """With the head, if the field has one, then without it."""
+    """With the head, if the scene has one, then without it."""
     ms_head: float | None = None
     """Milliseconds of the head alone; 0 without a head."""
     precision: str = ""
@@ -103,7 +103,7 @@ class Measured:
 
     @property
     def full(self) -> Configuration:
-        """The complete rendering: with the head, if the field has one."""
+        """The complete rendering: with the head, if the scene has one."""
         return self.configurations[0]
 
     @property
@@ -113,7 +113,7 @@ class Measured:
 
     @property
     def has_head(self) -> bool:
-        """Whether the field has an enabled head."""
+        """Whether the scene has an enabled head."""
         return len(self.configurations) > 1
 
     def as_json(self) -> dict[str, Any]:
@@ -126,7 +126,7 @@ class Measured:
 
 
 def heads_of(runs: Sequence[Measured]) -> list[str]:
-    """Heads of the table of the runs of a report; LPIPS names the nets that the runs have."""
+    """Column heads of the table of a report; LPIPS names the nets of the runs."""
     nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})
     heads = ["run", "rendered with", "primitives", "MB", "ms per frame", "PSNR, dB", "SSIM", "fitted, dB", "FLIP"]
     return [*heads, f"LPIPS ({', '.join(nets)})" if nets else "LPIPS"]
@@ -162,9 +162,8 @@ def csv_text(runs: Sequence[Mapping[str, Any]]) -> str:
     writer.writeheader()
     for run in runs:
         full, base = run["configurations"][0], run["configurations"][-1]
-        # Each time stands beside the metrics of its own renderings.
-        own = {"ms_frame": full["ms"], "ms_splat": base["ms"], **full["mean"]}
-        own |= {"psnr_base": base["mean"]["psnr"], "ssim_base": base["mean"]["ssim"]}
-        own["lpips_net"] = run["lpips_net"] if own["lpips"] is not None else ""
-        writer.writerow({**run, **own})
+        cells = {"ms_frame": full["ms"], "ms_splat": base["ms"], **full["mean"]}
+        cells |= {"psnr_base": base["mean"]["psnr"], "ssim_base": base["mean"]["ssim"]}
+        cells["lpips_net"] = run["lpips_net"] if cells["lpips"] is not None else ""
+        writer.writerow({**run, **cells})
     return buffer.getvalue()

@@ -48,7 +48,7 @@ def test_an_interrupted_distillation_goes_on(
     monkeypatch.setattr(Distillation, "_train_step", train_step)
     assert run(*words) == 0
     said = capsys.readouterr()
-    assert "going on from step 4 of 6" in said.err
+    assert "resuming after step 4 of 6" in said.err
     assert "100 of 200 Gaussians, without a head" in said.out
     assert sorted(path.name for path in source.parent.iterdir()) == ["a.ply", "b.spz"]
     assert sn.load(out).num_gaussians == 100

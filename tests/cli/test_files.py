@@ -162,10 +162,7 @@ def test_prune_does_not_change_kept_rows(
         (["prune", "in.ply", "-o", "a.ply", "--keep", "0.1", "--count", "5"], "--keep and --count exclude each other"),
         (["prune", "in.ply", "-o", "a.ply", "--keep", "0.1", "--target-drop", "1"], "--keep and --target-drop exclude"),
         (["prune", "in.ply", "-o", "a.ply", "--target-drop", "0"], "target-drop is 0.0; give a positive number of dB"),
-        (
-            ["prune", "in.ply", "-o", "a.ply", "--target-drop", "1", "--num-cameras", "1"],
-            "a target needs two views or more",
-        ),
+        (["prune", "in.ply", "-o", "a.ply", "--target-drop", "1", "--num-cameras", "1"], "a target needs two"),
         (["prune", "in.ply", "-o", "a.ply", "--count", "0"], "count is 0; give 1 or more"),
         (["prune", "none.ply", "-o", "a.ply"], "none.ply has 5 Gaussians, and none is finite; export it again"),
         (["prune", "empty.ply", "-o", "a.ply"], "empty.ply has 0 Gaussians, and none is finite; export it again"),

@@ -42,14 +42,14 @@ def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "mend"),
+    ("words", "remedy"),
     [([], "sundae --help lists them"), (["fly"], "sundae --help lists them"), (["reprot"], "use report")],
 )
-def test_unknown_commands_are_one_line(words: list[str], sanitise: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_commands_are_one_line(words: list[str], remedy: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*words) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("sundae: ")
-    assert line.endswith(sanitise)
+    assert line.endswith(remedy)
 
 
 def test_installed_command_and_its_exit_code(tmp_path: Path) -> None:

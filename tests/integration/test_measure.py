@@ -34,14 +34,14 @@ def test_figures_of_a_run(tiny: Any) -> None:
     model, cameras, truths = run.model, run.cameras, run.truths
     assert [truth.shape[:2] for truth in truths] == [(int(c.height), int(c.width)) for c in cameras]
     assert all(0 <= truth.min() <= truth.max() <= 1 for truth in truths)
-    times = frame_times(model, cameras[:1], warmup=0, repeats=1)
+    times = frame_times(model, cameras[0], warmup=0, repeats=1)
     assert min(times.frame, times.splat, times.head) > 0
     floats = sum(value.numel() for value in model.gauss_params.values())
     assert sizes(model).primitives == 4 * floats
     assert sizes(model).head == sum(p.numel() * p.element_size() for p in model.head.parameters())
     # Before the head is enabled there is none to time.
     model.state.head_starts_at = 10**9
-    assert frame_times(model, cameras[:1], warmup=0, repeats=1).head == 0
+    assert frame_times(model, cameras[0], warmup=0, repeats=1).head == 0
 
 
 def test_the_timed_frames_are_those_compared_with_the_truth(tiny: Any) -> None:
@@ -85,8 +85,8 @@ def test_the_head_is_timed_at_the_size_at_which_it_runs(tiny: Any) -> None:
         camera = copy.deepcopy(run.cameras[0])
         camera.rescale_output_resolution(factor)
         assert sizes_seen(partial(model.get_outputs_for_camera, camera)) == expected
-        assert sizes_seen(partial(frame_times, model, [camera], warmup=0, repeats=1)) == expected
-    assert frame_times(model, [camera], warmup=0, repeats=1).head == 0
+        assert sizes_seen(partial(frame_times, model, camera, warmup=0, repeats=1)) == expected
+    assert frame_times(model, camera, warmup=0, repeats=1).head == 0
 
 
 def test_the_head_is_disabled_inside_a_block(tiny: Any) -> None:
