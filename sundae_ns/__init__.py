@@ -1,13 +1,13 @@
-"""SUNDAE: spectrally pruned Gaussian fields with neural compensation, as a library and as a nerfstudio plug-in.
+"""SUNDAE: Gaussian scenes made small, by a merge along a graph and by what cameras see, with a neural head.
 
-The library needs no nerfstudio:
+A nerfstudio plug-in, and a library that needs no nerfstudio:
 
     import sundae_ns as sn
 
     scene = sn.load("garden.ply")                          # .ply, .spz, .sog, .glb, .sundae, or a run of ns-train
-    views = sn.virtual_cameras(scene)                        # or sn.cameras_of("transforms.json")
-    small = sn.prune(scene, keep=0.1, views=views)         # a new scene; dropped Gaussians are merged into kept ones
-    image = sn.render(small, views[0]).rgb                 # [H, W, 3], on a CPU or a GPU
+    cameras = sn.virtual_cameras(scene)                    # or sn.cameras_of("transforms.json")
+    small = sn.prune(scene, keep=0.1, cameras=cameras)     # a new scene; dropped Gaussians are merged into kept ones
+    image = sn.render(small, cameras[0]).rgb               # [H, W, 3], on a CPU or a GPU
     sn.save(small, "small.sundae")
 
 Names are imported on first use, so that ``ns-*`` commands, which load every plug-in, do not wait for this one.
@@ -43,12 +43,13 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 _HOMES = {
+    "Camera": "sundae_ns.core.camera",
     "PruneRule": "sundae_ns.pruning.rule",
     "Quality": "sundae_ns.scene.scene",
     "Rendering": "sundae_ns.scene.scene",
     "Scene": "sundae_ns.scene.scene",
     "SundaeError": "sundae_ns.core.errors",
-    "Camera": "sundae_ns.core.camera",
+    "cameras_of": "sundae_ns.scene.cameras",
     "crop": "sundae_ns.scene.cleaning",
     "distill": "sundae_ns.plugin.distill",
     "load": "sundae_ns.scene.load_save",
@@ -58,7 +59,6 @@ _HOMES = {
     "render": "sundae_ns.scene.scene",
     "save": "sundae_ns.scene.load_save",
     "show": "sundae_ns.scene.page",
-    "cameras_of": "sundae_ns.scene.cameras",
     "virtual_cameras": "sundae_ns.scene.virtual_cameras",
 }
 """Public names and the modules that hold them."""
