@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sundae_ns.core.camera import Camera as Camera
     from sundae_ns.core.errors import SundaeError as SundaeError
+    from sundae_ns.core.metrics import Quality as Quality
     from sundae_ns.plugin.distill import distill as distill
     from sundae_ns.pruning.rule import PruneRule as PruneRule
     from sundae_ns.scene.cameras import cameras_of as cameras_of
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from sundae_ns.scene.load_save import save as save
     from sundae_ns.scene.page import show as show
     from sundae_ns.scene.prune_scene import prune as prune
-    from sundae_ns.scene.scene import Quality as Quality
     from sundae_ns.scene.scene import Rendering as Rendering
     from sundae_ns.scene.scene import Scene as Scene
     from sundae_ns.scene.scene import measure as measure
@@ -45,7 +45,7 @@ __version__ = "0.2.0"
 _HOMES = {
     "Camera": "sundae_ns.core.camera",
     "PruneRule": "sundae_ns.pruning.rule",
-    "Quality": "sundae_ns.scene.scene",
+    "Quality": "sundae_ns.core.metrics",
     "Rendering": "sundae_ns.scene.scene",
     "Scene": "sundae_ns.scene.scene",
     "SundaeError": "sundae_ns.core.errors",

@@ -1,7 +1,7 @@
-"""Camera poses from nerfstudio's convention to the rasteriser's.
+"""Cameras in the rasteriser's form, from poses in nerfstudio's convention.
 
 nerfstudio stores camera-to-world with OpenGL axes (x right, y up, view along -z). The rasteriser takes world-to-camera
-with OpenCV axes (x right, y down, view along z). Both functions invert the rigid motion and flip y and z.
+with OpenCV axes (x right, y down, view along z).
 """
 
 from __future__ import annotations
@@ -13,15 +13,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-OPENGL_TO_OPENCV = (1.0, -1.0, -1.0)
-"""Sign of each camera axis."""
+OPENGL_TO_OPENCV = (1.0, -1.0, -1.0)  # sign of each camera axis
 
 
 def world_to_camera(pose: Tensor) -> Tensor:
-    """World-to-camera matrices ``[..., 4, 4]``, OpenCV axes, of camera-to-world ``[..., 3, 4]``, OpenGL axes.
-
-    Differentiable.
-    """
+    """World-to-camera ``[..., 4, 4]``, OpenCV axes, of camera-to-world ``[..., 3, 4]``, OpenGL axes; differentiable."""
     rotation = pose[..., :3] * pose.new_tensor(OPENGL_TO_OPENCV)
     top = torch.cat([rotation.mT, -rotation.mT @ pose[..., 3:]], dim=-1)
     bottom = pose.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*pose.shape[:-2], 1, 4)
@@ -46,7 +42,7 @@ class Crop(NamedTuple):
     width: int
     height: int
     mirrored: bool = False
-    """Whether it is seen in a mirror: left and right change places."""
+    """Whether left and right change places."""
 
 
 def camera_center(viewmat: Tensor) -> Tensor:
@@ -102,12 +98,12 @@ class Camera(NamedTuple):
         width: int = 640,
         height: int = 480,
     ) -> Camera:
-        """A camera at one place that looks at another, on the CPU.
+        """A camera on the CPU that looks at a point.
 
         Args:
             eye: centre of the camera, world units ``[3]``.
             target: point in the middle of the image ``[3]``.
-            up: direction that is upwards in the image ``[3]``; any other one if it is the viewing direction.
+            up: direction that is upwards in the image ``[3]``; ignored if it is the viewing direction.
             fov: vertical field of view, degrees.
             width: of the image, pixels.
             height: of the image, pixels.
@@ -143,7 +139,7 @@ class Camera(NamedTuple):
         return Camera(self.viewmat, K, width, height, self.focal * factor)
 
     def cut(self, crop: Crop) -> Camera:
-        """The camera of a window of the image. Of a mirrored one it sees what a mirror would show."""
+        """The camera of a window of the image; of a mirrored window, the camera of the mirror image."""
         viewmat, K = self.viewmat, self.K.clone()
         K[0, 2] -= crop.left
         K[1, 2] -= crop.top
@@ -155,15 +151,11 @@ class Camera(NamedTuple):
 
 
 def poses_looking_at(eyes: Tensor, targets: Tensor, up: Tensor) -> Tensor:
-    """Poses of cameras that look at points, camera-to-world with OpenGL axes; arguments as for :meth:`Camera.look_at`.
+    """Poses of cameras that look at points, camera-to-world with OpenGL axes ``[..., 3, 4]``, dtype of the eyes.
 
     Args:
-        eyes: centres of the cameras ``[..., 3]``.
-        targets: points in the middle of their images ``[..., 3]``.
+        eyes, targets: centres of the cameras, and points in the middle of their images ``[..., 3]``.
         up: direction that is upwards in the images ``[3]``.
-
-    Returns:
-        ``[..., 3, 4]``, dtype of the eyes.
     """
     back = torch.nn.functional.normalize(eyes - targets, dim=-1)
     right = torch.linalg.cross(up.expand_as(back), back)
@@ -177,5 +169,5 @@ def crop_image(image: Tensor, crop: Crop | None) -> Tensor:
     """A window of an image ``[H, W, C]``; None for the whole image."""
     if crop is None:
         return image
-    part = image[crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
-    return part.flip(1) if crop.mirrored else part
+    window = image[crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
+    return window.flip(1) if crop.mirrored else window

@@ -8,16 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-SURFACE_EXPONENT = 1.6075
-"""Exponent of Thomsen's formula for the surface area of an ellipsoid, which is exact to 1.1% for any axes."""
-
 PAIRS = 1 << 18  # pairs of Gaussians whose overlap is computed at once; they take about 50 MiB
-ROWS = 1 << 16  # Gaussians whose matrices are computed at once; the steps between take some 600 bytes a Gaussian
-_SWEEPS = 6  # rotations of each pair of axes; the error squares with each sweep, and five reach the rounding of float64
+ROWS = 1 << 16  # Gaussians whose matrices are computed at once; they take about 40 MiB
+# Rows and columns of the six entries of a symmetric matrix, diagonal first.
 _LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])
-"""Rows and columns of the six entries of a symmetric matrix, diagonal first."""
-
-_DIAGONAL = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -38,7 +32,7 @@ def covariances(scales: Tensor, quats: Tensor) -> Tensor:
 
 
 def covariances_of(params: Mapping[str, Tensor]) -> Tensor:
-    """Covariances of the Gaussians of a field, float64 on its device ``[N, 3, 3]``."""
+    """Covariances of Gaussians, float64 on their device ``[N, 3, 3]``."""
     scales, quats = params["scales"].detach(), params["quats"].detach()
     result = torch.empty(len(scales), 3, 3, dtype=torch.float64, device=scales.device)
     for rows in chunks(len(scales)):
@@ -47,7 +41,7 @@ def covariances_of(params: Mapping[str, Tensor]) -> Tensor:
 
 
 def chunks(n: int, size: int | None = None) -> Iterator[slice]:
-    """Consecutive slices of at most ``size`` of ``n`` rows, to bound the memory of steps between; by default `ROWS`."""
+    """Consecutive slices of at most ``size`` of ``n`` rows, by default `ROWS`, to limit the memory of temporaries."""
     size = size or ROWS
     return (slice(first, min(first + size, n)) for first in range(0, n, size))
 
@@ -80,11 +74,11 @@ def scales_and_quaternions(covariance: Tensor) -> tuple[Tensor, Tensor]:
 def _eigenvectors(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Ascending eigenvalues ``[N, 3]``, and rotations whose columns are the eigenvectors ``[N, 3, 3]``.
 
-    Jacobi's rotations treat all matrices at once. LAPACK takes them one by one, and CUDA's solver limits their number.
+    By Jacobi's method: LAPACK takes the matrices one by one, and CUDA's solver limits their number.
     """
     a = [list(row.unbind(dim=1)) for row in matrices.unbind(dim=1)]
     v = [list(row.unbind(dim=1)) for row in torch.eye(3).to(matrices).expand_as(matrices).unbind(dim=1)]
-    for _ in range(_SWEEPS):
+    for _ in range(6):  # the error squares with each sweep, and five reach the rounding of float64
         for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
             gap, twice = a[q][q] - a[p][p], 2 * a[p][q]
             below = gap.abs() + torch.hypot(gap, twice)
@@ -106,11 +100,12 @@ def _eigenvectors(matrices: Tensor) -> tuple[Tensor, Tensor]:
 def mean_projected_area(scales: Tensor) -> Tensor:
     """Mean projected area of ellipsoids with half axes ``[N, 3]`` over all directions, divided by pi ``[N]``.
 
-    The mean projected area is a quarter of the surface area (Cauchy), which Thomsen's formula gives. It measures how
-    much of an image a Gaussian covers; the volume does not, because most Gaussians are flat.
+    It is a quarter of the surface area (Cauchy), by Thomsen's formula, which is exact to 1.1%. The volume does not
+    measure how much of an image a Gaussian covers, because most Gaussians are flat.
     """
-    a, b, c = (scales / scales.amax(dim=1, keepdim=True)).pow(SURFACE_EXPONENT).unbind(dim=1)
-    return scales.amax(dim=1).square() * ((a * b + a * c + b * c) / 3).pow(1 / SURFACE_EXPONENT)
+    exponent = 1.6075
+    a, b, c = (scales / scales.amax(dim=1, keepdim=True)).pow(exponent).unbind(dim=1)
+    return scales.amax(dim=1).square() * ((a * b + a * c + b * c) / 3).pow(1 / exponent)
 
 
 def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: float) -> Tensor:
@@ -122,20 +117,20 @@ def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: 
         means: world units ``[N, 3]``.
         covariance: squared world units ``[N, 3, 3]``.
         indices: neighbours ``[N, K]``.
-        least_width: standard deviation added to all axes, world units; without it, two parallel flat Gaussians would
-            count as separate however close they are.
+        least_width: standard deviation added to all axes, world units; without it, parallel flat Gaussians would not
+            overlap however close they are.
 
     Returns:
         ``[N, K]``, dtype of ``means``.
     """
     indices = indices.to(means.device)
     least_variance = least_width**2
-    added = least_variance * torch.tensor(_DIAGONAL, dtype=torch.float64, device=means.device)
+    added = least_variance * torch.tensor([1, 1, 1, 0, 0, 0], dtype=torch.float64, device=means.device)
     points = means.double()
     entries, log_det = points.new_empty(len(means), 6), points.new_empty(len(means))
-    for own in chunks(len(means)):
-        entries[own] = covariance[own].double()[:, _LOWER[0], _LOWER[1]] + added
-        log_det[own] = 2 * torch.stack(_cholesky(entries[own], least_variance)[:3], dim=1).log().sum(dim=1)
+    for rows in chunks(len(means)):
+        entries[rows] = covariance[rows].double()[:, _LOWER[0], _LOWER[1]] + added
+        log_det[rows] = 2 * torch.stack(_cholesky(entries[rows], least_variance)[:3], dim=1).log().sum(dim=1)
     result = torch.empty(indices.shape, dtype=means.dtype, device=means.device)
     for rows in chunks(len(means), max(1, PAIRS // max(1, indices.shape[1]))):
         columns = indices[rows]
@@ -156,15 +151,12 @@ def outer_entries(vectors: Tensor) -> Tensor:
 
 
 def pair_overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """Bhattacharyya coefficient of pairs of Gaussians, as :func:`overlap`; 0 for one that overflows.
+    """Bhattacharyya coefficient of pairs of Gaussians ``[P]``, as :func:`overlap`; 0 for one that overflows.
 
     Args:
         means: world units ``[N, 3]``.
         entries: of positive definite covariances, by :func:`lower_entries` ``[N, 6]``.
         first, second: the pairs, int64 ``[P]``.
-
-    Returns:
-        ``[P]``, dtype of ``means``.
     """
     result = means.new_empty(len(first))
     for chunk in chunks(len(first), PAIRS):
@@ -177,13 +169,9 @@ def pair_overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor) 
 
 
 def _coefficient(middle: Tensor, offset: Tensor, log_numerator: Tensor, least_variance: float) -> Tensor:
-    """Bhattacharyya coefficient; 0 for one that overflows.
+    """Bhattacharyya coefficient from the entries of the mean covariance ``[..., 6]`` and the offset of the centres.
 
-    Args:
-        middle: entries of the mean of both covariances ``[..., 6]``.
-        offset: from one centre to the other ``[..., 3]``.
-        log_numerator: ``log (|A| |B|)^(1/4)`` ``[...]``.
-        least_variance: of ``middle``.
+    ``log_numerator`` is ``log (|A| |B|)^(1/4)``. 0 for a coefficient that overflows.
     """
     a, b, c, ba, ca, cb = _cholesky(middle, least_variance)
     x, y, z = offset.unbind(dim=-1)
@@ -199,9 +187,6 @@ def _cholesky(entries: Tensor, least_variance: float) -> tuple[Tensor, ...]:
 
     Written out, because the batched function calls LAPACK once per matrix. A pivot is never below the least eigenvalue,
     so clamping at a lower bound of it repairs pivots of needles that rounding made too small.
-
-    Returns:
-        Six factors ``[...]`` in the order of ``_LOWER``.
     """
     xx, yy, zz, yx, zx, zy = entries.unbind(dim=-1)
     a = xx.clamp_min(least_variance).sqrt()

@@ -1,7 +1,7 @@
 """Errors shown to users: one line each, the cause first and then the remedy.
 
-All derive from :class:`SundaeError`, which the command line prints without a traceback. Each also derives from the
-built-in exception that a caller would expect.
+The command line prints a :class:`SundaeError` without a traceback. Each class also derives from the built-in exception
+that a caller would expect.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from types import TracebackType
 
 STOPPED = (130, 143)  # exit codes of a training that SIGINT or SIGTERM stopped, and that has saved itself
 NOTHING_SAVED = "Stopped before the first step: nothing to save."
-passed_on: list[int] = []
-"""Signals that this process passed on to its ranks, in their order."""
+passed_on: list[int] = []  # signals that this process passed on to its ranks, in their order
 _REASONS = {
     errno.ENOSPC: "the disk is full; make room",
     errno.EDQUOT: "the disk quota is used up; make room",
@@ -32,7 +31,6 @@ _REASONS = {
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
     errno.EISDIR: "it is a folder; name a file",
 }
-_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class SundaeError(Exception):
@@ -56,18 +54,15 @@ class StorageError(SundaeError, OSError):
 
 
 class PackError(SundaeError, ValueError):
-    """A packed scene is damaged or of another version, or a field cannot be packed."""
+    """A packed scene is damaged or of another version, or a scene cannot be packed."""
 
 
 class MemoryExhaustedError(SundaeError, RuntimeError):
-    """The device lacks memory for the field or the image, or a view has more Gaussians than any real scene."""
+    """The device lacks memory for the scene or the image, or a view has more Gaussians than any real scene."""
 
 
 class CheckpointError(SundaeError, ValueError):
-    """A checkpoint does not fit the model.
-
-    A ``ValueError``, because nerfstudio retries without strictness when loading raises a ``RuntimeError``.
-    """
+    """A checkpoint does not fit the model. Not a ``RuntimeError``, on which nerfstudio retries without strictness."""
 
 
 class RankError(SundaeError, RuntimeError):
@@ -78,14 +73,18 @@ class RankError(SundaeError, RuntimeError):
 def writing(failure: str) -> Iterator[None]:
     """Turn file-system errors that a user can correct into ``StorageError``; others pass.
 
-    ``failure`` is the start of the message, without a full stop: ``"cannot make runs/a"``.
+    ``failure`` starts the message: ``"cannot make runs/a"``.
     """
     try:
         yield
     except SundaeError:
         raise
     except Exception as error:
-        reason = _reason(error)
+        cause: BaseException | None = error
+        # torch and zipfile replace a failed write by an error of their own when they close the file.
+        while cause is not None and not isinstance(cause, OSError):
+            cause = cause.__cause__ or cause.__context__
+        reason = None if cause is None else _REASONS.get(cause.errno or 0)
         if reason is None:
             raise
         raise StorageError(f"{failure}: {reason}") from error
@@ -102,8 +101,8 @@ def reading(
 ) -> Iterator[None]:
     """Turn every error of reading an untrusted file into a ``failure``; decoders raise errors of many kinds.
 
-    ``kind`` names what the file should be, ``"a complete .spz"``. ``remedy`` says what to do if it is damaged,
-    ``missing`` if it cannot be opened.
+    ``kind`` names what the file should be: ``"a complete .spz"``. ``remedy`` is the remedy for a damaged file,
+    ``missing`` that for one that cannot be opened.
     """
     try:
         yield
@@ -115,21 +114,8 @@ def reading(
         raise failure(f"{path} is not {kind} ({one_line(error)}); {remedy}") from error
 
 
-def _reason(error: Exception) -> str | None:
-    """Cause and remedy of a file-system error; None for other errors."""
-    if isinstance(error, OSError):
-        return _REASONS.get(error.errno or 0)
-    # torch and zipfile replace a failed write by an error of their own when they close the file.
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, OSError) and cause.errno in _NO_SPACE:
-            return _REASONS[cause.errno]
-        cause = cause.__cause__ or cause.__context__
-    return None
-
-
 def one_line(error: BaseException) -> str:
-    """Message of an error as one line of at most 200 characters; the name of its class if it has none."""
+    """Message of an error in one line of at most 200 characters; the name of its class if it has none."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
@@ -144,23 +130,20 @@ def rank_ended(error: BaseException) -> RankError:
     """The error for a rank that ended and stopped the others, from an exception of ``torch.multiprocessing``."""
     rank, signal = getattr(error, "error_index", 0), getattr(error, "signal_name", None)
     last = (str(error).strip().splitlines() or [""])[-1]
-    kind, _, message = last.partition(": ")
-    if kind.startswith(__name__ + "."):
-        return RankError(f"rank {rank}: {message}")  # our own errors already name the remedy
-    cause = f"killed by {signal}" if signal else last
+    if last.startswith(__name__ + "."):
+        return RankError(f"rank {rank}: {last.partition(': ')[2]}")  # our own errors already name the remedy
     return RankError(
-        f"rank {rank} ended ({cause}) and stopped the others; resume from the newest checkpoint with --load-dir, "
-        "on fewer GPUs with a smaller --machine.num-devices"
+        f"rank {rank} ended ({f'killed by {signal}' if signal else last}) and stopped the others; resume from the "
+        "newest checkpoint with --load-dir, on fewer GPUs with a smaller --machine.num-devices"
     )
 
 
 def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError:
-    """The error for a full CUDA device: the number of Gaussians, the allocation that failed, what to try."""
-    found = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", str(error))
-    asked = f"cannot allocate {found[1]} more" if found else "cannot allocate more"
+    """The error for a full CUDA device: the number of Gaussians, the allocation that failed, and what to try."""
+    allocation = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", str(error))
     return MemoryExhaustedError(
-        f"the GPU's memory is full: {asked} with {primitives:,} Gaussians; "
-        "try --pipeline.datamanager.cache-images cpu (images in host memory), "
+        f"the GPU's memory is full: cannot allocate {f'{allocation[1]} ' if allocation else ''}more with "
+        f"{primitives:,} Gaussians; try --pipeline.datamanager.cache-images cpu (images in host memory), "
         "--pipeline.datamanager.camera-res-scale-factor 0.5 (smaller images), or "
         "--pipeline.model.pruning.mode continuous --pipeline.model.pruning.keep-ratio 0.5 "
         f"--pipeline.model.pruning.max-gaussians {max(primitives // 2, 1)} (a lower peak); "
@@ -169,29 +152,29 @@ def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError
 
 
 def show_in_one_line() -> None:
-    """In a nerfstudio command (``ns-*``), print an uncaught :class:`SundaeError` as one line; end Ctrl-C with code 130.
+    """In an ``ns-*`` command, print an uncaught :class:`SundaeError` as one line, and end Ctrl-C with code 130.
 
-    Other errors and other programs stay as they are, and so does everything when ``SUNDAE_TRACEBACK`` is set.
+    Other errors stay as they are; all do when ``SUNDAE_TRACEBACK`` is set.
     """
     if not Path(sys.argv[0]).name.startswith("ns-") or os.environ.get("SUNDAE_TRACEBACK"):
         return
     before = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        of_rank = kind.__name__ in ("ProcessExitedException", "ProcessRaisedException")
+        code = getattr(error, "exit_code", None)
         if issubclass(kind, KeyboardInterrupt):
             print("\nStopped.", file=sys.stderr)
             raise SystemExit(130)
-        code = getattr(error, "exit_code", None)  # of the rank that ended first; it has said the rest
-        if code in STOPPED:
+        if code in STOPPED:  # the rank that ended first has printed the rest
             raise SystemExit(code)
-        ended_by = getattr(error, "signal_name", None)
-        if kind.__name__ == "ProcessExitedException" and passed_on and ended_by in (None, "SIGINT", "SIGTERM"):
+        stopped = getattr(error, "signal_name", None) in (None, "SIGINT", "SIGTERM")
+        if kind.__name__ == "ProcessExitedException" and passed_on and stopped:
             print(f"\n{NOTHING_SAVED}", file=sys.stderr)
             raise SystemExit(128 + passed_on[0])
-        if kind.__name__ in ("ProcessExitedException", "ProcessRaisedException"):
-            error = rank_ended(error)
-        if isinstance(error, SundaeError):
-            print(f"sundae: {error}", file=sys.stderr)
+        shown = rank_ended(error) if of_rank else error
+        if isinstance(shown, SundaeError):
+            print(f"sundae: {shown}", file=sys.stderr)
         else:
             before(kind, error, trace)
 

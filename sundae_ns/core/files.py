@@ -17,13 +17,12 @@ from sundae_ns.core.errors import writing
 if TYPE_CHECKING:
     from PIL import Image
 
-PARTIAL = ".partial"
-"""Suffix of files that are not complete yet."""
+PARTIAL = ".partial"  # suffix of files that are not complete yet
 _WINDOWS = os.name == "nt"  # renames no open file, opens no folder, and flushes only what it may write
 
 
 def locked(file: IO[Any]) -> bool | None:
-    """Lock an open file without waiting, for as long as a process has it open: the system drops locks of the dead.
+    """Lock an open file without waiting; the system drops the lock when the last process that has it open ends.
 
     Returns:
         True if this process holds the lock, False if another one does, None if the file system has no locks.
@@ -38,13 +37,13 @@ def locked(file: IO[Any]) -> bool | None:
 def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
     """Yield a path to write to; after the block, flush that file to disk and rename it to ``path``.
 
-    If the process is killed or the machine loses power, ``path`` is either the earlier file or the complete new one. If
-    the block raises, its file is removed and ``path`` is unchanged.
+    After a kill or a power cut, ``path`` is either the earlier file or the complete new one. If the block raises, its
+    file is removed and ``path`` is unchanged.
 
     Args:
-        path: the file to write; a missing folder of it is made.
-        partial: temporary file in the same folder. By default named after this process, and such files of killed
-            processes are removed.
+        path: the file to write; a missing folder is made.
+        partial: temporary file in the same folder. By default named after this process, and those of killed processes
+            are removed.
 
     Raises:
         StorageError: the disk is full or not writable.
@@ -76,7 +75,7 @@ def _remove_abandoned(path: Path) -> None:
 
 
 def write_files(contents: Mapping[Path, bytes]) -> None:
-    """Write files that belong together: all, or none if the disk is full or not writable, a ``StorageError``."""
+    """Write files that belong together: all, or none and a ``StorageError``."""
     with ExitStack() as stack:
         partials = [stack.enter_context(replacing(path)) for path in contents]
         for partial, content in zip(partials, contents.values(), strict=True):
@@ -101,7 +100,7 @@ def write_image(path: Path, image: Image.Image) -> None:
 
 
 def put_aside(path: Path) -> None:
-    """Rename a damaged file or folder, if there is one, to ``NAME.damaged``, in place of an earlier one."""
+    """Rename a damaged file or folder, if there is one, to ``NAME.damaged``; replaces an earlier one."""
     aside = path.with_name(f"{path.name}.damaged")
     if path.exists():
         if aside.is_dir():

@@ -1,7 +1,7 @@
-"""A field: the parameters of its Gaussians, their shapes and activations, and the mending of values not finite.
+"""The parameters of Gaussians, their shapes and encodings, and the repair of values that are not finite.
 
-A field is a mapping from the names below to tensors that share their first dimension, the number of Gaussians N.
-Values are stored before activation, as 3DGS and splatfacto do:
+Gaussians are a mapping from the names below to tensors that share their first dimension N. Values are stored before
+activation, as 3DGS and splatfacto do:
 
 =================  ==============  ===============================================================
 name               shape           meaning
@@ -28,28 +28,21 @@ from torch import Tensor
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 
 Encoding = Literal["harmonics", "logits"]
-"""How a field stores colours. ``harmonics``: ``features_dc`` and ``features_rest`` are coefficients of spherical
-harmonics. ``logits``: ``features_dc`` holds logits of view-independent colours, as splatfacto does at SH degree 0."""
-
+"""``harmonics``: ``features_dc`` and ``features_rest`` are coefficients of spherical harmonics. ``logits``:
+``features_dc`` holds logits of view-independent colours, as splatfacto does at SH degree 0."""
 SPLAT_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
-"""Parameters of every 3DGS field, named as in splatfacto's checkpoints."""
-
+"""Parameters of every 3DGS scene, named as in splatfacto's checkpoints."""
 _COLUMNS = {"means": 3, "scales": 3, "quats": 4, "features_dc": 3, "opacities": 1}
-
-MAX_SH_DEGREE = 4  # highest SH degree of a field
+MAX_SH_DEGREE = 4
 FEATURES = "features"  # name of the parameter that SUNDAE adds to each Gaussian
 LARGEST_LOGIT = 16.0
 """Logit for opacities of 0 and 1. Its float32 opacity is the last below 1, so that its logarithms stay finite."""
-
 LEAST_SCALES = (-80.0, -43.0)
-"""Range of the log-scale for widths of 0: as narrow as the narrowest of the field, and with a square that is a normal
-float32, unless a tiny scene needs less."""
-
-_QUATERNION_RANGE = 1e-6, 1e18  # largest components of quaternions that can be normalised in float32
+"""Limits of the log-scale for widths of 0; the square of the larger one is a normal float32."""
 
 
 def num_gaussians(params: Mapping[str, Tensor]) -> int:
-    """Number of Gaussians N in a field."""
+    """Number of Gaussians N."""
     return params["means"].shape[0]
 
 
@@ -66,8 +59,7 @@ def sh_degree_of(coefficients: int) -> int | None:
 def odd_shapes(params: Mapping[str, Tensor]) -> list[str]:
     """Descriptions of the parameters with a wrong shape, for an error message; N is the length of ``means``.
 
-    Args:
-        params: has all of :data:`SPLAT_NAMES`; ``features`` are not checked.
+    ``params`` has all of :data:`SPLAT_NAMES`; ``features`` are not checked.
     """
     n = params["means"].shape[0] if params["means"].ndim else 0
     rest = params["features_rest"].shape
@@ -108,11 +100,11 @@ def finite_mask(params: Mapping[str, Tensor]) -> Tensor:
 class Gaussians(UserDict[str, Any]):
     """Named parameters ``[N, ...]`` (see :mod:`sundae_ns.core.gaussians`) and the encoding of their colours.
 
-    A view of the mapping that it is given: surgery that replaces a parameter here replaces it there too. ``len`` counts
+    Wraps the given mapping without a copy: surgery that replaces a parameter here replaces it there too. ``len`` counts
     parameters, :attr:`num_gaussians` counts Gaussians.
 
     Args:
-        params: tensors, or ``Parameter``s of a field in training.
+        params: tensors, or ``Parameter``s in training.
         encoding: how colours are stored.
     """
 
@@ -132,15 +124,19 @@ class Gaussians(UserDict[str, Any]):
         return sh_degree(self["features_rest"])
 
     def rows(self, mask: Tensor) -> Gaussians:
-        """The Gaussians under a mask, bool ``[N]``, as a field of its own."""
+        """The Gaussians under a mask, bool ``[N]``, in a new mapping."""
         return Gaussians({name: value[mask] for name, value in self.items()}, self.encoding)
 
     def replaced(self, values: Mapping[str, Tensor]) -> Gaussians:
-        """A field of the same tensors but for these values, in a mapping of its own that surgery does not change."""
+        """The same tensors except for these values, in a new mapping that surgery does not change."""
         return Gaussians({**self, **values}, self.encoding)
 
+    def to(self, device: torch.device | str) -> Gaussians:
+        """The Gaussians on another device, in a new mapping."""
+        return self.replaced({name: value.to(device) for name, value in self.items()})
+
     def as_harmonics(self) -> Gaussians:
-        """The field with colours as spherical harmonics; itself if it stores them so."""
+        """The Gaussians with colours as spherical harmonics; itself if they are stored so."""
         if self.encoding == "harmonics":
             return self
         colors = rgb_to_sh(self["features_dc"].detach().sigmoid())
@@ -148,27 +144,27 @@ class Gaussians(UserDict[str, Any]):
 
 
 def as_gaussians(params: Mapping[str, Any]) -> Gaussians:
-    """A mapping of parameters as a field; a plain mapping stores colours as harmonics."""
+    """A mapping of parameters as :class:`Gaussians`; a plain mapping stores colours as harmonics."""
     return params if isinstance(params, Gaussians) else Gaussians(dict(params))
 
 
 class Sanitised(NamedTuple):
-    """A field whose values are finite, and what that took."""
+    """Gaussians whose values are finite, and what was changed."""
 
     gaussians: Gaussians
-    """The Gaussians that have a meaning ``[M, ...]``; the tensors of the source if nothing changed."""
+    """The valid Gaussians ``[M, ...]``; the tensors of the source if nothing changed."""
     mask: Tensor
     """True for these Gaussians of the source, bool ``[N]``."""
     limits: int
-    """Number of these Gaussians with an opacity of exactly 0 or 1, which was clamped."""
+    """Number of them with an opacity of exactly 0 or 1, which was clamped."""
     flat: int
-    """Number of these Gaussians with a width of 0, which was clamped."""
+    """Number of them with a width of 0, which was clamped."""
     unrotated: int
-    """Number of these Gaussians with an all-zero quaternion, which became the identity."""
+    """Number of them with an all-zero quaternion, which became the identity."""
 
     @property
     def dropped(self) -> int:
-        """Number of Gaussians that were left out: NaN, or infinite where that has no meaning."""
+        """Number of Gaussians that were dropped: NaN, or infinite where that has no meaning."""
         return len(self.mask) - self.gaussians.num_gaussians
 
     @property
@@ -188,16 +184,13 @@ class Sanitised(NamedTuple):
 
 @torch.no_grad()
 def sanitise(params: Mapping[str, Any]) -> Sanitised:
-    """The Gaussians of a field that have a meaning, with finite values.
+    """The valid Gaussians, with finite values; ``params`` does not change.
 
     - A logit of plus or minus infinity is an opacity of 1 or 0, and becomes plus or minus :data:`LARGEST_LOGIT`.
-    - A log-scale of minus infinity is a width of 0, and becomes the least of the field within :data:`LEAST_SCALES`.
+    - A log-scale of minus infinity is a width of 0, and becomes the least scale within :data:`LEAST_SCALES`.
     - An all-zero quaternion does not rotate, as in the renderers of 3DGS, and becomes the identity. One that is too
       short or too long to be normalised in float32 is rescaled.
-    - A Gaussian with any other value that is NaN or infinite is left out.
-
-    Args:
-        params: the field, N Gaussians; it does not change.
+    - A Gaussian with any other value that is NaN or infinite is dropped.
     """
     gaussians = as_gaussians(params)
     values: dict[str, Tensor] = {}
@@ -216,16 +209,14 @@ def sanitise(params: Mapping[str, Any]) -> Sanitised:
         values["scales"] = torch.where(narrow, narrowest, scales)
     if n:
         largest = quats.abs().amax(dim=1)
-        least, most = _QUATERNION_RANGE
-        odd = ((largest < least) | (largest > most)) & largest.isfinite()
+        # Quaternions outside of this range cannot be normalised in float32.
+        odd = ((largest < 1e-6) | (largest > 1e18)) & largest.isfinite()
         if bool(odd.any()):
             unrotated = largest == 0
             rescaled = quats / torch.where(odd, largest, 1.0).clamp_min(torch.finfo(quats.dtype).tiny)[:, None]
-            # The identity: w is 1, the others stay 0.
-            rescaled[:, 0] += unrotated.to(rescaled)
+            rescaled[:, 0] += unrotated.to(rescaled)  # the identity: w is 1, the others stay 0
             values["quats"] = torch.where(odd[:, None], rescaled, quats)
     sanitised = gaussians.replaced(values) if values else gaussians
     mask = finite_mask(sanitised)
-    whole = bool(mask.all())
     counts = (int((kind & mask).sum()) for kind in (limits, flat, unrotated))
-    return Sanitised(sanitised if whole else sanitised.rows(mask), mask, *counts)
+    return Sanitised(sanitised if bool(mask.all()) else sanitised.rows(mask), mask, *counts)

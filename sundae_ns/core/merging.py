@@ -26,62 +26,61 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
       place of areas would suit fog, but Gaussians are flat.
 
     Args:
-        params: the field, all finite, N Gaussians.
+        params: finite parameters of N Gaussians.
         label: index of the Gaussian that each one is merged into, int64 ``[N]``: its own index for a Gaussian that
             stays, -1 for one that is dropped, else the index of one that stays.
         weight: weight of each Gaussian in its group, not negative ``[N]``.
 
     Returns:
         Parameters ``[M, ...]`` of the Gaussians that stay, in order, with dtype and device of ``params``; computed in
-        float64 there, in the same order each time. A Gaussian whose group is itself alone, has no weight or overflows
-        is unchanged, bit for bit.
+        float64 in a fixed order. A Gaussian that is alone in its group, has no weight or overflows is unchanged, bit
+        for bit.
     """
     source = {name: value.detach() for name, value in params.items()}
     device = source["means"].device
     label, w = label.to(device), weight.detach().to(device).double().nan_to_num(0.0, posinf=0.0).clamp_min(0)
     n = len(label)
     stays = label == torch.arange(n, device=device)
-    place = stays.cumsum(0) - 1
     members = (label >= 0).nonzero().squeeze(1)
-    group = place[label[members]]
+    group = (stays.cumsum(0) - 1)[label[members]]
     count = int(stays.sum())
 
     def total(values: Callable[[slice], Tensor], *shape: int) -> Tensor:
-        # In chunks: values of all members in float64 would take several times the memory of the field.
+        # In chunks: values of all members in float64 would take several times the memory of the scene.
         result = torch.zeros(count, *shape, dtype=torch.float64, device=device)
-        for some in chunks(len(members)):
+        for rows in chunks(len(members)):
             if result.is_cuda:  # there index_add_ adds in any order
-                result.index_put_((group[some],), values(some), accumulate=True)
+                result.index_put_((group[rows],), values(rows), accumulate=True)
             else:
-                result.index_add_(0, group[some], values(some))
+                result.index_add_(0, group[rows], values(rows))
         return result
 
-    def of(name: str, some: slice) -> Tensor:
-        return source[name][members[some]].double()
+    def of(name: str, rows: slice) -> Tensor:
+        return source[name][members[rows]].double()
 
     w = w[members]
     # Divide by the largest weight of the group first, so that no sum underflows.
     largest = w.new_zeros(count).scatter_reduce_(0, group, w, "amax")
     w = torch.where(largest[group] > 0, w / largest[group], 0.0)
-    normalized = w / total(lambda some: w[some])[group].clamp_min(torch.finfo(torch.float64).tiny)
+    normalized = w / total(lambda rows: w[rows])[group].clamp_min(torch.finfo(torch.float64).tiny)
 
     def mean(name: str) -> Tensor:
         shape = source[name].shape[1:]
-        flat = total(lambda some: normalized[some, None] * of(name, some).flatten(1), shape.numel())
+        flat = total(lambda rows: normalized[rows, None] * of(name, rows).flatten(1), shape.numel())
         return flat.reshape(count, *shape)
 
     kept = {name: value[stays] for name, value in source.items()}
     origin = kept["means"].double()
 
-    def offset(some: slice) -> Tensor:
-        return of("means", some) - origin[group[some]]
+    def offset(rows: slice) -> Tensor:
+        return of("means", rows) - origin[group[rows]]
 
-    shift = total(lambda some: normalized[some, None] * offset(some), 3)
+    shift = total(lambda rows: normalized[rows, None] * offset(rows), 3)
 
-    def moments(some: slice) -> Tensor:
-        spread = offset(some) - shift[group[some]]
-        own = covariances(of("scales", some).exp(), of("quats", some)) + spread[:, :, None] * spread[:, None, :]
-        return normalized[some, None, None] * own
+    def moments(rows: slice) -> Tensor:
+        spread = offset(rows) - shift[group[rows]]
+        covariance = covariances(of("scales", rows).exp(), of("quats", rows)) + spread[:, :, None] * spread[:, None, :]
+        return normalized[rows, None, None] * covariance
 
     covariance = total(moments, 3, 3)
     # A covariance that overflows has no axes; its Gaussian stays unchanged.
@@ -89,17 +88,17 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     deviations, quats = scales_and_quaternions(torch.where(bounded[:, None, None], covariance, 0.0))
     # A width of zero has no logarithm; limit each axis to the thinnest axis of the members.
     thinnest = torch.full_like(largest, torch.inf)
-    for some in chunks(len(members)):
-        thinnest.scatter_reduce_(0, group[some], of("scales", some).exp().amin(dim=1), "amin")
+    for rows in chunks(len(members)):
+        thinnest.scatter_reduce_(0, group[rows], of("scales", rows).exp().amin(dim=1), "amin")
     deviations = deviations.maximum(thinnest[:, None])
 
-    def cover(some: slice) -> Tensor:
-        depth = softplus(of("opacities", some).squeeze(1), threshold=40.0)
-        return depth * mean_projected_area(of("scales", some).exp())
+    def cover(rows: slice) -> Tensor:
+        depth = softplus(of("opacities", rows).squeeze(1), threshold=40.0)
+        return depth * mean_projected_area(of("scales", rows).exp())
 
     merged_depth = total(cover) / mean_projected_area(deviations)
 
-    merged = {name: mean(name) for name in source if name not in _WITH_MOMENTS}
+    merged = {name: mean(name) for name in source if name not in ("means", "scales", "quats", "opacities")}
     merged["means"] = origin + shift
     merged["scales"] = deviations.log()
     merged["quats"] = quats
@@ -113,9 +112,6 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
         value[changed] = merged[name][changed].to(value.dtype)
         result[name] = value
     return result
-
-
-_WITH_MOMENTS = ("means", "scales", "quats", "opacities")
 
 
 def _logit_of_depth(depth: Tensor) -> Tensor:

@@ -10,10 +10,11 @@ from __future__ import annotations
 import importlib.util
 import logging
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from statistics import fmean
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -22,10 +23,9 @@ from torch import Tensor
 
 from sundae_ns.core.errors import DataError, one_line
 
-SSIM_WINDOW = 11
-"""Side of SSIM's Gaussian window, pixels (Wang et al. 2004)."""
-MOST_PSNR = 100.0
-"""Highest PSNR that a decision or a fit of colours gives, dB; 8-bit images carry no more."""
+SSIM_WINDOW = 11  # side of SSIM's Gaussian window, pixels (Wang et al. 2004)
+MOST_PSNR = 100.0  # highest PSNR that a decision or a fit of colours gives, dB; 8-bit images carry no more
+AnyCamera = TypeVar("AnyCamera")
 Net = Literal["alex", "vgg", "squeeze"]
 logger = logging.getLogger(__name__)
 
@@ -33,9 +33,8 @@ logger = logging.getLogger(__name__)
 def check_pair(pred: Tensor, target: Tensor) -> None:
     """Raise DataError unless both are images ``[H, W, 3]`` of one size."""
     if pred.shape != target.shape or pred.dim() != 3 or pred.shape[-1] != 3:
-        raise DataError(
-            f"Images have shapes {list(pred.shape)} and {list(target.shape)}; give two of one size, [H, W, 3]."
-        )
+        shapes = f"{list(pred.shape)} and {list(target.shape)}"
+        raise DataError(f"Images have shapes {shapes}; give two of one size, [H, W, 3].")
 
 
 def psnr(pred: Tensor, target: Tensor) -> Tensor:
@@ -59,7 +58,7 @@ def psnr(pred: Tensor, target: Tensor) -> Tensor:
 def fitted_psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """PSNR after the affine map of colours (12 numbers) that brings an image nearest to its target.
 
-    What is left if light and exposure of the photo differ from the others'.
+    It leaves out differences in light and exposure.
 
     Args:
         pred: ``[H, W, 3]``, nominally in [0, 1]; not clamped here.
@@ -104,7 +103,7 @@ def flip_available() -> bool:
 def flip(pred: Tensor, target: Tensor) -> Tensor | None:
     """Mean FLIP error (Andersson et al. 2020) of two sRGB images ``[H, W, 3]``, in [0, 1]; lower is better.
 
-    Images are clamped to [0, 1]. The authors' package computes it on the CPU, at 67 pixels per degree.
+    The authors' package computes it on the CPU, at 67 pixels per degree, from images clamped to [0, 1].
 
     Returns:
         A float32 scalar on the inputs' device; None if the package is not installed.
@@ -123,10 +122,7 @@ def flip(pred: Tensor, target: Tensor) -> Tensor | None:
 
 
 def lpips_weights(net: Net = "alex") -> tuple[str, Path]:
-    """URL of torchvision's weights of a backbone, and the file in which torch.hub caches them.
-
-    torchmetrics ships the linear layers on top.
-    """
+    """URL of torchvision's weights of a backbone, and the file in which torch.hub caches them."""
     from torchvision import models
 
     names = {"alex": "AlexNet_Weights", "vgg": "VGG16_Weights", "squeeze": "SqueezeNet1_1_Weights"}
@@ -138,7 +134,7 @@ class Lpips:
     """Learned perceptual image patch similarity (Zhang et al. 2018), built at its first use.
 
     torchmetrics' variant with ``normalize=True``, for images in [0, 1]. Values of different nets do not compare: most
-    papers report VGG, splatfacto and gsplat report AlexNet. It is no ``nn.Module``, so checkpoints do not hold the net.
+    papers report VGG, splatfacto and gsplat report AlexNet. No ``nn.Module``, so that checkpoints do not hold the net.
 
     Args:
         net: the backbone, ``alex``, ``vgg`` or ``squeeze``. Missing weights are downloaded.
@@ -154,8 +150,8 @@ class Lpips:
         """Distance of two images ``[H, W, 3]``, clamped to [0, 1]; lower is better.
 
         Returns:
-            A float32 scalar on the inputs' device. None if a side is shorter than 32 pixels, below which a backbone
-            pools its input to nothing, or if the weights are missing; the first such call logs a warning.
+            A float32 scalar on the inputs' device. None if a side is shorter than 32 pixels, which a backbone pools to
+            nothing, or if the weights are missing; the first such call logs a warning.
 
         Raises:
             DataError: the shapes differ, or are not ``[H, W, 3]``.
@@ -184,6 +180,43 @@ class Lpips:
 
 
 @dataclass(frozen=True)
+class Quality:
+    """Quality of images, a value for each camera."""
+
+    psnrs: tuple[float, ...]
+    """Peak signal-to-noise ratio over all pixels and channels, dB."""
+    ssims: tuple[float, ...]
+    """Structural similarity, window of 11 x 11 pixels without padding; NaN for smaller images."""
+
+    @property
+    def psnr(self) -> float:
+        """Mean PSNR over the cameras, dB."""
+        return fmean(self.psnrs)
+
+    @property
+    def ssim(self) -> float:
+        """Mean SSIM over the cameras."""
+        return fmean(self.ssims)
+
+
+@torch.no_grad()
+def evaluate(render: Callable[[AnyCamera], Tensor], cameras: Iterable[AnyCamera], targets: Iterable[Tensor]) -> Quality:
+    """Compare rendered images with true ones.
+
+    Args:
+        render: gives the image of a camera ``[H, W, 3]``.
+        cameras: at least one.
+        targets: the true image in [0, 1] ``[H, W, 3]`` of each camera, on any device.
+    """
+    values = []
+    for camera, target in zip(cameras, targets, strict=True):
+        image = render(camera)
+        values.append([float(metric(image, target.to(image))) for metric in (psnr, ssim)])
+    psnrs, ssims = zip(*values, strict=True)
+    return Quality(psnrs, ssims)
+
+
+@dataclass(frozen=True)
 class ViewQuality:
     """Metrics of one image; None is a metric that was not measured."""
 
@@ -200,15 +233,11 @@ class ViewQuality:
 def quality_of(
     image: Tensor, truth: Tensor, lpips: Callable[[Tensor, Tensor], Any] | None = None, *, visible: bool = True
 ) -> ViewQuality:
-    """Every metric of one image ``[H, W, 3]`` against its truth.
+    """Every metric of a rendered image ``[H, W, 3]`` against its truth.
 
-    Args:
-        image: rendered.
-        truth: the true image.
-        lpips: LPIPS of two images, None where it cannot be computed; None leaves it out.
-        visible: whether to compute FLIP, which takes a second for an image.
+    ``lpips`` may be left out, and so may FLIP, which takes a second for an image, by ``visible``.
     """
-    found: dict[str, Any] = {"psnr": psnr(image, truth), "psnr_fitted": fitted_psnr(image, truth)}
-    found |= {"ssim": ssim(image, truth), "lpips": None if lpips is None else lpips(image, truth)}
-    found |= {"flip": flip(image, truth)} if visible else {}
-    return ViewQuality(**{name: float(value) for name, value in found.items() if value is not None})
+    metrics: dict[str, Any] = {"psnr": psnr(image, truth), "psnr_fitted": fitted_psnr(image, truth)}
+    metrics |= {"ssim": ssim(image, truth), "lpips": None if lpips is None else lpips(image, truth)}
+    metrics |= {"flip": flip(image, truth)} if visible else {}
+    return ViewQuality(**{name: float(value) for name, value in metrics.items() if value is not None})

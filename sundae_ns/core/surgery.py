@@ -1,4 +1,4 @@
-"""Surgery on a field in training, with optimizer state and running states, and snapshots of a field or a network."""
+"""Surgery on Gaussians in training, with optimizer and running states; snapshots of Gaussians or a network."""
 
 from __future__ import annotations
 
@@ -28,14 +28,12 @@ def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimize
     n = num_gaussians(params)
     for name, value in params.items():
         if value.ndim == 0 or value.shape[0] != n:
-            raise DataError(f"parameter {name!r} has shape {list(value.shape)} in a field of {n} Gaussians: resize it")
+            raise DataError(f"parameter {name!r} has shape {list(value.shape)} for {n} Gaussians: resize it")
         if name not in optimizers:
             continue
         held = [p for group in optimizers[name].param_groups for p in group["params"]]
         if len(held) != 1 or held[0] is not value:
-            raise DataError(
-                f"the optimizer of {name!r} does not hold exactly the field's tensor: build it from params[{name!r}]"
-            )
+            raise DataError(f"the optimizer of {name!r} holds another tensor: build it from params[{name!r}]")
 
 
 def per_gaussian(value: Any, n: int) -> bool:
@@ -50,10 +48,10 @@ def replace_parameter(
     value: Tensor,
     state: Mapping[str, Any],
 ) -> None:
-    """Replace one parameter, in the field and in its optimizer.
+    """Replace one parameter, and in its optimizer if it has one.
 
     Args:
-        optimizers: by parameter name, with one parameter each; may lack ``name``.
+        optimizers: by parameter name, with one parameter each.
         value: the new values; ``requires_grad`` stays.
         state: optimizer state of the new parameter; empty resets it.
     """
@@ -68,7 +66,7 @@ def replace_parameter(
 
 
 def moments_of(optimizers: Mapping[str, Optimizer], name: str, value: Tensor) -> dict[str, Tensor]:
-    """The optimizer state of a parameter that has its shape: Adam's moments, without the step count."""
+    """Optimizer state of a parameter that has its shape: the moments of Adam, without the step count."""
     state = optimizers[name].state.get(value, {}) if name in optimizers else {}
     return {key: held for key, held in state.items() if isinstance(held, Tensor) and held.shape == value.shape}
 
@@ -79,12 +77,7 @@ def change_parameter(
     name: str,
     change: Callable[[Tensor], Tensor],
 ) -> None:
-    """Replace one parameter and its moments by a function of them; other optimizer state stays.
-
-    Args:
-        optimizers: by parameter name, with one parameter each; may lack ``name``.
-        change: returns the new values or moments ``[M, ...]`` of old ones ``[N, ...]``.
-    """
+    """Replace a parameter ``[N, ...]`` and its moments by a function of them; other optimizer state stays."""
     old = params[name]
     state = optimizers[name].state.get(old, {}) if name in optimizers else {}
     moments = {key: change(held) for key, held in moments_of(optimizers, name, old).items()}
@@ -101,13 +94,13 @@ def keep(
     """Keep the Gaussians under a mask and remove all others, in place on the mappings.
 
     Replaces every parameter by a new, shorter ``Parameter`` with the same ``requires_grad`` and without a gradient. The
-    optimizer of the same name holds the new one, with its per-primitive state (Adam's moments) sliced and its step
-    count kept. New objects are needed: after resizing through ``.data``, the backward pass of a live graph fails on the
-    old shape. The caller must refresh other holders of the old objects, such as nerfstudio's ``Optimizers.parameters``.
+    optimizer of the same name holds the new one, with Adam's moments sliced and the step count kept. New objects are
+    needed: after resizing through ``.data``, the backward pass of a live graph fails on the old shape. The caller must
+    refresh other holders of the old objects, such as nerfstudio's ``Optimizers.parameters``.
 
     Args:
-        params: the field, name to parameter ``[N, ...]``.
-        optimizers: optimizers with one parameter each; names that are not in ``params`` are ignored.
+        params: name to parameter ``[N, ...]``.
+        optimizers: with one parameter each; names that are not in ``params`` are ignored.
         states: running states; their tensors with first dimension N are sliced, all else stays.
         mask: True for Gaussians to keep, bool, any device ``[N]``.
 
@@ -135,14 +128,13 @@ def keep(
 def rewrite(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], values: Mapping[str, Tensor]) -> None:
     """Overwrite parameters in place.
 
-    Where a value changes, the first moment of Adam becomes 0, because it averages gradients at the old value. The
-    second moment stays: with a zero second moment, the next step would be over three times the learning rate in every
-    direction, for any gradient (``0.1 g / sqrt(0.001 g^2)``). Adam forgets the old second moment within a thousand
-    steps. Unchanged values keep both moments.
+    Where a value changes, Adam's first moment becomes 0, because it averages gradients at the old value. The second
+    moment stays: if it were 0, the next step would be over three times the learning rate in every direction, for any
+    gradient (``0.1 g / sqrt(0.001 g^2)``). Unchanged values keep both moments.
 
     Args:
-        params: the field, changed in place; the optimizers keep the same tensors.
-        optimizers: optimizers by parameter name.
+        params: changed in place; the optimizers keep the same tensors.
+        optimizers: by parameter name.
         values: new values by parameter name, each with the shape of its parameter.
 
     Raises:
@@ -162,7 +154,7 @@ def rewrite(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], v
 
 
 def snapshot(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> Snapshot:
-    """Copy a field and the state of its optimizers, by parameter name; a parameter may have none."""
+    """Copy parameters and the tensors of their optimizers, by name; a parameter may have no optimizer."""
     saved = {}
     for name, value in params.items():
         state = optimizers[name].state.get(value, {}) if name in optimizers else {}
@@ -175,10 +167,7 @@ def snapshot(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) 
 def restore(
     params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], saved: Mapping[str, dict[str, Tensor]]
 ) -> None:
-    """Restore a snapshot with any number of Gaussians, in place on the mappings.
-
-    Replaces the parameter objects, as :func:`keep` does.
-    """
+    """Restore a snapshot with any number of Gaussians; replaces parameters as :func:`keep` does."""
     for name, entries in saved.items():
         value = entries["value"].to(params[name].device, copy=True)
         state = _state(entries, value, optimizers[name]) if name in optimizers else {}
@@ -193,15 +182,15 @@ def narrow(params: MutableMapping[str, Parameter], optimizers: Mapping[str, Opti
 
 def module_snapshot(parameters: Iterable[Tensor], optimizer: Optimizer) -> Snapshot:
     """Copy the parameters of a network and the state of its optimizer; keys are the parameters' positions."""
-    named = {str(place): value for place, value in enumerate(parameters)}
+    named = {str(i): value for i, value in enumerate(parameters)}
     return snapshot(named, dict.fromkeys(named, optimizer))
 
 
 @torch.no_grad()
 def restore_module(parameters: Iterable[Tensor], optimizer: Optimizer, saved: Mapping[str, dict[str, Tensor]]) -> None:
     """Restore a :func:`module_snapshot` in place; keeps the parameter objects."""
-    for place, value in enumerate(parameters):
-        entries = saved[str(place)]
+    for i, value in enumerate(parameters):
+        entries = saved[str(i)]
         value.copy_(entries["value"])
         optimizer.state.pop(value, None)
         if len(entries) > 1:
@@ -223,15 +212,11 @@ def _state(entries: Mapping[str, Tensor], value: Tensor, optimizer: Optimizer) -
 def grow(
     params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], count: int, min_opacity: float
 ) -> None:
-    """Add ``count`` Gaussians: the most opaque ones become two at one place, which render alike.
+    """Add ``count`` Gaussians: the most opaque ones become two at one position, which render alike.
 
-    Opacities ``o' = 1 - sqrt(1 - o)`` preserve the opacity at the centre, scales ``s' = s o / (2 o' - o'^2 / sqrt(2))``
-    the integral along a ray (3DGS-MCMC, Kheradmand et al., 2024, equation 9 for two copies). Replaces the parameter
-    objects, as :func:`keep` does.
-
-    Args:
-        optimizers: by parameter name; the moments of the copies are 0.
-        min_opacity: lower limit of the new opacities.
+    Opacities ``o' = 1 - sqrt(1 - o)``, at least ``min_opacity``, preserve the opacity at the centre. Scales
+    ``s' = s o / (2 o' - o'^2 / sqrt(2))`` preserve the integral along a ray (3DGS-MCMC, Kheradmand et al., 2024,
+    equation 9 for two copies). Moments of the copies are 0. Replaces the parameter objects, as :func:`keep` does.
     """
     while count > 0:
         opacities = params["opacities"].detach().sigmoid().flatten()

@@ -6,8 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-MEGABYTE = 1e6
-"""Bytes in the MB of tables and plots."""
+MEGABYTE = 1e6  # bytes in the MB of tables and plots
 
 
 def without_nan(value: Any) -> Any:

@@ -13,7 +13,7 @@ from sundae_ns.core.errors import ConfigError
 
 
 def now(device: torch.device | str) -> float:
-    """Seconds on the host's wall clock, from an arbitrary start, after the device has finished its queued work."""
+    """Seconds on the host's wall clock, after the device has finished its queued work; only differences count."""
     device = torch.device(device)
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -16,11 +16,11 @@ from typing import NamedTuple
 import torch
 
 from sundae_ns.core.errors import PackError, SundaeError
+from sundae_ns.core.metrics import Quality, evaluate
 from sundae_ns.io.pack.codecs import Codecs
 from sundae_ns.io.pack.config import STEPS, PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.plugin.finished_runs import load_model, place
-from sundae_ns.scene.scene import Quality, evaluate
 from sundae_ns.train.choice import GAIN_PER_DOUBLING
 
 FINEST, COARSEST = -3.0, 4.0

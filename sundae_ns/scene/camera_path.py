@@ -1,4 +1,4 @@
-"""The cameras of a film: a closed, smooth path among the views of a scene, or a circle around a scene without any."""
+"""The cameras of a film: a closed, smooth path among the cameras of a scene, or a circle around it."""
 
 from __future__ import annotations
 
@@ -17,28 +17,25 @@ from sundae_ns.scene.cameras import unit
 from sundae_ns.scene.scene import Scene
 from sundae_ns.scene.virtual_cameras import FOV, middle_and_reach, virtual_cameras
 
-MOST_FRAMES = 36_000
-"""Frames of 25 minutes."""
-_STEEP = 0.95
-"""Largest sine of the angle by which a camera looks up or down; steeper ones have no upright image."""
-
+MOST_FRAMES = 36_000  # 25 minutes
+_STEEP = 0.95  # largest sine of a camera's pitch; steeper ones have no upright image
 Array = NDArray[np.float64]
 
 
 def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float = 24.0) -> list[Camera]:
     """Cameras of a film of a scene, along a closed and smooth path at an even speed; upright, without roll.
 
-    The path leads through up to eight of the views that are stored with the scene, from the start view, else the first,
-    on the shortest way, and looks where they look. A scene with fewer than three views is seen from a circle around its
-    middle. The speed is that of motion and turning together.
+    The path leads through up to eight stored cameras, from the start view, else the first, on the shortest way, and
+    looks where they look. A scene with fewer than three cameras is seen from a circle around its middle. The speed is
+    that of motion and turning together.
 
     Args:
-        scene: its up axis, else the mean of its views', else z, is upwards in the images.
+        scene: its up axis, else the mean of its cameras', else z, is upwards in the images.
         seconds: length of the film.
         frames_per_second: number of cameras a second.
 
     Returns:
-        One camera a frame, with the lens and the shape of the first view's images, at most 1,280 pixels a side.
+        One camera a frame, with the lens and the shape of the first camera's images, at most 1,280 pixels a side.
 
     Raises:
         ConfigError: there is not even one frame, or there are more than :data:`MOST_FRAMES`.
@@ -62,10 +59,10 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     keys = _tour(np.hstack([eyes / scale, ahead]))
     path = _even(keys, up, count)
     centers = torch.from_numpy(path[:, :3] * scale)
-    found = poses_looking_at(centers, centers + torch.from_numpy(path[:, 3:]), torch.from_numpy(up))
+    moved = poses_looking_at(centers, centers + torch.from_numpy(path[:, 3:]), torch.from_numpy(up))
     lens = lens.zoomed(min(1280 / max(lens.width, lens.height), 1.0))
     intrinsics = [float(lens.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    return [Camera.from_pose(pose, intrinsics, lens.width, lens.height) for pose in found]
+    return [Camera.from_pose(pose, intrinsics, lens.width, lens.height) for pose in moved]
 
 
 def _up_of(scene: Scene) -> Array:
@@ -77,7 +74,7 @@ def _up_of(scene: Scene) -> Array:
 
 
 def _circle(scene: Scene, up: Array) -> tuple[Array, Array]:
-    """Eyes on a circle, at the median distance and height of the virtual views, and directions to its middle."""
+    """Eyes on a circle, at the median distance and height of the virtual cameras, and directions to its middle."""
     middle, reach = middle_and_reach(scene)
     center = middle.numpy()
     arms = np.stack([camera.center.double().numpy() for camera in virtual_cameras(scene, 48)]) - center

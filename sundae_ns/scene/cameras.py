@@ -1,4 +1,4 @@
-"""Cameras of a scene: those of a file, the one in front of it, its start view, and a path for a film."""
+"""Cameras of a scene: those of a file, one in front of it, and its start view."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ Direction = tuple[float, float, float]
 
 
 class CameraFile(NamedTuple):
-    """The cameras of a file."""
+    """Cameras of a file, with the frames per second of a camera path; None for those of a capture."""
 
     cameras: list[Camera]
     frames_per_second: float | None
-    """Speed of a camera path; None for the cameras of a capture."""
 
 
 def camera_in_front(scene: Scene) -> Camera:
@@ -38,9 +37,8 @@ def camera_in_front(scene: Scene) -> Camera:
     up = torch.tensor(scene.up or (0.0, 0.0, 1.0))
     side = torch.tensor([1.0, 0.0, 0.0] if abs(float(up[0])) < 0.9 else [0.0, 1.0, 0.0])
     back = torch.nn.functional.normalize(torch.linalg.cross(side, up), dim=0)
-    return Camera.look_at(
-        center + away * back, center, up, fov=2 * math.degrees(math.atan(240 / 500))
-    )  # that of the web page
+    fov = 2 * math.degrees(math.atan(240 / 500))  # that of the web page
+    return Camera.look_at(center + away * back, center, up, fov=fov)
 
 
 def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
@@ -73,11 +71,8 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
     path = path / "transforms.json" if path.is_dir() else path
     content = read_json(path)
     if "camera_path" in content:
-        cameras, speed = (
-            _camera_path(content, path.name),
-            finite(content.get("fps", 24), "fps", path.name, positive=True),
-        )
-        return CameraFile(cameras, speed)
+        speed = finite(content.get("fps", 24), "fps", path.name, positive=True)
+        return CameraFile(_camera_path(content, path.name), speed)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
@@ -99,14 +94,14 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
 def _moved(
     pose: np.ndarray, transform: np.ndarray, scale: float, intrinsics: Sequence[float], width: int, height: int
 ) -> Camera:
-    """A camera, camera-to-world with OpenGL axes ``[3 or 4, 4]``, after a transform and then a scale."""
+    """The camera of a pose, camera-to-world with OpenGL axes ``[3 or 4, 4]``, after a transform and then a scale."""
     moved = transform[:3, :3] @ pose[:3]
     moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
     return Camera.from_pose(torch.from_numpy(moved), intrinsics, width, height)
 
 
 def _of_colmap(model: Path, scene: Scene | None) -> list[Camera]:
-    """Views of a COLMAP model, in its own coordinates or in those of a run trained on it."""
+    """Cameras of a COLMAP model, in its own coordinates or in those of a run trained on it."""
     transform, scale = _to_model(scene, {}, model.name)
     cameras = []
     for image in read_images(model).values():
@@ -121,7 +116,7 @@ def _of_colmap(model: Path, scene: Scene | None) -> list[Camera]:
 def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple[np.ndarray, float]:
     """Transform ``[4, 4]`` and then scale, from the coordinates of a ``transforms.json`` to those of a scene.
 
-    A run states both from the coordinates before the transform that the file states as applied.
+    A run states both relative to the capture before its ``applied_transform``.
     """
     frame = scene.meta.get("frame") if scene is not None and scene.in_model_frame else None
     if frame is None:
@@ -135,7 +130,7 @@ def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple
 
 
 def _camera_path(content: dict[str, Any], where: str) -> list[Camera]:
-    """Views of a camera path of nerfstudio's viewer, which is in the coordinates of the model."""
+    """Cameras of a path of nerfstudio's viewer, in the coordinates of the model."""
     entries = content["camera_path"]
     if not isinstance(entries, list) or not entries:
         raise DataError(f"{where} has an empty camera_path; add keyframes in the viewer, and export it again")
@@ -144,13 +139,13 @@ def _camera_path(content: dict[str, Any], where: str) -> list[Camera]:
     width, height = (side(content.get(f"render_{name}"), f"render_{name}", where) for name in ("width", "height"))
     cameras = []
     for i, entry in enumerate(entries):
-        place = f"{where}, camera {i}"
+        named = f"{where}, camera {i}"
         flat = entry.get("camera_to_world") if isinstance(entry, dict) else None
         rows = [flat[k : k + 4] for k in range(0, 16, 4)] if isinstance(flat, list) and len(flat) == 16 else flat
-        pose = matrix(rows, (4,), "camera_to_world", place)
-        fov = finite(entry.get("fov", 60.0), "fov", place, positive=True)
+        pose = matrix(rows, (4,), "camera_to_world", named)
+        fov = finite(entry.get("fov", 60.0), "fov", named, positive=True)
         if not fov < 180:
-            raise DataError(f"{place}: fov is {fov:g}; it must be below 180 degrees")
+            raise DataError(f"{named}: fov is {fov:g}; it must be below 180 degrees")
         cameras.append(Camera.from_fov(torch.from_numpy(pose), fov, width, height))
     return cameras
 
@@ -183,13 +178,12 @@ def unit(direction: Sequence[float]) -> Direction:
 
 
 def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None) -> Scene:
-    """The scene with another start view or up axis, as a user names them.
+    """The scene with another start view or up axis, as a user names them; None keeps that of the scene.
 
     Args:
-        scene: whose stored views an index counts.
-        start_view: index of a stored camera, or a file whose first camera it is (:func:`sundae_ns.cameras_of`); None
-            keeps that of the scene.
-        up: direction ``[3]`` of any length; None keeps that of the scene.
+        scene: whose stored cameras an index counts.
+        start_view: index of a stored camera, or a file whose first camera it is (:func:`sundae_ns.cameras_of`).
+        up: direction ``[3]`` of any length.
 
     Raises:
         ConfigError: there is no such view, or the direction is zero.

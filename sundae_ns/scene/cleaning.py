@@ -1,4 +1,4 @@
-"""Cuts before a scene is published: a box around it, and floaters, which no surface supports."""
+"""Cuts before a scene is published: a box, and floaters, which no surface supports."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from sundae_ns.scene.scene import Scene
 if TYPE_CHECKING:
     from rich.console import Console
 
-REACH = 3.0
-"""Two Gaussians touch if they are nearer than this many times the sum of their largest standard deviations."""
+REACH = 3.0  # Gaussians touch if they are nearer than this many times the sum of their largest standard deviations
 
 
 def crop(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Scene:
@@ -48,15 +47,14 @@ def crop(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Scene:
 def remove_floaters(scene: Scene, *, cameras: Sequence[Camera] | None = None) -> Scene:
     """The scene without Gaussians that no surface supports.
 
-    These are small groups that touch no other Gaussian (:data:`REACH`), and what none of the views sees. Floaters that
-    touch a surface stay.
+    These are small groups that touch no other Gaussian, and what no camera sees. Floaters that touch a surface stay.
 
     Args:
         scene: to clean; it does not change.
         cameras: cameras of the photographs; by default those stored with the scene. Without any, groups alone count.
 
     Raises:
-        DataError: no Gaussian is finite, or the views see none.
+        DataError: no Gaussian is finite, or the cameras see none.
 
     >>> import torch, sundae_ns as sn
     >>> points = torch.cat([torch.rand(2000, 3), torch.tensor([[9.0, 9.0, 9.0]])])
@@ -74,42 +72,37 @@ def kept(scene: Scene, mask: Tensor) -> Scene:
 
 
 def within(mask: Tensor | None, inner: Tensor) -> Tensor:
-    """The entries of a mask ``[N]`` that an inner mask keeps: ``[M]``, for its M true ones. None is true everywhere."""
+    """A mask ``[N]`` of which only the entries under ``inner`` ``[M]`` stay, for its M true ones; None is all true."""
     if mask is None:
         return inner
-    found = mask.clone()
-    found[mask] = inner
-    return found
+    narrowed = mask.clone()
+    narrowed[mask] = inner
+    return narrowed
 
 
 def crop_mask(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Tensor:
     """True for the Gaussians in a box, bool ``[N]``; arguments and errors as for :func:`crop`."""
     if len(low) != 3 or len(high) != 3 or not all(math.isfinite(value) for value in (*low, *high)):
         raise ConfigError("the box is not six finite numbers; give its lowest x y z, then its highest")
-    if not all(one < other for one, other in zip(low, high, strict=True)):
+    if not all(a < b for a, b in zip(low, high, strict=True)):
         raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
     means = scene.gaussians["means"].detach()
-    # In float64, where both numbers are exact.
-    inside = (means.double() >= means.new_tensor(low, dtype=torch.float64)).all(dim=1)
-    inside &= (means.double() <= means.new_tensor(high, dtype=torch.float64)).all(dim=1)
+    lowest, highest = (means.new_tensor(corner, dtype=torch.float64) for corner in (low, high))
+    inside = ((means.double() >= lowest) & (means.double() <= highest)).all(dim=1)  # exact in float64
     if not bool(inside.any()):
         finite = means[means.isfinite().all(dim=1)].double().cpu().numpy()
         if not len(finite):
             raise DataError("no Gaussian is in the box, because none is finite; export the scene again")
-        lowest, highest = (" ".join(f"{value:.3g}" for value in np.quantile(finite, q, axis=0)) for q in (0.05, 0.95))
-        raise DataError(f"no Gaussian is in the box; most of them lie between {lowest} and {highest}")
+        low, high = np.quantile(finite, (0.05, 0.95), axis=0)
+        corners = (" ".join(f"{value:.3g}" for value in corner) for corner in (low, high))
+        raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
     return inside
 
 
 @torch.no_grad()
 def floater_mask(scene: Scene, cameras: Sequence[Camera], *, console: Console | None = None) -> Tensor:
-    """True for floaters, bool ``[N]``; arguments and errors as for :func:`remove_floaters`.
-
-    Args:
-        console: shows a progress bar; None for none.
-    """
+    """True for floaters, bool ``[N]``; arguments and errors as for :func:`remove_floaters`."""
     sanitised = sanitise(scene.gaussians)
-    found = ~sanitised.mask
     if not sanitised.gaussians.num_gaussians:
         raise DataError("no Gaussian is finite; export the scene again")
     usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
@@ -117,8 +110,9 @@ def floater_mask(scene: Scene, cameras: Sequence[Camera], *, console: Console | 
     if cameras:
         small = [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]
         floats |= weights_in(usable, small, console=console) <= 0
-    found[sanitised.mask] = floats
-    return found
+    mask = ~sanitised.mask
+    mask[sanitised.mask] = floats
+    return mask
 
 
 def _unsupported(scene: Scene) -> Tensor:

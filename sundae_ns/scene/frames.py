@@ -1,8 +1,8 @@
-"""Images of finished fields for viewers: outputs that are computed on first access, and frames as recorded CUDA graphs.
+"""Images of finished scenes for viewers: outputs that are computed on first access, and frames as recorded CUDA graphs.
 
-A frame is many small kernels, each launched from Python. A CUDA graph launches them together. A recorded frame reads
-its inputs where they were when it was recorded: the field, which may be trained meanwhile, the head's weights, and the
-three tensors that hold camera and background.
+A frame is many small kernels, each launched from Python. A CUDA graph launches them together. It reads its inputs
+where they were when it was recorded: the Gaussians, which may be trained meanwhile, the head's weights, and the three
+tensors that hold camera and background.
 """
 
 from __future__ import annotations
@@ -26,16 +26,18 @@ from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import response
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
-from sundae_ns.scene import display
 from sundae_ns.scene.render import GaussianSource, RenderSettings, degree_in_use, render_view, scale_plan, splat
 
 _log = logging.getLogger(__name__)
 
 OUTPUTS = ("rgb", "base_rgb", "depth", "accumulation", "features", "response")
 """Outputs beside the background, in the order in which viewers list them."""
-
 GaussiansKey = tuple[int, int]
-"""Identifies a state of a field: number of Gaussians, and number of prunes."""
+"""Identifies a state of the Gaussians: their number, and the number of prunes."""
+SPARE_CAPACITY = 1.5
+"""Capacity for tile and Gaussian pairs, as a multiple of those of the recorded view. Another view may have more."""
+REPLAYED = ("rgb", "base_rgb", "accumulation")
+"""Images of a recorded frame."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +45,14 @@ class Later:
     """An output that is not computed yet."""
 
     make: Callable[[], Any]
-    """Computes it. It may run in another thread after the model has changed, so it must hold what it reads."""
+    """May run in another thread after the model has changed, so it must hold what it reads."""
 
 
 class LazyOutputs(UserDict[str, Any]):
     """Named outputs. One that is :class:`Later` is computed on first access, without gradients, and then kept.
 
-    nerfstudio's commands read one or two outputs of a frame; the others cost nothing. Listing names, counting and
-    ``in`` compute nothing. It is not a ``dict``, because ``dict(outputs)`` and ``{**outputs}`` would then skip the
-    computation.
+    nerfstudio's commands read one or two outputs of a frame; the others cost nothing. No ``dict``, because
+    ``dict(outputs)`` and ``{**outputs}`` would then skip the computation.
     """
 
     def __getitem__(self, name: str) -> Any:
@@ -63,26 +64,23 @@ class LazyOutputs(UserDict[str, Any]):
 
 
 class ShownResponse:
-    """Spectral response of a field for display, kept until the field is pruned again."""
+    """Spectral response for display, kept until the Gaussians are pruned again."""
 
     def __init__(self) -> None:
-        # The field, and its values. One tuple, because the viewer reads it from its own thread.
+        # One tuple, because the viewer reads it from its own thread.
         self._last: tuple[GaussiansKey | None, Tensor | None] = (None, None)
 
     def values(self, gaussians: Gaussians, key: GaussiansKey | None, rule: PruneRule) -> Tensor | None:
-        """Values in [0, 1] ``[N]``; None if there is no response, as for a single Gaussian without neighbours.
+        """Values in [0, 1] ``[N]``; None without a response, as for a single Gaussian.
 
-        Args:
-            gaussians: the Gaussians.
-            key: their state; None for a field that still grows, whose response is not shown.
-            rule: signal and graph.
+        ``key`` is the state of the Gaussians; None while they grow, when their response is not shown.
         """
         if key is None:
             return None
         of, values = self._last
         if of != key:
             try:
-                values = display.response_values(response(gaussians, rule))
+                values = response_values(response(gaussians, rule))
             except DataError:
                 values = None
             self._last = (key, values)
@@ -105,32 +103,27 @@ def late_outputs(
     ``features`` shows principal components as colours, ``response`` the response of the visible Gaussians.
 
     Args:
-        images: from a render. Depth and features that are missing are splatted on access.
+        images: ``rgb``, ``base_rgb`` and ``accumulation``.
         drawn: the Gaussians of these images.
-        gaussians: all Gaussians. Both fields are kept, so their mappings must not change.
+        gaussians: all Gaussians. Both are kept, so their mappings must not change.
         mask: the Gaussians that were drawn, bool ``[N]``; None for all.
         camera: the camera.
         settings: of the render.
         values: gives the response of all Gaussians, in [0, 1] ``[N]``, or None.
-        splattable: whether there are features that this process can splat by itself; otherwise their image is black.
+        splattable: whether there are features that this process can splat; otherwise their image is black.
     """
-    alpha, found_depth, found_features = (images.get(name) for name in ("accumulation", "depth", "feature_image"))
-    assert alpha is not None
+    alpha = images["accumulation"]
 
     def depth() -> Tensor:
-        found = found_depth
-        if found is None:
-            found = splat(drawn, camera, drawn["opacities"], settings, render_depth=True).depth
-            assert found is not None
-        return display.fill_depth(found, alpha)
+        splatted = splat(drawn, camera, drawn["opacities"], settings, render_depth=True).depth
+        assert splatted is not None
+        return fill_depth(splatted, alpha)
 
     def features() -> Tensor:
-        image = found_features
-        if image is None or image.shape[-1] == 0:
-            if not splattable:
-                return alpha.new_zeros(*alpha.shape[:2], 3)
-            image = splat(drawn, camera, drawn[FEATURES], settings).colors
-        return display.feature_colors(image, *display.principal_components(gaussians[FEATURES]), alpha)
+        if not splattable:
+            return alpha.new_zeros(*alpha.shape[:2], 3)
+        image = splat(drawn, camera, drawn[FEATURES], settings).colors
+        return feature_colors(image, *principal_components(gaussians[FEATURES]), alpha)
 
     def response_image() -> Tensor:
         shown = values()
@@ -145,25 +138,57 @@ def late_outputs(
 
 
 def empty_outputs(width: int, height: int, background: Tensor) -> dict[str, Any]:
-    """Outputs of a crop without Gaussians: the keys and shapes of any other image."""
+    """Outputs of a crop without Gaussians, with the names and shapes of other outputs."""
     image = background.expand(height, width, 3)
     zeros = background.new_zeros(height, width, 1)
-    return {
-        "rgb": image,
-        "base_rgb": image,
-        "depth": zeros + 10,
-        "accumulation": zeros,
-        "features": background.new_zeros(height, width, 3),
-        "response": zeros,
-        "background": image,
-    }
+    images = (image, image, zeros + 10, zeros, background.new_zeros(height, width, 3), zeros)
+    return {**dict(zip(OUTPUTS, images, strict=True)), "background": image}
 
 
-SPARE_CAPACITY = 1.5
-"""Capacity for tile and Gaussian pairs, as a multiple of those of the recorded view. Another view may have more."""
+def fill_depth(depth: Tensor, alpha: Tensor) -> Tensor:
+    """Depth ``[H, W, 1]`` with the largest rendered depth in pixels where ``alpha`` is 0."""
+    return torch.where(alpha > 0, depth, depth.max())
 
-REPLAYED = ("rgb", "base_rgb", "accumulation")
-"""Images of a recorded frame."""
+
+def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean ``[F]``, first three principal directions ``[F, 3]`` and standard deviations ``[3]`` of features ``[N, F]``.
+
+    With fewer than three channels, the missing directions are zero. Signs are fixed, so displayed colours are stable.
+    """
+    mean = features.mean(dim=0)
+    centred = features - mean
+    covariance = centred.T @ centred / max(len(features), 1)
+    variances, directions = torch.linalg.eigh(covariance)
+    k = min(3, features.shape[1])
+    directions = directions[:, -k:].flip(-1)
+    signs = torch.where(directions.sum(dim=0) < 0, -1.0, 1.0)
+    basis = features.new_zeros(features.shape[1], 3)
+    basis[:, :k] = directions * signs
+    deviations = features.new_zeros(3)
+    deviations[:k] = variances[-k:].flip(-1).clamp_min(0).sqrt()
+    return mean, basis, deviations
+
+
+def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Tensor, alpha: Tensor) -> Tensor:
+    """Rendered features as colours ``[H, W, 3]``; [0, 1] spans three standard deviations to each side of the mean.
+
+    Args:
+        features: rendered features ``[H, W, F]``, already weighted by ``alpha``.
+        mean, basis, deviations: from :func:`principal_components` of the Gaussians' features.
+        alpha: accumulation ``[H, W, 1]``; colours are black where it is 0.
+    """
+    components = (features - alpha * mean) @ basis
+    scaled = components / (6 * deviations.clamp_min(1e-8)) + 0.5 * alpha
+    return scaled.clamp(0, 1)
+
+
+def response_values(response: Tensor) -> Tensor:
+    """Rank of each response magnitude ``[N]``, scaled to (0, 1], float32; 0 where the response is not finite."""
+    known = torch.isfinite(response)
+    order = response[known].argsort().argsort()
+    values = torch.zeros_like(response, dtype=torch.float32)
+    values[known] = (order + 1).float() / max(int(known.sum()), 1)
+    return values
 
 
 @dataclass(frozen=True)
@@ -180,7 +205,7 @@ class _Frame:
 
 
 class FrameReplay:
-    """Replays recorded frames of one field, which are recorded on demand and dropped when the field changes."""
+    """Replays frames of one scene, which are recorded on demand and dropped when the Gaussians move in memory."""
 
     def __init__(self) -> None:
         self._frames: GraphCache[_Frame] = GraphCache()
@@ -192,19 +217,10 @@ class FrameReplay:
     def render(
         self, source: GaussianSource, camera: Camera, background: Tensor, settings: RenderSettings
     ) -> dict[str, Any]:
-        """The images of a view, as :func:`sundae_ns.scene.render.render_view` makes them.
+        """``rgb, base_rgb, accumulation`` of a view, each ``[H, W, C]``, as :func:`.render_view` makes them.
 
-        Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of a whole local field. Other
-        frames, and the first of a size, are rendered kernel by kernel. Both agree up to the order in which kernels sum.
-
-        Args:
-            source: of the Gaussians.
-            camera: the camera.
-            background: colour ``[3]``.
-            settings: everything else.
-
-        Returns:
-            ``rgb, base_rgb, accumulation``, each ``[H, W, C]``, owned by the caller.
+        Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of all Gaussians in this process.
+        Other frames, and the first of a size, are rendered kernel by kernel. Both agree up to the order of sums.
         """
         if self._can_record and _recordable(source, settings):
             with self._lock:
@@ -237,7 +253,7 @@ class FrameReplay:
         return images
 
     def _key(self, source: GaussianSource, camera: Camera, settings: RenderSettings) -> object:
-        """What a recorded frame has fixed. Addresses identify the field, because the frame reads these."""
+        """What a recorded frame has fixed. It reads the Gaussians at their addresses."""
         gaussians = source.gaussians
         addresses = tuple((name, value.data_ptr(), value.shape) for name, value in gaussians.items())
         if addresses != self._gaussians:

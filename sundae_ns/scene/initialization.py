@@ -1,4 +1,4 @@
-"""Initial parameters of a field: from a sparse point cloud, or random."""
+"""Initial Gaussians: from a sparse point cloud, or random."""
 
 from __future__ import annotations
 
@@ -29,18 +29,16 @@ def random_points(n: int, extent: float, generator: torch.Generator | None = Non
 def from_points(
     points: Tensor, rgb: Tensor, *, sh_degree: int, num_features: int, generator: torch.Generator | None = None
 ) -> dict[str, Tensor]:
-    """Parameters of a field with one Gaussian per point.
+    """Parameters of one Gaussian for each point, float32, on the device of ``points``.
 
-    The standard deviation of a Gaussian is the mean distance to its three nearest neighbours (3DGS, Kerbl et al.
-    2023). Coincident points get the smallest positive one of the cloud, where 3DGS would take the logarithm of zero.
+    The standard deviation is the mean distance to the three nearest neighbours (3DGS, Kerbl et al. 2023). Coincident
+    points get the smallest positive one, where 3DGS would take the logarithm of zero.
 
     Args:
-        points: ``[N, 3]`` world units; points that are not finite, in place or colour, are dropped.
+        points: ``[N, 3]`` world units; points that are not finite, in position or colour, are dropped.
         rgb: ``[N, 3]`` colours in [0, 1].
+        sh_degree: of the coefficients, which are 0 from degree 1 on.
         num_features: length F of the feature vectors; 0 for none.
-
-    Returns:
-        The field by parameter name (see ``gaussians.gaussians``), float32, on the device of ``points``.
 
     Raises:
         DataError: no point is finite.

@@ -22,17 +22,16 @@ from sundae_ns.scene.page import write_page
 from sundae_ns.scene.render import degree_in_use
 from sundae_ns.scene.scene import Scene
 
-SUFFIXES = (*FORMATS, ".sundae", ".html")
-"""Suffixes of the files that :func:`save` writes."""
+SUFFIXES = (*FORMATS, ".sundae", ".html")  # of the files that save() writes
+# Transform from the capture's coordinates to the model's, which nerfstudio writes into the folder of a run.
 FRAME_FILE = "dataparser_transforms.json"
-"""Transform from the capture's coordinates to the model's, which nerfstudio writes into the folder of a run."""
 
 
 def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     """Open a finished scene. Nothing in its files is executed, and nerfstudio is not needed.
 
-    Opacities of exactly 0 or 1 and widths of 0, which files store as infinite, become finite. Gaussians that are NaN,
-    or infinite without a meaning, are left out. A warning says how many.
+    Opacities of 0 or 1 and widths of 0, which files store as infinite, become finite. Other Gaussians that are NaN or
+    infinite are dropped. A warning says how many.
 
     Args:
         path: a ``.ply``, also a compressed one, a ``.spz``, ``.sog``, ``.glb``, ``.splat`` or ``.ksplat`` of any
@@ -64,9 +63,9 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
         return scene_of(read_scene(path)).to(device), None
     if kind_of_gaussians(path) is None:
         return _of_run(path).to(device), None
-    found = formats.read_gaussian_file(path)
-    scene = Scene(found.sanitised.gaussians, antialiased=found.antialiased, in_model_frame=found.in_model_frame)
-    return scene.to(device), found.sanitised.mask
+    read = formats.read_gaussian_file(path)
+    gaussians, mask = read.sanitised.gaussians.to(device), read.sanitised.mask
+    return Scene(gaussians, antialiased=read.antialiased, in_model_frame=read.in_model_frame), mask
 
 
 def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
@@ -173,11 +172,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
 
 
 def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path) -> CompensationHead | None:
-    """The head of a checkpoint. Its size is that of its weights, because training may choose another than configured.
-
-    Raises:
-        CheckpointError: its weights fit no known size.
-    """
+    """The head of a checkpoint. Its size is that of its weights: training may choose another than configured."""
     prefix = "networks.head."
     weights = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
     features = state.get(f"gauss_params.{FEATURES}")

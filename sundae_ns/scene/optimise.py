@@ -1,4 +1,4 @@
-"""The loop of every training outside of nerfstudio's: refits, distillations and fine-tunes."""
+"""The loop of every training outside of nerfstudio's: refit, distillation and fine-tune."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def optimise(
 
     Args:
         step: takes step ``i``: its loss, gradients and updates.
-        optimizers: by name. The rates that their groups have now are the initial ones, unless they hold ``initial_lr``.
+        optimizers: by name. The present rates are the initial ones, unless a group holds ``initial_lr``.
         steps: number of steps in all.
         factor: of the initial rate of an optimizer (by name) at a step.
-        first: step to begin with, if others were taken before.
+        first: number of steps that were taken before.
         on_step: called after each step with the number of steps taken; False stops.
 
     Returns:

@@ -1,4 +1,4 @@
-"""From a field to the images of a view: colours, one splatting pass, the head's correction, and what views see."""
+"""From Gaussians to the images of a view: colours, one splatting pass, the head's correction; and what views see."""
 
 from __future__ import annotations
 
@@ -22,52 +22,46 @@ if TYPE_CHECKING:
 
 SHOWN_BACKGROUNDS = {"random": (0.1490, 0.1647, 0.2157), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 """Backgrounds of images that are not trained on, by the option ``background_color``; for random the viewer's."""
-NEAR_PLANE = 0.01
-"""Distance of the near plane, world units."""
+NEAR_PLANE = 0.01  # distance of the near plane, world units
 
 
 class StepResolution(NamedTuple):
     """Form of the training images at one step: a function of the step and the options."""
 
     step: int
-    """Training step."""
     downscale: int
     """Divisor of the sides of the images."""
     window_pixels: int
     """Most pixels of an image; larger images are trained on by a random window. 0 for no limit."""
     mirror: bool = False
-    """Whether half of the steps see their image in a mirror."""
+    """Whether half of the steps mirror their image."""
 
 
 class TrainingCamera(NamedTuple):
     """A training view for passes that do not train."""
 
     camera: Camera
-    """The camera."""
     mask: Tensor | None
     """Pixels that count, bool ``[H, W, 1]``; None for all."""
 
 
 @dataclass(frozen=True)
 class ColorSettings:
-    """How stored colours become colours seen from a camera."""
+    """How colours are evaluated for a camera."""
 
     backend: Backend
     active_sh_degree: int | None = None
-    """Highest SH degree in use; None for the degree of the field."""
+    """Highest SH degree in use; None for that of the Gaussians."""
 
 
 def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tensor, settings: ColorSettings) -> Tensor:
-    """Colours of Gaussians as seen from a place.
+    """Colours of Gaussians as seen from a place, at least 0 ``[M, 3]``.
 
     Args:
-        params: ``means`` ``[M, 3]``, ``features_dc`` and ``features_rest`` of the Gaussians.
-        gaussians: the field that they belong to, for its encoding.
+        params: ``means`` ``[M, 3]``, ``features_dc`` and ``features_rest``.
+        gaussians: those that the parameters belong to, for their encoding.
         center: camera centre ``[3]``, or one for each Gaussian ``[M, 3]``; world units.
         settings: backend and SH degree.
-
-    Returns:
-        ``[M, 3]``, at least 0.
     """
     if gaussians.encoding == "logits":
         return params["features_dc"].sigmoid()
@@ -77,26 +71,23 @@ def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tens
 
 
 def degree_in_use(sh_degree: int, active: int | None) -> int:
-    """The SH degree that colours are evaluated at: ``active``, at most the field's own; None for the field's own."""
+    """The SH degree that colours are evaluated at: ``active``, at most ``sh_degree``; None for ``sh_degree``."""
     return sh_degree if active is None else min(active, sh_degree)
 
 
 class GaussianSource:
     """The Gaussians of one process.
 
-    Args:
-        gaussians: the Gaussians.
-        whole: False for a part, whose tensors are new each time.
+    ``whole`` is False for a share of them, whose tensors are new each time; frames of it cannot be recorded.
     """
 
     def __init__(self, gaussians: Gaussians, *, whole: bool = True) -> None:
         self.gaussians = gaussians
         self.replayable = whole
-        """Whether frames may be recorded: the tensors stay where they are."""
 
     @property
     def total(self) -> int:
-        """Number of Gaussians of the whole field."""
+        """Number of Gaussians in all processes."""
         return self.gaussians.num_gaussians
 
     def primitives(
@@ -104,11 +95,7 @@ class GaussianSource:
     ) -> dict[str, Tensor]:
         """Parameters of the Gaussians that the view may see ``[M, ...]``, with ``colors`` from its camera ``[M, 3]``.
 
-        Args:
-            camera: the camera.
-            settings: how colours are evaluated.
-            features: whether feature vectors are needed.
-            colors: whether colours are needed.
+        ``features`` and ``colors`` say whether feature vectors and colours are needed.
         """
         primitives = dict(self.gaussians)
         if colors:
@@ -118,12 +105,12 @@ class GaussianSource:
 
 @dataclass(frozen=True)
 class RenderSettings(ColorSettings):
-    """What images depend on beside field and view."""
+    """What images depend on beside Gaussians and view."""
 
     antialiased: bool = False
     """Whether opacities compensate for the smallest footprint (``rasterize_mode`` of splatfacto)."""
     training: bool = False
-    """Whether gradients are needed. The image is then not clamped, and the head runs at the scale of the image."""
+    """Whether gradients are needed. Images are then not clamped, and the head runs at their scale."""
     absgrad: bool = False
     """Whether to sum absolute gradients of the projected centres."""
     head: CompensationHead | None = None
@@ -137,7 +124,7 @@ class RenderSettings(ColorSettings):
 
 
 def pass_options(params: Mapping[str, Tensor], camera: Camera, settings: RenderSettings) -> dict[str, Any]:
-    """Arguments that every pass over a view hands to the rasteriser: activated parameters, camera and settings."""
+    """Arguments of every pass over a view to the rasteriser: activated parameters, camera and settings."""
     return {
         "means": params["means"],
         "quats": params["quats"],
@@ -171,15 +158,15 @@ def draw(
     """Splat colours, features and depth in one pass.
 
     Args:
-        Gaussians: from a :class:`GaussianSource`; with ``features`` if the head is enabled.
+        primitives: from a :class:`GaussianSource`; with ``features`` if the head is enabled.
         camera: the camera.
         background: colour ``[3]``.
         settings: everything else.
         depth: whether to render depth.
 
     Returns:
-        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result. Without
-        a head ``rgb`` is ``base_rgb``.
+        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result. The head
+        has not run, so ``rgb`` is ``base_rgb``.
     """
     channels = primitives["colors"]
     if settings.head is not None:
@@ -187,22 +174,16 @@ def draw(
     splatted = splat(primitives, camera, channels, settings, render_depth=depth, absgrad=settings.absgrad)
     blended, features = splatted.colors[..., :3], splatted.colors[..., 3:]
     base = (blended + (1 - splatted.alpha) * background).clamp(0.0, 1.0)
-    images = {
-        "rgb": base,
-        "base_rgb": base,
-        "depth": splatted.depth,
-        "accumulation": splatted.alpha,
-        "feature_image": features,
-    }
-    return images, splatted
+    images = {"rgb": base, "base_rgb": base, "depth": splatted.depth, "accumulation": splatted.alpha}
+    return {**images, "feature_image": features}, splatted
 
 
 def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, background: Tensor) -> Tensor:
-    """The compensated image of one splatting pass ``[H, W, 3]``, not clamped. This is the one place that runs the head.
+    """The corrected image of one splatting pass ``[H, W, 3]``, not clamped. Only this function runs the head.
 
     Args:
         head: the head.
-        base: image without the head, ``[H, W, 3]``.
+        base: image without the head ``[H, W, 3]``.
         splatted: colours and features without background.
         background: colour ``[3]``.
 
@@ -222,12 +203,7 @@ def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, ba
 
 
 def render_view(
-    source: GaussianSource,
-    camera: Camera,
-    background: Tensor,
-    settings: RenderSettings,
-    *,
-    depth: bool = True,
+    source: GaussianSource, camera: Camera, background: Tensor, settings: RenderSettings, *, depth: bool = True
 ) -> tuple[dict[str, Any], Rasterization]:
     """The images of one view: Gaussians, one splatting pass, and the head.
 
@@ -238,7 +214,7 @@ def render_view(
         source: of the Gaussians.
         camera: the camera.
         background: colour ``[3]``.
-        settings: everything else; ``head=None`` leaves the head out.
+        settings: everything else; ``head=None`` disables the head.
         depth: whether to render depth.
 
     Returns:
@@ -294,10 +270,8 @@ def contribution(
         shown = track(cameras, "Contribution of Gaussians", transient=True, console=console)
     for camera, mask in shown:
         if mask is not None and tuple(mask.shape) != (camera.height, camera.width, 1):
-            raise DataError(
-                f"a mask is {list(mask.shape)} but its view is {camera.width} x {camera.height} px; "
-                "give masks the size of their images"
-            )
+            size = f"{camera.width} x {camera.height}"
+            raise DataError(f"a mask is {list(mask.shape)} but its view is {size} px; give masks of their images' size")
         primitives = source.primitives(camera, settings, features=False, colors=count is not None)
         pixels = None if mask is None else mask[..., 0].to(total)
         if count is None:
@@ -324,7 +298,6 @@ def _detail_weights(
         images, splatted = draw(fixed, camera, background, settings.without_head(), depth=False)
     # A prune keeps the same share of the visible Gaussians as of all.
     detail = pixel_detail(images["base_rgb"], share * float((splatted.radii > 0).sum()))
-    pixels = detail if pixels is None else detail * pixels
     with torch.enable_grad():
-        blended = (splatted.colors[..., 0] * pixels).sum()
+        blended = (splatted.colors[..., 0] * (detail if pixels is None else detail * pixels)).sum()
     return torch.autograd.grad(blended, fixed["colors"])[0][:, 0]

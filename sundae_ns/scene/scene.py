@@ -1,12 +1,11 @@
-"""A scene (field, head, and what is needed to render both), its images, and their quality."""
+"""A scene: Gaussians, a head, and what is needed to render both; its images, and their quality."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import fmean
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import torch
 from PIL import Image
@@ -15,42 +14,38 @@ from torch import Tensor
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import Gaussians
-from sundae_ns.core.metrics import psnr, ssim
+from sundae_ns.core.metrics import Quality, evaluate
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.rasterize.interface import BackendName, select_backend
 from sundae_ns.scene.initialization import from_points
 from sundae_ns.scene.render import SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, render_view
 
-AnyCamera = TypeVar("AnyCamera")
 Background = Literal["random", "black", "white"]
-"""Names of backgrounds; ``random`` is that of a run trained over random ones, and shows nerfstudio's grey."""
+"""Names of backgrounds; a scene that was trained over ``random`` ones is shown on nerfstudio's grey."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A field of Gaussian Gaussians, with its compensation head if it has one.
-
-    Scenes are values: functions return new ones and change none.
-    """
+    """Gaussians, and their compensation head if they have one. Functions return new scenes and change none."""
 
     gaussians: Gaussians
-    """The Gaussians: tensors ``[N, ...]`` by name, see :mod:`sundae_ns.core.gaussians`; any device."""
+    """Tensors ``[N, ...]`` by name, see :mod:`sundae_ns.core.gaussians`; any device."""
     head: CompensationHead | None = None
-    """The compensation head, on the device of the field; None without one."""
+    """The compensation head, on the device of the Gaussians; None without one."""
     background_color: Background = "black"
     antialiased: bool = False
     """Whether opacities compensate for the smallest footprint, as in training (``rasterize_mode`` of splatfacto)."""
     trained_focal: tuple[float, float] | None = None
     """Shortest and longest focal length of the images that the head was trained on, pixels."""
     cameras: tuple[Camera, ...] = ()
-    """Cameras stored with the scene, such as some of its training views; on the CPU."""
+    """Cameras stored with the scene, such as some training views; on the CPU."""
     up: tuple[float, float, float] | None = None
-    """The direction that is upwards, of unit length; None if it is not known. The web page turns about it."""
+    """Upward direction of unit length, about which the web page turns; None if it is not known."""
     start: Camera | None = None
-    """The camera that the web page opens with, on the CPU; None for the first of the stored ones."""
+    """The camera that the web page opens with, on the CPU; None for the first stored one."""
     in_model_frame: bool = False
-    """Whether coordinates are those of nerfstudio's model, not of the capture or of another program."""
+    """Whether coordinates are those of nerfstudio's model; otherwise of a capture or of another program."""
     meta: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """JSON values that a packed scene carries along: ``frame``, ``capture``, ``source``."""
 
@@ -83,20 +78,19 @@ class Scene:
 
     @property
     def device(self) -> torch.device:
-        """Device of the field and the head."""
+        """Device of the Gaussians and the head."""
         device: torch.device = self.gaussians["means"].device
         return device
 
     @property
     def background(self) -> Tensor:
-        """Colour behind the scene ``[3]``, on the device of the field."""
+        """Colour behind the scene ``[3]``, on the device of the scene."""
         return torch.tensor(SHOWN_BACKGROUNDS[self.background_color], device=self.device)
 
     def to(self, device: torch.device | str) -> Scene:
-        """The scene on another device; stored views stay on the CPU."""
+        """The scene on another device; stored cameras stay on the CPU."""
         if torch.device(device) == self.device:
             return self
-        gaussians = self.gaussians.replaced({name: value.to(device) for name, value in self.gaussians.items()})
         head = None
         if self.head is not None:
             # No deep copy: on a GPU the head keeps recorded CUDA graphs, which cannot be copied.
@@ -104,7 +98,7 @@ class Scene:
                 head = CompensationHead(dataclasses.replace(self.head.config))
             head.load_state_dict(self.head.state_dict())
             head = head.train(self.head.training).to(device)
-        return dataclasses.replace(self, gaussians=gaussians, head=head)
+        return dataclasses.replace(self, gaussians=self.gaussians.to(device), head=head)
 
     def settings(self, backend: BackendName = "auto", *, head: bool = True) -> RenderSettings:
         """Settings that render the scene with all of its SH degrees.
@@ -116,12 +110,8 @@ class Scene:
         Raises:
             BackendError: the rasteriser cannot run on the device of the scene.
         """
-        return RenderSettings(
-            select_backend(backend, self.device),
-            antialiased=self.antialiased,
-            head=self.head if head else None,
-            trained_focal=self.trained_focal,
-        )
+        rasteriser, enabled = select_backend(backend, self.device), self.head if head else None
+        return RenderSettings(rasteriser, antialiased=self.antialiased, head=enabled, trained_focal=self.trained_focal)
 
     def __repr__(self) -> str:
         head = "no head" if self.head is None else f"{self.head.config.size} head"
@@ -172,43 +162,6 @@ def render(scene: Scene, camera: Camera, *, head: bool = True, backend: BackendN
     return Rendering(*(images[name] for name in Rendering._fields))
 
 
-@dataclass(frozen=True)
-class Quality:
-    """Quality of images, a value for each camera."""
-
-    psnrs: tuple[float, ...]
-    """Peak signal-to-noise ratio over all pixels and channels, dB."""
-    ssims: tuple[float, ...]
-    """Structural similarity, window of 11 x 11 pixels without padding; NaN for smaller images."""
-
-    @property
-    def psnr(self) -> float:
-        """Mean PSNR over the cameras, dB."""
-        return fmean(self.psnrs)
-
-    @property
-    def ssim(self) -> float:
-        """Mean SSIM over the cameras."""
-        return fmean(self.ssims)
-
-
-@torch.no_grad()
-def evaluate(render: Callable[[AnyCamera], Tensor], cameras: Iterable[AnyCamera], targets: Iterable[Tensor]) -> Quality:
-    """Compare rendered images with true ones.
-
-    Args:
-        render: gives the image of a camera ``[H, W, 3]``.
-        cameras: at least one.
-        targets: the true image in [0, 1] ``[H, W, 3]`` of each camera, on any device.
-    """
-    values = []
-    for camera, target in zip(cameras, targets, strict=True):
-        image = render(camera)
-        values.append([float(metric(image, target.to(image))) for metric in (psnr, ssim)])
-    psnrs, ssims = zip(*values, strict=True)
-    return Quality(psnrs, ssims)
-
-
 @torch.no_grad()
 def measure(
     scene: Scene,
@@ -241,12 +194,12 @@ def measure(
     cameras = tuple(cameras) if cameras is not None else stored or scene.cameras
     if not cameras:
         raise DataError("there is no view to measure in; give views, such as sundae_ns.virtual_cameras(scene)")
-    if not isinstance(reference, Scene) and len(reference) != len(cameras):
-        raise DataError(f"{len(reference)} images do not fit {len(cameras)} views; give one image for each view")
+    targets: Iterable[Tensor]
     if isinstance(reference, Scene):
         scene = dataclasses.replace(scene, background_color=reference.background_color)
-    options: dict[str, Any] = {"head": head, "backend": backend}
-    targets = (
-        (render(reference, camera, **options).rgb for camera in cameras) if isinstance(reference, Scene) else reference
-    )
-    return evaluate(lambda camera: render(scene, camera, **options).rgb, cameras, targets)
+        targets = (render(reference, camera, head=head, backend=backend).rgb for camera in cameras)
+    elif len(reference) != len(cameras):
+        raise DataError(f"{len(reference)} images do not fit {len(cameras)} views; give one image for each view")
+    else:
+        targets = reference
+    return evaluate(lambda camera: render(scene, camera, head=head, backend=backend).rgb, cameras, targets)

@@ -14,6 +14,7 @@ import torch
 
 from sundae_ns.cli import main
 from sundae_ns.core.errors import PackError
+from sundae_ns.core.metrics import Quality
 from sundae_ns.io.pack.codecs import Codecs
 from sundae_ns.io.pack.config import FINETUNED, PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes, read_scene
@@ -21,7 +22,6 @@ from sundae_ns.io.pack.quantize import Transform
 from sundae_ns.plugin.finished_runs import load_run
 from sundae_ns.plugin.targets import COARSEST, Candidate, Judge, Search, best_pack, scaled
 from sundae_ns.scene.packing import contents_of
-from sundae_ns.scene.scene import Quality
 
 
 def packed(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sundae_ns.scene import display
+from sundae_ns.scene import frames as display
 
 
 def test_empty_pixels_get_the_largest_depth() -> None:
