@@ -45,15 +45,18 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Project:
-    """The files of ``sundae run`` and the choices of its user."""
+    """The options of ``sundae run``, and the files and steps that follow from them."""
 
-    photos: Path
-    """Folder of photos, a video, or a capture."""
-    out: Path
-    train: TrainOptions
-    poses: PoseOptions
-    quality: Literal["draft", "normal", "best"]
-    max_mb: float | None
+    photos: Source
+    """folder of photos, a video, or a capture, which has poses already."""
+    out: Out
+    """folder for the capture, the run, scene.sundae, scene.html and the report; created if missing."""
+    quality: Literal["draft", "normal", "best"] = "normal"
+    """draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03)."""
+    max_mb: float | None = None
+    """most megabytes of the packed scene; fewer Gaussians and coarser steps keep to it."""
+    train: Annotated[TrainOptions, tyro.conf.arg(name="")] = TrainOptions()
+    poses: Annotated[PoseOptions, tyro.conf.arg(name="")] = PoseOptions()
 
     @cached_property
     def posed(self) -> bool:
@@ -194,30 +197,17 @@ class Project:
             raise ConfigError(f"{self.out} was made with {name} {first}, not {now}; {again}")
 
 
-def run(
-    photos: Source,
-    out: Out,
-    quality: Literal["draft", "normal", "best"] = "normal",
-    max_mb: float | None = None,
-    train: Annotated[TrainOptions, tyro.conf.arg(name="")] = TrainOptions(),  # noqa: B008
-    poses: Annotated[PoseOptions, tyro.conf.arg(name="")] = PoseOptions(),  # noqa: B008
-) -> int:
+def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
     """Turn photos or a video into a packed scene: find camera poses, train, pack, write a report and a page.
 
     Each step prints the command that it runs. The same command again skips the steps that are done, and resumes an
     interrupted training.
-
-    Args:
-        photos: folder of photos, a video, or a capture, which has poses already.
-        out: folder for the capture, the run, scene.sundae, scene.html and the report; created if missing.
-        quality: draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03).
-        max_mb: most megabytes of the packed scene; fewer Gaussians and coarser steps keep to it.
     """
-    _check_input(photos)
-    project = Project(photos, out, train, poses, quality, max_mb)
+    out, poses = project.out, project.poses
+    _check_input(project.photos)
     project.check()
     if not project.posed and not project.placed():
-        check_poses(photos, poses.frames, poses.masks, remarks=False)  # sundae poses prints them
+        check_poses(project.photos, poses.frames, poses.masks, remarks=False)  # sundae poses prints them
     project.claim()
     plan = project.plan()
     for number, step in enumerate(plan, start=1):

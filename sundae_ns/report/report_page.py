@@ -7,7 +7,6 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from importlib import resources
 from io import BytesIO
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch
-from jinja2 import Environment, StrictUndefined, Template
+from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -33,11 +32,11 @@ from sundae_ns.train.curve import CountCurve
 MOST_VIEWS = 24
 """Most views that a page shows of a run."""
 MOST_ON_A_PAGE = 32
-"""Most views that a page shows of all runs, unless the worst and the best of each are more."""
+"""Most views that a page shows of all runs, if that leaves two for each."""
 LONGEST_SIDE = 1200
-"""Of the images in a page, pixels; larger ones are reduced."""
+"""Longest side of images in a page, pixels; larger ones are reduced."""
 EXACT_SIDE = 512
-"""Longest side of images that lose nothing, pixels: a browser enlarges them, so that losses at colours' edges show."""
+"""Longest side of images that are stored without loss, pixels: a browser enlarges them, and losses would show."""
 LARGEST_ERROR = 51
 """Mean absolute difference of the channels, in levels of 255, that gets the last colour of the error map."""
 ERROR_COLORS: NDArray[np.uint8] = np.round(
@@ -54,13 +53,12 @@ class ShownView:
     index: int
     """In the order of the capture, from 0."""
     name: str
-    """Of the photo's file."""
+    """Name of the photo's file."""
     size: tuple[int, int]
-    """Width and height of the photo that was measured, pixels."""
+    """Width and height of the measured photo, pixels."""
     shown: tuple[int, int]
     """Width and height of the images here."""
     full: ViewQuality
-    """Of the complete rendering, at the size that was measured."""
     base: ViewQuality | None
     """Without the head; None if there is no head."""
     photo: str
@@ -74,11 +72,11 @@ class ShownRun:
 
     measured: Measured
     views: Sequence[ShownView]
-    """Its views to show, in the order of the capture."""
+    """In the order of the capture."""
     curve: CountCurve | None = None
     """Expected quality over the number of Gaussians; None if no trials decided about it."""
     capture: str = ""
-    """Stands for the capture: views of one index and name compare between runs of one capture."""
+    """Identifies the capture: views of one index and name compare between runs of one capture."""
 
 
 def choose_cameras(qualities: Sequence[float], most: int) -> list[int]:
@@ -99,7 +97,7 @@ def choose_cameras(qualities: Sequence[float], most: int) -> list[int]:
 
 
 def cameras_for_each(runs: int) -> int:
-    """Most views to show of each of a number of runs, so that a page keeps its size."""
+    """Most views of each run on a page of this number of runs."""
     return min(MOST_VIEWS, max(MOST_ON_A_PAGE // max(runs, 1), 2))
 
 
@@ -108,7 +106,7 @@ def error_map(rendering: Tensor, photo: Tensor, size: tuple[int, int] | None = N
 
     Args:
         rendering, photo: ``[H, W, 3]`` in [0, 1]; values beyond are clamped.
-        size: width and height of the map, by the mean over each of its pixels; by default that of the images.
+        size: width and height of the map; by default that of the images.
 
     Returns:
         An image with a palette, from 0 to :data:`LARGEST_ERROR` levels of 255; more gets the last colour.
@@ -132,11 +130,10 @@ def error_map(rendering: Tensor, photo: Tensor, size: tuple[int, int] | None = N
 def shown_view(
     index: int, name: str, photo: Tensor, rendering: Tensor, bare: Tensor, full: ViewQuality, base: ViewQuality | None
 ) -> ShownView:
-    """A view with its images reduced and encoded; those of the head off only with ``base``.
+    """A view with its images reduced and encoded, those without the head only with ``base``.
 
-    Args:
-        index, name, full, base: as in :class:`ShownView`.
-        photo, rendering, bare: images ``[H, W, 3]`` in [0, 1]; ``bare`` is without the head.
+    Images are ``[H, W, 3]`` in [0, 1]; ``bare`` is without the head. The other arguments are those of
+    :class:`ShownView`.
     """
     height, width = photo.shape[:2]
     scale = min(1.0, LONGEST_SIDE / max(height, width))
@@ -149,25 +146,21 @@ def shown_view(
 
 
 def _plain(image: Tensor) -> Tensor:
-    # A damaged field may render NaN, which no image holds.
+    # A damaged scene may render NaN.
     return image.detach().to(device="cpu", dtype=torch.float32).nan_to_num(nan=0.0).clamp(0, 1)
 
 
 def _image(image: Tensor, size: tuple[int, int]) -> Image.Image:
-    whole = Image.fromarray((255 * _plain(image)).round().to(torch.uint8).numpy())
-    return whole if whole.size == size else whole.resize(size, Image.Resampling.LANCZOS)
+    converted = Image.fromarray((255 * _plain(image)).round().to(torch.uint8).numpy())
+    return converted if converted.size == size else converted.resize(size, Image.Resampling.LANCZOS)
 
 
 def _encoded(image: Image.Image) -> str:
     """An image as a ``data:`` address: PNG if it has a palette, else WebP."""
-    file = BytesIO()
-    if image.mode == "P":
-        image.save(file, "png", optimize=True)
-    elif max(image.size) <= EXACT_SIDE:
-        image.save(file, "webp", lossless=True)
-    else:
-        image.save(file, "webp", quality=90)
-    return _address(file.getvalue(), "png" if image.mode == "P" else "webp")
+    file, kind = BytesIO(), "png" if image.mode == "P" else "webp"
+    quality = {"lossless": True} if max(image.size) <= EXACT_SIDE else {"quality": 90}
+    image.save(file, kind, optimize=True, **quality)
+    return _address(file.getvalue(), kind)
 
 
 def _address(content: bytes, kind: str) -> str:
@@ -199,7 +192,7 @@ def curve_plot(curve: CountCurve) -> str:
 
 
 def report_page(runs: Sequence[ShownRun], notes: Sequence[str], command: str) -> str:
-    """The HTML of the page. It holds all that it shows, and its policy forbids it to load anything.
+    """The HTML of a page that loads nothing, which its policy forbids.
 
     Args:
         runs: with labels that differ.
@@ -210,7 +203,8 @@ def report_page(runs: Sequence[ShownRun], notes: Sequence[str], command: str) ->
     numbers = {run.label: number for number, run in enumerate(measured)}
     scenes = {run.scene: [other for other in runs if other.measured.scene == run.scene] for run in measured}
     script, last = _text("page.js"), LARGEST_ERROR
-    return _template().render(
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return environment.from_string(_text("page.html")).render(
         title=", ".join(scenes),
         command=command,
         devices=", ".join(sorted({run.gpu or "CPU" for run in measured})),
@@ -218,10 +212,10 @@ def report_page(runs: Sequence[ShownRun], notes: Sequence[str], command: str) ->
         scenes=[
             {
                 "name": scene,
-                "rows": rows_of([run.measured for run in beside]),
-                "runs": [_run(run, numbers, beside) for run in beside],
+                "rows": rows_of([run.measured for run in group]),
+                "runs": [_run(run, numbers, group) for run in group],
             }
-            for scene, beside in scenes.items()
+            for scene, group in scenes.items()
         ],
         runs=[(number, label) for label, number in numbers.items()],
         explanations=EXPLANATIONS,
@@ -231,25 +225,19 @@ def report_page(runs: Sequence[ShownRun], notes: Sequence[str], command: str) ->
         largest_error=last,
         longest_side=LONGEST_SIDE,
         script=Markup(script),
-        # The only script that a browser runs here, even if some name of a file should ever slip through unescaped.
+        # A browser runs no other script here, even if a file's name should ever stand unescaped.
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
-
-
-@cache
-def _template() -> Template:
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(_text("page.html"))
 
 
 def _text(name: str) -> str:
     return resources.files("sundae_ns.report").joinpath(name).read_text(encoding="utf-8")
 
 
-def _run(run: ShownRun, numbers: Mapping[str, int], beside: Sequence[ShownRun]) -> dict[str, Any]:
-    """Values of the template for a run; ``beside`` are the runs of its scene."""
+def _run(run: ShownRun, numbers: Mapping[str, int], group: Sequence[ShownRun]) -> dict[str, Any]:
+    """Values of the template for a run; ``group`` are the runs of its scene."""
     measured = run.measured
-    place = numbers[measured.label]
+    run_number = numbers[measured.label]
     facts = {
         "source": measured.source,
         "method": measured.method,
@@ -268,11 +256,11 @@ def _run(run: ShownRun, numbers: Mapping[str, int], beside: Sequence[ShownRun]) 
 
     # The same view of another run of this scene may stand in the photo's place.
     peers = [
-        (other.measured.label, {identity(other, view) for view in other.views}) for other in beside if other is not run
+        (other.measured.label, {identity(other, view) for view in other.views}) for other in group if other is not run
     ]
     views = [
         {
-            "id": f"v{place}-{view.index}",
+            "id": f"v{run_number}-{view.index}",
             "view": view,
             "quality": _figures(view.full),
             "base": None if view.base is None else _figures(view.base),
@@ -287,7 +275,7 @@ def _run(run: ShownRun, numbers: Mapping[str, int], beside: Sequence[ShownRun]) 
         for view in run.views
     ]
     return {
-        "number": place,
+        "number": run_number,
         "label": measured.label,
         "facts": {name: value for name, value in facts.items() if value},
         "views": views,
@@ -300,7 +288,7 @@ def _run(run: ShownRun, numbers: Mapping[str, int], beside: Sequence[ShownRun]) 
 
 
 def _figures(view: ViewQuality) -> str:
-    """Figures of a view, those that were measured."""
+    """The measured figures of a view."""
     values = [(name, getattr(view, name), digits) for name, digits in METRICS]
     return ", ".join(
         f"{_NAMES[name]} {number(value, digits)}{' dB' if name.startswith('psnr') else ''}"
