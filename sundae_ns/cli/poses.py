@@ -19,7 +19,7 @@ from sundae_ns.cli.process import quoted, word
 from sundae_ns.core.errors import ConfigError, DataError, StorageError, SundaeError, one_line
 
 if TYPE_CHECKING:
-    from sundae_ns.data.reconstruct import Found
+    from sundae_ns.data.capture_files import Placed
 
 
 @dataclass(frozen=True)
@@ -64,16 +64,16 @@ def poses(
 
     pycolmap()
     request = Request(photos, out, options.matching, options.frames, masks)
-    result = _interruptible(lambda: find_poses(request, _report), request.work)
-    placed, models = result.photos, result.models
-    cameras = "1 camera" if result.cameras == 1 else f"{result.cameras} cameras"
+    placed = _interruptible(lambda: find_poses(request, _report), request.work)
+    models = placed.models
+    cameras = "1 camera" if placed.cameras == 1 else f"{placed.cameras} cameras"
     counts = f"{len(placed.placed):,} of {placed.total:,} photos have a pose, of {cameras}"
-    print(f"{out}: {counts}; mean reprojection error {result.error:.2f} px")
+    print(f"{out}: {counts}; mean reprojection error {placed.error:.2f} px")
     if len(models) > 1:
         others = ", ".join(f"{count:,}" for count in models[1:])
         print(f"# this is the largest of {len(models)} models that do not join; others have {others} photos")
-    if result.masks is not None:
-        print(f"# masks: {result.masks}")
+    if placed.masks is not None:
+        print(f"# masks: {placed.masks}")
     if placed.left_out:
         names = ", ".join(placed.left_out[:3]) + (", ..." if len(placed.left_out) > 3 else "")
         mark = "" if placed.enough else "warning: "
@@ -93,7 +93,7 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
     """
     from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside, masks_of
     from sundae_ns.data.reconstruct import check_installed
-    from sundae_ns.data.video import SUFFIXES, is_video, video_size
+    from sundae_ns.data.video import SUFFIXES, check_video, is_video
 
     check_installed()
     if not photos.exists():
@@ -104,7 +104,7 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
     if is_video(photos):
         if masks is not None:
             raise ConfigError("a video has no masks; leave out --masks")
-        video_size(photos)
+        check_video(photos)
         return None
     if photos.is_file():
         raise DataError(f"{photos} is neither a folder of photos nor a video ({', '.join(SUFFIXES)})")
@@ -145,7 +145,7 @@ def _report(stage: str, total: int) -> Iterator[Callable[[int], None]]:
     print(f"{stage}: {done:,} of {total:,}, {time.monotonic() - begun:.0f} s", flush=True)
 
 
-def _interruptible(work: Callable[[], Found], folder: Path) -> Found:
+def _interruptible(work: Callable[[], Placed], folder: Path) -> Placed:
     """Run in a thread: COLMAP's functions return to Python only after minutes, and an interrupt ends them at once."""
     with ThreadPoolExecutor(1) as threads:
         future = threads.submit(work)

@@ -240,7 +240,7 @@ def _check_input(photos: Path) -> None:
     if is_posed(photos):
         layout = posed_layout(photos)
         if layout is not None:
-            print(f"# capture in {layout.program} layout: {layout.description}", flush=True)
+            print(f"# capture in {layout.description}", flush=True)
     elif (photos / "sparse").is_dir() or is_model(photos):
         raise no_transforms(photos)  # says how to use a capture in another layout
 

@@ -23,7 +23,6 @@ from sundae_ns.data.lenses import DISTORTION, FISHEYE624, INTRINSICS, kind_of_mo
 
 _MAX_SIDE = 65535  # pixels: JPEG's limit
 _LARGEST = 1e12  # its square must stay in the range of float32
-_ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 
 def finite(value: Any, name: str, where: str, *, positive: bool = False) -> float:
@@ -48,11 +47,7 @@ def side(value: Any, name: str, where: str) -> int:
 
 
 def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray:
-    """``value`` as a float64 matrix ``[R, 4]``, with R one of ``rows``.
-
-    Raises:
-        DataError: it has another shape, an entry that is not finite, or is singular.
-    """
+    """``value`` as a finite, regular float64 matrix ``[R, 4]`` with R one of ``rows``; ``DataError`` if it is none."""
     listed = isinstance(value, list) and len(value) in rows
     if not listed or not all(isinstance(row, list) and len(row) == 4 for row in value):
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
@@ -65,7 +60,7 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
 
 
 def rigid(pose: np.ndarray, where: str) -> np.ndarray:
-    """A camera pose ``[3 or 4, 4]`` whose rotation has no scale; programs that scale a scene may leave theirs in it.
+    """A camera pose ``[3 or 4, 4]`` without the scale that programs may leave in its rotation.
 
     Raises:
         DataError: the axes of the camera differ in length, or are not at right angles.
@@ -91,11 +86,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any]:
-    """Check the ``transforms.json`` of a capture; returns its contents.
-
-    Args:
-        path: the file.
-        splits: splits that will be read, such as ``"train"``; checked if the file lists images by split.
+    """Check the ``transforms.json`` of a capture, and its lists of ``splits`` if it has any; returns its contents.
 
     Raises:
         DataError: names the first unusable entry, its frame, and what it must be.
@@ -104,45 +95,55 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{path} lists no frames; a capture needs at least one image with its pose")
-    _check_entries(meta, path.name)
+    _check_values(meta, path.name)
     meta = with_focal_lengths(meta, path.parent)
     kinds: Counter[str] = Counter()
     for index, frame in enumerate(frames):
         where = f"{path.name}, frame {index}"
         if not isinstance(frame, dict):
             raise DataError(f"{where}: it must be an object with file_path and transform_matrix")
-        where += f" ({_short(_path(frame.get('file_path'), 'file_path', where))})"
-        _check_entries({"transform_matrix": None, **frame}, where)
+        _path(frame.get("file_path"), "file_path", where)
+        where += f" ({_short(frame['file_path'])})"
+        _check_values({"transform_matrix": None, **frame}, where)
         missing = [key for key in INTRINSICS if key not in meta and key not in frame]
         if missing:
             raise DataError(f"{where}: {', '.join(missing)} missing; give them in each frame, or for all at the top")
         kinds[lens_of(meta, frame, where).kind] += 1
-    stated = {key: sum(key in frame for frame in frames) for key in ("mask_path", "depth_file_path")}
-    for key, count in stated.items():
+    for key in ("mask_path", "depth_file_path"):
+        count = sum(key in frame for frame in frames)
         if count not in (0, len(frames)):
             raise DataError(f"{path.name}: {count} of {len(frames)} frames have a {key}; give it in all or in none")
     if FISHEYE624 in kinds:
-        _check_round_lens(meta, kinds, stated["mask_path"] > 0, path.name)
+        # nerfstudio makes the masks of such a lens, and reads it with no other kind.
+        radius = meta.get("fisheye_crop_radius")
+        counts = ", ".join(f"{count} images with {kind}" for kind, count in sorted(kinds.items()))
+        for wrong, remedy in (
+            (len(kinds) > 1, f"FISHEYE624 cannot be mixed with other lenses ({counts}); undistort the images first"),
+            (
+                not isinstance(radius, float) or not 0 < radius < math.inf,
+                f"fisheye_crop_radius is {_short(radius)}; a FISHEYE624 camera needs it, a positive number of pixels "
+                "with a decimal point",
+            ),
+            ("mask_path" in frames[0], "nerfstudio makes the masks of a FISHEYE624 camera; remove mask_path"),
+        ):
+            if wrong:
+                raise DataError(f"{path.name}: {remedy}")
     _check_splits(meta, splits, path.name)
     return meta
 
 
-def _check_entries(entries: Mapping[str, Any], where: str) -> None:
-    """Check what the file or one of its frames states."""
+def _check_values(entries: Mapping[str, Any], where: str) -> None:
     for key, check in _CHECKS.items():
         if key in entries:
             check(entries[key], key, where)
 
 
-def _path(value: Any, name: str, where: str) -> str:
-    if not isinstance(value, str) or not value or "\0" in value:
-        raise DataError(f"{where}: {name} is {_short(value)}; it must be the path of a file")
-    return value
+def _must(holds: Callable[[Any], object], requirement: str) -> Callable[[Any, str, str], None]:
+    def check(value: Any, name: str, where: str) -> None:
+        if not holds(value):
+            raise DataError(f"{where}: {name} is {_short(value)}; it must be {requirement}")
 
-
-def _angle(value: Any, name: str, where: str) -> None:
-    if not 0 < finite(value, name, where) < math.pi:
-        raise DataError(f"{where}: {name} is {_short(value)}; it must be an angle of view in radians, below pi")
+    return check
 
 
 def _distortion(value: Any, name: str, where: str) -> None:
@@ -152,11 +153,10 @@ def _distortion(value: Any, name: str, where: str) -> None:
         finite(number, name, where)
 
 
-def _orientation(value: Any, name: str, where: str) -> None:
-    if value not in _ORIENTATIONS:
-        raise DataError(f"{where}: {name} is {_short(value)}; use one of {', '.join(_ORIENTATIONS)}")
-
-
+_path = _must(lambda value: isinstance(value, str) and value and "\0" not in value, "the path of a file")
+_angle = _must(
+    lambda value: type(value) in (int, float) and 0 < value < math.pi, "an angle of view in radians, below pi"
+)
 _CHECKS: dict[str, Callable[[Any, str, str], Any]] = {
     **dict.fromkeys(("w", "h"), side),
     **dict.fromkeys(("fl_x", "fl_y", "applied_scale"), partial(finite, positive=True)),
@@ -167,41 +167,25 @@ _CHECKS: dict[str, Callable[[Any, str, str], Any]] = {
     "camera_model": lambda value, _, where: kind_of_model(value, where),
     "transform_matrix": lambda value, name, where: rigid(matrix(value, (4,), name, where), where),
     "applied_transform": lambda value, name, where: matrix(value, (3,), name, where),
-    "orientation_override": _orientation,
+    "orientation_override": _must(
+        lambda value: value in ("pca", "up", "vertical", "none"), "pca, up, vertical or none"
+    ),
 }
 """The check of each entry of a file or of a frame, called with its value, its name and where it stands."""
-
-
-def _check_round_lens(meta: Mapping[str, Any], kinds: Counter[str], masked: bool, where: str) -> None:
-    """Check what a FISHEYE624 camera needs: nerfstudio makes its masks, and holds it with no other kind of lens."""
-    if len(kinds) > 1:
-        counts = ", ".join(f"{count} images with {kind}" for kind, count in sorted(kinds.items()))
-        raise DataError(f"{where}: FISHEYE624 cannot be mixed with other lenses ({counts}); undistort the images first")
-    radius = meta.get("fisheye_crop_radius")
-    if not isinstance(radius, float) or not 0 < radius < math.inf:
-        raise DataError(
-            f"{where}: fisheye_crop_radius is {_short(radius)}; a FISHEYE624 camera needs it, a positive number of "
-            "pixels with a decimal point"
-        )
-    if masked:
-        raise DataError(f"{where}: nerfstudio makes the masks of a FISHEYE624 camera; remove mask_path")
 
 
 def _check_splits(meta: Mapping[str, Any], splits: Sequence[str], where: str) -> None:
     listed = [split for split in ("train", "val", "test") if f"{split}_filenames" in meta]
     known = {str(Path(frame["file_path"])) for frame in meta["frames"]}
     for split in splits if listed else ():
-        files = meta.get(f"{split}_filenames")
+        name = f"{split}_filenames"
+        files = meta.get(name)
         if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
-            raise DataError(
-                f"{where} lists images for {', '.join(listed)}, but none for {split}; add {split}_filenames as a list "
-                "of paths, or remove all such lists"
-            )
-        unknown = [file for file in files if str(Path(file)) not in known]
-        if unknown:
-            raise DataError(
-                f"{where}: {split}_filenames has {_short(unknown[0])}, which no frame has as its file_path; correct it"
-            )
+            remedy = f"add {name} as a list of paths, or remove all such lists"
+            raise DataError(f"{where} lists images for {', '.join(listed)}, but none for {split}; {remedy}")
+        for file in files:
+            if str(Path(file)) not in known:
+                raise DataError(f"{where}: {name} has {_short(file)}, which no frame has as its file_path; correct it")
 
 
 def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
@@ -237,7 +221,7 @@ def undecodable(path: Path, error: Exception) -> DataError:
 
 
 def beside(path: Path) -> str:
-    """A remark on a file that has the name of a missing one but for case or suffix: `` (there is x.PNG)``, or empty."""
+    """A remark on a file with another case or suffix than a missing one: `` (there is x.PNG)``; empty without one."""
     wanted = (path.stem.lower(), path.name.lower())
     names = [entry.name for entry in entries(path.parent) if entry.stem.lower() in wanted]
     return "" if path.name in names or not names else f" (there is {names[0]})"

@@ -28,11 +28,18 @@ _JPEG: dict[str, Any] = {"quality": 95, "subsampling": 0}
 
 
 class Placed(NamedTuple):
-    """Photos of a capture, in the order of their names."""
+    """Photos of a capture in the order of their names, and what :func:`.find_poses` reports of them."""
 
     placed: tuple[str, ...]
     left_out: tuple[str, ...]
     """Those without a pose."""
+    cameras: int = 1
+    error: float = 0.0
+    """Mean reprojection error, pixels."""
+    models: tuple[int, ...] = ()
+    """Numbers of photos of COLMAP's models, the largest first; it is the capture."""
+    masks: str | None = None
+    """How many frames have a mask, ``24 of 24``; None without masks."""
 
     @property
     def total(self) -> int:
@@ -80,12 +87,7 @@ def names_of(photos: Sequence[Photo]) -> list[str]:
 
 
 def write_images(photos: Sequence[Photo], folder: Path, advance: Callable[[int], None]) -> None:
-    """Write the photos, upright, under their :func:`names_of`; those that are there stay.
-
-    Args:
-        photos: the photos.
-        folder: of the images.
-        advance: called with the number of further images.
+    """Write the photos, upright, under their :func:`names_of`; images that exist stay.
 
     Raises:
         DataError: the pixels of a photo cannot be decoded, or a raw photo has another size than the others.
@@ -118,10 +120,9 @@ def _write_image(photo: Photo, path: Path) -> None:
 
 
 def write_smaller(images: Path, advance: Callable[[int], None]) -> None:
-    """Write ``images_2``, ``images_4``, ... beside a folder: three sizes, or more for the largest images.
+    """Write ``images_2``, ``images_4``, ... beside a folder: three sizes, or more until one has 1,600 pixels at most.
 
-    nerfstudio trains at the first size of at most 1,600 pixels, or at one that the user names. A size that is odd is
-    rounded down, as its cameras are.
+    Odd sizes are rounded down, as nerfstudio rounds those of cameras.
     """
     paths = sorted(images.iterdir())
     longest, factors = max(max(check_image(path)) for path in paths), [2, 4, 8]
@@ -148,7 +149,7 @@ def write_capture(
     """Write a capture into a folder, ``transforms.json`` last.
 
     Args:
-        out: the folder; an earlier half of it is replaced.
+        out: the folder; it is replaced.
         model: ``pycolmap.Reconstruction``.
         images: folder of the images of the model, each in a folder of its camera.
         sources: names of the photos, by the names of their images; also of those without a pose.
@@ -161,7 +162,7 @@ def write_capture(
             source, target = images / image.name, out / "images" / Path(image.name).name
             try:
                 os.link(source, target)
-            except OSError:  # a disk without second names of files
+            except OSError:  # a disk without hard links
                 shutil.copyfile(source, target)
     write_smaller(out / "images", advance)
     stored = out / "colmap" / "sparse" / "0"
@@ -180,29 +181,31 @@ def transforms_of(model: Any, sources: Mapping[str, str]) -> dict[str, Any]:
 
     Args:
         model: ``pycolmap.Reconstruction`` with cameras of the kind OPENCV or SIMPLE_RADIAL.
-        sources: names of the photos, by the names of their images. A frame states its photo as ``original``; those
+        sources: names of the photos, by the names of their images. A frame states its photo as ``original``; photos
             without a pose are ``left_out``.
     """
     cameras = {number: _intrinsics(camera) for number, camera in model.cameras.items()}
     posed = {image.name: image for image in model.images.values() if image.has_pose}
     shared = {image.camera_id for image in posed.values()}
-    frames, left_out = [], []
-    for name in sorted({*posed, *sources}, key=lambda name: Path(name).name):
-        if name not in posed:
-            left_out.append(sources[name])
-            continue
-        image = posed[name]
-        frames.append(
-            {
-                "file_path": f"images/{Path(name).name}",
-                "original": sources[name],
-                **({} if len(shared) == 1 else cameras[image.camera_id]),
-                "transform_matrix": _pose(np.asarray(image.cam_from_world().matrix())).tolist(),
-            }
-        )
-    top = cameras[shared.pop()] if len(shared) == 1 else {}
-    stated = {"applied_transform": APPLIED.tolist(), "ply_file_path": CLOUD, "left_out": left_out}
-    return {"camera_model": "OPENCV", **top, **stated, "frames": frames}
+    names = sorted({*posed, *sources}, key=lambda name: Path(name).name)
+    frames = [
+        {
+            "file_path": f"images/{Path(name).name}",
+            "original": sources[name],
+            **({} if len(shared) == 1 else cameras[posed[name].camera_id]),
+            "transform_matrix": _pose(np.asarray(posed[name].cam_from_world().matrix())).tolist(),
+        }
+        for name in names
+        if name in posed
+    ]
+    return {
+        "camera_model": "OPENCV",
+        **(cameras[shared.pop()] if len(shared) == 1 else {}),
+        "applied_transform": APPLIED.tolist(),
+        "ply_file_path": CLOUD,
+        "left_out": [sources[name] for name in names if name not in posed],
+        "frames": frames,
+    }
 
 
 def _intrinsics(camera: Any) -> dict[str, float]:
@@ -224,15 +227,7 @@ def _pose(camera_from_world: np.ndarray) -> np.ndarray:
 
 
 def add_masks(capture: Path, masks: Sequence[Path]) -> str:
-    """Copy masks into a capture, at the sizes of its images, and name them in its frames.
-
-    Args:
-        capture: whose images are named ``frame_00001`` and so on, in the order of the masks.
-        masks: one for each photo.
-
-    Returns:
-        How many frames have theirs, ``24 of 24``.
-    """
+    """Copy the masks of all photos into a capture, at the sizes of its images; returns how many frames have one."""
     by_name = {f"frame_{number:05d}": mask for number, mask in enumerate(masks, start=1)}
     for images in sorted(capture.glob("images*")):
         folder = capture / images.name.replace("images", "masks", 1)

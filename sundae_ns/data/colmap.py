@@ -55,11 +55,7 @@ class ColmapImage(NamedTuple):
 
 
 def read_images(model: Path) -> dict[int, ColmapImage]:
-    """The images of a model by their numbers, with their cameras.
-
-    Raises:
-        DataError: names the file and its first unusable entry.
-    """
+    """The images of a model by their numbers, with their cameras; ``DataError`` names the first unusable entry."""
     if not model.is_dir():
         raise DataError(
             f"{model} is not a folder; give the folder of the model with colmap --colmap-path (usually sparse/0)"
@@ -103,16 +99,16 @@ def read_points(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
                 starts.append(end)
                 end += _POINT.itemsize
                 end += 8 * _COUNT.unpack_from(content, end - _COUNT.size)[0]
-            _check_end(content, end)
+            if end > len(content):
+                raise ValueError(f"it ends {end - len(content):,} bytes early")
             crops = sliding_window_view(np.frombuffer(content + bytes(_POINT.itemsize), np.uint8), _POINT.itemsize)
             points = crops[starts].view(_POINT)[:, 0]
             return points["xyz"].copy(), points["rgb"].copy()
     if (model / "points3D.txt").exists():
         with _content(model / "points3D.txt") as content:
-            rows = [line.split() for line in _lines(content) if line]
+            rows = _rows(content)
             positions = np.array([[float(word) for word in row[1:4]] for row in rows], dtype=np.float64)
             colours = b"".join(bytes(int(word) for word in row[4:7]) for row in rows)
-            _check_count(content, len(rows))
             return positions.reshape(len(rows), 3), np.frombuffer(colours, np.uint8).reshape(len(rows), 3).copy()
     raise DataError(f"{model} has no points3D.bin or .txt; add it, or start with colmap --load-3D-points False")
 
@@ -120,13 +116,7 @@ def read_points(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
 def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> None:
     """Check the files of a COLMAP model, and the paths of its images, which nerfstudio passes to a shell.
 
-    Args:
-        model: folder of the model, such as ``sparse/0``.
-        images: folder of its images; None skips the check that they exist.
-        points: also check the points.
-
-    Raises:
-        DataError: names the first unusable entry.
+    ``DataError`` names the first unusable entry. Without a folder of ``images`` they need not exist.
     """
     names = [image.name for image in read_images(model).values()]
     hostile = next((name for name in [str(images or ""), *names] if set(name) & set('"$`\\\n')), None)
@@ -143,7 +133,6 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
 
 @contextmanager
 def _content(path: Path) -> Iterator[bytes]:
-    """The bytes of a file; whatever fails while they are parsed becomes one line."""
     with reading(path, f"a complete {path.name} of COLMAP", remedy="copy or export it again"):
         yield regular(path).read_bytes()
 
@@ -155,11 +144,6 @@ def _camera(model: str, width: int, height: int, params: Sequence[float], where:
     for name, value in zip(names, params, strict=True):
         finite(value, f"parameter {name}", where, positive=name.startswith("f"))
     return ColmapCamera(side(width, "width", where), side(height, "height", where), *colmap_lens(model, params, where))
-
-
-def _check_end(content: bytes, end: int) -> None:
-    if end > len(content):
-        raise ValueError(f"it ends {end - len(content):,} bytes early")
 
 
 def _binary_cameras(content: bytes) -> Iterator[tuple[int, int, int, int, tuple[float, ...]]]:
@@ -179,37 +163,34 @@ def _binary_images(content: bytes) -> Iterator[tuple[int, tuple[float, ...], int
         end = content.index(b"\0", start, start + 4096)
         at = end + 1 + _COUNT.size
         at += 24 * _COUNT.unpack_from(content, end + 1)[0]
-        _check_end(content, at)
+        if at > len(content):
+            raise ValueError(f"it ends {at - len(content):,} bytes early")
         yield number, tuple(pose), camera, content[start:end].decode("utf-8")
 
 
-def _lines(content: bytes) -> list[str]:
-    """Lines of a text, stripped; comments are empty ones."""
-    lines = [line.strip() for line in re.split(r"\r\n|\r|\n", content.decode("utf-8"))]
-    return ["" if line.startswith("#") else line for line in lines]
-
-
-def _check_count(content: bytes, count: int) -> None:
-    """Compare with the number that COLMAP states in a comment; a text cut between two lines has no other sign."""
+def _rows(content: bytes, *, images: bool = False) -> list[list[str]]:
+    """Words of the entries of a text. An image has a second line, and a name that may have spaces."""
+    lines = map(str.strip, re.split(r"\r\n|\r|\n", content.decode("utf-8")))
+    rows = []
+    for line in lines:
+        if line and not line.startswith("#"):
+            rows.append(line.split(maxsplit=9 if images else -1))
+            if images:
+                next(lines, None)  # observations, which may be an empty line
+    # A text cut between two lines has no other sign.
     stated = re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)
-    if stated and int(stated[1]) != count:
-        raise ValueError(f"it states {int(stated[1]):,} entries and has {count:,}")
+    if stated and int(stated[1]) != len(rows):
+        raise ValueError(f"it states {int(stated[1]):,} entries and has {len(rows):,}")
+    return rows
 
 
 def _text_cameras(content: bytes) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
-    rows = [line.split() for line in _lines(content) if line]
-    for number, name, width, height, *params in rows:
+    for number, name, width, height, *params in _rows(content):
         yield int(number), name, int(width), int(height), tuple(map(float, params))
-    _check_count(content, len(rows))
 
 
 def _text_images(content: bytes) -> Iterator[tuple[int, tuple[float, ...], int, str]]:
-    lines, count = iter(_lines(content)), 0
-    for line in filter(None, lines):
-        number, *pose, camera, name = line.split(maxsplit=9)
+    for number, *pose, camera, name in _rows(content, images=True):
         if len(pose) != 7:
             raise ValueError(f"image {number} has {len(pose)} numbers as its pose")
-        next(lines, None)  # observations, which may be an empty line
-        count += 1
         yield int(number), tuple(map(float, pose)), int(camera), name
-    _check_count(content, count)

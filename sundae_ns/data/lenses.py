@@ -1,13 +1,14 @@
 """Lenses: what a ``transforms.json`` or a COLMAP model states of a camera, and which projections can be trained on.
 
-The rasteriser draws perspective images. A perspective or fisheye lens is undistorted before training; any other
-projection has no perspective image of the whole picture, so it is refused with the way to make some.
+The rasteriser draws perspective images. Perspective and fisheye images are undistorted before training; other
+projections are refused with the way to make perspective images of them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,7 +52,7 @@ _REMEDIES = {
     "VR180": f"the images are half panoramas of stereo: {_ONE_EYE}",
     "ORTHOPHOTO": "an orthophoto has no focal length: train on the photos that it was made of",
 }
-"""Projections that no perspective image shows whole, by the start of their names, and what to do instead."""
+"""Projections that no perspective image shows whole, by the start of their names, and the remedy."""
 
 
 class Lens(NamedTuple):
@@ -64,16 +65,16 @@ class Lens(NamedTuple):
 
 
 def kind_of_model(model: Any, where: str) -> str:
-    """The kind of lens of a ``camera_model``; ``DataError`` with the way out for other projections."""
+    """The kind of lens of a ``camera_model``; ``DataError`` with the remedy for other projections."""
     if isinstance(model, str) and model in _KINDS:
         return _KINDS[model]
-    _refuse_projection(model, f"{where}: camera_model")
+    _refuse_projection(str(model), f"{where}: camera_model")
     raise DataError(f"{where}: camera_model is {repr(model)[:80]}; use one of {', '.join(_KINDS)}")
 
 
-def _refuse_projection(model: Any, what: str) -> None:
+def _refuse_projection(model: str, what: str) -> None:
     for start, remedy in _REMEDIES.items():
-        if isinstance(model, str) and model.startswith(start):
+        if model.startswith(start):
             raise DataError(f"{what} {model} is no lens that perspective images can be made of; {remedy}")
 
 
@@ -86,10 +87,10 @@ def kind_of_frame(stated: Mapping[str, Any], where: str) -> str:
 
 
 def lens_of(meta: Mapping[str, Any], frame: Mapping[str, Any], where: str) -> Lens:
-    """The lens of a frame of a ``transforms.json``: what the frame states, and for the rest what the file states.
+    """The lens of a frame of a ``transforms.json``, whose entries count before those of the file.
 
     Raises:
-        DataError: its projection or its distortion cannot be undistorted.
+        DataError: nerfstudio cannot undistort its projection or its distortion.
     """
     stated = {**meta, **frame}
     kind = kind_of_frame(stated, where)
@@ -111,21 +112,16 @@ def lens_of(meta: Mapping[str, Any], frame: Mapping[str, Any], where: str) -> Le
 
 
 def colmap_lens(model: str, params: Sequence[float], where: str) -> tuple[tuple[float, float, float, float], Lens]:
-    """Intrinsics ``fx, fy, cx, cy`` in pixels and the lens of a COLMAP camera.
-
-    Raises:
-        DataError: nerfstudio cannot undistort it; says what does.
-    """
+    """Intrinsics ``fx, fy, cx, cy`` in pixels and the lens of a COLMAP camera; ``DataError`` if it is unsupported."""
     _, kind, names, zeros = COLMAP_LENSES[model]
     stated = dict(zip(names.split(), map(float, params), strict=True))
     if kind is None or any(stated[name] for name in zeros.split()):
-        raise unsupported(model, where)
+        raise _unsupported(model, where)
     fx, fy = stated.get("fx", stated.get("f", 0.0)), stated.get("fy", stated.get("f", 0.0))
     return (fx, fy, stated["cx"], stated["cy"]), Lens(kind, tuple(stated.get(key, 0.0) for key in DISTORTION))
 
 
-def unsupported(model: str, where: str) -> DataError:
-    """The error for a camera model of COLMAP that nerfstudio cannot undistort."""
+def _unsupported(model: str, where: str) -> DataError:
     _refuse_projection(model, f"{where}: camera model")
     return DataError(
         f"{where}: nerfstudio does not support camera model {model}; make undistorted images with `colmap "
@@ -134,11 +130,11 @@ def unsupported(model: str, where: str) -> DataError:
 
 
 def colmap_model(model: int | str, where: str) -> str:
-    """Name of a COLMAP camera model by its number or name; ``DataError`` with the way out if it cannot be read."""
+    """Name of a COLMAP camera model by its number or name; ``DataError`` with the remedy if it is unsupported."""
     for name, (number, kind, _, _) in COLMAP_LENSES.items():
         if model in (name, number):
             if kind is None:
-                raise unsupported(name, where)
+                raise _unsupported(name, where)
             return name
     raise DataError(f"{where}: camera model {model} is not known here; calibrate the capture with OPENCV")
 
@@ -148,31 +144,19 @@ def with_focal_lengths(meta: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     One that states focal lengths stays as it is. The size of its first image in ``folder`` counts if it states none.
     """
-    angle: Any = meta.get("camera_angle_x")
+    angles: list[Any] = [meta.get(f"camera_angle_{axis}") for axis in "xy"]
+    known = [type(angle) in (int, float) and 0 < angle < math.pi for angle in angles]
     frames = meta.get("frames")
     entries = [meta, *(frames if isinstance(frames, list) else [])]
-    if not _is_angle(angle) or any(isinstance(entry, dict) and "fl_x" in entry for entry in entries):
+    if not known[0] or any(isinstance(entry, dict) and "fl_x" in entry for entry in entries):
         return meta
-    size = size_of_first_image(meta, folder) or (None, None)
-    width: Any = meta.get("w", size[0])
-    height: Any = meta.get("h", size[1])
+    size: Any = (None, None)
+    with suppress(OSError, KeyError, IndexError, TypeError, ValueError):
+        with Image.open(folder / meta["frames"][0]["file_path"]) as image:
+            size = image.size
+    width, height = meta.get("w", size[0]), meta.get("h", size[1])
     if not isinstance(width, (int, float)) or not isinstance(height, (int, float)):
         return meta
-    angle_y: Any = meta.get("camera_angle_y")
-    across = width / 2 / math.tan(angle / 2)
-    down = height / 2 / math.tan(angle_y / 2) if _is_angle(angle_y) else across
-    known = {"w": width, "h": height, "cx": width / 2, "cy": height / 2}
-    return {**known, **meta, "fl_x": across, "fl_y": down}
-
-
-def _is_angle(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.pi
-
-
-def size_of_first_image(meta: Mapping[str, Any], folder: Path) -> tuple[int, int] | None:
-    """Width and height in pixels of the image of the first frame, by its header; None if there is none."""
-    try:
-        with Image.open(folder / meta["frames"][0]["file_path"]) as image:
-            return image.size
-    except (OSError, KeyError, IndexError, TypeError, ValueError):
-        return None
+    focal_x = width / 2 / math.tan(angles[0] / 2)
+    focal_y = height / 2 / math.tan(angles[1] / 2) if known[1] else focal_x
+    return {"w": width, "h": height, "cx": width / 2, "cy": height / 2, **meta, "fl_x": focal_x, "fl_y": focal_y}

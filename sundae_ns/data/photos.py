@@ -23,19 +23,18 @@ HEIF = (".heic", ".heif")
 RAW = ".cr2"
 """Raw photos of Canon, which Pillow does not read."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIF, RAW)
-"""Photos that are read."""
+_OTHERS = (".avif", ".jxl", ".dng", ".nef", ".arw", ".cr3", ".raf", ".orf", ".rw2", ".gif")
+"""Suffixes of photos that are not read."""
 LEAST_PHOTOS = 3
 """Number of photos with a pose that a scene needs, because nerfstudio holds out at least one for test."""
 TURNED = (5, 6, 7, 8)
 """EXIF orientations that swap width and height."""
 _COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
-"""Suffix for a format of Pillow that a capture may have; phones write MPO, a JPEG of several images."""
+"""Suffix of photos in a capture by Pillow's format; phones write MPO, a JPEG of several images."""
 _CONVERTED = ("TIFF", "WEBP", "BMP", "HEIF")
 """Formats of Pillow whose photos are saved as JPEG, or as PNG if they have an alpha channel."""
-_OTHERS = (".avif", ".jxl", ".dng", ".nef", ".arw", ".cr3", ".raf", ".orf", ".rw2", ".gif")
-"""Photos of other formats, which are passed over."""
 _MASKS = ("masks", "mask")
-"""Names of folders whose images are masks, not photos."""
+"""Names of folders whose images are masks."""
 
 
 class Photo(NamedTuple):
@@ -45,7 +44,7 @@ class Photo(NamedTuple):
     suffix: str
     """Of the image in a capture: ``.jpg`` or ``.png``."""
     size: tuple[int, int]
-    """Width and height in pixels, upright; of a raw photo as it is stored, (0, 0)."""
+    """Width and height in pixels, upright; (0, 0) for a raw photo."""
     as_it_is: bool
     """Whether the file can be copied: its format is that of the suffix, and its pixels are upright."""
     lens: tuple[str, ...]
@@ -55,8 +54,7 @@ class Photo(NamedTuple):
 def find_photos(folder: Path) -> list[Photo]:
     """The photos in a folder and its subfolders, sorted by path. Only headers are read.
 
-    Hidden files and folders are left out, and so are folders of masks and files of other suffixes, which
-    :func:`left_out` names.
+    Hidden files and folders, folders of masks and files of other suffixes are left out.
 
     Raises:
         DataError: the folder cannot be read, has photos in several subfolders only, holds fewer than
@@ -67,18 +65,18 @@ def find_photos(folder: Path) -> list[Photo]:
         paths = sorted(path for path in _files(folder) if path.suffix.lower() in SUFFIXES)
     counts = Counter(path.parent for path in paths)
     if len(counts) > 1 and folder not in counts:
-        listed = ", ".join(f"{one.relative_to(folder)}: {count:,}" for one, count in list(counts.items())[:3])
+        listed = ", ".join(f"{path.relative_to(folder)}: {count:,}" for path, count in list(counts.items())[:3])
         raise DataError(
             f"{folder} holds {len(paths):,} photos in {len(counts)} folders ({listed}{', ...' * (len(counts) > 3)}); "
             "give the folder of one scene, or move the photos of one scene into one folder"
         )
     if not reads_heif():
         paths = [path for path in paths if path.suffix.lower() not in HEIF]
-    photos = [photo_of(path) for path in paths]
     if not paths and (remark := left_out(folder)):
         raise DataError(f"{folder} holds no photos that can be read: {remark}")
     if not paths:
         raise DataError(f"{folder} holds no photos ({', '.join(SUFFIXES)}); give a folder of photos, or a capture")
+    photos = [photo_of(path) for path in paths]
     if len(paths) < LEAST_PHOTOS:
         few = "1 photo" if len(paths) == 1 else f"{len(paths)} photos"
         raise DataError(f"{folder} holds {few}, and camera poses need {LEAST_PHOTOS} or more that overlap; add some")
@@ -116,7 +114,7 @@ def masks_beside(folder: Path) -> Path | None:
 
 
 def upright(photo: Photo) -> Image.Image:
-    """The pixels of a photo as they are to be seen, with its EXIF data; ``DataError`` if they cannot be decoded."""
+    """The upright pixels of a photo with its EXIF data; ``DataError`` if they cannot be decoded."""
     try:
         if photo.path.suffix.lower() == RAW:
             import rawpy  # comes with nerfstudio
@@ -131,8 +129,6 @@ def upright(photo: Photo) -> Image.Image:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Files of a folder and its subfolders that are neither hidden nor masks."""
-
     def fail(error: OSError) -> None:
         raise error
 
@@ -164,7 +160,7 @@ def photo_of(path: Path) -> Photo:
 
 
 def _lens(exif: Image.Exif) -> tuple[str, ...]:
-    """Maker, model, lens and focal length of a photo, as far as they are stated."""
+    """Maker, model, lens and focal length of a photo, if they are stated."""
     with suppress(Exception):  # a damaged entry is none
         inner = exif.get_ifd(ExifTags.IFD.Exif)
         named = [exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), inner.get(ExifTags.Base.LensModel)]
@@ -182,7 +178,7 @@ def exif_orientation(path: Path) -> int:
 
 
 def turn(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
-    """Stored pixels ``[H, W, C]`` as they are to be seen by their EXIF orientation."""
+    """Turn stored pixels ``[H, W, C]`` upright by their EXIF orientation."""
     image = Image.fromarray(pixels)
     image.getexif()[ExifTags.Base.Orientation] = orientation
     return np.array(ImageOps.exif_transpose(image))
@@ -190,17 +186,14 @@ def turn(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
 
 def wrong_size(path: Path, size: Sequence[int], expected: Sequence[int], orientation: int) -> DataError:
     """The error for an image whose size is not that of its camera."""
+    remedy = "give each size its own camera, or resize the images"
     if orientation in TURNED:
         remedy = "it is also turned by its EXIF entry: turn its pixels and remove the entry"
     elif max(abs(a - b) for a, b in zip(size, expected, strict=True)) <= 1:
-        remedy = (
-            "it was rounded another way: give colmap --downscale-rounding-mode round (or ceil), or make the smaller "
-            "images again"
-        )
-    else:
-        remedy = "give each size its own camera, or resize the images"
+        remedy = "give colmap --downscale-rounding-mode round (or ceil), or make the smaller images again"
+    (width, height), (stated_width, stated_height) = size, expected
     return DataError(
-        f"{path.name} is {size[0]} x {size[1]} px but its camera says {expected[0]} x {expected[1]}; {remedy}"
+        f"{path.name} is {width} x {height} px but its camera says {stated_width} x {stated_height}; {remedy}"
     )
 
 

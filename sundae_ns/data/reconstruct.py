@@ -13,9 +13,8 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -24,6 +23,7 @@ import numpy as np
 from sundae_ns.core.errors import ConfigError, DataError, writing
 from sundae_ns.core.files import flush, write_text
 from sundae_ns.data.capture_files import TRANSFORMS, Placed, add_masks, names_of, placed_in, write_capture, write_images
+from sundae_ns.data.layouts import LONGEST_SIDE
 from sundae_ns.data.photos import find_photos, masks_of
 from sundae_ns.data.video import is_video, write_frames
 from sundae_ns.io.run_folder import reserve
@@ -34,30 +34,18 @@ Advance = Callable[[int], None]
 Reporter = Callable[[str, int], AbstractContextManager[Advance]]
 """Shows the progress of a stage with this name and this number of parts."""
 INSTALL = 'pip install "sundae_ns[photos]"'
-"""Command that installs pycolmap."""
-MODELS = "sparse"
-_DATABASE = "database.db"
-_REQUEST = "request.json"
-_CAMERAS = ("OPENCV", "SIMPLE_RADIAL")
-"""COLMAP's models of the cameras of an attempt. The first has two focal lengths and four terms of distortion. Where few
-photos constrain these, they diverge; the second has one of each."""
-_LARGEST = 1600
-"""Longest side in pixels at which features are looked for, as that of training images."""
 _MOST_EXHAUSTIVE = 200
 """Number of photos up to which all pairs are compared: 19,900 pairs."""
 _ALIKE = 40
-"""Most similar photos that each is compared with; as many photos or fewer are all compared with each other."""
+"""Number of similar photos that each is compared with."""
 _PAIRS_AT_ONCE = 100
 """Pairs per thread between two reports of progress."""
 _LEAST_MODEL = 3
 """Images of the smallest model that is kept."""
-_LEAST_POINTS = 15
-"""Points that an image with a pose sees; one that sees fewer after outliers were removed may stand anywhere."""
 
 
-@dataclass(frozen=True)
-class Request:
-    """What is asked for."""
+class Request(NamedTuple):
+    """Photos, and how to make a capture of them."""
 
     photos: Path
     """Folder of photos, or a video."""
@@ -75,20 +63,6 @@ class Request:
         return self.capture.with_name(f"{self.capture.name}.partial")
 
 
-@dataclass(frozen=True)
-class Found:
-    """What has been found."""
-
-    photos: Placed
-    cameras: int
-    error: float
-    """Mean reprojection error, pixels."""
-    models: tuple[int, ...]
-    """Numbers of photos of COLMAP's models, the largest first; it is the capture."""
-    masks: str | None
-    """How many frames have a mask, ``24 of 24``; None without masks."""
-
-
 class Model(NamedTuple):
     """A model of COLMAP."""
 
@@ -100,9 +74,9 @@ class Model(NamedTuple):
 
 
 def pycolmap() -> Any:
-    """The module, with its log of progress turned off; ``ConfigError`` if it is not installed or cannot be loaded.
+    """The silenced module; ``ConfigError`` if it is not installed or cannot be loaded.
 
-    The main thread imports it first: its library takes over SIGTERM, to print the stack where the process ends.
+    The main thread imports it first: its library takes over SIGTERM to print a stack.
     """
     check_installed()
     before = signal.getsignal(signal.SIGTERM)
@@ -129,8 +103,8 @@ def threads() -> int:
     return int(stated) if stated.isdigit() and int(stated) > 0 else (os.cpu_count() or 1)
 
 
-def find_poses(request: Request, report: Reporter) -> Found:
-    """Make a capture; what an earlier process has done with the same photos and options is used.
+def find_poses(request: Request, report: Reporter) -> Placed:
+    """Make a capture; continue what an earlier process has begun with the same photos and options.
 
     Raises:
         DataError: photos cannot be used, or none could be placed.
@@ -152,7 +126,7 @@ def find_poses(request: Request, report: Reporter) -> Found:
             write_images(photos, images, advance)
         with report("features", len(photos)) as advance:
             _find_features(work, images, names, advance)
-        if not (work / MODELS).exists():
+        if not (work / "sparse").exists():
             pairs = _pairs(work, names, request.matching, video)
             with report("matches of pairs", len(pairs)) as advance:
                 _match(work, pairs, advance)
@@ -167,14 +141,14 @@ def find_poses(request: Request, report: Reporter) -> Found:
         shutil.rmtree(work, ignore_errors=True)
     cameras = len({Path(name).parent for name in models[0].images})
     sizes = tuple(len(model.images) for model in models)
-    return Found(placed_in(request.capture), cameras, models[0].error, sizes, masks)
+    return placed_in(request.capture)._replace(cameras=cameras, error=models[0].error, models=sizes, masks=masks)
 
 
 def _keep_or_clear(request: Request, files: Sequence[Path]) -> None:
-    """Keep what the folder holds if it was made of the same files with the same options; remove it otherwise."""
+    """Clear the working folder, unless it was made of the same files with the same options."""
     times = [(str(path.absolute()), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
     stated = {"matching": request.matching, "frames": request.frames, "files": times}
-    asked, path = json.dumps(stated, indent=1) + "\n", request.work / _REQUEST
+    asked, path = json.dumps(stated, indent=1) + "\n", request.work / "request.json"
     if path.is_file() and path.read_text(encoding="utf-8", errors="replace") == asked:
         return
     for entry in request.work.iterdir():
@@ -187,10 +161,10 @@ def _keep_or_clear(request: Request, files: Sequence[Path]) -> None:
 
 def _find_features(work: Path, images: Path, names: Sequence[str], advance: Advance) -> None:
     """Make a database of images, with a camera for each of their folders, and find the features that it lacks."""
-    module, path, partial = pycolmap(), work / _DATABASE, work / f"{_DATABASE}.partial"
+    module, path, partial = pycolmap(), work / "database.db", work / "database.db.partial"
     reader, extraction = module.ImageReaderOptions(), module.FeatureExtractionOptions()
-    reader.camera_model = _CAMERAS[0]
-    extraction.num_threads, extraction.max_image_size = threads(), _LARGEST
+    reader.camera_model = "OPENCV"
+    extraction.num_threads, extraction.max_image_size = threads(), LONGEST_SIDE
     if not path.exists():
         for left in work.glob(f"{partial.name}*"):  # with the journal of a killed process
             left.unlink()
@@ -211,15 +185,12 @@ def _find_features(work: Path, images: Path, names: Sequence[str], advance: Adva
 
 
 def _pairs(work: Path, names: Sequence[str], matching: Matching, video: bool) -> list[tuple[str, str]]:
-    """Names of the images that are compared, by COLMAP's generators of pairs.
-
-    Frames of a video are compared with neighbours, at distances that double, and with similar ones that close a loop;
-    other photos with all, or with the most similar ones and the next by name.
-    """
+    """Pairs of images to compare: in a video neighbours, frames at distances that double, and similar ones that close
+    a loop; otherwise all pairs, or the most similar photos and the next by name."""
     module = pycolmap()
     if matching == "auto":
         matching = "sequential" if video else "exhaustive" if len(names) <= _MOST_EXHAUSTIVE else "similar"
-    with module.Database.open(work / _DATABASE) as database:
+    with module.Database.open(work / "database.db") as database:
         stored = {image.image_id: image.name for image in database.read_all_images()}
         if matching == "exhaustive" or len(names) <= _ALIKE:
             found = module.ExhaustivePairGenerator(module.ExhaustivePairingOptions(), database).all_pairs()
@@ -250,23 +221,16 @@ def _vocabulary(module: Any, database: Any, images: Sequence[int], path: Path) -
     options.num_visual_words = min(max(len(descriptors) // 40, 16), 2048)
     options.num_iterations, options.num_rounds, options.num_threads = 10, 1, threads()
     index = module.VisualIndex.create(descriptors.shape[1], 64)
-    with _quiet():  # it warns where there are few words
-        index.build(options, module.FeatureDescriptorsFloat(module.FeatureExtractorType.SIFT, descriptors))
-    index.write(path)
-    return path
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep what libraries print to stderr to themselves."""
     saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(nowhere, 2)
-        yield
+        os.dup2(nowhere, 2)  # the library warns of few words
+        index.build(options, module.FeatureDescriptorsFloat(module.FeatureExtractorType.SIFT, descriptors))
     finally:
         os.dup2(saved, 2)
         os.close(saved)
         os.close(nowhere)
+    index.write(path)
+    return path
 
 
 def _match(work: Path, pairs: Sequence[tuple[str, str]], advance: Advance) -> None:
@@ -278,24 +242,26 @@ def _match(work: Path, pairs: Sequence[tuple[str, str]], advance: Advance) -> No
     for start in range(0, len(pairs), size):
         part = pairs[start : start + size]
         listed.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in part), encoding="utf-8", newline="\n")
-        module.match_image_pairs(work / _DATABASE, options, listed)
+        module.match_image_pairs(work / "database.db", options, listed)
         advance(len(part))
 
 
 def _reconstruct(work: Path, images: Path, count: int, advance: Advance) -> list[Model]:
     """Find poses and points, unless they are there; the models, the largest first.
 
-    Simple cameras are tried where the first ones leave out more than a twentieth of the photos; as they fit less well,
-    they must place a tenth more.
+    OPENCV has two focal lengths and four terms of distortion, which diverge where few photos constrain them. If it
+    leaves out more than a twentieth of the photos, SIMPLE_RADIAL is tried, with one of each; as it fits less well, it
+    must place a tenth more.
     """
-    module, folder = pycolmap(), work / MODELS
+    module, folder = pycolmap(), work / "sparse"
     if not folder.exists():
         kept: list[Model] = []
-        for number, camera in enumerate(_CAMERAS):
-            partial = work / f"{MODELS}.partial-{number}"
+        for attempt in ("database", "simple_radial"):
+            database, partial = work / f"{attempt}.db", work / f"sparse.partial-{attempt}"
             shutil.rmtree(partial, ignore_errors=True)
             partial.mkdir()
-            database = work / _DATABASE if number == 0 else _with_cameras(module, work, camera)
+            if attempt == "simple_radial":
+                _simplify_cameras(module, shutil.copyfile(work / "database.db", database))
             # COLMAP's own thresholds: weaker ones, and global mapping, join what only looks alike, with small errors.
             options = module.IncrementalPipelineOptions()
             # A fixed seed: the same photos give the same poses on the same machine.
@@ -318,17 +284,14 @@ def _reconstruct(work: Path, images: Path, count: int, advance: Advance) -> list
     return models
 
 
-def _with_cameras(module: Any, work: Path, kind: str) -> Path:
-    """A copy of the database whose cameras are of another model, with the focal lengths that are known so far."""
-    path = work / f"{kind.lower()}.db"
-    shutil.copyfile(work / _DATABASE, path)
+def _simplify_cameras(module: Any, path: Path) -> None:
+    """Turn the cameras of a database into SIMPLE_RADIAL ones with their known focal lengths."""
     with module.Database.open(path) as database:
         for camera in database.read_all_cameras():
-            size = camera.width, camera.height
-            other = module.Camera.create_from_model_name(camera.camera_id, kind, camera.mean_focal_length(), *size)
+            lens = camera.mean_focal_length(), camera.width, camera.height
+            other = module.Camera.create_from_model_name(camera.camera_id, "SIMPLE_RADIAL", *lens)
             other.has_prior_focal_length = camera.has_prior_focal_length
             database.update_camera(other)
-    return path
 
 
 def _models(folder: Path) -> list[Model]:
@@ -346,6 +309,6 @@ def load_model(folder: Path) -> Any:
     """A stored model (``pycolmap.Reconstruction``), without the poses of images that see hardly a point of it."""
     model = pycolmap().Reconstruction(folder)
     for image in list(model.images.values()):
-        if image.has_pose and image.num_points3D < _LEAST_POINTS:
+        if image.has_pose and image.num_points3D < 15:  # after the removal of outliers it may stand anywhere
             model.deregister_frame(image.frame_id)
     return model

@@ -22,21 +22,14 @@ def is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in SUFFIXES
 
 
-def video_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels of the frames of a video.
-
-    Raises:
-        DataError: it cannot be decoded, or has too few frames.
-    """
+def check_video(path: Path) -> None:
+    """Raise ``DataError`` if a video cannot be decoded, or has too few frames."""
     with _opened(path) as video:
         length = _length(video, path)
-        whole, frame = video.read()
-        if not whole:
+        if not video.grab():
             raise DataError(f"{path} has no frame that can be decoded; convert it to .mp4 (H.264)")
     if length < LEAST_PHOTOS:
         raise DataError(f"{path} has {length} frames, and camera poses need {LEAST_PHOTOS} or more; give a longer one")
-    height, width = frame.shape[:2]
-    return width, height
 
 
 def write_frames(path: Path, folder: Path, count: int, advance: Callable[[int], None]) -> None:
@@ -44,7 +37,7 @@ def write_frames(path: Path, folder: Path, count: int, advance: Callable[[int], 
 
     Args:
         path: the video.
-        folder: for the frames; it is there only once it is whole.
+        folder: for the frames; it appears once all are written.
         count: number of frames; a shorter video gives all of its own.
         advance: called with the number of further frames.
 
@@ -62,12 +55,10 @@ def write_frames(path: Path, folder: Path, count: int, advance: Callable[[int], 
             written = 0
             for frame in _sharpest(video, _length(video, path), count):
                 written += 1
-                name = partial / f"{written:05d}.jpg"
-                coded, content = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
-                if not coded:
+                encoded, content = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
+                if not encoded:
                     raise DataError(f"frame {written} of {path} cannot be saved as JPEG; make the video smaller")
-                with name.open("wb") as file:
-                    file.write(content.tobytes())
+                (partial / f"{written:05d}.jpg").write_bytes(content.tobytes())
                 advance(1)
         if written < LEAST_PHOTOS:
             raise DataError(f"{path} ends after {written} frames that can be decoded; convert it to .mp4 (H.264)")
@@ -80,7 +71,7 @@ def _opened(path: Path) -> Iterator[Any]:
         regular(path)
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror}); check the path") from error
-    # Quiet: our error says what is wrong. OpenCV reads both when it is imported first.
+    # Our error says what is wrong; OpenCV reads both variables when it is imported first.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     import cv2
@@ -95,17 +86,14 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _length(video: Any, path: Path) -> int:
-    """Number of frames: as the file states, or counted where it states none."""
+    """Number of frames: as the file states, or counted."""
     import cv2
 
     stated = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     if stated > 0:
         return stated
     with _opened(path) as other:
-        count = 0
-        while other.grab():
-            count += 1
-    return count
+        return sum(1 for _ in iter(other.grab, False))
 
 
 def _sharpest(video: Any, length: int, count: int) -> Iterator[np.ndarray]:
@@ -113,19 +101,19 @@ def _sharpest(video: Any, length: int, count: int) -> Iterator[np.ndarray]:
     count = min(count, length)
     every = max(1, length // (count * 12))
     best: tuple[float, np.ndarray] | None = None
-    stretch, at = 0, 0
+    number = stretch = 0
     while video.grab():
         # A file may hold more frames than it states; they belong to the last stretch.
-        found = min(at * count // length, count - 1)
-        if found != stretch:
+        current = min(number * count // length, count - 1)
+        if current != stretch:
             if best is not None:
                 yield best[1]
-            stretch, best = found, None
-        if best is None or at % every == 0:
-            whole, frame = video.retrieve()
-            if whole and (best is None or sharpness(frame) > best[0]):
+            stretch, best = current, None
+        if best is None or number % every == 0:
+            decoded, frame = video.retrieve()
+            if decoded and (best is None or sharpness(frame) > best[0]):
                 best = sharpness(frame), frame
-        at += 1
+        number += 1
     if best is not None:
         yield best[1]
 

@@ -67,7 +67,7 @@ def test_smaller_images_are_taken_where_there_are_some(tmp_path: Path, made: lis
         photos(tmp_path / f"images_{one}", 3, (6000 // one, 40 // one))
     layout = posed_layout(tmp_path)
     assert layout is not None
-    assert layout.downscale == factor
+    assert layout.words[-1] == str(factor)
     (tmp_path / "transforms.json").write_text("{}")
     assert is_posed(tmp_path)
     assert posed_layout(tmp_path) is None, "a transforms.json comes first"
@@ -87,7 +87,8 @@ def test_a_capture_of_blender(tmp_path: Path) -> None:
     assert is_posed(data)
     layout = posed_layout(data)
     assert layout is not None
-    assert (layout.size, layout.downscale, layout.description) == ((20, 16), 1, "2 training images, over white")
+    assert layout.description == "Blender layout: 2 training images, over white"
+    assert (layout.words, layout.options[-1]) == (["blender-data"], "white")
     for missing in ("train/0.png", "transforms_val.json"):
         (data / missing).unlink()
         with pytest.raises(DataError, match=missing):

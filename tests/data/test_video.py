@@ -12,7 +12,7 @@ from run_commands import write_video
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.data import video
-from sundae_ns.data.video import is_video, sharpness, video_size, write_frames
+from sundae_ns.data.video import check_video, is_video, sharpness, write_frames
 
 
 def frames_of(folder: Path) -> list[np.ndarray]:
@@ -58,10 +58,10 @@ def test_frames_are_there_only_once_they_are_whole(tmp_path: Path, monkeypatch: 
     assert not (tmp_path / "frames.partial").exists()
 
 
-def test_size_of_a_video(tmp_path: Path) -> None:
+def test_a_video_by_its_suffix(tmp_path: Path) -> None:
     write_video(tmp_path / "A WALK.MP4", 5)
     assert is_video(tmp_path / "A WALK.MP4")
-    assert video_size(tmp_path / "A WALK.MP4") == (64, 48)
+    check_video(tmp_path / "A WALK.MP4")
     (tmp_path / "folder.mp4").mkdir()
     assert not is_video(tmp_path / "folder.mp4")
 
@@ -85,7 +85,7 @@ def test_what_is_no_video(tmp_path: Path, make: object, cause: str, capfd: pytes
     path = tmp_path / "x.mp4"
     make(path)  # type: ignore[operator]
     with pytest.raises(DataError, match=cause) as error:
-        video_size(path)
+        check_video(path)
     assert "\n" not in str(error.value)
 
 
