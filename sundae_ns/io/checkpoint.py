@@ -18,6 +18,7 @@ import random
 import re
 import zipfile
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from numbers import Integral
 from pathlib import Path
 from typing import Any, BinaryIO, get_args
@@ -26,11 +27,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sundae_ns.core.errors import CheckpointError, StorageError, one_line, regular
+from sundae_ns.core.errors import CheckpointError, StorageError, one_line, reading, regular
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SPLAT_NAMES, Encoding, Gaussians, odd_shapes
 
 EXTRA_STATE = "_extra_state"
+_NO_CLOCK = "the checkpoint does not say where training stopped; give another"
 FORMAT = 2
 _PREFIX = "gauss_params."
 _NAME = re.compile(r"step-(\d+)\.ckpt")
@@ -40,25 +42,24 @@ _PARTIAL = "partial--1.{}.tmp"
 
 def checkpoints(folder: Path) -> list[Path]:
     """Checkpoints of a folder by step, the newest last; other file names are ignored."""
-    found = {path: match for path in folder.glob("*.ckpt") if (match := _NAME.fullmatch(path.name))}
-    return sorted(found, key=lambda path: int(found[path][1]))
+    steps = {path: int(match[1]) for path in folder.glob("*.ckpt") if (match := _NAME.fullmatch(path.name))}
+    return sorted(steps, key=steps.__getitem__)
 
 
-def folder_of(place: Path) -> Path:
+def folder_of(run: Path) -> Path:
     """The folder of a run's checkpoints, given that folder or the run's."""
-    below = place / "nerfstudio_models"
-    return below if below.is_dir() and not any(place.glob("*.ckpt")) else place
+    below = run / "nerfstudio_models"
+    return below if below.is_dir() and not any(run.glob("*.ckpt")) else run
 
 
-def newest_step(place: Path) -> int | None:
+def newest_step(path: Path) -> int | None:
     """Step of a checkpoint by its name, or of the newest whole one of a run or its folder; None if there is none."""
-    if not place.is_file():
+    if not path.is_file():
         try:
-            place, file, _ = _open_newest(place)
+            path, _ = newest_whole(path)
         except CheckpointError:
             return None
-        file.close()
-    match = _NAME.fullmatch(place.name)
+    match = _NAME.fullmatch(path.name)
     return None if match is None else int(match[1])
 
 
@@ -77,15 +78,13 @@ def write(state: Mapping[str, Any], path: Path) -> None:
 
 
 def _compact(value: Any) -> Any:
-    """The value with tensors that own all of their memory: torch would save the whole memory of a part."""
+    """Clone tensors that are a part of a larger memory, which torch would save with them."""
     if isinstance(value, Tensor):
-        whole = value.untyped_storage().nbytes() > value.numel() * value.element_size()
-        return value.detach().cpu().clone() if whole else value
+        is_part = value.untyped_storage().nbytes() > value.numel() * value.element_size()
+        return value.detach().cpu().clone() if is_part else value
     if isinstance(value, dict):
-        return {key: _compact(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [_compact(one) for one in value]
-    return value
+        return {key: _compact(inner) for key, inner in value.items()}
+    return [_compact(inner) for inner in value] if isinstance(value, list) else value
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -96,82 +95,64 @@ def read(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist; give a .ckpt file, or the folder of them")
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise _unreadable(path, error.strerror or one_line(error)) from error
-    with file:
+    with _naming(path), path.open("rb") as file:
         if (damage := damage_of(file)) is not None:
-            raise _unreadable(path, damage)
-        return _loaded(file, path)
+            raise ValueError(damage)
+        return _loaded(file)
 
 
-def _loaded(file: BinaryIO, path: Path) -> dict[str, Any]:
-    """The contents of an open checkpoint without damage."""
-    try:
-        loaded = load_tensors(file)
-        state = loaded.get("pipeline") if isinstance(loaded, dict) else None
-        if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
-            raise ValueError("it holds no model")
-        if not isinstance(loaded.get("step"), Integral):
-            raise ValueError("it does not say after which step it was saved")
-    except Exception as error:  # torch.load raises many kinds with one meaning for the user
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        if isinstance(error, pickle.UnpicklingError):
-            reason = "it holds more than tensors and plain values, or nothing that can be read"
-        raise _unreadable(path, reason) from error
-    return loaded
+def _naming(path: Path) -> AbstractContextManager[None]:
+    another = "give another file"
+    return reading(path, "a nerfstudio checkpoint", CheckpointError, remedy=another, missing=another)
 
 
-def _unreadable(path: Path, reason: str) -> CheckpointError:
-    return CheckpointError(f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file")
+def _loaded(file: BinaryIO) -> dict[str, Any]:
+    loaded = load_tensors(file)
+    state = loaded.get("pipeline") if isinstance(loaded, dict) else None
+    if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
+        raise ValueError("it holds no model")
+    if not isinstance(loaded.get("step"), Integral):
+        raise ValueError("it does not say after which step it was saved")
+    return loaded  # type: ignore[no-any-return]
 
 
 def newest_whole(folder: Path) -> tuple[Path, list[str]]:
     """The newest whole checkpoint of a folder or a run, and a line for each newer damaged one.
 
-    A training may replace it at any time: :func:`read_newest` reads it too.
-
-    Raises:
-        CheckpointError: there is none.
+    A training may replace it at any time: :func:`read_newest` reads it too. Both raise ``CheckpointError`` without one.
     """
-    path, file, passed_over = _open_newest(folder)
+    path, file, skipped = _open_newest(folder)
     file.close()
-    return path, passed_over
+    return path, skipped
 
 
 def read_newest(folder: Path) -> tuple[Path, dict[str, Any]]:
-    """The newest whole checkpoint of a folder or a run, and its contents, also while a training replaces it.
-
-    Raises:
-        CheckpointError: there is none, or it is of another kind.
-    """
+    """The newest whole checkpoint of a folder or a run, and its contents, also while a training replaces it."""
     path, file, _ = _open_newest(folder)
-    with file:
-        return path, _loaded(file, path)
+    with file, _naming(path):
+        return path, _loaded(file)
 
 
 def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
     """As :func:`newest_whole`, with the open file, which stays readable after a training has removed it."""
-    found = checkpoints(folder_of(folder))
+    listed = checkpoints(folder_of(folder))
     while True:
-        passed_over: list[str] = []
-        for path in reversed(found):
+        skipped: list[str] = []
+        for path in reversed(listed):
             try:
                 file = regular(path).open("rb")
             except OSError as error:
-                passed_over.append(f"{path.name} is not whole ({error.strerror or one_line(error)})")
-                continue
-            reason = damage_of(file)
-            if reason is None:
-                return path, file, passed_over
-            file.close()
-            passed_over.append(f"{path.name} is not whole ({reason})")
-        before, found = found, checkpoints(folder_of(folder))
-        if found == before:  # else a training has replaced them since they were listed
+                damage = error.strerror or one_line(error)
+            else:
+                if (damage := damage_of(file) or "") == "":
+                    return path, file, skipped
+                file.close()
+            skipped.append(f"{path.name} is not whole ({damage})")
+        before, listed = listed, checkpoints(folder_of(folder))
+        if listed == before:  # else a training has replaced them since they were listed
             break
-    skipped = f" ({'; '.join(passed_over)})" if passed_over else ""
-    raise CheckpointError(f"{folder} holds no whole checkpoint{skipped}; give the folder of a run that saved one")
+    reasons = f" ({'; '.join(skipped)})" if skipped else ""
+    raise CheckpointError(f"{folder} holds no whole checkpoint{reasons}; give the folder of a run that saved one")
 
 
 def extra_state(
@@ -186,14 +167,8 @@ def extra_state(
 ) -> dict[str, Any]:
     """State of a model beside its tensors: plain numbers, strings, and tensors.
 
-    Args:
-        step: training step.
-        num_features: configured length of the feature vectors; 0 without a head.
-        encoding: how the field stores colours.
-        running: running states of ``densification`` and ``pruning``.
-        train_callbacks: states of the extensions, by name.
-        trained_focal: shortest and longest focal length that the head was trained at, pixels.
-        head_enabled: whether images get the head's correction at this step; readers of finished scenes need it.
+    ``num_features`` is the configured length, 0 without a head. ``running`` has the states of ``densification`` and
+    ``pruning``. ``trained_focal`` is the shortest and the longest focal length that the head was trained at, pixels.
     """
     return {
         "method": "sundae",
@@ -232,9 +207,9 @@ def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Enc
             f"the checkpoint stores colours as {extra.get('encoding')}, the model as {encoding}; load it with the "
             "--pipeline.model.sh-degree that it was trained with (0 stores logits)"
         )
-    parts = [extra.get("running"), extra.get("extensions")]
-    if not all(isinstance(part, Mapping) for part in parts) or "trained_focal" not in extra:
-        raise CheckpointError("the checkpoint does not say where training stopped; give another")
+    states = (extra.get("running"), extra.get("extensions"))
+    if not all(isinstance(state, Mapping) for state in states) or "trained_focal" not in extra:
+        raise CheckpointError(_NO_CLOCK)
     return extra
 
 
@@ -247,7 +222,7 @@ def _check_format(extra: Mapping[str, Any]) -> None:
 
 
 def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) -> None:
-    """Check that a ``state``, whose extra state was checked, fits the ``state_dict`` that a model has.
+    """Check that a ``state``, whose extra state was checked, fits the ``state_dict`` of a model.
 
     Raises:
         CheckpointError: a tensor is missing or has another shape, or the running states do not fit.
@@ -272,17 +247,17 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
     pruning, strategy = extra["running"].get("pruning"), extra["running"].get("densification")
     numbers = [extra.get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
     if not all(isinstance(value, int) for value in numbers) or not isinstance(strategy, Mapping):
-        raise CheckpointError("the checkpoint does not say where training stopped; give another")
+        raise CheckpointError(_NO_CLOCK)
     for name, value in strategy.items():
         if isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] != n:
             raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} Gaussians; give another")
 
 
 def gaussians_of(loaded: Mapping[str, Any], path: Path) -> Gaussians:
-    """The stored field of a checkpoint from :func:`read`, without features, float32 on the CPU.
+    """Gaussians of a checkpoint from :func:`read`, without features, float32 on the CPU.
 
     Raises:
-        CheckpointError: it holds no Gaussian field, or is a SUNDAE checkpoint of another format.
+        CheckpointError: it holds no Gaussians, or is a SUNDAE checkpoint of another format.
     """
     state = model_state(loaded)
     stored = {name: state.get(_PREFIX + name) for name in SPLAT_NAMES}
@@ -304,7 +279,7 @@ def model_state(loaded: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _encoding(gaussians: Mapping[str, Tensor], extra: Any) -> Encoding:
-    """How the field of a checkpoint stores colours; splatfacto, which does not say, stores logits at SH degree 0."""
+    """How a checkpoint stores colours; splatfacto, which does not say, stores logits at SH degree 0."""
     if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
         return "logits" if gaussians["features_rest"].shape[1] == 0 else "harmonics"
     _check_format(extra)
@@ -325,8 +300,8 @@ def damage_of(file: BinaryIO) -> str | None:
             packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
             if packed or sum(entry.file_size for entry in entries) > os.fstat(file.fileno()).st_size:
                 return "it would unpack to more than its size"
-            broken = archive.testzip()
-            return None if broken is None else f"{broken} in it is damaged"
+            damaged = archive.testzip()
+            return None if damaged is None else f"{damaged} in it is damaged"
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
         return getattr(error, "strerror", None) or one_line(error)
 
@@ -338,8 +313,15 @@ def load_tensors(file: BinaryIO) -> Any:
         Exception: of many kinds, which all mean that it holds something else.
     """
     file.seek(0)
-    with _numpy_numbers_allowed():
-        loaded = torch.load(file, map_location="cpu", weights_only=True)
+    # Stock nerfstudio leaves numpy floats in a scheduler's state.
+    scalar: Any = np.float64(0.0).__reduce__()[0]
+    names = [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    types: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
+    with torch.serialization.safe_globals([scalar, *names, *types]):
+        try:
+            loaded = torch.load(file, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError as error:
+            raise ValueError("it holds more than tensors and plain values, or nothing that can be read") from error
     _check_tensors(loaded)
     return loaded
 
@@ -354,14 +336,6 @@ def _check_tensors(value: Any) -> None:
     elif isinstance(value, (Mapping, list, tuple)):
         for inner in value.values() if isinstance(value, Mapping) else value:
             _check_tensors(inner)
-
-
-def _numpy_numbers_allowed() -> Any:
-    """A context in which torch reads the numpy floats that stock nerfstudio leaves in a scheduler's state."""
-    scalar: Any = np.float64(0.0).__reduce__()[0]
-    names = [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
-    types: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
-    return torch.serialization.safe_globals([scalar, *names, *types])
 
 
 # -------------------------------------------------------------------------------------------------- random generators

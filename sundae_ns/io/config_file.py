@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from enum import Enum
 from functools import cache
@@ -20,7 +20,6 @@ from yaml.constructor import ConstructorError
 from sundae_ns.core.errors import CheckpointError, reading, regular
 from sundae_ns.io.formats import refuse
 
-_REMEDY = "give the folder of a finished run, or its config.yml"
 _PATHS = {"PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath"}
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
 
@@ -39,29 +38,33 @@ def _trusted_packages() -> frozenset[str]:
 def _named(name: str, node: yaml.Node) -> Any:
     """The class or function of a dotted name, which a trusted package must define."""
     module, _, attribute = name.rpartition(".")
-    found = None
+    value = None
     if module.partition(".")[0] in _trusted_packages():
         with suppress(ImportError):
-            found = getattr(importlib.import_module(module), attribute, None)
-    home = str(getattr(found, "__module__", "")).partition(".")[0]
-    if home not in _trusted_packages() or not isinstance(found, (type, FunctionType)):
-        raise ConstructorError(None, None, f"it names {name}", node.start_mark)
-    return found
+            value = getattr(importlib.import_module(module), attribute, None)
+    home = str(getattr(value, "__module__", "")).partition(".")[0]
+    if home not in _trusted_packages() or not isinstance(value, (type, FunctionType)):
+        raise _refused(f"it names {name}", node)
+    return value
+
+
+def _refused(reason: str, node: yaml.Node) -> ConstructorError:
+    return ConstructorError(None, None, reason, node.start_mark)
 
 
 def _make_object(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Iterator[Any]:
     kind = _named(suffix, node)
     if not isinstance(kind, type) or not dataclasses.is_dataclass(kind) or not isinstance(node, yaml.MappingNode):
-        raise ConstructorError(None, None, f"{suffix} is no configuration", node.start_mark)
+        raise _refused(f"{suffix} is no configuration", node)
     made = kind.__new__(kind)
     yield made
     state = loader.construct_mapping(node, deep=True)
     # Setting a configuration up calls its target.
     if not isinstance(state.get("_target", type), type):
-        raise ConstructorError(None, None, f"the target of {suffix} is no class", node.start_mark)
-    for gaussians in dataclasses.fields(kind):  # options newer than the run
-        if gaussians.name not in state and gaussians.default_factory is not dataclasses.MISSING:
-            state[gaussians.name] = gaussians.default_factory()
+        raise _refused(f"the target of {suffix} is no class", node)
+    for option in dataclasses.fields(kind):  # options newer than the run
+        if option.name not in state and option.default_factory is not dataclasses.MISSING:
+            state[option.name] = option.default_factory()
     vars(made).update(state)
 
 
@@ -75,10 +78,10 @@ def _make_value(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
         kind, name = arguments if len(arguments) == 2 else (None, "")
         if isinstance(kind, type) and issubclass(kind, Enum) and isinstance(name, str) and name in kind.__members__:
             return kind[name]
-        raise ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
+        raise _refused(f"it asks to call {suffix}", node)
     kind = _named(suffix, node)
     if not isinstance(kind, type) or not issubclass(kind, Enum) or len(arguments) != 1:
-        raise ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
+        raise _refused(f"it asks to call {suffix}", node)
     return kind(arguments[0])
 
 
@@ -122,18 +125,15 @@ def load_config(path: Path) -> Any:
     Raises:
         CheckpointError: it cannot be read, is no configuration, or asks for something else.
     """
-    config = _read(path, lambda text: yaml.load(text, Loader=_ConfigLoader))
+    config = _read(path, _ConfigLoader)
     find_capture(config, path.absolute().parent)
     return config
 
 
-def _read(path: Path, parse: Callable[[str], Any]) -> Any:
-    kind = "a run's config.yml, or of another version"
-    with reading(path, kind, CheckpointError, remedy=_REMEDY, missing=_REMEDY):
-        return parse(regular(path).read_text(encoding="utf-8"))
-
-
-# --------------------------------------------------------------------------------- plain values, which import no class
+def _read(path: Path, loader: type[yaml.SafeLoader]) -> Any:
+    remedy = "give the folder of a finished run, or its config.yml"
+    with reading(path, "a run's config.yml, or of another version", CheckpointError, remedy=remedy, missing=remedy):
+        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
 
 
 class _ValueLoader(yaml.SafeLoader):
@@ -151,7 +151,7 @@ _ValueLoader.add_multi_constructor(_PYTHON, _make_plain)
 
 def _value(path: Path, *keys: str) -> Any:
     """A plain value of a ``config.yml``, or None; ``CheckpointError`` if the file cannot be read."""
-    value = _read(path, lambda text: yaml.load(text, Loader=_ValueLoader))
+    value = _read(path, _ValueLoader)
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
     return value
@@ -174,8 +174,8 @@ def parser_options(path: Path) -> dict[str, Any]:
 def capture_and_source(path: Path) -> tuple[Path | None, Path | None]:
     """Paths of a run's capture and of the checkpoints that it resumes; ``CheckpointError`` if it cannot be read."""
     options = _value(path)
-    parts = (options.get(name) if isinstance(options, dict) else None for name in ("data", "load_dir"))
-    capture, source = (Path(*map(str, names)) if isinstance(names, list) and names else None for names in parts)
+    values = (options.get(name) if isinstance(options, dict) else None for name in ("data", "load_dir"))
+    capture, source = (Path(*map(str, parts)) if isinstance(parts, list) and parts else None for parts in values)
     return capture, source
 
 

@@ -65,9 +65,6 @@ _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0,
 _log = logging.getLogger(__name__)
 
 
-# --------------------------------------------------------------------------------------------------------------- kinds
-
-
 def kind_of(path: Path) -> Kind | None:
     """Kind of the file at a path by its first bytes; None for any other file, a folder or a missing file."""
     try:
@@ -76,9 +73,8 @@ def kind_of(path: Path) -> Kind | None:
     except OSError:
         return None
     kind = next((kind for begin, kind in _FIRST_BYTES.items() if first.startswith(begin)), None)
-    if kind == "sog":  # a checkpoint is a zip file too
-        return _ZIPS.get(path.suffix.lower())
-    return _HEADERLESS.get(path.suffix.lower()) if kind is None else kind
+    others = _ZIPS if kind == "sog" else _HEADERLESS  # a checkpoint is a zip file too
+    return others.get(path.suffix.lower()) if kind in ("sog", None) else kind
 
 
 def kind_of_gaussians(path: Path) -> Kind | None:
@@ -118,18 +114,13 @@ def refuse(path: Path, *, packed: str | None = None, primitives: str | None = No
         raise CheckpointError(f"{path} {other}")
 
 
-# ------------------------------------------------------------------------------------------------------------- reading
-
-
 class StoredGaussians(NamedTuple):
-    """The Gaussians of a file."""
+    """The Gaussians of a file, and what the file says of its antialiasing and coordinates."""
 
     sanitised: Sanitised
     """Those that have a meaning, with finite values, float32 on the CPU; and what was clamped or dropped."""
     antialiased: bool
-    """Whether the file is marked as trained with antialiasing."""
     in_model_frame: bool
-    """Whether coordinates are those of nerfstudio's model."""
 
 
 def read_gaussian_file(path: Path) -> StoredGaussians:
@@ -138,16 +129,19 @@ def read_gaussian_file(path: Path) -> StoredGaussians:
     Raises:
         DataError: the file is missing, damaged, of another kind, or has no finite Gaussian.
     """
-    kind, antialiased, in_model_frame = kind_of_gaussians(path), False, False
-    if kind == "glb":
-        params, antialiased, in_model_frame = read_glb(path)
-    elif kind in ("spz", "sog"):
-        params, antialiased = read_spz(path) if kind == "spz" else read_sog(path)
-    elif kind in ("splat", "ksplat", "gsplat"):
-        params = {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}[kind](path)
-    else:
-        params, antialiased = read_ply(path), ANTIALIASED in ply_comments(path)
-        in_model_frame = is_nerfstudio_ply(path)
+    antialiased = in_model_frame = False
+    match kind_of_gaussians(path):
+        case "glb":
+            params, antialiased, in_model_frame = read_glb(path)
+        case "spz":
+            params, antialiased = read_spz(path)
+        case "sog":
+            params, antialiased = read_sog(path)
+        case "splat" | "ksplat" | "gsplat" as kind:
+            params = {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}[kind](path)
+        case _:
+            params, antialiased = read_ply(path), ANTIALIASED in ply_comments(path)
+            in_model_frame = is_nerfstudio_ply(path)
     return StoredGaussians(usable(params, path, DataError, "export it again"), antialiased, in_model_frame)
 
 
@@ -170,25 +164,18 @@ def usable(
     return sanitised
 
 
-class FinishedGaussians(NamedTuple):
-    """A field to start from or to look at."""
-
-    params: dict[str, Tensor]
-    """Finite, without features, float32 on the CPU, colours as harmonics."""
-    in_model_frame: bool
-    """Whether coordinates are those of nerfstudio's model (checkpoints, ``ns-export``), not the capture's (others)."""
-    dropped: int
-    """Number of Gaussians left out because they have no meaning (``gaussians.sanitise``)."""
-
-
-def read_gaussians(path: Path) -> FinishedGaussians:
-    """Read a finished field: a splatfacto or SUNDAE checkpoint, a packed scene without its head, or Gaussians.
+def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
+    """Read a splatfacto or SUNDAE checkpoint, a packed scene without its head, or a file of Gaussians.
 
     Args:
         path: ``.ckpt`` file, a folder of them (the newest counts), or a file of Gaussians or packed scene.
 
+    Returns:
+        Finite Gaussians without features, float32 on the CPU, colours as harmonics; and whether coordinates are those
+        of nerfstudio's model (checkpoints, ``ns-export``), not the capture's (others).
+
     Raises:
-        CheckpointError: there is no such file, it holds no Gaussian field, or has another format.
+        CheckpointError: there is no such file, it holds no Gaussians, or has another format.
         PackError: the packed scene is damaged.
     """
     wanted = "give a .ckpt file, the folder of them, or a .ply"
@@ -196,12 +183,19 @@ def read_gaussians(path: Path) -> FinishedGaussians:
         raise CheckpointError(f"{path} does not exist; {wanted}")
     if kind_of_gaussians(path) is not None:
         try:
-            sanitised, _, in_model_frame = read_gaussian_file(path)
+            stored = read_gaussian_file(path)
         except DataError as error:
             raise CheckpointError(str(error)) from error
-        return FinishedGaussians(dict(sanitised.gaussians), in_model_frame, sanitised.dropped)
+        return dict(stored.sanitised.gaussians), stored.in_model_frame
     if kind_of(path) == "packed":
-        return _packed_gaussians(path)
+        from sundae_ns.io.pack.packed_scene import read_scene  # its decoder needs a compiler, which other files do not
+
+        packed = read_scene(path)
+        model, source = ((packed.meta.get(key) or {}) for key in ("model", "source"))
+        logits = isinstance(model, dict) and model.get("sh_degree") == 0
+        params = {name: packed.gaussians[name] for name in SPLAT_NAMES}
+        in_model_frame = not isinstance(source, dict) or source.get("model_frame") is not False
+        return dict(Gaussians(params, "logits" if logits else "harmonics").as_harmonics()), in_model_frame
     refuse(path)
     if not path.is_dir():
         loaded = checkpoint.read(path)
@@ -209,22 +203,7 @@ def read_gaussians(path: Path) -> FinishedGaussians:
         path, loaded = checkpoint.read_newest(path)
     else:
         raise CheckpointError(f"{path} holds no checkpoint; {wanted}")
-    sanitised = usable(checkpoint.gaussians_of(loaded, path), path)
-    return FinishedGaussians(dict(sanitised.gaussians.as_harmonics()), True, sanitised.dropped)
-
-
-def _packed_gaussians(path: Path) -> FinishedGaussians:
-    from sundae_ns.io.pack.packed_scene import read_scene  # its decoder needs a compiler, which other files do not
-
-    packed = read_scene(path)
-    model, source = packed.meta.get("model"), packed.meta.get("source")
-    logits = isinstance(model, dict) and model.get("sh_degree") == 0
-    gaussians = Gaussians({name: packed.gaussians[name] for name in SPLAT_NAMES}, "logits" if logits else "harmonics")
-    in_model_frame = not isinstance(source, dict) or source.get("model_frame") is not False
-    return FinishedGaussians(dict(gaussians.as_harmonics()), in_model_frame, 0)
-
-
-# ------------------------------------------------------------------------------------------------------------- writing
+    return dict(usable(checkpoint.gaussians_of(loaded, path), path).gaussians.as_harmonics()), True
 
 
 class ViewerFile(NamedTuple):
@@ -238,7 +217,7 @@ class ViewerFile(NamedTuple):
     clamped: int
     """Gaussians with values beyond the range of a .spz, which stores the nearest value."""
     cut: bool
-    """Whether the field has a higher SH degree than the file."""
+    """Whether the scene has a higher SH degree than the file."""
     bytes: int
 
 
@@ -256,21 +235,20 @@ def write_for_viewers(
     upright: bool = False,
     in_model_frame: bool = True,
 ) -> ViewerFile:
-    """Write a field in the format of the file's suffix, atomically.
+    """Write Gaussians in the format of the file's suffix, atomically.
 
     Drops Gaussians without a meaning (``gaussians.sanitise``), and SH coefficients above the format's degree.
 
     Args:
         path: its folder must exist.
-        params: the field; see :mod:`sundae_ns.core.gaussians`. A :class:`Gaussians` says how it stores colours.
+        params: see :mod:`sundae_ns.core.gaussians`. A :class:`Gaussians` says how it stores colours.
         antialiased: mark the scene as trained with antialiasing.
-        upright: rotate the scene from nerfstudio's axes to those of a 3DGS .ply, so that viewers show it upright;
-            a .glb is in any case.
-        in_model_frame: the field is in the coordinates of nerfstudio's model, as a .ply then says.
+        upright: rotate from nerfstudio's axes to those of a 3DGS .ply, which viewers show upright; a .glb always is.
+        in_model_frame: coordinates are those of nerfstudio's model, as a .ply then says.
 
     Raises:
         ConfigError: the suffix is not supported.
-        DataError: the field has wrong shapes, or the format cannot store it.
+        DataError: wrong shapes, or the format cannot store the Gaussians.
         StorageError: the disk is full or not writable.
     """
     check_format(path)
@@ -284,8 +262,8 @@ def write_for_viewers(
     if kind != ".ply":
         gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
     if kind == ".ply":
-        comments = [MODEL_FRAME] if in_model_frame and not upright else []
-        write_ply(path, gaussians, comments=comments + ([ANTIALIASED] if antialiased else []))
+        marks = {MODEL_FRAME: in_model_frame and not upright, ANTIALIASED: antialiased}
+        write_ply(path, gaussians, comments=[comment for comment, applies in marks.items() if applies])
     elif kind == ".glb":
         write_glb(path, gaussians, antialiased=antialiased, in_model_frame=in_model_frame)
     else:

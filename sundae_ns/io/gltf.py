@@ -20,7 +20,7 @@ import math
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,23 +37,12 @@ from sundae_ns.io.ply import LEAST_OPACITY, MAX_SH_DEGREE, check_gaussians, chec
 EXTENSION = "KHR_gaussian_splatting"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
-_MOST_JSON = 1 << 24
 _MOST_NODES = 10_000
-_POINTS, _VERTICES = 0, 34962
-_FLOAT, _UNSIGNED_BYTE = 5126, 5121
-_NUMBERS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
+_TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _FROM_MODEL = torch.tensor([[-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])  # its own inverse
 _FROM_PLY = torch.tensor([[-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])  # its own inverse
 _OURS, _MODEL_FRAME, _ANTIALIASED = "sundae_ns", "modelFrame", "antialiased"
-
-
-class GltfScene(NamedTuple):
-    """The Gaussians of a .glb: a field, float32 on the CPU, and the marks of :func:`write_glb`."""
-
-    params: dict[str, Tensor]
-    antialiased: bool
-    in_model_frame: bool
 
 
 def semantics(degree: int) -> list[str]:
@@ -64,12 +53,12 @@ def semantics(degree: int) -> list[str]:
 def write_glb(
     path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False, in_model_frame: bool = False
 ) -> None:
-    """Write the base colours of a finite field of SH degree at most 3 as a .glb, atomically.
+    """Write the base colours of finite Gaussians of SH degree at most 3 as a .glb, atomically.
 
-    ``in_model_frame`` says that it is in the coordinates of nerfstudio's model.
+    ``in_model_frame`` says that they are in the coordinates of nerfstudio's model.
 
     Raises:
-        DataError: the field has no Gaussians, an SH degree above 3, or wrong shapes.
+        DataError: there are no Gaussians, an SH degree above 3, or wrong shapes.
         StorageError: the disk is full or not writable.
     """
     gaussians = similarity(checked(path, params), _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0)
@@ -86,33 +75,35 @@ def write_glb(
     rest = gaussians["features_rest"].unbind(dim=1)
     attributes |= dict(zip(semantics(sh_degree(gaussians["features_rest"])), rest, strict=True))
     marks = {_MODEL_FRAME: in_model_frame, _ANTIALIASED: antialiased}
-    document, binary = _document(attributes, {name: True for name, true in marks.items() if true})
+    document, binary = _document(attributes, {name: True for name, applies in marks.items() if applies})
     with replacing(path) as partial, partial.open("wb") as file:
         file.write(_HEADER.pack(b"glTF", 2, _HEADER.size + 2 * _CHUNK.size + len(document) + len(binary)))
-        file.write(_CHUNK.pack(len(document), _JSON) + document)
-        file.write(_CHUNK.pack(len(binary), _BINARY))
-        file.write(binary)
+        for kind, content in ((_JSON, document), (_BINARY, binary)):
+            file.write(_CHUNK.pack(len(content), kind))
+            file.write(content)
 
 
 def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tuple[bytes, bytearray]:
-    """The JSON and the buffer of a file with one Gaussian of these attributes."""
+    """The JSON and the buffer of a file with one primitive of these attributes."""
     accessors: list[dict[str, Any]] = []
     buffer_views: list[dict[str, int]] = []
     buffer = bytearray()
+    types = {number: name for name, number in _TYPES.items()}
     for name, value in attributes.items():
         data = value.contiguous().numpy().tobytes()  # a multiple of four bytes
-        kind = next(kind for kind, number in _NUMBERS.items() if number == value.shape[1])
-        accessor: dict[str, Any] = {"bufferView": len(buffer_views), "count": len(value), "type": kind}
-        if value.is_floating_point():
-            accessor["componentType"] = _FLOAT
-        else:
-            accessor |= {"componentType": _UNSIGNED_BYTE, "normalized": True}
+        accessor: dict[str, Any] = {
+            "bufferView": len(buffer_views),
+            "count": len(value),
+            "type": types[value.shape[1]],
+            **({"componentType": 5126} if value.is_floating_point() else {"componentType": 5121, "normalized": True}),
+        }
         if name == "POSITION":  # as glTF demands
             accessor |= {"min": value.amin(dim=0).tolist(), "max": value.amax(dim=0).tolist()}
         accessors.append(accessor)
-        buffer_views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": _VERTICES})
+        # The target is ARRAY_BUFFER.
+        buffer_views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": 34962})
         buffer += data
-    callback = {
+    extension = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
         "projection": "perspective",
@@ -120,8 +111,8 @@ def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tu
     }
     primitive = {
         "attributes": {name: i for i, name in enumerate(attributes)},
-        "mode": _POINTS,
-        "extensions": {EXTENSION: callback},
+        "mode": 0,  # points
+        "extensions": {EXTENSION: extension},
     }
     document = {
         "asset": {"version": "2.0", "generator": "sundae_ns", **({"extras": {_OURS: marks}} if marks else {})},
@@ -138,8 +129,11 @@ def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tu
     return text + b" " * (-len(text) % 4), buffer
 
 
-def read_glb(path: Path) -> GltfScene:
+def read_glb(path: Path) -> tuple[dict[str, Tensor], bool, bool]:
     """Read the Gaussians of a .glb of any program; meshes and cameras beside them are left out. No code in it runs.
+
+    Returns:
+        Gaussians, float32 on the CPU, and the marks of :func:`write_glb`, antialiased and in the model's frame.
 
     Raises:
         DataError: the file is missing, damaged, no .glb, or holds no Gaussians in a form that this module reads.
@@ -147,22 +141,17 @@ def read_glb(path: Path) -> GltfScene:
     with reading(path, "a complete .glb with Gaussians", remedy="export it again, or as .ply"):
         document, binary = _chunks(path)
         try:
-            return _scene_of(document, binary)
+            parts = [_read_primitive(document, binary, *found) for found in _primitives(document)]
+            marks = document["asset"].get("extras", {}).get(_OURS, {})
+            antialiased, in_model_frame = (marks.get(name) is True for name in (_ANTIALIASED, _MODEL_FRAME))
         except (AttributeError, IndexError, KeyError, TypeError) as error:
             raise ValueError("its JSON is not that of a glTF scene") from error
-
-
-def _scene_of(document: Mapping[str, Any], binary: memoryview) -> GltfScene:
-    parts = [_read_gaussian(document, binary, *placed) for placed in _placed(document)]
-    if not parts:
-        raise ValueError(f"no mesh of its scene has {EXTENSION}")
-    if len({part["features_rest"].shape[1] for part in parts}) > 1:
-        raise ValueError("its Gaussians have different SH degrees")
-    params = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    marks = document["asset"].get("extras", {}).get(_OURS, {})
-    in_model_frame = marks.get(_MODEL_FRAME) is True
-    params = similarity(params, _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0)
-    return GltfScene(params, marks.get(_ANTIALIASED) is True, in_model_frame)
+        if not parts:
+            raise ValueError(f"no mesh of its scene has {EXTENSION}")
+        if len({part["features_rest"].shape[1] for part in parts}) > 1:
+            raise ValueError("its Gaussians have different SH degrees")
+        params = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        return similarity(params, _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0), antialiased, in_model_frame
 
 
 def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
@@ -173,42 +162,41 @@ def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
         if magic != b"glTF" or version != 2 or length > size:
             raise ValueError("its header is not that of a whole glTF 2.0 file")
         count, kind = _CHUNK.unpack(file.read(_CHUNK.size))
-        if kind != _JSON or count > min(_MOST_JSON, size):
+        if kind != _JSON or count > min(1 << 24, size):
             raise ValueError("its first chunk is no JSON of at most 16 MiB")
         document = json.loads(file.read(count))
-        rest = file.read(length - file.tell())
+        rest = memoryview(file.read(length - file.tell()))
     if not isinstance(document, dict):
         raise ValueError("its JSON is no object")
     if not rest:
-        return document, memoryview(b"")
+        return document, rest
     count, kind = _CHUNK.unpack(rest[: _CHUNK.size])
     if kind != _BINARY or count > len(rest) - _CHUNK.size:
         raise ValueError("its binary chunk is cut")
-    return document, memoryview(rest)[_CHUNK.size : _CHUNK.size + count]
+    return document, rest[_CHUNK.size : _CHUNK.size + count]
 
 
-def _placed(document: Mapping[str, Any]) -> Iterator[tuple[Mapping[str, Any], NDArray[np.float64]]]:
-    """Gaussians of the scene with Gaussians, and the transform ``[4, 4]`` of the nodes above them."""
-    nodes = document.get("nodes", [])
+def _primitives(document: Mapping[str, Any]) -> Iterator[tuple[Mapping[str, Any], NDArray[np.float64]]]:
+    """Primitives of the scene with Gaussians, and the transform ``[4, 4]`` of the nodes above them."""
     scene = document["scenes"][document.get("scene", 0)]
     waiting = [(index, np.eye(4)) for index in scene.get("nodes", [])]
     for _ in range(_MOST_NODES):
         if not waiting:
             return
         index, above = waiting.pop()
-        node = nodes[_index(index)]
+        node = document["nodes"][_index(index)]
         transform = above @ _matrix(node)
         waiting += [(child, transform) for child in node.get("children", [])]
-        if "mesh" in node:
-            for primitive in document["meshes"][_index(node["mesh"])]["primitives"]:
-                if EXTENSION in primitive.get("extensions", {}):
-                    yield primitive, transform
+        primitives = document["meshes"][_index(node["mesh"])]["primitives"] if "mesh" in node else []
+        for primitive in primitives:
+            if EXTENSION in primitive.get("extensions", {}):
+                yield primitive, transform
     raise ValueError(f"its scene has more than {_MOST_NODES:,} nodes, or a node below itself")
 
 
 def _index(value: object) -> int:
     """An index or a count of the document."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+    if type(value) is not int or value < 0:
         raise ValueError(f"{value!r} is no index")
     return value
 
@@ -218,8 +206,7 @@ def _matrix(node: Mapping[str, Any]) -> NDArray[np.float64]:
 
     def numbers(name: str, default: tuple[int, ...]) -> NDArray[np.float64]:
         values = node.get(name, default)
-        plain = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
-        if len(values) != len(default) or not plain:
+        if len(values) != len(default) or not all(type(value) in (int, float) for value in values):
             raise TypeError(f"{values!r} are not {len(default)} numbers")
         return np.array(values, dtype=np.float64)
 
@@ -232,15 +219,14 @@ def _matrix(node: Mapping[str, Any]) -> NDArray[np.float64]:
     return matrix
 
 
-def _read_gaussian(
+def _read_primitive(
     document: Mapping[str, Any], binary: memoryview, primitive: Mapping[str, Any], transform: NDArray[np.float64]
 ) -> dict[str, Tensor]:
-    """The field of one Gaussian of the document, where its nodes put it."""
-    stated = primitive["extensions"][EXTENSION]
-    if stated.get("extensions") or stated.get("kernel", "ellipse") != "ellipse":
+    extension = primitive["extensions"][EXTENSION]
+    if extension.get("extensions") or extension.get("kernel", "ellipse") != "ellipse":
         raise ValueError("its Gaussians are compressed, or of another kernel")
-    if stated.get("colorSpace", "srgb_rec709_display") != "srgb_rec709_display":
-        raise ValueError(f"its colours are in {stated['colorSpace']!r}")
+    if extension.get("colorSpace", "srgb_rec709_display") != "srgb_rec709_display":
+        raise ValueError(f"its colours are in {extension['colorSpace']!r}")
     attributes = primitive["attributes"]
 
     def values(name: str) -> Tensor:
@@ -276,16 +262,15 @@ def _values(document: Mapping[str, Any], binary: memoryview, index: object) -> N
     accessor = document["accessors"][_index(index)]
     if "sparse" in accessor or "bufferView" not in accessor:
         raise ValueError("it has sparse or empty accessors")
-    camera = document["bufferViews"][_index(accessor["bufferView"])]
-    if _index(camera.get("buffer", 0)) != 0 or "uri" in document["buffers"][0] or camera.get("extensions"):
+    buffer_view = document["bufferViews"][_index(accessor["bufferView"])]
+    if _index(buffer_view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0] or buffer_view.get("extensions"):
         raise ValueError("its data are compressed, or in another file")
-    kind, columns = np.dtype(_COMPONENTS[accessor["componentType"]]), _NUMBERS[accessor["type"]]
-    rows, start = _index(accessor["count"]), _index(camera.get("byteOffset", 0))
-    stride = _index(camera.get("byteStride", kind.itemsize * columns))
-    inside = _index(accessor.get("byteOffset", 0))
-    used = inside + (rows - 1) * stride + kind.itemsize * columns if rows else 0
-    beyond = used > _index(camera["byteLength"]) or start + camera["byteLength"] > len(binary)
-    if beyond or stride < kind.itemsize * columns:
+    kind, columns = np.dtype(_COMPONENTS[accessor["componentType"]]), _TYPES[accessor["type"]]
+    rows, start, length = map(_index, (accessor["count"], buffer_view.get("byteOffset", 0), buffer_view["byteLength"]))
+    width = kind.itemsize * columns
+    stride, inside = _index(buffer_view.get("byteStride", width)), _index(accessor.get("byteOffset", 0))
+    used = inside + (rows - 1) * stride + width if rows else 0
+    if used > length or start + length > len(binary) or stride < width:
         raise ValueError("its accessors reach beyond its data")
     table: NDArray[Any] = np.ndarray((rows, columns), kind, binary, start + inside, (stride, kind.itemsize))
     values = table.astype(np.float32)

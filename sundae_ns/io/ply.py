@@ -33,7 +33,7 @@ from torch import Tensor
 
 from sundae_ns.core.errors import DataError, SundaeError, reading, regular
 from sundae_ns.core.files import replacing
-from sundae_ns.core.gaussians import SPLAT_NAMES, num_gaussians, odd_shapes, rgb_to_sh, sh_degree_of, sh_to_rgb
+from sundae_ns.core.gaussians import SPLAT_NAMES, odd_shapes, rgb_to_sh, sh_degree_of, sh_to_rgb
 
 MODEL_FRAME = "Coordinates: nerfstudio model"
 """Header comment of files in the coordinates of nerfstudio's model, not of the capture."""
@@ -47,7 +47,6 @@ _COLUMNS = {
     "scales": ("scale_0", "scale_1", "scale_2"),
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
-_NORMALS = ("nx", "ny", "nz")
 _RGB = ("red", "green", "blue")
 _CLOUD_COLORS: tuple[tuple[str, ...], ...] = (
     _RGB,
@@ -60,13 +59,11 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _CHUNK = 256
 _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
-_MAX_HEADER = 1 << 16  # bytes
 
 
 def check_gaussians(params: Mapping[str, Tensor], failure: type[SundaeError] = DataError) -> None:
-    """Raise a ``failure`` unless a field has all of ``SPLAT_NAMES``, in their shapes."""
-    missing = [name for name in SPLAT_NAMES if name not in params]
-    if missing:
+    """Raise a ``failure`` unless there are all of ``SPLAT_NAMES``, in their shapes."""
+    if missing := [name for name in SPLAT_NAMES if name not in params]:
         raise failure(f"the field has no {', '.join(missing)}; it needs all of {', '.join(SPLAT_NAMES)}")
     for odd in odd_shapes(params):
         raise failure(odd)
@@ -90,38 +87,30 @@ def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     gaussians["opacities"] = gaussians["opacities"].clamp(-30.0, 30.0)
     # Normalise in float64: the square of 1e-30 is 0 in float32.
     quats = gaussians["quats"].double()
-    norms = quats.norm(dim=1, keepdim=True)
-    identity = torch.tensor(np.eye(1, 4)[0])
-    gaussians["quats"] = torch.where(
-        norms > 0, quats / norms.clamp_min(torch.finfo(torch.float64).tiny), identity
-    ).float()
+    quats[(quats == 0).all(dim=1), 0] = 1.0
+    gaussians["quats"] = (quats / quats.norm(dim=1, keepdim=True)).float()
     return gaussians
 
 
-# ------------------------------------------------------------------------------------------------------------- writing
-
-
-def _rest_columns(count: int) -> tuple[str, ...]:
-    return tuple(f"f_rest_{i}" for i in range(count))
-
-
-def _table(params: Mapping[str, Tensor]) -> list[tuple[tuple[str, ...], NDArray[np.float32]]]:
-    """Properties of a field and their values ``[N, C]``, in the order of the format."""
+def _table(params: Mapping[str, Tensor]) -> tuple[list[str], NDArray[np.float32]]:
+    """Properties of Gaussians but the normals, and their values ``[N, C]``, in the order of the format."""
     values = {name: params[name].detach().to("cpu", torch.float32).numpy() for name in SPLAT_NAMES}
     n, width = len(values["means"]), 3 * values["features_rest"].shape[1]
-    rest = values["features_rest"].transpose(0, 2, 1).reshape(n, width)
-    blocks = [(_COLUMNS[name], values[name]) for name in ("means", "features_dc", "opacities", "scales", "quats")]
-    return [*blocks[:2], (_rest_columns(width), rest), *blocks[2:]]
+    values["features_rest"] = values["features_rest"].transpose(0, 2, 1).reshape(n, width)
+    columns = {**_COLUMNS, "features_rest": tuple(f"f_rest_{i}" for i in range(width))}
+    order = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
+    names = [column for name in order for column in columns[name]]
+    return names, np.concatenate([values[name] for name in order], axis=1)
 
 
 def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[str] = ()) -> None:
-    """Write the base colours of a field as a 3DGS .ply, atomically.
+    """Write the base colours of Gaussians as a 3DGS .ply, atomically.
 
     Args:
         path: the file; its folder must exist.
-        params: a field; see :mod:`sundae_ns.core.gaussians`. ``features`` are not written. Values that are not
-            finite are written unchanged: drop such Gaussians first (``finite_mask``), because viewers do not.
-        comments: lines for the header: :data:`MODEL_FRAME` for the field of a nerfstudio model, ``SplatRenderMode:
+        params: see :mod:`sundae_ns.core.gaussians`. ``features`` are not written. Values that are not finite are
+            written unchanged: drop such Gaussians first (``finite_mask``), because viewers do not.
+        comments: lines for the header: :data:`MODEL_FRAME` for Gaussians of a nerfstudio model, ``SplatRenderMode:
             mip`` for an antialiased scene.
 
     Raises:
@@ -129,12 +118,10 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
         StorageError: the disk is full or not writable.
     """
     check_gaussians(params)
-    n = num_gaussians(params)
-    means, *others = _table(params)
-    blocks = [means, (_NORMALS, np.zeros((n, 3), np.float32)), *others]
-    names = [name for block, _ in blocks for name in block]
-    table = np.ascontiguousarray(np.concatenate([values for _, values in blocks], axis=1), dtype="<f4")
-    vertices = table.view([(name, "<f4") for name in names]).reshape(n)
+    names, table = _table(params)
+    names[3:3] = ("nx", "ny", "nz")
+    table = np.insert(table, [3, 3, 3], 0, axis=1).astype("<f4", copy=False)
+    vertices = table.view([(name, "<f4") for name in names]).reshape(len(table))
     data = PlyData([PlyElement.describe(vertices, "vertex")], text=False, byte_order="<", comments=list(comments))
     with replacing(path) as partial:
         data.write(str(partial))
@@ -158,8 +145,9 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
     if vertex.count != len(mask):
         raise DataError(f"{source} has {vertex.count} vertices, not {len(mask)}: it was changed meanwhile; run again.")
     rows = np.asarray(vertex.data[mask.cpu().numpy()])
-    for names, values in _table(params) if params is not None else ():
-        for name, column in zip(names, values.T, strict=True):
+    if params is not None:
+        names, table = _table(params)
+        for name, column in zip(names, table.T, strict=True):
             rows[name] = column
     # The header's own bytes, because plyfile writes no comment in UTF-8.
     header = re.sub(rb"(?<=[\r\n])(element\s+vertex\s+)\d+", rb"\g<1>%d" % len(rows), _header(source), count=1)
@@ -170,13 +158,10 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
             file.write(values.view(np.uint8).data if len(values) else b"")  # tofile hides why it fails
 
 
-# ------------------------------------------------------------------------------------------------- headers and parsing
-
-
 def _header(path: Path) -> bytes:
-    """The header of a .ply with the end of its last line; nothing if it has none. ``OSError`` if it cannot be read."""
+    """The header of a .ply with the end of its last line; empty if it has none. ``OSError`` if it cannot be read."""
     with regular(path).open("rb") as file:
-        begin = file.read(_MAX_HEADER)
+        begin = file.read(1 << 16)
     newline = b"\r\n" if begin[3:5] == b"\r\n" else begin[3:4]
     # A comment may contain the word.
     content, end, _ = begin.partition(newline + b"end_header" + newline)
@@ -186,35 +171,31 @@ def _header(path: Path) -> bytes:
 def _check_header(path: Path, primitives: bool) -> bytes:
     """Check the header alone, and return it: plyfile allocates by it, and reads lists and text row by row, in minutes.
 
-    ``primitives`` refuses what no binary .ply of Gaussian Gaussians has: text and lists.
+    ``primitives`` refuses text and lists, which no .ply of Gaussians has.
     """
     header = _header(path)
     lines = [line.split() for line in header.decode("latin-1").splitlines()]
     text = ["format", "ascii", "1.0"] in lines
-    counts: list[int] = []
+    elements: list[tuple[str, int]] = []
     sizes: list[int] = []  # least bytes of a row; in ascii, a value takes at least a digit and a space
     lists: list[tuple[str, str]] = []
-    element = ""
     for words in lines:
         if words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
-            element = words[1]
-            counts.append(int(words[2]))
+            elements.append((words[1], int(words[2])))
             sizes.append(0)
-        elif words[:1] == ["property"] and counts and len(words) >= 3:
+        elif words[:1] == ["property"] and elements and len(words) >= 3:
             is_list = words[1] == "list"
             sizes[-1] += 2 if text else _SIZES.get(words[2] if is_list else words[1], 1)
-            lists += [(element, words[-1])] if is_list else []
+            lists += [(elements[-1][0], words[-1])] if is_list else []
+    counts = [count for _, count in elements]
     least = sum(count * size for count, size in zip(counts, sizes, strict=True))
     available = path.stat().st_size - len(header)
-    reason = None
     if lines[:1] != [["ply"]]:
-        reason = "it has no .ply header"
-    elif any(count > 0 and size == 0 for count, size in zip(counts, sizes, strict=True)):
-        reason = "an element has no properties"
-    elif least > available:
-        reason = f"its header states at least {least:,} bytes, it has {available:,}"
-    if reason is not None:
-        raise DataError(f"{path} is not a complete .ply file ({reason}); export it again.")
+        raise ValueError("it has no .ply header")
+    if any(count > 0 and size == 0 for count, size in zip(counts, sizes, strict=True)):
+        raise ValueError("an element has no properties")
+    if least > available:
+        raise ValueError(f"its header states at least {least:,} bytes, it has {available:,}")
     if primitives and text:
         raise DataError(f"{path} is an ascii .ply; export it as binary.")
     for element, name in lists:
@@ -230,7 +211,7 @@ def _load(path: Path, *, primitives: bool = False) -> PlyData:
         with _AsciiHeader(FileIO(path), len(header)) as file:
             data = PlyData.read(file)
     if "vertex" not in data:
-        raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussian Gaussians.")
+        raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussians.")
     return data
 
 
@@ -254,7 +235,7 @@ class _AsciiHeader(BufferedReader):
 
 
 def has_own_columns(path: Path) -> bool:
-    """Whether a .ply that :func:`read_ply` reads has the values of a field as they are, so that rows can be copied."""
+    """Whether a .ply that :func:`read_ply` reads has unpacked values, so that rows can be copied."""
     names = {prop.name for prop in _load(path, primitives=True)["vertex"].properties}
     return all(names.issuperset(columns) for columns in _COLUMNS.values())
 
@@ -281,13 +262,9 @@ def is_nerfstudio_ply(path: Path) -> bool:
     return any(comment.startswith(marks) for comment in ply_comments(path))
 
 
-# ------------------------------------------------------------------------------------------------------------- reading
-
-
 def _columns(rows: Any, names: Sequence[str], dtype: type[np.floating[Any]] = np.float32) -> Tensor:
     """Properties of vertices as columns ``[N, len(names)]``."""
-    count = len(rows)
-    table = np.empty((count, len(names)), dtype)
+    table = np.empty((len(rows), len(names)), dtype)
     for i, name in enumerate(names):
         with np.errstate(over="ignore"):  # values beyond float32 become infinite; callers drop them
             table[:, i] = rows[name]
@@ -298,12 +275,12 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     """Read a binary 3DGS .ply, with SH coefficients or with colours, or a compressed one; ignores other properties.
 
     Returns:
-        A field by the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU. The SH degree
+        Gaussians by the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU. The SH degree
         follows from the number of ``f_rest_*``; without any, ``features_rest`` is ``[N, 0, 3]``. Values may be
-        infinite, where that is how the file states an opacity of 1; see ``gaussians.sanitise``.
+        infinite, such as the logit of an opacity of 1; see ``gaussians.sanitise``.
 
     Raises:
-        DataError: the file is missing, not a binary .ply, truncated, or does not hold Gaussian Gaussians.
+        DataError: the file is missing, not a binary .ply, truncated, or does not hold Gaussians.
     """
     data = _load(path, primitives=True)
     rows = data["vertex"].data
@@ -316,10 +293,10 @@ def read_ply(path: Path) -> dict[str, Tensor]:
         columns["features_dc"] = _RGB
     missing = [name for names in columns.values() for name in names if name not in present]
     if missing:
-        raise DataError(f"{path} lacks {', '.join(missing)}; give a .ply of 3D Gaussian Gaussians with SH colours.")
+        raise DataError(f"{path} lacks {', '.join(missing)}; give a .ply of 3D Gaussians with SH colours.")
     rest = sum(name.startswith("f_rest_") for name in present)
     degree = sh_degree_of(rest // 3) if rest % 3 == 0 else None
-    if degree is None or not present.issuperset(_rest_columns(rest)):
+    if degree is None or not present.issuperset(f"f_rest_{i}" for i in range(rest)):
         raise DataError(f"{path} has {rest} f_rest properties, which fit no SH degree; export it again.")
 
     params = {name: _columns(rows, names) for name, names in columns.items()}
@@ -335,16 +312,15 @@ def read_ply(path: Path) -> dict[str, Tensor]:
 
 
 def _decompressed(chunks: NDArray[Any], vertices: NDArray[Any], harmonics: NDArray[Any] | None) -> dict[str, Tensor]:
-    """A field of the elements of a compressed .ply; ``ValueError`` if they do not fit together."""
+    """Gaussians of the elements of a compressed .ply; ``ValueError`` if they do not fit together."""
     n = len(vertices)
     if len(chunks) < -(-n // _CHUNK):
         raise ValueError(f"{len(chunks)} chunks are too few for {n:,} Gaussians")
     chunk = np.arange(n) // _CHUNK
 
     def between(ratios: NDArray[np.float32], kind: str, axes: str) -> NDArray[np.float32]:
-        low, high = (
-            _columns(chunks, [f"{end}_{kind}{axis}" for axis in axes]).numpy()[chunk] for end in ("min", "max")
-        )
+        bounds = ([f"{end}_{kind}{axis}" for axis in axes] for end in ("min", "max"))
+        low, high = (_columns(chunks, names).numpy()[chunk] for names in bounds)
         return low + ratios * (high - low)
 
     color = _ratios(vertices["packed_color"], (8, 8, 8, 8))
@@ -363,10 +339,10 @@ def _decompressed(chunks: NDArray[Any], vertices: NDArray[Any], harmonics: NDArr
 
 def _ratios(words: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float32]:
     """Fields of 32-bit words, from the top bit down, relative to their largest value ``[N, len(bits)]``."""
-    shifts = 32 - np.cumsum(bits)
-    most = (1 << np.array(bits)) - 1
-    levels = (words.astype(np.uint32)[:, None] >> shifts.astype(np.uint32)) & most.astype(np.uint32)
-    return levels.astype(np.float32) / most.astype(np.float32)
+    shifts = (32 - np.cumsum(bits)).astype(np.uint32)
+    largest = ((1 << np.array(bits)) - 1).astype(np.uint32)
+    levels = (words.astype(np.uint32)[:, None] >> shifts) & largest
+    return levels.astype(np.float32) / largest.astype(np.float32)
 
 
 def from_smallest_three(others: NDArray[Any], largest: NDArray[Any]) -> NDArray[Any]:

@@ -3,7 +3,7 @@
 config.yml           options, as nerfstudio saves them (:mod:`sundae_ns.io.config_file`)
 nerfstudio_models/   checkpoints (:mod:`sundae_ns.io.checkpoint`)
 prune.json           a list with an object for each prune
-trials.json                  what the trials decided
+trials.json          what the trials decided
 training.lock        names the process that trains here, which holds its lock
 """
 
@@ -83,19 +83,14 @@ def _in_training(run: Path) -> bool:
         return False
 
 
-def _records(path: Path) -> list[dict[str, Any]]:
-    records = json.loads(regular(path).read_text(encoding="utf-8"))
-    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
-        raise ValueError(f"{path} is no list of objects")
-    return records
-
-
 def prunes_of(run: Path) -> list[dict[str, Any]]:
     """Records of the prunes of a run, given its folder; empty if they cannot be read."""
     try:
-        return _records(run / PRUNES)
+        records = json.loads(regular(run / PRUNES).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return []
+    is_list = isinstance(records, list) and all(isinstance(record, dict) for record in records)
+    return records if is_list else []
 
 
 def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
@@ -104,7 +99,7 @@ def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
     A file that cannot be read is renamed to ``*.damaged.json``, because it should not end a training.
     """
     try:
-        return [record for record in _records(path) if record["step"] < step]
+        return [record for record in json.loads(regular(path).read_text(encoding="utf-8")) if record["step"] < step]
     except FileNotFoundError:
         pass
     except (ValueError, TypeError, KeyError):
@@ -113,12 +108,9 @@ def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
 
 
 def take_records(source: Path, run: Path, step: int) -> None:
-    """Copy the records of a run to the folder of another that resumes it after a step, but those of later steps.
+    """Copy the records of a run's prunes up to a ``step`` to the folder of another run that resumes it there.
 
-    Args:
-        source: folder of the run that is resumed. Its damaged records are passed over.
-        run: folder of the other; a record that it has is kept.
-        step: step of the checkpoint, in steps of one image.
+    Damaged records are passed over; a record that the other run has is kept.
 
     Raises:
         StorageError: no space or no right to write.
@@ -129,17 +121,12 @@ def take_records(source: Path, run: Path, step: int) -> None:
         write_text(run / PRUNES, json.dumps(before, indent=2))
 
 
-# ----------------------------------------------------------------------------------------------------- unfinished runs
-
-
 class UnfinishedRun(NamedTuple):
-    """A run that can be resumed."""
+    """A run that can be resumed, with ``step`` steps trained of the ``length`` of its schedule."""
 
     folder: Path
     step: int
-    """Number of steps that are trained."""
     length: int
-    """Number of steps of its schedule."""
 
 
 def steps_left(run: Path) -> int | None:
@@ -154,10 +141,7 @@ def steps_left(run: Path) -> int | None:
 def unfinished_run(out: Path, method: str, capture: Path) -> UnfinishedRun | None:
     """The newest run of a method on a capture that nobody trains and that no other run has resumed.
 
-    Args:
-        out: folder of runs, as of ``ns-train --output-dir``.
-        method: name of the method.
-        capture: its folder or its ``transforms.json``.
+    ``out`` is the folder of runs, as of ``ns-train --output-dir``; ``capture`` a folder or its ``transforms.json``.
     """
     candidates: list[tuple[float, UnfinishedRun]] = []
     resumed: set[Path] = set()

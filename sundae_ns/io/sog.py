@@ -39,24 +39,20 @@ from sundae_ns.io.ply import MAX_SH_DEGREE, checked, from_smallest_three
 META = "meta.json"
 MAX_PALETTE = 1 << 16  # palette rows that two bytes can index
 _ROW_ENTRIES = 64  # palette rows in a row of the palette's image
-_ENTRIES = 256  # codebook entries that a byte can index
 _COARSE = 256  # coarse cells of a large palette
-_ROUNDS = 30  # Lloyd iterations of a one-dimensional codebook
-_ROW_ROUNDS = 8  # Lloyd iterations of a palette
-_SAMPLE = 1 << 16  # rows that a k-means is fitted to
-_CHUNK = 1 << 14  # rows compared with all centres at once
 _LEVELS = 65535  # highest level of a position, in two bytes
-_MAX_INFLATED = 1 << 26  # bytes of a deflated entry; images are stored
 _FIRST_MODE = 252  # alpha of a rotation without its first component; the next values stand for the other components
 
 
 def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
-    """Write the base colours of a finite field of SH degree at most 3 as a bundled .sog, atomically, in another order.
+    """Write the base colours of finite Gaussians of SH degree at most 3 as a .sog, atomically, in another order.
 
     Raises:
-        DataError: the field has no Gaussians, an SH degree above 3, or wrong shapes.
+        DataError: there are no Gaussians, an SH degree above 3, or wrong shapes.
         StorageError: the disk is full or not writable.
     """
+    from PIL import Image
+
     gaussians = checked(path, params)
     order = scene_order(gaussians["means"].numpy())
     arrays = {name: value.numpy()[order] for name, value in gaussians.items()}
@@ -93,9 +89,7 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
         padded = np.zeros((math.ceil(len(rows) / _ROW_ENTRIES) * _ROW_ENTRIES, coefficients, 3), np.uint8)
         padded[: len(rows)] = codes
         images["shN_centroids"] = padded.reshape(-1, _ROW_ENTRIES * coefficients, 3)
-        images["shN_labels"] = _square(
-            np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1).astype(np.uint8)
-        )
+        images["shN_labels"] = _square(np.stack([labels & 255, labels >> 8, 0 * labels], axis=1).astype(np.uint8))
         meta["shN"] = {
             "count": len(rows),
             "bands": math.isqrt(coefficients + 1) - 1,
@@ -106,14 +100,17 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
         # ZipInfo has a fixed date, so that equal fields give equal bytes.
         bundle.writestr(zipfile.ZipInfo(META), json.dumps(meta))
         for name, pixels in images.items():
-            bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(pixels))
+            image = io.BytesIO()
+            # exact: keep colours where alpha, here the opacity, is 0.
+            Image.fromarray(pixels).save(image, "WEBP", lossless=True, exact=True)
+            bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), image.getvalue())
 
 
 def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
     """Read a bundled .sog, or a folder of images or the ``meta.json`` in it.
 
     Returns:
-        A field as of ``ply.read_ply``, and whether it is marked as trained with antialiasing.
+        Gaussians as of ``ply.read_ply``, and whether they are marked as trained with antialiasing.
 
     Raises:
         DataError: a file is missing, damaged, no .sog, or of another version than 2.
@@ -140,13 +137,13 @@ def _file_entry(folder: Path, name: str) -> bytes:
 def _zip_entry(bundle: zipfile.ZipFile, name: str) -> bytes:
     """An entry of a bundle, which is stored, not deflated, so that it cannot grow."""
     info = bundle.getinfo(name)
-    if info.compress_type != zipfile.ZIP_STORED and info.file_size > _MAX_INFLATED:
+    if info.compress_type != zipfile.ZIP_STORED and info.file_size > 1 << 26:
         raise ValueError(f"{name} inflates to {info.file_size:,} bytes")
     return bundle.read(name)
 
 
 def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """The arrays of a field, from the files by their names; the inverse of :func:`write_sog`."""
+    """The arrays of Gaussians, from the files by their names; the inverse of :func:`write_sog`."""
     n = int(meta["count"])
 
     def pixels(entry: Mapping[str, Any], index: int, channels: int) -> NDArray[np.uint8]:
@@ -200,9 +197,9 @@ def codebook(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
     ordered = np.sort(values, axis=None).astype(np.float64)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
     # Start with half of the centres at quantiles and half spread evenly, for the few values at the ends.
-    quantiles = np.quantile(ordered, (np.arange(_ENTRIES // 2) + 0.5) / (_ENTRIES // 2))
-    centres = np.sort(np.concatenate([quantiles, np.linspace(ordered[0], ordered[-1], _ENTRIES // 2)]))
-    for _ in range(_ROUNDS):
+    quantiles = np.quantile(ordered, (np.arange(128) + 0.5) / 128)
+    centres = np.sort(np.concatenate([quantiles, np.linspace(ordered[0], ordered[-1], 128)]))
+    for _ in range(30):
         bounds = np.concatenate([[0], np.searchsorted(ordered, _middles(centres)), [len(ordered)]])
         number = np.diff(bounds)
         # Sort again: rounding of the sums may swap neighbouring means.
@@ -240,9 +237,9 @@ def palette(rows: NDArray[np.float32], max_rows: int = MAX_PALETTE) -> tuple[NDA
 
 def kmeans(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Centres ``[count, D]`` by Lloyd iterations on a sample of the rows."""
-    sample = rows[torch.randperm(len(rows), generator=generator)[:_SAMPLE]]
+    sample = rows[torch.randperm(len(rows), generator=generator)[: 1 << 16]]
     centres = sample[:count].clone()
-    for _ in range(_ROW_ROUNDS):
+    for _ in range(8):
         nearest = _nearest_centre(sample, centres)
         number = torch.bincount(nearest, minlength=count)[:, None]
         sums = torch.zeros_like(centres).index_add_(0, nearest, sample)
@@ -254,7 +251,7 @@ def _nearest_centre(rows: Tensor, centres: Tensor) -> Tensor:
     """Index ``[N]`` of the nearest centre of each row."""
     # |x - c|^2 minus |x|^2, in float32: a wrong choice between nearly equal centres costs nothing.
     flat, half = centres.float(), (centres * centres).sum(dim=1).float() / 2
-    return torch.cat([(chunk.float() @ flat.T - half).argmax(dim=1) for chunk in rows.split(_CHUNK)])
+    return torch.cat([(chunk.float() @ flat.T - half).argmax(dim=1) for chunk in rows.split(1 << 14)])
 
 
 def _smallest_three(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -274,12 +271,3 @@ def _square(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     image = np.zeros((math.ceil(n / width) * width, channels), np.uint8)
     image[:n] = pixels
     return image.reshape(-1, width, channels)
-
-
-def _webp(pixels: NDArray[np.uint8]) -> bytes:
-    from PIL import Image
-
-    file = io.BytesIO()
-    # exact: keep colours where alpha, here the opacity, is 0.
-    Image.fromarray(pixels).save(file, "WEBP", lossless=True, exact=True)
-    return file.getvalue()

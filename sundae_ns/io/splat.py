@@ -21,7 +21,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 import re
 import struct
 from collections.abc import Mapping
@@ -33,7 +32,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.core.errors import DataError, reading, regular
+from sundae_ns.core.errors import reading, regular
 from sundae_ns.core.gaussians import SPLAT_NAMES, odd_shapes, rgb_to_sh
 from sundae_ns.io.checkpoint import damage_of, load_tensors
 from sundae_ns.io.ply import LEAST_OPACITY
@@ -41,35 +40,36 @@ from sundae_ns.io.ply import LEAST_OPACITY
 _SPLAT = np.dtype([("means", "<f4", 3), ("widths", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _HEADER, _HEADER_BYTES = struct.Struct("<BBxxIIIIHxx12x2f"), 4096
 _SECTION, _SECTION_BYTES = struct.Struct("<IIIIfHxxIIIIH"), 1024
-_RANGE = 32767  # of a coordinate in 16 bits, if a section states none
-_BOUND = 1.5  # of SH coefficients in 8 bits, if the header states none
 _SH_DTYPES = ("<f4", "<f2", "u1")  # by level
-_GSPLAT_NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
-_RANK = re.compile(r"(.*_rank)\d+")
+_GSPLAT_NAMES = {name: name for name in SPLAT_NAMES} | {"features_dc": "sh0", "features_rest": "shN"}
 
 
 def _gaussians(rows: NDArray[Any], means: NDArray[Any], quats: NDArray[Any], rest: NDArray[Any]) -> dict[str, Tensor]:
-    """A field of rows with ``widths`` and ``rgba``."""
+    """Gaussians of rows with ``widths`` and ``rgba``."""
+    arrays = {"means": means, "scales": rows["widths"], "quats": quats, "features_rest": rest}
+    params = {name: torch.from_numpy(np.array(values, np.float32, order="C")) for name, values in arrays.items()}
+    colors = torch.from_numpy(rows["rgba"] / np.float32(255))
+    params["scales"] = params["scales"].log()
+    params["features_dc"] = rgb_to_sh(colors[:, :3])
+    params["opacities"] = torch.logit(colors[:, 3:], eps=LEAST_OPACITY)
+    return params
 
-    def tensor(values: NDArray[Any]) -> Tensor:
-        return torch.from_numpy(np.array(values, np.float32, order="C"))
 
-    colors = tensor(rows["rgba"] / np.float32(255))
-    return {
-        "means": tensor(means),
-        "scales": tensor(rows["widths"]).log(),
-        "quats": tensor(quats),
-        "features_dc": rgb_to_sh(colors[:, :3]),
-        "features_rest": tensor(rest),
-        "opacities": torch.logit(colors[:, 3:], eps=LEAST_OPACITY),
-    }
+def _joined(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """The Gaussians of all parts; ``ValueError`` if there are none, or if they differ in their SH degree."""
+    parts = [part for part in parts if len(part["means"])]
+    if not parts:
+        raise ValueError("it has no Gaussians")
+    if len({part["features_rest"].shape[1:] for part in parts}) > 1:
+        raise ValueError("its sections or ranks have different SH degrees")
+    return {name: torch.cat([part[name] for part in parts]) for name in SPLAT_NAMES}
 
 
 def read_splat(path: Path) -> dict[str, Tensor]:
     """Read a .splat, which has no view-dependent colours.
 
     Returns:
-        A field by the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
+        Gaussians by the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
         coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.sanitise``.
 
     Raises:
@@ -102,25 +102,20 @@ def read_ksplat(path: Path) -> dict[str, Tensor]:
         start = _HEADER_BYTES + stored * _SECTION_BYTES
         if used > stored or start > len(data):
             raise ValueError(f"its {len(data):,} bytes cannot hold {max(used, stored):,} sections")
-        bounds = (low or -_BOUND, high or _BOUND)  # its own viewer takes 0 for none
+        bounds = (low or -1.5, high or 1.5)  # of SH coefficients in 8 bits; its own viewer takes 0 for none
         parts = []
         for i in range(used):
             part, start = _section(data, _HEADER_BYTES + i * _SECTION_BYTES, start, level, bounds)
-            parts += [part] if len(part["means"]) else []
-        if not parts:
-            raise ValueError("it has no Gaussians")
-        if len({part["features_rest"].shape[1] for part in parts}) > 1:
-            raise ValueError("its sections have different SH degrees")
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+            parts.append(part)
+        return _joined(parts)
 
 
 def _section(
     data: memoryview, header: int, start: int, level: int, bounds: tuple[float, float]
 ) -> tuple[dict[str, Tensor], int]:
-    """The field of a section with its header and its data at these offsets; and the offset of the next one."""
-    used, stored, size, buckets, width, center_bytes, limit, _, full, partial, degree = _SECTION.unpack_from(
-        data, header
-    )
+    """The Gaussians of a section with its header and its data at these offsets; and the offset of the next one."""
+    fields = _SECTION.unpack_from(data, header)
+    used, stored, size, buckets, width, center_bytes, limit, _, full, partial, degree = fields
     if degree > 2:
         raise ValueError(f"SH degree {degree}; the format ends at 2")
     number, coefficients = "<f2" if level else "<f4", (degree + 1) ** 2 - 1
@@ -141,7 +136,7 @@ def _section(
         if full * size + int(lengths.sum(dtype=np.uint64)) != stored:
             raise ValueError(f"its buckets do not hold {stored:,} Gaussians")
         bucket = np.repeat(np.arange(buckets), np.concatenate([np.full(full, size, np.int64), lengths]))[:used]
-        limit = limit or _RANGE
+        limit = limit or 32767
         middle = np.frombuffer(data, "<f4", 3 * buckets, centers).reshape(-1, 3)[bucket]
         means = (means.astype(np.float64) - limit) * (width / 2 / limit) + middle
     if level == 2:
@@ -161,46 +156,36 @@ def read_gsplat(path: Path) -> dict[str, Tensor]:
             ``_rank1`` and so on.
 
     Returns:
-        A field as that of :func:`read_splat`, in the coordinates of gsplat's training.
+        As :func:`read_splat`, in the coordinates of gsplat's training.
 
     Raises:
         DataError: a file is missing or damaged, or holds no Gaussians with SH colours.
     """
-
-    def step_of(file: Path) -> str | None:
-        match = _RANK.fullmatch(file.stem)
-        return match and match[1]
-
-    step = step_of(path)
-    ranks = [path] if step is None else [file for file in path.parent.glob("*.pt") if step_of(file) == step]
-    parts = [_rank(file) for file in sorted(ranks or [path])]
-    if len({part["features_rest"].shape[1:] for part in parts}) > 1:
-        raise DataError(f"{path} and the ranks beside it have different SH degrees; give files of one training")
-    return {name: torch.cat([part[name] for part in parts]) for name in SPLAT_NAMES}
+    ranks = []
+    if match := re.fullmatch(r"(.*_rank)\d+", path.stem):
+        name = re.compile(re.escape(match[1]) + r"\d+")
+        ranks = sorted(file for file in path.parent.glob("*.pt") if name.fullmatch(file.stem))
+    with reading(path, "a checkpoint of gsplat", remedy="give another file"):
+        return _joined([_rank(file) for file in ranks or [path]])
 
 
 def _rank(path: Path) -> dict[str, Tensor]:
     """The Gaussians of one file."""
     with reading(path, "a checkpoint of gsplat", remedy="give another file"), regular(path).open("rb") as file:
-        damage = damage_of(file)
-        if damage is not None:
+        if (damage := damage_of(file)) is not None:
             raise ValueError(damage)
-        try:
-            loaded = load_tensors(file)
-        except pickle.UnpicklingError as error:
-            raise ValueError("it holds more than tensors and plain values, or nothing that can be read") from error
+        loaded = load_tensors(file)
         splats = loaded.get("splats") if isinstance(loaded, dict) else None
         if not isinstance(splats, Mapping):
             raise ValueError("it holds no splats")
-        missing = [name for name in _GSPLAT_NAMES if not isinstance(splats.get(name), Tensor)]
+        missing = [name for name in _GSPLAT_NAMES.values() if not isinstance(splats.get(name), Tensor)]
         if missing and isinstance(splats.get("colors"), Tensor):
             raise ValueError("its colours need a network (app_opt); train with SH colours")
         if missing:
             raise ValueError(f"its splats lack {', '.join(missing)}")
-        values: dict[str, Any] = {name: splats[name].detach().float() for name in _GSPLAT_NAMES}
-        gaussians = {name: values[name] for name in ("means", "scales", "quats")}
-        gaussians |= {"features_dc": values["sh0"].flatten(1), "features_rest": values["shN"]}
-        gaussians["opacities"] = values["opacities"].reshape(-1, 1)
+        gaussians = {ours: splats[theirs].detach().float() for ours, theirs in _GSPLAT_NAMES.items()}
+        gaussians["features_dc"] = gaussians["features_dc"].flatten(1)
+        gaussians["opacities"] = gaussians["opacities"].reshape(-1, 1)
         for odd in odd_shapes(gaussians):
             raise ValueError(odd)
     return gaussians

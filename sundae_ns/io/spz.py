@@ -31,17 +31,7 @@ from sundae_ns.core.files import replacing
 from sundae_ns.io.ply import checked
 
 _HARMONICS_STEP = 1 / 64  # costs 0.03 dB; twice this step costs 0.12 dB (docs/formats.md)
-_VERSION = 3  # one gzip stream; more programs read it than version 4
-_HEADER_FLAGS = 14  # offset of the flags in the header
-_ANTIALIASED = 0x1  # flag
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
-_LEAST_BYTES = 19  # of a Gaussian of SH degree 0
-_CHUNK = 1 << 20
-_LARGEST = (1 << 23) - 1  # largest coordinate in steps, 24 bits with a sign
-_MOST_BITS = 24  # fractional bits of a coordinate
-_FEWEST_BITS = 8
-_SCALES = (-10.0, 5.9375)  # log-scales that fit
-_COLOR, _HARMONIC = 0.5 / 0.15, 1.0  # largest SH coefficients of degree 0, and of higher degrees
 
 
 def fractional_bits(means: Tensor) -> int:
@@ -53,8 +43,8 @@ def fractional_bits(means: Tensor) -> int:
         DataError: a Gaussian is so far away that fewer than 8 bits are left.
     """
     farthest = float(means.abs().max())
-    for bits in range(_MOST_BITS, _FEWEST_BITS - 1, -1):
-        if round(farthest * 2**bits) <= _LARGEST:
+    for bits in range(24, 7, -1):
+        if round(farthest * 2**bits) < 1 << 23:  # a coordinate has 24 bits with its sign
             return bits
     raise DataError(
         f"a Gaussian is {farthest:.3g} from the origin, too far for the fixed point of a .spz; write a .sog or .ply"
@@ -62,10 +52,10 @@ def fractional_bits(means: Tensor) -> int:
 
 
 def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
-    """Write the base colours of a finite field of SH degree at most 3 as a .spz, atomically.
+    """Write the base colours of finite Gaussians of SH degree at most 3 as a .spz, atomically.
 
     Raises:
-        DataError: the field has no Gaussians, an SH degree above 3, a Gaussian too far away, or wrong shapes.
+        DataError: there are no Gaussians, an SH degree above 3, a Gaussian too far away, or wrong shapes.
         StorageError: the disk is full or not writable.
     """
     from gsply import GSData
@@ -74,20 +64,20 @@ def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
     gaussians = checked(path, params)
     bits = fractional_bits(gaussians["means"])
     gaussians["features_rest"] = (gaussians["features_rest"] / _HARMONICS_STEP).round() * _HARMONICS_STEP
-    opacities, colors, rest = (gaussians[name].numpy() for name in ("opacities", "features_dc", "features_rest"))
-    means, scales, quats = (gaussians[name].numpy() for name in ("means", "scales", "quats"))
+    names = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
+    means, scales, quats, opacities, colors, rest = (gaussians[name].numpy() for name in names)
     harmonics = rest if rest.size else None
     data = GSData.from_arrays(means, scales, quats, opacities[:, 0], colors, harmonics, format="ply")
     with replacing(path) as partial:
-        write(partial, data, version=_VERSION, fractional_bits=bits)
-        # gsply 0.4 has no option for the flag.
+        write(partial, data, version=3, fractional_bits=bits)  # more programs read version 3 than 4
+        # gsply 0.4 has no option for the flag of antialiasing, in byte 14.
         raw = bytearray(gzip.decompress(partial.read_bytes()))
-        raw[_HEADER_FLAGS] |= _ANTIALIASED * antialiased
+        raw[14] |= antialiased
         partial.write_bytes(gzip.compress(bytes(raw), mtime=0))
 
 
 def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
-    """Read a .spz of version 1 to 4: a field as of ``ply.read_ply``, and whether it is marked as antialiased.
+    """Read a .spz of version 1 to 4: Gaussians as of ``ply.read_ply``, and whether they are marked as antialiased.
 
     Raises:
         DataError: the file is missing, damaged, no .spz, or unpacks to far more than its size.
@@ -108,7 +98,7 @@ def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
         "opacities": data.opacities.reshape(n, 1),
     }
     gaussians = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in columns.items()}
-    return gaussians, bool(flags & _ANTIALIASED)
+    return gaussians, bool(flags & 1)
 
 
 def _checked_flags(path: Path) -> int:
@@ -120,12 +110,12 @@ def _checked_flags(path: Path) -> int:
     if len(header) < _HEADER.size or header[:4] != b"NGSP":
         raise DataError(f"{path} is no .spz; give a .ply, .spz, .sog, .sundae, or a run")
     _, _, count, _, _, flags, _ = _HEADER.unpack(header)
-    if count == 0 or count * _LEAST_BYTES > most:
+    if count == 0 or count * 19 > most:  # bytes of a Gaussian of SH degree 0
         raise DataError(f"{path} states {count:,} Gaussians, which its {len(raw):,} bytes cannot hold; export it again")
     if packed:
         stream, rest, size = zlib.decompressobj(wbits=31), raw, 0
         while rest and not stream.eof:
-            size += len(stream.decompress(rest, _CHUNK))
+            size += len(stream.decompress(rest, 1 << 20))
             rest = stream.unconsumed_tail
             if size > most:
                 raise DataError(f"{path} unpacks to far more than its {len(raw):,} bytes; export it again")
@@ -134,8 +124,7 @@ def _checked_flags(path: Path) -> int:
 
 def clamped(gaussians: Mapping[str, Tensor]) -> int:
     """Number of Gaussians with a scale or an SH coefficient beyond what a .spz stores; it stores the nearest value."""
-    low, high = _SCALES
-    beyond = ((gaussians["scales"] < low) | (gaussians["scales"] > high)).any(dim=1)
-    beyond |= (gaussians["features_dc"].abs() > _COLOR).any(dim=1)
-    beyond |= (gaussians["features_rest"].flatten(1).abs() > _HARMONIC).any(dim=1)
+    beyond = ((gaussians["scales"] < -10) | (gaussians["scales"] > 5.9375)).any(dim=1)
+    beyond |= (gaussians["features_dc"].abs() > 0.5 / 0.15).any(dim=1)
+    beyond |= (gaussians["features_rest"].flatten(1).abs() > 1).any(dim=1)
     return int(beyond.sum())

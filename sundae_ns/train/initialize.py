@@ -113,7 +113,7 @@ def _sparse_gaussians(
 
 
 def _warm_gaussians(options: Any, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
-    params, in_model_frame, _ = read_gaussians(source)
+    params, in_model_frame = read_gaussians(source)
     if options.warm_start_frame != "auto":
         in_model_frame = options.warm_start_frame == "model"
     elif kind_of(source) == "gsplat":

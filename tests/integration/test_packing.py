@@ -95,7 +95,7 @@ def test_a_packed_scene_is_measured_on_its_capture(tiny: Any, packed: Packed) ->
 
 
 def test_a_warm_start_reads_a_packed_scene(packed: Packed) -> None:
-    found, truth = read_gaussians(packed.file), load(packed.file)
-    assert found.in_model_frame
-    assert "features" not in found.params
-    assert all(torch.equal(value, truth.gaussians[name]) for name, value in found.params.items())
+    (params, in_model_frame), truth = read_gaussians(packed.file), load(packed.file)
+    assert in_model_frame
+    assert "features" not in params
+    assert all(torch.equal(value, truth.gaussians[name]) for name, value in params.items())

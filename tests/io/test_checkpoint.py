@@ -104,7 +104,7 @@ def _without(name: str) -> dict[str, Any]:
         (model_state(format=99), "format 99"),
         (model_state(encoding="logits"), "colours as logits, the model as harmonics; .*sh-degree"),
         (model_state(running=None), "where training stopped"),
-        (model_state(train_callbacks=[]), "where training stopped"),
+        (model_state(extensions=[]), "where training stopped"),
         (
             {
                 **model_state(),
@@ -134,7 +134,7 @@ def test_stock_checkpoint_with_numpy_numbers(tmp_path: Path, prefix: str) -> Non
     params = stock_checkpoint(tmp_path / "step-000000001.ckpt", prefix)
     with pytest.raises(Exception, match="[Ww]eights.only"):
         torch.load(tmp_path / "step-000000001.ckpt", weights_only=True)
-    read, in_model_frame, _ = read_gaussians(tmp_path / "step-000000001.ckpt")
+    read, in_model_frame = read_gaussians(tmp_path / "step-000000001.ckpt")
     assert in_model_frame
     assert tuple(read) == SPLAT_NAMES
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
@@ -165,7 +165,7 @@ def save_without_harmonics(folder: Path, extra: Any) -> None:
 def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path: Path, extra: Any, logits: bool) -> None:
     """Logits if the model was built at degree 0, harmonics if a search has lowered the degree."""
     save_without_harmonics(tmp_path, extra)
-    read, _, _ = read_gaussians(tmp_path)
+    read, _ = read_gaussians(tmp_path)
     stored = gaussians()["features_dc"]
     expected = sh_to_rgb(read["features_dc"]).logit() if logits else read["features_dc"]
     torch.testing.assert_close(expected, stored)
@@ -223,7 +223,7 @@ def test_newest_of_a_folder(tmp_path: Path, inside: str) -> None:
 def test_ply(tmp_path: Path, comments: tuple[str, ...], in_model_frame: bool) -> None:
     params = gaussians()
     write_ply(tmp_path / "a.ply", params, comments=list(comments))
-    read, in_frame, _ = read_gaussians(tmp_path / "a.ply")
+    read, in_frame = read_gaussians(tmp_path / "a.ply")
     assert in_frame is in_model_frame
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
     renamed = (tmp_path / "a.ply").rename(tmp_path / "cloud")
@@ -243,7 +243,7 @@ class Burglar:
 def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
     stolen = tmp_path / "stolen"
     torch.save({"pipeline": {}, "extra": Burglar(stolen)}, tmp_path / "a.ckpt")
-    with pytest.raises(CheckpointError, match="cannot be read"):
+    with pytest.raises(CheckpointError, match="is not a nerfstudio checkpoint"):
         read_gaussians(tmp_path / "a.ckpt")
     assert not stolen.exists()
 
@@ -262,13 +262,13 @@ def _save(content: object) -> Callable[[Path], object]:
 WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "missing": (lambda path: None, "does not exist"),
     "empty folder": (lambda path: path.mkdir(), "holds no checkpoint"),
-    "no checkpoint": (lambda path: path.write_text("hello"), "cannot be read"),
-    "empty file": (lambda path: path.write_bytes(b""), "cannot be read"),
+    "no checkpoint": (lambda path: path.write_text("hello"), "is not a nerfstudio checkpoint"),
+    "empty file": (lambda path: path.write_bytes(b""), "is not a nerfstudio checkpoint"),
     "only tensors": (_save({"weight": torch.zeros(2)}), "it holds no model"),
     "no step": (_save({"pipeline": {"_model.field.weight": torch.zeros(2)}}), "after which step it was saved"),
     "a step of words": (_save({"step": "3", "pipeline": {}}), "after which step it was saved"),
     "a number for a name": (_save({"step": 3, "pipeline": {3: torch.zeros(2)}}), "it holds no model"),
-    "a list": (_save([1, 2]), "cannot be read"),
+    "a list": (_save([1, 2]), "is not a nerfstudio checkpoint"),
     "of another method": (_save({"step": 3, "pipeline": {"_model.field.weight": torch.zeros(2)}}), "no Gaussian field"),
 }
 

@@ -176,7 +176,7 @@ DAMAGED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "a cut archive": ("a.pt", _cut("ckpt_6999_rank0.pt", 3000), "not a checkpoint of gsplat"),
     "code": ("a.pt", lambda path: torch.save({"splats": Harmful()}, path), "more than tensors and plain values"),
     "no splats": ("a.pt", lambda path: torch.save({"step": 1}, path), "it holds no splats"),
-    "no harmonics": ("a.pt", _saved(means=torch.zeros(3, 3)), "its splats lack scales, quats, opacities, sh0, shN"),
+    "no harmonics": ("a.pt", _saved(means=torch.zeros(3, 3)), "its splats lack scales, quats, sh0, shN, opacities"),
     "colours of a network": ("a.pt", _saved(colors=torch.zeros(3, 3)), "its colours need a network"),
     "an odd shape": (
         "a.pt",

@@ -33,7 +33,7 @@ TOLERANCES: dict[str, dict[str, float]] = {
     ".glb": dict.fromkeys(("means", "scales", "features_rest"), 1e-5) | {"quats": 1e-6, "opacities": 1e-6},
     ".spz": {"means": 1e-6, "scales": 1 / 32, "quats": 0.002, "features_dc": 0.0134, "features_rest": 0.0079}
     | {"opacities": 0.5 / 255},
-    ".sog": {"means": 1e-4, "scales": 0.02, "quats": 0.006, "features_dc": 0.02, "features_rest": 0.02}
+    ".sog": {"means": 1e-4, "scales": 0.02, "quats": 0.0085, "features_dc": 0.02, "features_rest": 0.02}
     | {"opacities": 0.5 / 255},
 }
 

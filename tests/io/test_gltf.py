@@ -60,8 +60,8 @@ def test_a_field_comes_back(tmp_path: Path, degree: int, in_model_frame: bool, a
     gaussians = small_field(40, degree)
     write_glb(tmp_path / "a.glb", gaussians, antialiased=antialiased, in_model_frame=in_model_frame)
     found = read_glb(tmp_path / "a.glb")
-    close(found.params, gaussians)
-    assert (found.antialiased, found.in_model_frame) == (antialiased, in_model_frame)
+    close(found[0], gaussians)
+    assert found[1:] == (antialiased, in_model_frame)
 
 
 @pytest.mark.parametrize("in_model_frame", [False, True])
@@ -102,15 +102,15 @@ def test_names_and_types_are_those_of_the_extension(tmp_path: Path) -> None:
 
 def test_a_file_of_another_program() -> None:
     found = read_glb(THEIRS)
-    torch.testing.assert_close(found.params["means"], theirs()["means"])
-    assert found.params["features_rest"].shape == (5, 8, 3)
+    torch.testing.assert_close(found[0]["means"], theirs()["means"])
+    assert found[0]["features_rest"].shape == (5, 8, 3)
     assert not found.in_model_frame
     assert sn.load(THEIRS).num_gaussians == 5
 
 
 def test_what_another_program_wrote_is_written_alike(tmp_path: Path) -> None:
     found = read_glb(THEIRS)
-    write_glb(tmp_path / "a.glb", found.params)
+    write_glb(tmp_path / "a.glb", found[0])
     (ours, data), (document, truth) = parts(tmp_path / "a.glb"), parts(THEIRS)
     names = ours["meshes"][0]["primitives"][0]["attributes"]
     for name, i in document["meshes"][0]["primitives"][0]["attributes"].items():
@@ -173,7 +173,7 @@ def test_integers_are_normalised(tmp_path: Path) -> None:
         binary += data
     document["buffers"][0]["byteLength"] = len(binary)
     put(tmp_path / "b.glb", document, binary)
-    close(read_glb(tmp_path / "b.glb").params, read_glb(tmp_path / "a.glb").params, 2e-4)
+    close(read_glb(tmp_path / "b.glb")[0], read_glb(tmp_path / "a.glb")[0], 2e-4)
 
 
 def _in(name: str, **values: object) -> Callable[[Document], None]:

@@ -89,7 +89,7 @@ def test_what_is_not_whole_is_passed_over(tmp_path: Path, harm: Any) -> None:
     assert checkpoint.newest_step(tmp_path) == 20
     (line,) = passed_over
     assert name(30) in line
-    with pytest.raises(CheckpointError, match="cannot be read"):
+    with pytest.raises(CheckpointError, match="is not a nerfstudio checkpoint"):
         checkpoint.read(tmp_path / name(30))
     for step in (10, 20):
         harm(tmp_path / name(step))

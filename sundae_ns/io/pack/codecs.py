@@ -28,8 +28,7 @@ _STEPS = {
     "features_dc": "color_step",
     "features_rest": "harmonics_step",
     FEATURES: "feature_step",
-}
-"""Options of the steps of attributes."""
+}  # options of the steps of attributes
 _LARGEST_SHARE = 0.5  # step of an output channel of the head, at most, relative to its largest weight
 _RUN = 16  # neighbours on the curve whose levels share a mean and a magnitude, in the estimate of bits
 
@@ -60,7 +59,7 @@ class HeadCodec:
             PackError: weights are not finite.
         """
         names = sorted(head)
-        values = {name: head[name].detach().to("cpu", torch.float32) for name in names}
+        values = {name: _on_cpu(head[name]) for name in names}
         if not all(torch.isfinite(value).all() for value in values.values()):
             raise PackError("the head has weights that are not finite; go back to an earlier checkpoint")
         weights = [name for name in names if values[name].ndim > 1]
@@ -87,7 +86,7 @@ class HeadCodec:
         """Steps of the same ratios for a head, larger by a factor, but no output channel beyond its largest share."""
         rows = {}
         for name, row in self.rows.items():
-            largest = quantize.weight_steps(head[name].detach().to("cpu", torch.float32), _LARGEST_SHARE)
+            largest = quantize.weight_steps(_on_cpu(head[name]), _LARGEST_SHARE)
             rows[name] = torch.minimum(row * factor, torch.maximum(row, largest))
         return HeadCodec(rows, self.columns)
 
@@ -116,14 +115,9 @@ class Codecs:
         return _moved(self, device)  # type: ignore[no-any-return]
 
     def with_steps(self, config: PackConfig, gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Codecs:
-        """The same grids and bases with the steps of other options; their bits and blocks of positions have no effect.
+        """The same grids and bases with the steps of other valid options; bits and blocks of positions stay.
 
-        With the present options, these are the same steps.
-
-        Args:
-            config: valid options.
-            gaussians: Gaussians in the order of these codecs, which the steps have to suit.
-            head: its head; {} for none.
+        Gaussians, in the order of these codecs, and the head ({} for none) bound the steps.
         """
         ratios = {name: getattr(config, name) / getattr(self.config, name) for name in STEPS}
         codecs: dict[str, Rotations | Transform] = {}
@@ -159,9 +153,7 @@ def _moved(value: Any, device: torch.device) -> Any:
     if isinstance(value, dict):
         return {name: _moved(inner, device) for name, inner in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
-        return replace(
-            value, **{gaussians.name: _moved(getattr(value, gaussians.name), device) for gaussians in fields(value)}
-        )
+        return replace(value, **{part.name: _moved(getattr(value, part.name), device) for part in fields(value)})
     return value
 
 
@@ -202,7 +194,7 @@ def _fit_head(head: Mapping[str, Tensor], share: float, sensitivity: Mapping[str
     """
     if not head:
         return None
-    weights = {name: value.detach().to("cpu", torch.float32) for name, value in head.items() if value.ndim > 1}
+    weights = {name: _on_cpu(value) for name, value in head.items() if value.ndim > 1}
     rows = {name: quantize.weight_steps(value, share) for name, value in weights.items()}
     columns = {name: torch.ones(value.shape[1]) for name, value in weights.items()}
     mean = max((float(value.mean()) for value in sensitivity.values()), default=0.0)
@@ -212,11 +204,11 @@ def _fit_head(head: Mapping[str, Tensor], share: float, sensitivity: Mapping[str
     for name, value in weights.items():
         # All of a layer's derivatives are zero where a later layer is, as in a head that was enabled just now.
         least = max(1e-3 * float(sensitivity[name].mean()), 1e-9 * mean)
-        found, count = sensitivity[name].clamp_min(least), value[0, 0].numel()
-        target += count * float((found * rows[name].double()[:, None] ** 2).sum())
-        row, column = found.mean(dim=1), found.mean(dim=0) / found.mean()
+        loss, count = sensitivity[name].clamp_min(least), value[0, 0].numel()
+        target += count * float((loss * rows[name].double()[:, None] ** 2).sum())
+        row, column = loss.mean(dim=1), loss.mean(dim=0) / loss.mean()
         rows[name], columns[name] = (_quarters(side.rsqrt()) for side in (row, column))
-        error += count * float((found * (rows[name][:, None] * columns[name]).double() ** 2).sum())
+        error += count * float((loss * (rows[name][:, None] * columns[name]).double() ** 2).sum())
     factor = _quarters(torch.tensor((target / error) ** 0.5))
     for name, value in weights.items():
         # A derivative says nothing of changes as large as the weights: in an untrained head they all seem useless.
@@ -231,7 +223,11 @@ def _quarters(values: Tensor) -> Tensor:
 
 def as_matrix(values: Tensor) -> Floats:
     """Return a tensor ``[N, ...]`` as contiguous float32 ``[N, C]`` on the CPU."""
-    return np.ascontiguousarray(values.detach().to("cpu", torch.float32).numpy().reshape(len(values), -1))
+    return np.ascontiguousarray(_on_cpu(values).numpy().reshape(len(values), -1))
+
+
+def _on_cpu(values: Tensor) -> Tensor:
+    return values.detach().to("cpu", torch.float32)
 
 
 def estimated_bits(codecs: Codecs, gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -26,9 +26,9 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,8 +46,6 @@ VERSION, MAX_HEADER, SPARE, MAX_RATIO = (LIMITS[name] for name in ("version", "h
 MAGIC = b"\x89SUNDAE\n"
 PADDING = "padding"
 _PREAMBLE = struct.Struct("<8sII32s")
-_THREADS = 2
-_ORTHONORMAL_TOLERANCE = 0.1  # of products of rows; poses of captures may be as far off
 
 Array = NDArray[Any]
 Floats = NDArray[np.float32]
@@ -78,17 +76,15 @@ class Section(NamedTuple):
     @property
     def planes(self) -> int:
         """Number of planes of the array."""
-        return _rows(self.shape) * self.dtype.itemsize
+        return _rows(self.shape) * self.dtype.itemsize if self.size else 0
 
 
 class Header(NamedTuple):
-    """The header of a file."""
+    """The header of a file of ``size`` bytes; ``meta`` is its JSON object, with ``sections``."""
 
     meta: dict[str, Any]
-    """The JSON object, ``sections`` included."""
     sections: dict[str, Section]
     size: int
-    """Bytes of the file."""
 
 
 @contextmanager
@@ -102,9 +98,6 @@ def naming(path: Path) -> Iterator[None]:
         raise PackError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
 
 
-# -------------------------------------------------------------------------------------------------------------- schema
-
-
 def _unique_by(_: Any, key: str | int, items: list[Any], __: Any) -> Iterator[jsonschema.ValidationError]:
     if len({item[key] for item in items}) < len(items):
         yield jsonschema.ValidationError(f"two items have the same {key}")
@@ -112,7 +105,7 @@ def _unique_by(_: Any, key: str | int, items: list[Any], __: Any) -> Iterator[js
 
 def _orthonormal(_: Any, __: bool, value: list[Any], ___: Any) -> Iterator[jsonschema.ValidationError]:
     rows = np.array([row[:3] for row in value] if isinstance(value[0], list) else [value], np.float64)
-    crooked = np.abs(rows @ rows.T - np.eye(len(rows))).max() > _ORTHONORMAL_TOLERANCE
+    crooked = np.abs(rows @ rows.T - np.eye(len(rows))).max() > 0.1  # poses of captures may be as far off
     if crooked or (len(rows) == 3 and np.linalg.det(rows) <= 0):
         yield jsonschema.ValidationError("the rows are not those of a rotation")
 
@@ -146,8 +139,7 @@ def fault(value: Any, schema: Mapping[str, Any], prefix: str = "") -> str | None
 
 def check(value: Any, schema: str, prefix: str = "") -> None:
     """Raise ``DamagedError`` if a part of the header violates a schema of ``FORMAT``."""
-    wrong = fault(value, FORMAT[schema], prefix)
-    if wrong is not None:
+    if (wrong := fault(value, FORMAT[schema], prefix)) is not None:
         raise DamagedError(f"its header has no valid {wrong or schema}")
 
 
@@ -176,13 +168,7 @@ def parsed(content: bytes) -> Any:
 
 
 def fits(array: Array, section: Mapping[str, Any], lengths: Mapping[str, int]) -> bool:
-    """Whether an array has dtype and shape of a section.
-
-    Args:
-        array: the section's array.
-        section: of ``FORMAT["sections"]``.
-        lengths: sides that the shape names; None there matches any length.
-    """
+    """Whether an array has dtype and shape of a section of ``FORMAT``; ``lengths`` are the sides that it names."""
     sides = [lengths.get(side, side) for side in section["shape"]]
     same = all(side is None or side == length for side, length in zip(sides, array.shape, strict=False))
     return array.dtype.str == section["dtype"] and array.ndim == len(sides) and same
@@ -196,9 +182,6 @@ def in_range(array: Array, section: Mapping[str, Any]) -> bool:
     return bool(((array >= lowest) & (array <= highest)).all())
 
 
-# ------------------------------------------------------------------------------------------------------------- writing
-
-
 def _rows(shape: tuple[int, ...]) -> int:
     return shape[0] if len(shape) > 1 else 1
 
@@ -207,9 +190,9 @@ def split_planes(array: Array) -> list[bytes]:
     """The planes of an array."""
     if array.size == 0:
         return []
-    flat = np.ascontiguousarray(array).reshape(_rows(array.shape), -1)
-    planes = flat.view(np.uint8).reshape(flat.shape[0], flat.shape[1], array.dtype.itemsize)
-    return [plane.tobytes() for plane in planes.transpose(0, 2, 1).reshape(-1, flat.shape[1])]
+    rows, size = _rows(array.shape), array.dtype.itemsize
+    numbers = np.ascontiguousarray(array).reshape(-1).view(np.uint8).reshape(rows, -1, size)
+    return [plane.tobytes() for plane in numbers.transpose(0, 2, 1).reshape(rows * size, -1)]
 
 
 def _deflated(plane: bytes) -> bytes:
@@ -229,8 +212,7 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
     Raises:
         PackError: the header is too long for a reader.
     """
-    named = {name: np.asarray(array) for name, array in arrays.items()}
-    little = {name: array.astype(array.dtype.newbyteorder("<"), copy=False) for name, array in named.items()}
+    little = {name: array.astype(array.dtype.newbyteorder("<"), copy=False) for name, array in arrays.items()}
     parts = {name: [_deflated(plane) for plane in split_planes(array)] for name, array in little.items()}
     body = sum(len(part) for planes in parts.values() for part in planes)
     size = max(unpacked, sum(array.nbytes for array in little.values()))
@@ -248,9 +230,9 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
         }
         for name, array in little.items()
     ]
-    front = _front({**meta, "sections": sections})
-    content = b"".join([front, *(part for planes in parts.values() for part in planes)])
-    return content, {name: sum(map(len, planes)) for name, planes in parts.items()}
+    stored = {name: b"".join(planes) for name, planes in parts.items()}
+    content = b"".join([_front({**meta, "sections": sections}), *stored.values()])
+    return content, {name: len(section) for name, section in stored.items()}
 
 
 def _front(meta: Mapping[str, Any]) -> bytes:
@@ -270,9 +252,6 @@ def restated(content: bytes, entries: Mapping[str, Any]) -> bytes:
     """
     end = _PREAMBLE.size + _PREAMBLE.unpack_from(content)[2]
     return _front({**parsed(content[_PREAMBLE.size : end]), **entries}) + content[end:]
-
-
-# ------------------------------------------------------------------------------------------------------------- reading
 
 
 def read_header(path: Path) -> Header:
@@ -310,8 +289,7 @@ def _sections(meta: Any, offset: int, size: int) -> dict[str, Section]:
     for entry in meta["sections"]:
         shape, parts = (tuple(map(int, entry[key])) for key in ("shape", "parts"))
         section = Section(entry["name"], np.dtype(entry["dtype"]), shape, parts, entry["sha256"], offset)
-        longest = section.size // section.planes if section.size else 0
-        if len(parts) != (section.planes if section.size else 0) or max(parts, default=0) > longest:
+        if len(parts) != section.planes or max(parts, default=0) > section.size // max(section.planes, 1):
             raise DamagedError(f"its header states impossible parts of {section.name}")
         sections[section.name] = section
         offset += sum(parts)
@@ -337,14 +315,18 @@ def read_sections(path: Path, header: Header) -> dict[str, Array]:
                 raise DamagedError(f"the checksum of {section.name} is wrong")
 
         def decode(section: Section) -> Array:
+            if section.size == 0:
+                return np.zeros(section.shape, section.dtype)
             planes, start = [], section.offset
             for part in section.parts:
                 planes.append(_inflated(content[start : start + part], section.size // section.planes))
                 start += part
-            return _join(planes, section)
+            table = np.frombuffer(b"".join(planes), np.uint8).reshape(_rows(section.shape), section.dtype.itemsize, -1)
+            numbers = np.ascontiguousarray(table.transpose(0, 2, 1))
+            return numbers.reshape(-1).view(section.dtype).reshape(section.shape)
 
         wanted = [section for section in header.sections.values() if section.name != PADDING]
-        with ThreadPoolExecutor(_THREADS) as pool:
+        with ThreadPoolExecutor(2) as pool:
             return dict(zip([section.name for section in wanted], pool.map(decode, wanted), strict=True))
 
 
@@ -353,24 +335,8 @@ def _inflated(part: memoryview, size: int) -> bytes:
     if len(part) == size:
         return bytes(part)
     inflate = zlib.decompressobj(wbits=-15)
-    try:
+    with suppress(zlib.error):
         plane = inflate.decompress(part, size + 1)
-    except zlib.error as error:
-        raise DamagedError("a section cannot be decompressed") from error
-    if len(plane) != size or not inflate.eof or inflate.unused_data:
-        raise DamagedError("a section cannot be decompressed")
-    return plane
-
-
-def _join(planes: Sequence[bytes], section: Section) -> Array:
-    """The array of planes of :func:`split_planes`."""
-    if not planes:
-        return np.zeros(section.shape, section.dtype)
-    size = section.dtype.itemsize
-    if len(planes) == 1:
-        return np.frombuffer(planes[0], section.dtype).reshape(section.shape)
-    rows = _rows(section.shape)
-    table = np.empty((rows, math.prod(section.shape) // rows, size), np.uint8)
-    for i, plane in enumerate(planes):
-        table[i // size, :, i % size] = np.frombuffer(plane, np.uint8)
-    return table.reshape(-1).view(section.dtype).reshape(section.shape)
+        if len(plane) == size and inflate.eof and not inflate.unused_data:
+            return plane
+    raise DamagedError("a section cannot be decompressed")

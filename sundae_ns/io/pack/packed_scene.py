@@ -52,13 +52,11 @@ class PackedScene:
 
 
 class PackReport(NamedTuple):
-    """Size of a packed scene."""
+    """Bytes of a packed scene, of each of its sections, and of ``header``."""
 
     primitives: int
     bytes: int
-    """Bytes of the file."""
     sections: dict[str, int]
-    """Bytes of each section, and of ``header``."""
 
     @property
     def bits(self) -> dict[str, float]:
@@ -87,23 +85,16 @@ def _check(params: Mapping[str, Tensor]) -> None:
     ):
         raise PackError(f"features has shape {list(features.shape)}; it must be [{n}, 1 to {_MAX_WIDTH}]")
     known = {name: params[name].float() for name in (*SPLAT_NAMES, FEATURES) if name in params}
-    broken = n - int(finite_mask(known).sum())
-    if broken:
+    if broken := n - int(finite_mask(known).sum()):
         raise PackError(f"{broken} of {n} Gaussians are not finite (NaN or infinite); prune the field first")
 
 
-# ------------------------------------------------------------------------------------------------------------- encoding
-
-
 def fit_scene(scene: PackedScene, config: PackConfig | None = None) -> tuple[PackedScene, Codecs]:
-    """Fit codecs to a scene.
-
-    Returns:
-        The scene with its Gaussians in the stored order and with rounded positions, and the codecs.
+    """The scene with its Gaussians in the stored order and with rounded positions, and codecs fitted to it.
 
     Raises:
         ConfigError: an option is invalid.
-        PackError: the field has no Gaussians, wrong shapes or values that are not finite.
+        PackError: there are no Gaussians, wrong shapes or values that are not finite.
     """
     config = config or PackConfig()
     config.validate()
@@ -150,7 +141,7 @@ def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int
         head = codecs.head.encode(scene.head)
         coded["head"] = head, entropy.predecessors(len(head[1]))
     with ThreadPoolExecutor(2) as pool:
-        streams = pool.map(lambda one: entropy.encode_levels(one[0][1], one[1]), coded.values())
+        streams = pool.map(lambda stored: entropy.encode_levels(stored[0][1], stored[1]), coded.values())
         for (name, ((entry, _, parts), _)), stream in zip(coded.items(), streams, strict=True):
             about[name] = entry
             arrays |= {f"{name}/levels": stream, **{f"{name}/{part}": array for part, array in parts.items()}}
@@ -166,9 +157,6 @@ def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int
     return container.encode(meta, arrays, unpacked=unpacked)
 
 
-# ------------------------------------------------------------------------------------------------------------- decoding
-
-
 class _Reader:
     """Header and sections of a file; each section is checked before use. All methods raise ``DamagedError``."""
 
@@ -182,8 +170,7 @@ class _Reader:
         entry = self.meta["attributes"].get(attribute)
         if entry is None:
             raise DamagedError(f"its header has no valid attributes.{attribute}")
-        found: dict[str, Any] = entry
-        return found
+        return entry  # type: ignore[no-any-return]
 
     def array(self, attribute: str, part: str, **lengths: int) -> Array:
         """A section in the dtype, shape and range that the format states; ``lengths`` are sides that it names."""
@@ -258,7 +245,9 @@ def read_scene(path: Path) -> PackedScene:
     """
     header = container.read_header(path)
     with container.naming(path):
-        n, width, features = _shape(header.meta)
+        container.check(header.meta, "header")
+        n, attributes = int(header.meta["primitives"]), header.meta["attributes"]
+        width, features = (int(attributes.get(name, {"width": 0})["width"]) for name in ("features_rest", FEATURES))
         container.check_ratio(4 * n * (14 + width + features), header.size)
         return _decoded(_Reader(header, container.read_sections(path, header)), n, width, features)
 
@@ -268,9 +257,6 @@ def _decoded(reader: _Reader, n: int, width: int, features: int) -> PackedScene:
     low, high = (reader.array("means", end, blocks=-(-n // size)) for end in ("low", "high"))
     blocks = Blocks(reader.decoded("means", "gaps", entropy.decode_gaps, n, size, bits), low, high)
     near = entropy.neighbours_of(blocks.cells, size)
-
-    def means() -> Array:
-        return quantize.dequantize_positions(blocks, bits, size)
 
     def quats() -> Array:
         levels, step = reader.levels("quats", near, 3)
@@ -289,17 +275,9 @@ def _decoded(reader: _Reader, n: int, width: int, features: int) -> PackedScene:
         head = pool.submit(_decode_head, reader)
         jobs["quats"] = pool.submit(quats)
         jobs |= {name: pool.submit(rows, name, channels) for name, channels in narrow.items()}
-        jobs["means"] = pool.submit(means)
+        jobs["means"] = pool.submit(quantize.dequantize_positions, blocks, bits, size)
         gaussians = {name: torch.from_numpy(job.result()) for name, job in jobs.items()}
-    rest = gaussians.get("features_rest")
-    gaussians["features_rest"] = torch.zeros(n, 0, 3) if rest is None else rest.reshape(n, width // 3, 3)
+    gaussians["features_rest"] = gaussians.get("features_rest", torch.zeros(0)).reshape(n, width // 3, 3)
     ordered = {name: gaussians[name] for name in (*SPLAT_NAMES, FEATURES) if name in gaussians}
     meta = {name: value for name, value in reader.meta.items() if name not in ("sections", "attributes", "primitives")}
     return PackedScene(ordered, head.result(), _decode_cameras(reader), meta)
-
-
-def _shape(meta: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Numbers of Gaussians, of SH values of degrees 1 and up, and of features, from the header alone."""
-    container.check(meta, "header")
-    width, features = (int(meta["attributes"].get(name, {"width": 0})["width"]) for name in ("features_rest", FEATURES))
-    return int(meta["primitives"]), width, features

@@ -28,14 +28,14 @@ _LEAST_EIGENVALUE = 0.02  # of a form, relative to the mean: other cameras see m
 
 
 class Blocks(NamedTuple):
-    """Positions in blocks of neighbours; per block and axis, the error is at most (high - low) / (2^bits - 1) / 2."""
+    """Positions in blocks of neighbours; per block and axis, the error is at most (high - low) / (2^bits - 1) / 2.
+
+    ``codes`` ``[N]`` are Morton codes of cells, ascending in each block; ``low`` and ``high`` its bounds ``[B, 3]``.
+    """
 
     codes: NDArray[np.uint64]
-    """Morton codes of the cells, ascending in each block ``[N]``."""
     low: Floats
-    """Lower bounds of the blocks ``[B, 3]``."""
     high: Floats
-    """Upper bounds of the blocks ``[B, 3]``."""
 
     @property
     def cells(self) -> NDArray[np.uint64]:
@@ -47,7 +47,7 @@ def quantize_positions(means: Floats, bits: int, size: int) -> tuple[Blocks, NDA
     """Round positions to a grid in each block, and sort each block by Morton code, so that differences are small.
 
     Args:
-        means: ``[N, 3]``, finite, in the order of ``morton.scene_order``.
+        means: ``[N, 3]``, finite, in the order of ``coordinates.scene_order``.
         bits: bits of each coordinate of a cell.
         size: Gaussians per block.
 
@@ -73,14 +73,6 @@ def dequantize_positions(packed: Blocks, bits: int, size: int) -> Floats:
     return (packed.cells * step[block] + packed.low[block]).astype(np.float32)
 
 
-def _turns() -> NDArray[np.float64]:
-    """The 24 rotations of a cube as unit quaternions wxyz ``[24, 4]``."""
-    found = [q for q in itertools.product((1, 0, -1), repeat=4) if np.count_nonzero(q) in (1, 2, 4)]
-    # Of a quaternion and its negative, keep the one whose first component that is not 0 is positive.
-    kept = np.array([q for q in found if q > (0, 0, 0, 0)], np.float64)
-    return kept / np.linalg.norm(kept, axis=1, keepdims=True)
-
-
 def aligned(quats: Floats, scales: Floats) -> tuple[Floats, Floats]:
     """Turn the axes of ellipsoids so that their rotations are as small as possible; the ellipsoids are the same.
 
@@ -94,7 +86,10 @@ def aligned(quats: Floats, scales: Floats) -> tuple[Floats, Floats]:
     Returns:
         Unit quaternions ``[N, 4]`` with w positive, and the scales in their new order ``[N, 3]``.
     """
-    turns = _turns()
+    # The 24 rotations of a cube; of a quaternion and its negative, the one whose first nonzero component is positive.
+    candidates = [q for q in itertools.product((1, 0, -1), repeat=4) if np.count_nonzero(q) in (1, 2, 4)]
+    turns = np.array([q for q in candidates if q > (0, 0, 0, 0)], np.float64)
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     w, x, y, z = torch.from_numpy(quats).double().T.numpy()
     products = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     best = np.abs(np.einsum("cn,gc->gn", products[0], turns)).argmax(axis=0)
@@ -168,7 +163,7 @@ class Transform:
     basis: Tensor
     """Change of a row per step of each coefficient, in 127ths of the step, int8 ``[D, D]``."""
     inverse: Tensor
-    """Matrix from rows to coefficients, float64 ``[D, D]``."""
+    """From rows to coefficients, float64 ``[D, D]``."""
     step: float
 
     @property
@@ -220,7 +215,7 @@ def fit_transform(rows: Floats, step: float, *, centred: bool = True, form: Tens
     shrunk = values / np.sqrt(np.maximum(np.linalg.norm(values, axis=1, keepdims=True), step))
     axes = np.linalg.eigh(shrunk.T @ shrunk)[1][:, ::-1].T @ back
     largest = float(np.abs(axes).max()) if form is not None else 1.0
-    # In the order of a file: products of other layouts round differently.
+    # Contiguous, as from a file: products of other layouts round differently.
     basis = np.ascontiguousarray(np.rint(axes / largest * _UNIT).astype(np.int8))
     # Invert the stored basis, so that its rounding adds no error.
     inverse = torch.from_numpy(np.linalg.inv(basis / _UNIT))
