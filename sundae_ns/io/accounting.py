@@ -1,4 +1,4 @@
-"""Stored bytes of the Gaussians and of the head. MB means 1e6 bytes."""
+"""Stored bytes of the Gaussians and of the head."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ from torch import Tensor, nn
 
 from sundae_ns.head.head import CompensationHead, HeadConfig
 
-BYTES_PER_FLOAT = 4
-
 
 def bytes_of(params: Mapping[str, Tensor]) -> int:
-    """Bytes of a field's parameters in fp32, feature vectors included, for any dtype in memory."""
-    return sum(value.numel() for value in params.values()) * BYTES_PER_FLOAT
+    """Bytes of the parameters of Gaussians in fp32, feature vectors included, for any dtype in memory."""
+    return sum(value.numel() for value in params.values()) * 4
 
 
 def bytes_of_module(module: nn.Module) -> int:
@@ -25,20 +23,15 @@ def bytes_of_module(module: nn.Module) -> int:
 
 
 def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
-    """Bytes of a field and its head, whose weights are not allocated; the one count that decides in training."""
+    """Bytes of Gaussians and their head, whose weights are not allocated; the one count that decides in training."""
     if head is None or head.mode == "off":
         return bytes_of(params)
     with torch.device("meta"):
         return bytes_of(params) + bytes_of_module(CompensationHead(head))
 
 
-def megabytes(count: int) -> str:
-    """Format bytes in MB = 1e6 bytes: ``31.10 MB``."""
-    return f"{count / 1e6:.2f} MB"
-
-
 class Sizes(NamedTuple):
-    """Stored bytes of a compensated field."""
+    """Stored bytes of Gaussians and of their head."""
 
     primitives: int
     head: int = 0

@@ -155,32 +155,14 @@ def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
     raise CheckpointError(f"{folder} holds no whole checkpoint{reasons}; give the folder of a run that saved one")
 
 
-def extra_state(
-    *,
-    step: int,
-    num_features: int,
-    encoding: Encoding,
-    running: Mapping[str, Mapping[str, Any]],
-    train_callbacks: Mapping[str, Mapping[str, Any]],
-    trained_focal: tuple[float, float] | None,
-    head_enabled: bool,
-) -> dict[str, Any]:
+def extra_state(**entries: Any) -> dict[str, Any]:
     """State of a model beside its tensors: plain numbers, strings, and tensors.
 
-    ``num_features`` is the configured length, 0 without a head. ``running`` has the states of ``densification`` and
-    ``pruning``. ``trained_focal`` is the shortest and the longest focal length that the head was trained at, pixels.
+    ``step``; ``num_features`` as configured, 0 without a head; ``encoding`` of colours; ``running`` with the states of
+    ``densification`` and ``pruning``; ``extensions`` with those of the callbacks, by name; ``trained_focal``, the
+    shortest and the longest focal length that the head was trained at, pixels; ``head_enabled``.
     """
-    return {
-        "method": "sundae",
-        "format": FORMAT,
-        "step": step,
-        "num_features": num_features,
-        "encoding": encoding,
-        "running": {name: dict(value) for name, value in running.items()},
-        "extensions": {name: dict(value) for name, value in train_callbacks.items()},
-        "trained_focal": None if trained_focal is None else list(trained_focal),
-        "head_enabled": head_enabled,
-    }
+    return {"method": "sundae", "format": FORMAT, **entries}
 
 
 def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Encoding) -> Mapping[str, Any]:

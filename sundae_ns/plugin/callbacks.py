@@ -14,7 +14,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sundae_ns.io.accounting import BYTES_PER_FLOAT, bytes_of_module, megabytes
+from sundae_ns.io.accounting import bytes_of, bytes_of_module
 from sundae_ns.io.config_file import find_config
 from sundae_ns.io.run_folder import take_records
 from sundae_ns.plugin.datamanager import SundaeDatamanager
@@ -181,10 +181,9 @@ class NerfstudioRun:
             quality = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
             _say(f"trained: {quality} on {len(self._datamanager.eval_dataset)} test views")
         head = self.state.head if self.state.head_enabled else None
-        numbers = sum(value.numel() for value in self.state.gaussians.values())
-        size = BYTES_PER_FLOAT * numbers + (0 if head is None else bytes_of_module(head))
+        size = bytes_of(self.state.gaussians) + (0 if head is None else bytes_of_module(head))
         with_head = f"{'without' if head is None else 'with'} a head"
-        _say(f"{self.source.total:,} Gaussians, {with_head}: {megabytes(size)} before packing")
+        _say(f"{self.source.total:,} Gaussians, {with_head}: {size / 1e6:.2f} MB before packing")
         _say(f"next: {shlex.join(['sundae', 'pack', str(self.folder), '-o', 'scene.sundae'])}")
 
 

@@ -171,8 +171,8 @@ class SundaeModel(SplatfactoModel):
             num_features=self.config.num_features,
             encoding=state.gaussians.encoding,
             running=state.running_states(),
-            train_callbacks={callback.name: callback.state_dict() for callback in self.train_callbacks},
-            trained_focal=state.trained_focal,
+            extensions={callback.name: dict(callback.state_dict()) for callback in self.train_callbacks},
+            trained_focal=state.trained_focal and list(state.trained_focal),
             head_enabled=state.head_enabled,
         )
 

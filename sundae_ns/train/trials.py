@@ -36,7 +36,7 @@ from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.core.metrics import MOST_PSNR, SSIM_WINDOW, fitted_psnr, psnr, ssim
 from sundae_ns.core.surgery import replace_parameter
 from sundae_ns.head.head import HeadConfig
-from sundae_ns.io.accounting import megabytes, stored_bytes
+from sundae_ns.io.accounting import stored_bytes
 from sundae_ns.io.coordinates import scene_order
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.pruning.decision import Pruner
@@ -772,6 +772,6 @@ def _figures(tried: list[Tried]) -> dict[str, dict[str, Any]]:
 def _in_words(figures: Mapping[str, Mapping[str, Any]]) -> str:
     return "; ".join(
         f"{NAMES[name]} {figure['psnr']:.2f} dB, SSIM {figure['ssim']:.4f}"
-        + ("" if figure["bytes"] is None else f", {megabytes(figure['bytes'])}")
+        + ("" if figure["bytes"] is None else f", {figure['bytes'] / 1e6:.2f} MB")
         for name, figure in figures.items()
     )

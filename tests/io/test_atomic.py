@@ -174,7 +174,7 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
 def test_errors_of_reading_name_the_file(raised: Exception, kind: type[Exception], message: str) -> None:
     with (
         pytest.raises(kind, match=f"^{message}$"),
-        reading(Path("a.x"), "a whole x", PackError, sanitise="get it again"),
+        reading(Path("a.x"), "a whole x", PackError, remedy="get it again"),
     ):
         raise raised
 

@@ -15,18 +15,15 @@ import pytest
 import torch
 from foreign_files import FOREIGN, colors_of, small_field, write_colored_ply, write_compressed_ply, write_gsplat
 from foreign_files import write_splat as write_small_splat
-from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.formats import kind_of, read_gaussian_file, unread
-from sundae_ns.io.ply import ply_comments, read_ply, read_point_cloud, write_ply
 from sundae_ns.io.sog import write_sog
 
 FIELD = small_field()
-RGB = ("red", "green", "blue")
 
 
 def found(path: Path) -> dict[str, Tensor]:
@@ -97,26 +94,6 @@ def test_colours_in_place_of_harmonics(tmp_path: Path, dtype: str, most: float) 
         {"means": 0, "scales": 0, "quats": 1e-6, "features_dc": 0.002, "opacities": 1e-6},
     )
     assert read.in_model_frame
-
-
-def test_harmonics_come_before_colours(tmp_path: Path) -> None:
-    """Some programs write both, the colours for viewers of points."""
-    write_ply(tmp_path / "a.ply", FIELD)
-    content = (tmp_path / "a.ply").read_bytes()
-    (tmp_path / "b.ply").write_bytes(content.replace(b"nx", b"red", 1).replace(b"ny", b"green").replace(b"nz", b"blue"))
-    assert torch.equal(read_ply(tmp_path / "b.ply")["features_dc"], FIELD["features_dc"])
-
-
-@pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
-def test_a_header_with_other_letters(tmp_path: Path, newline: bytes) -> None:
-    write_ply(tmp_path / "a.ply", FIELD)
-    header, end, rows = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
-    comment = "comment Aufnahme: Küche, 東京, end_header\n".encode()
-    changed = header.replace(b"element", comment + b"comment \xff\xe9\nelement", 1) + end
-    (tmp_path / "b.ply").write_bytes(changed.replace(b"\n", newline) + rows)
-    values = read_ply(tmp_path / "b.ply")
-    assert all(torch.equal(values[name], FIELD[name]) for name in SPLAT_NAMES)
-    assert ply_comments(tmp_path / "b.ply")[0] == "Aufnahme: Küche, 東京, end_header"
 
 
 def test_gsplat(tmp_path: Path) -> None:
@@ -235,16 +212,6 @@ def test_other_folders_are_refused(tmp_path: Path, change: dict[str, Any], messa
     meta.write_text(json.dumps(content))
     with pytest.raises(DataError, match=re.escape(message)):
         read_gaussian_file(meta)
-
-
-@pytest.mark.parametrize("text", [False, True])
-def test_a_cloud_with_a_comment_in_utf_8(tmp_path: Path, text: bool) -> None:
-    rows = np.array([(0.5, -1.25, 2.0, 10, 20, 30)], [(n, "f4") for n in "xyz"] + [(n, "u1") for n in RGB])
-    PlyData([PlyElement.describe(rows, "vertex")], text=text).write(str(tmp_path / "a.ply"))
-    content = (tmp_path / "a.ply").read_bytes().replace(b"element", "comment Küche 東京\nelement".encode(), 1)
-    (tmp_path / "b.ply").write_bytes(content)
-    points, colors = read_point_cloud(tmp_path / "b.ply")
-    assert (points.tolist(), colors.tolist()) == ([[0.5, -1.25, 2.0]], [[10, 20, 30]])
 
 
 def test_kinds(tmp_path: Path) -> None:

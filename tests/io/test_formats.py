@@ -19,7 +19,7 @@ from torch import Tensor
 
 from sundae_ns.core.errors import CheckpointError, ConfigError, DataError
 from sundae_ns.core.gaussians import Gaussians
-from sundae_ns.io.accounting import Sizes, bytes_of, bytes_of_module, megabytes
+from sundae_ns.io.accounting import bytes_of, bytes_of_module
 from sundae_ns.io.formats import ANTIALIASED, FORMATS, kind_of, read_gaussian_file, refuse, write_for_viewers
 from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
 from sundae_ns.io.ply import read_ply, write_ply
@@ -206,4 +206,3 @@ def test_bytes_of_fields_and_modules() -> None:
     b.weight = a.weight
     assert bytes_of_module(torch.nn.ModuleList([a, b])) == 36
     assert bytes_of_module(torch.nn.BatchNorm1d(8).half()) == 2 * 4 * 8 + 8  # counts its batches in one int64
-    assert megabytes(Sizes(23_600_000, 7_800_000).total) == "31.40 MB"

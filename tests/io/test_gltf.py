@@ -104,7 +104,7 @@ def test_a_file_of_another_program() -> None:
     found = read_glb(THEIRS)
     torch.testing.assert_close(found[0]["means"], theirs()["means"])
     assert found[0]["features_rest"].shape == (5, 8, 3)
-    assert not found.in_model_frame
+    assert not found[2]
     assert sn.load(THEIRS).num_gaussians == 5
 
 
@@ -202,7 +202,7 @@ HOSTILE: dict[str, tuple[Callable[[Document], object], str]] = {
     "no Gaussians": (_mesh, f"no mesh of its scene has {EXTENSION}"),
     "no widths": (_without, "SCALE"),
     "another kernel": (_splats(kernel="box"), "of another kernel"),
-    "compressed": (_splats(train_callbacks={"KHR_gaussian_splatting_compression_spz": {}}), "compressed"),
+    "compressed": (_splats(extensions={"KHR_gaussian_splatting_compression_spz": {}}), "compressed"),
     "other colours": (_splats(colorSpace="lin_rec709_display"), "lin_rec709_display"),
     "a node below itself": (_in("nodes", children=[0]), "a node below itself"),
     "a node beyond all": (_in("scenes", nodes=[7]), "not that of a glTF scene"),

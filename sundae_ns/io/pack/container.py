@@ -147,23 +147,22 @@ def parsed(content: bytes) -> Any:
     """A JSON value of UTF-8; ``ValueError`` if it is none, is nested too deeply, or has numbers beyond float64."""
 
     def finite(text: str) -> int | float:
-        value = int(text) if text.lstrip("-").isdigit() else float(text)
-        if not math.isfinite(float(value)):
+        if not math.isfinite(float(text)):
             raise ValueError(f"{text} is beyond float64")
-        return value
+        return int(text) if text.lstrip("-").isdigit() else float(text)
 
-    def nested(value: Any, depth: int) -> None:
+    def check_depth(value: Any, left: int) -> None:
         if isinstance(value, (list, dict)):
-            if depth == 0:
+            if left == 0:
                 raise RecursionError
             for inner in value.values() if isinstance(value, dict) else value:
-                nested(inner, depth - 1)
+                check_depth(inner, left - 1)
 
     try:
         value = json.loads(content.decode(), parse_int=finite, parse_float=finite, parse_constant=finite)
-        nested(value, LIMITS["depth"])
-    except (OverflowError, RecursionError) as error:
-        raise ValueError("a number is beyond float64, or it is nested too deeply") from error
+        check_depth(value, LIMITS["depth"])
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
     return value
 
 

@@ -1,4 +1,4 @@
-"""A scene in one file: field, head and cameras are sections of ``container``, all else is in its header.
+"""A scene in one file: Gaussians, head and cameras are sections of ``container``, all else is in its header.
 
 ``docs/formats.md`` lists the names, shapes and error bounds of all sections.
 """
@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from dataclasses import field as default
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,7 +32,6 @@ CAMERAS: dict[str, dict[str, Any]] = FORMAT["sections"]["cameras"]
 """dtype, shape and range of the arrays of M cameras: ``poses`` ``[M, 3, 4]``, camera-to-world with OpenGL axes in the
 model's coordinates; ``intrinsics`` ``[M, 4]``, fx, fy, cx, cy in pixels; ``sizes`` ``[M, 2]``, width and height."""
 _MAX_WIDTH: int = FORMAT["header"]["properties"]["attributes"]["properties"][FEATURES]["properties"]["width"]["maximum"]
-Decoded = TypeVar("Decoded")
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,10 +166,9 @@ class _Reader:
 
     def about(self, attribute: str) -> dict[str, Any]:
         """The header's entry of an attribute."""
-        entry = self.meta["attributes"].get(attribute)
-        if entry is None:
+        if attribute not in self.meta["attributes"]:
             raise DamagedError(f"its header has no valid attributes.{attribute}")
-        return entry  # type: ignore[no-any-return]
+        return self.meta["attributes"][attribute]  # type: ignore[no-any-return]
 
     def array(self, attribute: str, part: str, **lengths: int) -> Array:
         """A section in the dtype, shape and range that the format states; ``lengths`` are sides that it names."""
@@ -183,17 +181,10 @@ class _Reader:
             raise DamagedError(f"{name} has values that are not finite or out of range")
         return array
 
-    def decoded(self, attribute: str, part: str, decode: Callable[..., Decoded], *arguments: Any) -> Decoded:
-        """What the entropy coder decodes from a section."""
-        stream = self.array(attribute, part)
-        try:
-            return decode(stream, *arguments)
-        except DamagedError as error:
-            raise DamagedError(f"{attribute}/{part}: {error}") from error
-
     def levels(self, name: str, near: Near, width: int) -> tuple[Levels, float]:
         """Levels ``[N, C]`` of an attribute, and their step."""
-        return self.decoded(name, "levels", entropy.decode_levels, width, near), float(self.about(name)["step"])
+        levels = entropy.decode_levels(self.array(name, "levels"), width, near)
+        return levels, float(self.about(name)["step"])
 
 
 def _decode_head(reader: _Reader) -> dict[str, Tensor]:
@@ -208,7 +199,7 @@ def _decode_head(reader: _Reader) -> dict[str, Tensor]:
         raise DamagedError("the head has another number of weights than it states")
     container.check_ratio(4 * count, reader.size)
     near = entropy.predecessors(count)
-    sources["levels"] = reader.decoded("head", "levels", entropy.decode_levels, 1, near).reshape(-1)
+    sources["levels"] = entropy.decode_levels(reader.array("head", "levels"), 1, near).reshape(-1)
 
     def take(part: str, count: int) -> Tensor:
         if count > len(sources[part]):
@@ -255,7 +246,7 @@ def read_scene(path: Path) -> PackedScene:
 def _decoded(reader: _Reader, n: int, width: int, features: int) -> PackedScene:
     bits, size = (int(reader.about("means")[key]) for key in ("bits", "block"))
     low, high = (reader.array("means", end, blocks=-(-n // size)) for end in ("low", "high"))
-    blocks = Blocks(reader.decoded("means", "gaps", entropy.decode_gaps, n, size, bits), low, high)
+    blocks = Blocks(entropy.decode_gaps(reader.array("means", "gaps"), n, size, bits), low, high)
     near = entropy.neighbours_of(blocks.cells, size)
 
     def quats() -> Array:
