@@ -16,20 +16,13 @@ from foreign_files import small_field
 from torch import Tensor
 
 import sundae_ns as sn
-from sundae_ns.core.errors import DataError, SundaeError
-from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.gltf import EXTENSION, read_glb, semantics, write_glb
 
 THEIRS = Path(__file__).parent / "foreign" / "splat_transform.glb"
-"""Five Gaussians of SH degree 2, by ``splat-transform`` 3.7.0 from a .ply that ``theirs`` makes again."""
+"""Five Gaussians of SH degree 2, by ``splat-transform`` 3.7.0 from a .ply with random means of seed 0."""
 Document = dict[str, Any]
-
-
-def theirs() -> dict[str, Tensor]:
-    """What the file was made of."""
-    generator = torch.Generator().manual_seed(0)
-    means = torch.rand(5, 3, generator=generator)
-    return {"means": means}
 
 
 def parts(path: Path) -> tuple[Document, bytes]:
@@ -51,17 +44,6 @@ def close(found: dict[str, Tensor], truth: dict[str, Tensor], tolerance: float =
         if name == "quats":
             a, b = (value * value[:, :1].sign() for value in (a, torch.nn.functional.normalize(b)))
         torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 3])
-@pytest.mark.parametrize("in_model_frame", [False, True])
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_a_field_comes_back(tmp_path: Path, degree: int, in_model_frame: bool, antialiased: bool) -> None:
-    gaussians = small_field(40, degree)
-    write_glb(tmp_path / "a.glb", gaussians, antialiased=antialiased, in_model_frame=in_model_frame)
-    found = read_glb(tmp_path / "a.glb")
-    close(found[0], gaussians)
-    assert found[1:] == (antialiased, in_model_frame)
 
 
 @pytest.mark.parametrize("in_model_frame", [False, True])
@@ -102,7 +84,8 @@ def test_names_and_types_are_those_of_the_extension(tmp_path: Path) -> None:
 
 def test_a_file_of_another_program() -> None:
     found = read_glb(THEIRS)
-    torch.testing.assert_close(found[0]["means"], theirs()["means"])
+    means = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(found[0]["means"], means)
     assert found[0]["features_rest"].shape == (5, 8, 3)
     assert not found[2]
     assert sn.load(THEIRS).num_gaussians == 5
@@ -237,34 +220,9 @@ def test_hostile_files_are_refused_in_one_line(tmp_path: Path, kind: str) -> Non
     assert "\n" not in str(caught.value)
 
 
-def test_any_cut_or_flipped_byte_is_a_success_or_one_line(tmp_path: Path) -> None:
-    write_glb(tmp_path / "a.glb", small_field(4, 1))
-    data, rng = (tmp_path / "a.glb").read_bytes(), np.random.default_rng(0)
-    lines: list[str] = []
-    for round_ in range(300):
-        changed = bytearray(data[: rng.integers(len(data))] if round_ % 3 == 0 else data)
-        for _ in range(rng.integers(1, 4) if changed else 0):
-            changed[rng.integers(len(changed))] = rng.integers(256)
-        (tmp_path / "b.glb").write_bytes(changed)
-        try:
-            sn.load(tmp_path / "b.glb")
-        except SundaeError as error:
-            lines.append(str(error))
-    assert len(lines) > 30
-    assert not any("\n" in line for line in lines)
-
-
 def test_a_field_that_does_not_fit(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="up to 3"):
         write_glb(tmp_path / "a.glb", small_field(4, 4))
     with pytest.raises(DataError, match="no Gaussians"):
         write_glb(tmp_path / "a.glb", small_field(0))
     assert not list(tmp_path.iterdir())
-
-
-def test_the_front_door_writes_and_reads(tmp_path: Path) -> None:
-    scene = sn.Scene(Gaussians(small_field(30)), in_model_frame=True)
-    sn.save(scene, tmp_path / "a.glb")
-    found = sn.load(tmp_path / "a.glb")
-    assert found.in_model_frame
-    close(dict(found.gaussians), dict(scene.gaussians))

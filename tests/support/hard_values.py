@@ -25,3 +25,11 @@ def hard_values(kind: str, n: int, width: int, seed: int) -> NDArray[np.float32]
     elif kind == "far from zero":
         x += 1e6
     return x.astype(np.float32)
+
+
+def drifted(x: NDArray[np.float32], seed: int) -> NDArray[np.float32]:
+    """Values after training: moved, and some out of range."""
+    rng = np.random.default_rng(seed + 1)
+    moved = x + 0.05 * x.std() * rng.normal(size=x.shape)
+    moved[rng.random(len(x)) < 0.01] *= 3
+    return moved.astype(np.float32)

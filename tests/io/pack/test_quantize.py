@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hard_values import KINDS, hard_values
+from hard_values import KINDS, drifted, hard_values
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.io import coordinates
-from sundae_ns.io.pack import quantize
+from sundae_ns.io.pack import entropy, quantize
 from sundae_ns.io.pack.container import Floats
 
 hard = given(st.sampled_from(KINDS), st.integers(1, 700), st.integers(0, 2**16))
@@ -110,6 +110,7 @@ def test_rotations(n: int, seed: int, step: float) -> None:
     q = hard_quaternions(n, seed, 1.0)
     turned, _ = quantize.aligned(q, np.zeros((n, 3), np.float32))
     found = through_rotations(q, step)
+    assert np.array_equal(quantize.Rotations(step).rounded(torch.from_numpy(turned)).numpy(), found)
     assert np.allclose(np.linalg.norm(found, axis=1), 1, atol=1e-6)
     if step < 0.5:
         assert angles(turned.astype(np.float64), found.astype(np.float64)).max() <= quantize.rotation_bound(step) + 2e-6
@@ -141,9 +142,12 @@ def test_weights(kind: str, n: int, seed: int) -> None:
 def test_transform(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 9, seed)
     codec = quantize.fit_transform(x, 0.03)
-    _, levels, arrays = codec.encode(x)
-    arrays["basis"] = arrays["basis"].reshape(9, 9)
-    found = quantize.rows_at(levels, step=codec.step, **arrays).astype(np.float64)
+    for values in (drifted(x, seed), x):  # rounding is what a reader decodes, bit for bit
+        _, levels, arrays = codec.encode(values)
+        arrays["basis"] = arrays["basis"].reshape(9, 9)
+        found = quantize.rows_at(levels, step=codec.step, **arrays).astype(np.float64)
+        assert np.array_equal(codec.rounded(torch.from_numpy(values)).numpy(), found)
+        assert np.abs(levels).max() <= entropy.LARGEST
     # Sums of nine products in float32.
     slack = 20 * ulp(np.linalg.norm(x.astype(np.float64), axis=1, keepdims=True))
     assert (np.abs(found - x) <= codec.bound + slack).all()

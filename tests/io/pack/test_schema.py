@@ -128,11 +128,6 @@ def test_names_are_unique_and_heads_have_no_other_option() -> None:
     assert fault({key: value for key, value in MODEL.items() if key != "sh_degree"}, FORMAT["model"]) == "sh_degree"
 
 
-def test_whole_numbers_may_be_written_as_real_ones() -> None:
-    """JavaScript does not tell 3.0 from 3."""
-    assert fault({**MODEL, "sh_degree": 2.0, "head": {**HEAD, "num_features": 3.0}}, FORMAT["model"]) is None
-
-
 def test_the_format_lists_what_the_code_knows() -> None:
     model = FORMAT["model"]["properties"]
     kinds = get_type_hints(HeadConfig)
