@@ -214,7 +214,7 @@ def _of_head(scene: Scene, cameras: Sequence[Camera]) -> tuple[Tensor, dict[str,
     for i in torch.linspace(0, len(cameras) - 1, min(8, len(cameras))).round().int().tolist():
         camera = cameras[i]
         if camera.width * camera.height > 1 << 17:
-            camera = camera.zoomed((1 << 17 / (camera.width * camera.height)) ** 0.5)
+            camera = camera.zoomed((2**17 / (camera.width * camera.height)) ** 0.5)
         image = render_view(source, camera, scene.background, settings, depth=False)[0]["rgb"]
         random = torch.randint(0, 2, image.shape, generator=signs) * 2.0 - 1
         of_features, *grads = torch.autograd.grad((image * random).sum(), [features, *weights.values()])

@@ -330,9 +330,9 @@ def test_prune_uses_the_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     devices: list[str] = []
     whole = pruning.prune_with_mask
 
-    def noted(scene: sn.Scene, **options: Any) -> pruning.PrunedScene:
+    def noted(scene: sn.Scene, *arguments: Any, **options: Any) -> pruning.PrunedScene:
         devices.append(scene.device.type)
-        return whole(scene, **options)
+        return whole(scene, *arguments, **options)
 
     monkeypatch.setattr(pruning, "prune_with_mask", noted)
     sn.save(sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3)), tmp_path / "a.ply")
