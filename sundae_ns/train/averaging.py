@@ -22,12 +22,6 @@ AVERAGED_EVERY = 10  # Steps between two weights that count: neighbours differ b
 NamedTensors = Mapping[str, Tensor]
 
 
-@torch.no_grad()
-def _put(values: NamedTensors, weights: NamedTensors) -> None:
-    for name, value in values.items():
-        weights[name].copy_(value)
-
-
 class RunningMean:
     """The mean of weights that are counted in one after another.
 
@@ -59,22 +53,24 @@ class RunningMean:
         self.count += 1
         torch._foreach_lerp_([self.values[name] for name in weights], list(weights.values()), 1 / self.count)
 
+    @torch.no_grad()
     def replace(self, weights: NamedTensors) -> dict[str, Tensor]:
         """Put the mean, if one fits, in the place of weights; returns their copies, which are empty without a mean."""
         if not self.fits(weights):
             return {}
         copies = {name: value.clone() for name, value in weights.items()}
-        _put(self.values, weights)
+        for name, value in self.values.items():
+            weights[name].copy_(value)
         return copies
 
     @contextmanager
     def shown(self, weights: NamedTensors) -> Iterator[None]:
         """Put the mean, if one fits, in the place of weights for the length of a block."""
-        own = self.replace(weights)
+        copies = self.replace(weights)
         try:
             yield
         finally:
-            _put(own, weights)
+            RunningMean(copies, len(copies)).replace(weights)
 
     def fits(self, weights: NamedTensors) -> bool:
         """Whether there is a mean, and of weights of these names and shapes."""
@@ -110,10 +106,7 @@ class Averaging(Callback):
         self._alone = True
 
     def state_dict(self) -> dict[str, Any]:
-        """The mean so far, or the weights that it has replaced.
-
-        Several ranks save neither, because each has those of its own shard: resumed, they go on from the mean.
-        """
+        """The mean so far, or the weights that it has replaced; neither of several ranks, as each has its shard."""
         return {**self._mean.state_dict(), "replaced": self._replaced} if self._alone else {}
 
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The parts of a model, built from its options: parameters, networks, state and extensions."""
+"""The parts of a model, built from its options: parameters, networks, state and callbacks."""
 
 from __future__ import annotations
 
@@ -27,19 +27,27 @@ def check(options: Any) -> None:
     options.pruning.validate()
     if options.head.mode != "off":
         options.head.validate()
-    for name in ("base_loss_weight", "prior_after_prune"):
-        if getattr(options, name) < 0:
-            raise ConfigError(f"{name.replace('_', '-')} is {getattr(options, name)}; give 0 or more")
-    if options.dense_start_views < 0:
-        raise ConfigError(f"dense-start-views is {options.dense_start_views}; give a number of images, 0 for no sweep")
-    if not 0 <= options.average_share <= 1:
-        raise ConfigError(
-            f"average-share is {options.average_share}; give a share of the schedule, 0.1 for the last tenth"
-        )
-    if options.warm_start is not None and options.pruning.mode == "continuous":
-        raise ConfigError("a warm start is pruned at once, not while it grows: set pruning.mode to one-shot")
-    if options.use_bilateral_grid:
-        raise ConfigError("sundae has no bilateral grid: the head would learn against it; use splatfacto for it")
+    warm_while_growing = options.warm_start is not None and options.pruning.mode == "continuous"
+    refusals = [
+        (options.base_loss_weight < 0, f"base-loss-weight is {options.base_loss_weight}; give 0 or more"),
+        (options.prior_after_prune < 0, f"prior-after-prune is {options.prior_after_prune}; give 0 or more"),
+        (
+            options.dense_start_views < 0,
+            f"dense-start-views is {options.dense_start_views}; give a number of images, 0 for no sweep",
+        ),
+        (
+            not 0 <= options.average_share <= 1,
+            f"average-share is {options.average_share}; give a share of the schedule, 0.1 for the last tenth",
+        ),
+        (warm_while_growing, "a warm start is pruned at once, not while it grows: set pruning.mode to one-shot"),
+        (
+            options.use_bilateral_grid,
+            "sundae has no bilateral grid: the head would learn against it; use splatfacto for it",
+        ),
+    ]
+    for refused, message in refusals:
+        if refused:
+            raise ConfigError(message)
 
 
 def build(
@@ -54,9 +62,7 @@ def build(
         frame: transform from the capture's coordinates to the model's, if known.
 
     Returns:
-        State of field and head; extensions in their order (dense start, densification, removal of floaters, trials,
-        scheduled pruning, trials after the prune, gains of the photos, averaging; trials and averaging optional);
-        what to announce when training starts.
+        State of Gaussians and head; callbacks in their order; what to announce when training starts.
 
     Raises:
         ConfigError: an option cannot work.
@@ -79,18 +85,16 @@ def build(
     densification.initialize(state)
     state.pruning = schedule.initialize_state()
     begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
-    removal = FloaterRemoval(None if points is None else points[0])
-    dense = DenseStart(options, points, num_images, num_features=num_features, cap=strategy.cap)
-    train_callbacks: list[Callback] = [dense, densification, removal]
+    train_callbacks: list[Callback] = [
+        DenseStart(options, points, num_images, num_features=num_features, cap=strategy.cap),
+        densification,
+        FloaterRemoval(None if points is None else points[0]),
+    ]
     scheduled, decides_head = ScheduledPruning(schedule, evaluate=options.evaluate_prune), options.head.mode == "auto"
     if pruning.decides or decides_head:
+        weight = options.ssim_lambda
         trials = Trials(
-            pruning,
-            state,
-            densification,
-            begins_at=begins_at,
-            decides_head=decides_head,
-            ssim_weight=options.ssim_lambda,
+            pruning, state, densification, begins_at=begins_at, decides_head=decides_head, ssim_weight=weight
         )
         train_callbacks += [trials, scheduled, AfterPrune(trials)]
     else:

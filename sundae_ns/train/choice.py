@@ -85,13 +85,7 @@ def mean_quality(views: Sequence[HeldOutQuality]) -> tuple[float, float]:
 
 
 def spread_cameras(indices: Sequence[int], count: int, half: int) -> list[int]:
-    """``count`` views evenly over a capture, because neighbours in a path look alike.
-
-    Args:
-        indices: of the training views.
-        count: number of views.
-        half: 0 or 1: two choices of the same number that share no view.
-    """
+    """``count`` indices evenly over a capture, as neighbours look alike; those of half 0 and 1 share none."""
     return [indices[(2 * i + half) * len(indices) // (2 * count)] for i in range(count)]
 
 
@@ -132,16 +126,14 @@ def best_head(tried: Sequence[Tried], folds: int) -> str:
     for first in range(0, len(tried) - folds + 1, folds):
         rows = list(tried[first : first + folds])
         if best:
-            (psnr, ssim), (better, closer) = (mean_quality(_views(found)) for found in (best, rows))
+            (psnr, ssim), (better, closer) = (
+                mean_quality([view for row in candidate for view in row.qualities]) for candidate in (best, rows)
+            )
             doublings = math.log2(sum(rows[0].bytes or [1]) / sum(best[0].bytes or [1]))
             if not is_enough(better - psnr, closer - ssim, doublings):
                 continue
         best = rows
     return best[0].head if best else "plain"
-
-
-def _views(rows: Sequence[Tried]) -> list[HeldOutQuality]:
-    return [view for row in rows for view in row.qualities]
 
 
 class HeadGain(NamedTuple):
@@ -166,7 +158,7 @@ class HeadGain(NamedTuple):
         return gain
 
     def falls_by(self, count: int, power: float) -> float:
-        """Factor of the gain at another count. Fewer Gaussians than in the trials were not tried with a head."""
+        """Factor of the gain at another count; below that of the trials it is not known to rise."""
         return (self.primitives / max(count, self.primitives)) ** power
 
     def bytes_of(self, count: int) -> int | None:
@@ -296,9 +288,9 @@ def choose(curve: Sequence[CurvePoint], tolerance: Tolerance) -> int:
     index = good[-1]
     if index + 1 == len(curve) or not math.isfinite(over[index + 1]):
         return curve[index].count
-    part = (1 - over[index]) / (over[index + 1] - over[index])
+    share = (1 - over[index]) / (over[index + 1] - over[index])
     large, small = (math.log(point.count) for point in curve[index : index + 2])
-    return round(math.exp(large + part * (small - large)))
+    return round(math.exp(large + share * (small - large)))
 
 
 def choose_within(
@@ -315,15 +307,14 @@ def choose_within(
 
 def affordable(curve: Sequence[CurvePoint], most: int) -> int | None:
     """Largest count whose packed field fits into ``most`` bytes, by the estimates; None if no size is known."""
-    known = [(math.log(point.count), math.log(point.bytes)) for point in curve if point.bytes]
-    if not known:
+    sizes = {math.log(point.count): math.log(point.bytes) for point in curve if point.bytes}
+    if not sizes:
         return None
-    rest = max(most, 1)
-    if len(known) == 1:
-        return max(int(math.exp(known[0][0]) * rest / math.exp(known[0][1])), 1)
-    x, y = (np.array(column) for column in zip(*known, strict=True))
+    x, y, size = [*sizes], [*sizes.values()], math.log(max(most, 1))
+    if len(sizes) == 1:
+        return max(int(math.exp(x[0] + size - y[0])), 1)
     slope, start = np.polyfit(x, y, 1)
-    return max(int(math.exp((math.log(rest) - start) / max(slope, 0.1))), 1)
+    return max(int(math.exp((size - start) / max(slope, 0.1))), 1)
 
 
 def still_climbs(curve: Sequence[CurvePoint], tolerance: Tolerance) -> bool:

@@ -18,37 +18,27 @@ RECORD = "trials.json"  # in the folder of a run
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """What to expect of a field of one count, on the held-out training views."""
+    """What to expect of one number of Gaussians, on the held-out training views."""
 
-    count: int
-    """Number of Gaussians."""
+    count: int  # Number of Gaussians
     bytes: int | None
     """Bytes of the packed scene, with a head if trials have found that it pays, estimated; None if unknown."""
-    psnr: float
-    """Expected PSNR after a fit of colours to each photo, dB. Differences to other points are more certain."""
-    ssim: float
-    """Expected SSIM."""
-    psnr_loss: float
-    """PSNR (dB) that is lost against the best count for it; so for SSIM."""
-    ssim_loss: float
-    psnr_error: float
-    """Standard error of the loss over the views, dB."""
-    ssim_error: float
-    """Standard error of the loss of SSIM over the views."""
+    psnr: float  # Expected PSNR after a fit of colours to each photo, dB; differences to other points are more certain
+    ssim: float  # Expected SSIM
+    psnr_loss: float  # PSNR that is lost against the best count for it, dB
+    ssim_loss: float  # SSIM that is lost against the best count for it
+    psnr_error: float  # Standard error of the loss over the views, dB
+    ssim_error: float  # Standard error of the loss of SSIM over the views
 
 
 @dataclass(frozen=True)
 class CountCurve:
     """The record of a decision."""
 
-    chosen: int
-    """The number of Gaussians that the run has kept."""
-    full: int
-    """Their number before the prune."""
-    reason: str
-    """Why this number was chosen."""
-    points: tuple[CurvePoint, ...]
-    """What was tried, largest count first."""
+    chosen: int  # Number of Gaussians that the run has kept
+    full: int  # Their number before the prune
+    reason: str  # Why this number was chosen
+    points: tuple[CurvePoint, ...]  # What was tried, largest count first
 
 
 def read_count_curve(folder: Path) -> CountCurve | None:
@@ -60,13 +50,13 @@ def read_count_curve(folder: Path) -> CountCurve | None:
     Raises:
         CheckpointError: the record is damaged.
     """
-    path, names = folder / RECORD, {gaussians.name for gaussians in fields(CurvePoint)}
+    path, names = folder / RECORD, {entry.name for entry in fields(CurvePoint)}
     try:
-        found = json.loads(path.read_text(encoding="utf-8")).get("count")
-        if found is None:
+        record = json.loads(path.read_text(encoding="utf-8")).get("count")
+        if record is None:
             return None
-        points = [CurvePoint(**{name: _number(point[name]) for name in names}) for point in found["curve"]]  # type: ignore[arg-type]
-        return CountCurve(int(found["chosen"]), int(found["full"]), str(found["reason"]), tuple(points))
+        points = [CurvePoint(**{name: _number(point[name]) for name in names}) for point in record["curve"]]  # type: ignore[arg-type]
+        return CountCurve(int(record["chosen"]), int(record["full"]), str(record["reason"]), tuple(points))
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
@@ -90,14 +80,12 @@ def expected_change(points: Sequence[CurvePoint], count: int, other: int) -> tup
         count, other: numbers of Gaussians.
     """
     known = sorted((point for point in points if math.isfinite(point.psnr_loss)), key=lambda point: point.count)
-    if not known or not all(known[0].count <= one <= known[-1].count for one in (count, other)):
+    if not known or not all(known[0].count <= end <= known[-1].count for end in (count, other)):
         return None
-    places = [math.log(point.count) for point in known]
-    changes = []
-    for losses in ([point.psnr_loss for point in known], [point.ssim_loss for point in known]):
-        before, after = np.interp([math.log(count), math.log(other)], places, losses)
-        changes.append(float(before - after))
-    return changes[0], changes[1]
+    counts, ends = [math.log(point.count) for point in known], [math.log(count), math.log(other)]
+    psnr = np.interp(ends, counts, [point.psnr_loss for point in known])
+    ssim = np.interp(ends, counts, [point.ssim_loss for point in known])
+    return float(psnr[0] - psnr[1]), float(ssim[0] - ssim[1])
 
 
 def curve_table(points: Sequence[CurvePoint]) -> list[str]:

@@ -47,12 +47,7 @@ def limit_growth(
 
 
 def start_counting(state: MutableMapping[str, Any], means: Tensor) -> None:
-    """Make the tensors that are missing in the running state of gsplat's strategy.
-
-    Args:
-        state: the running state.
-        means: centres ``[N, 3]``.
-    """
+    """Make the tensors that are missing in the running state of gsplat's strategy, for centres ``[N, 3]``."""
     for name in STATISTICS:
         if name in state and state[name] is None:
             state[name] = torch.zeros(len(means), device=means.device)
@@ -83,19 +78,6 @@ class CappedStrategy(DefaultStrategy):
     """gsplat's densification with an exact cap: under it, the Gaussians with the highest gradients grow first."""
 
     cap: int | None = None  # Highest number of Gaussians; None for no cap
-
-    def see_each_image_after_resets(self, steps: int) -> None:
-        """Let the field grow again only once opacities have recovered from a reset.
-
-        Args:
-            steps: steps in which each image is seen once. Growth waits for half of the time if resets are closer.
-        """
-        pause = steps + self.refine_every
-        if self.reset_every >= self.refine_stop_iter:
-            pause = 0  # gsplat also waits at the start of a run that never resets
-        elif pause >= self.reset_every:
-            pause = self.reset_every // 2
-        self.pause_refine_after_reset = pause
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State of gsplat's strategy, and the peak."""
@@ -178,5 +160,11 @@ def make_strategy(options: Any, num_images: int) -> CappedStrategy:
         absgrad=options.use_absgrad,
         verbose=False,
     )
-    strategy.see_each_image_after_resets(num_images)
+    # Opacities recover from a reset before anything grows; for half of the time if resets are closer.
+    pause = num_images + strategy.refine_every
+    if strategy.reset_every >= strategy.refine_stop_iter:
+        pause = 0  # gsplat also waits at the start of a run that never resets
+    elif pause >= strategy.reset_every:
+        pause = strategy.reset_every // 2
+    strategy.pause_refine_after_reset = pause
     return strategy

@@ -29,16 +29,13 @@ log = logging.getLogger(__name__)
 
 NEIGHBORS = 8  # Neighbours of a camera in the graph
 SMOOTHING = 8.0  # Strength of the filter that computes the smooth part of the gains
-NOISE = 0.03
-"""Relative differences between neighbours by errors of the field. They are 1 to 3% where the light is constant."""
-NOTICED = 0.035
-"""``auto`` divides photos if half of them differ by more from their neighbours (root mean square of the channels)."""
-FIRST_STEPS = 1500  # Steps before that decision. A younger field errs more than the photos differ.
-FIRST_MEASUREMENTS = 2  # Measurements of a photo before that decision, in the mean
-LEAST_PHOTOS = 32  # Least number of photos. The neighbours of fewer photos are too far apart.
-MEASURED_EVERY = 2  # Steps between two measurements. A measurement launches some ten small kernels.
-REFRESHED_EVERY = 200  # Steps between two updates. An update waits for the GPU.
-NEWEST_WEIGHT = 0.3  # Weight of a new measurement in the mean of a photo. Older ones are of an earlier field.
+NOISE = 0.03  # Relative differences between neighbours by errors of the Gaussians, where the light is constant
+NOTICED = 0.035  # "auto" divides photos if half of them differ by more (root mean square of the channels)
+FIRST_STEPS, FIRST_MEASUREMENTS = 1500, 2  # Steps, and measurements of a photo in the mean, before that decision
+LEAST_PHOTOS = 32  # The neighbours of fewer photos are too far apart
+MEASURED_EVERY = 2  # Steps between two measurements, which launch some ten small kernels
+REFRESHED_EVERY = 200  # Steps between two updates, which wait for the GPU
+NEWEST_WEIGHT = 0.3  # Weight of a new measurement in the mean of a photo
 MOST = 4.0  # Largest measured factor between a photo and its image
 CLIPPED = 0.98  # Pixels of a photo from this value on may be clipped, and are not measured
 SAMPLE = 1 << 14  # Approximate number of measured pixels of an image
@@ -94,7 +91,7 @@ class ExposureCompensation(Callback):
                 log.warning(f"exposure-compensation is off: {few}")
             return
         self._state, self._rows = run.state, np.asarray(indices)
-        positions = places([own.camera for own in run.training_views()]).cpu()
+        positions = places([view.camera for view in run.training_views()]).cpu()
         self._smoother = Smoother(build_graph(positions, num_neighbors=NEIGHBORS), SMOOTHING)
         if run.images_per_step > 1:  # of the first rank alone
             self._sums.zero_()
@@ -151,11 +148,11 @@ class ExposureCompensation(Callback):
         """Add measurements to the means, and compute the gains from them."""
         assert self._smoother is not None
         products, squares = sums[:, 0], sums[:, 1]
-        seen = np.isfinite(sums).all(axis=(1, 2)) & (products > 0).all(axis=1) & (squares > 0).all(axis=1)
-        ratio = np.log(products[seen] / squares[seen]).clip(-np.log(MOST), np.log(MOST))
-        weight = np.maximum(1 / (self._counts[seen] + 1), NEWEST_WEIGHT)[:, None]
-        self._measured[seen] += weight * (ratio - self._measured[seen])
-        self._counts[seen] += 1
+        valid = np.isfinite(sums).all(axis=(1, 2)) & (products > 0).all(axis=1) & (squares > 0).all(axis=1)
+        ratio = np.log(products[valid] / squares[valid]).clip(-np.log(MOST), np.log(MOST))
+        weight = np.maximum(1 / (self._counts[valid] + 1), NEWEST_WEIGHT)[:, None]
+        self._measured[valid] += weight * (ratio - self._measured[valid])
+        self._counts[valid] += 1
         rows, known = self._rows, self._counts[self._rows] > 0
         response = (self._measured[rows] - self._smoother(self._measured[rows], known))[known]
         ready = self._state.step + 1 >= FIRST_STEPS and self._counts[rows].mean() >= FIRST_MEASUREMENTS

@@ -128,10 +128,9 @@ def _warm_gaussians(options: Any, source: Path, frame: Frame | None, num_feature
                 "train with it, or give --pipeline.model.warm-start-frame model"
             )
         params = similarity(params, *frame)
-    wanted, found = (options.sh_degree + 1) ** 2 - 1, params["features_rest"].shape[1]
-    rest = params["features_rest"].new_zeros(len(params["means"]), wanted, 3)
-    rest[:, : min(wanted, found)] = params["features_rest"][:, : min(wanted, found)]
-    params["features_rest"] = rest
+    rest = params["features_rest"][:, : (options.sh_degree + 1) ** 2 - 1]
+    missing = (options.sh_degree + 1) ** 2 - 1 - rest.shape[1]
+    params["features_rest"] = torch.cat([rest, rest.new_zeros(len(rest), missing, 3)], dim=1)
     if num_features:
         params[FEATURES] = initial_features(params["features_dc"], num_features)
     log.info(f"warm start: {len(params['means'])} Gaussians from {source}")
@@ -165,10 +164,6 @@ class DenseStart(Callback):
         wanted = 2 <= num_images <= options.dense_start_views and options.warm_start is None and not options.random_init
         self._done = not wanted or points is None or len(points[0]) == 0
 
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing: a checkpoint holds the field that has begun."""
-        return {}
-
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """A field of a checkpoint is in training."""
         self._done = True
@@ -183,9 +178,17 @@ class DenseStart(Callback):
         too_many = state.device.type == "cpu" and len(run.view_indices()) > MOST_ON_CPU
         if too_many or len(sparse) >= by_device(FILLED, state.device):
             return
-        xyz, rgb = self._swept(run, sparse.to(state.device))
-        colours = colours.float()
-        colours = colours if len(colours) else torch.full_like(sparse, 127.5)
+        most = by_device(FILLED, state.device) - len(sparse)
+        on_device = sparse.to(state.device)
+        with torch.no_grad():
+            sweep = Sweep(run.photos(), on_device[on_device.isfinite().all(dim=1)], by_device(SIDES, state.device))
+            for i in track(range(len(sweep.photos)), "Plane sweep", transient=True):
+                sweep.add(i)
+            xyz, rgb = sweep.points(most)
+            if len(xyz) > most:
+                even = select_systematic(torch.ones(len(xyz)), most, neighbor_order(xyz), self._options.pruning.seed)
+                xyz, rgb = xyz[even.to(xyz.device)], rgb[even.to(rgb.device)]
+        colours = colours.float() if len(colours) else torch.full_like(sparse, 127.5)
         points = torch.cat([sparse, xyz.to(sparse)]), torch.cat([colours, 255 * rgb.to(colours)])
         params, _ = initial_gaussians(self._options, points, None, num_features=self._num_features, cap=self._cap)
         for name, value in params.items():  # without moments
@@ -194,16 +197,3 @@ class DenseStart(Callback):
             f"{len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones "
             "(--pipeline.model.dense-start-views 0 leaves them out)"
         )
-
-    @torch.no_grad()
-    def _swept(self, run: TrainingRun, sparse: Tensor) -> Points:
-        """Positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``; evenly spread ones if too many are found."""
-        most = by_device(FILLED, run.state.device) - len(sparse)
-        sweep = Sweep(run.photos(), sparse[sparse.isfinite().all(dim=1)], by_device(SIDES, run.state.device))
-        for i in track(range(len(sweep.photos)), "Plane sweep", transient=True):
-            sweep.add(i)
-        xyz, rgb = sweep.points(most)
-        if len(xyz) > most:
-            even = select_systematic(torch.ones(len(xyz)), most, neighbor_order(xyz), self._options.pruning.seed)
-            xyz, rgb = xyz[even.to(xyz.device)], rgb[even.to(rgb.device)]
-        return xyz.cpu(), rgb.cpu()

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, normalize, pad
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.cuda.kernels import Launch, kernels_where_possible
+from sundae_ns.cuda.kernels import kernels_where_possible
 from sundae_ns.cuda.sweep import WINDOW, FusedCorrelations, Patches, sweep_kernels
 from sundae_ns.train.state import Photo
 
@@ -60,13 +59,6 @@ class _Reduced:
         return pixels.to(self.unproject) @ self.unproject.T
 
 
-class _Neighbors(NamedTuple):
-    """Indices of the views that are compared with a view, and of those that confirm its depths; the best come first."""
-
-    compared: list[int]
-    confirming: list[int]
-
-
 class Sweep:
     """The sweep through all views, one at a time.
 
@@ -86,7 +78,7 @@ class Sweep:
 
     def add(self, index: int) -> Tensor:
         """Find the depths of a view ``[H, W]``, along its axis; 0 where there are none."""
-        photo, others = self.photos[index], [self.photos[i] for i in self._neighbors[index].compared]
+        photo, others = self.photos[index], [self.photos[i] for i in self._neighbors[index][0]]
         limits = self._limits(photo.camera)
         if limits is None or not others:
             return self._depths[index]
@@ -143,7 +135,7 @@ class Sweep:
         points = _to_world(photo, photo.rays(rows, columns) * depth[rows, columns][:, None])
         x, y, _ = _project(photo.camera, points)
         total, count = points.clone(), torch.ones_like(x)
-        for i in self._neighbors[index].confirming:
+        for i in self._neighbors[index][1]:
             other, depths = self.photos[i], self._depths[i]
             there_x, there_y, z = _project(other.camera, points)
             column = there_x.nan_to_num().clamp(0, other.camera.width - 1).long()
@@ -198,13 +190,16 @@ def _to_world(photo: _Reduced, points: Tensor) -> Tensor:
     return points @ photo.pose[:3, :3].T + photo.pose[:3, 3]
 
 
-def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[_Neighbors]:
-    """For each view the others that see most of its sparse points, from directions that differ by some degrees."""
+def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[tuple[list[int], list[int]]]:
+    """For each view those that are compared with it, and those that confirm its depths; the best come first.
+
+    They see most of its sparse points, from directions that differ by some degrees.
+    """
     if len(photos) < 2 or not len(sparse):
-        return [_Neighbors([], []) for _ in photos]
+        return [([], []) for _ in photos]
     seen = torch.stack([_in_view(photo.camera, *_project(photo.camera, sparse)) for photo in photos])
     directions = torch.stack([normalize(sparse - photo.pose[:3, 3], dim=-1) for photo in photos])
-    found = []
+    neighbors = []
     for i in range(len(photos)):
         angles = torch.rad2deg((directions * directions[i]).sum(dim=-1).clamp(-1, 1).acos())
         # Near directions tell little about depths; from far ones places look different.
@@ -212,8 +207,8 @@ def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[_Neighbors]:
         shared = (weights * (seen & seen[i])).sum(dim=1)
         shared[i] = -1
         order = torch.argsort(shared, descending=True, stable=True)[: len(photos) - 1].tolist()
-        found.append(_Neighbors([j for j in order[:NEIGHBORS] if shared[j] > 0], order[:CONFIRMING]))
-    return found
+        neighbors.append(([j for j in order[:NEIGHBORS] if shared[j] > 0], order[:CONFIRMING]))
+    return neighbors
 
 
 def _directions(camera: Camera, up: Tensor) -> list[Tensor]:
@@ -249,7 +244,10 @@ def _correlations(
     patches = _patches(photo.grey)
     # X' = R X + t with s normal . X = 1: the ray r projects to K (R r + s (normal . r) t).
     ways = [other.camera.K @ (other.camera.viewmat @ photo.pose)[:3] for other in others]
-    if kernels := _kernels(photo.grey):
+    slower, kernels = "a plane sweep runs as hundreds of kernels a direction", None
+    if photo.grey.is_cuda:
+        kernels = kernels_where_possible(sweep_kernels, photo.grey.device, slower)
+    if kernels:
         maps = torch.stack([torch.cat([way[:, :3] @ photo.unproject, way[:, 3:]], dim=1) for way in ways])
         images = [other.grey[0, 0] for other in others]
         return FusedCorrelations(kernels, patches, images, maps, inverses, LEAST_VARIANCE)
@@ -283,13 +281,6 @@ def _scores(
         score = (product - average * patches.mean) / (patches.deviation * variance.sqrt())
         scores.append(torch.where(valid, score, -1.0))
     return torch.stack(scores).amax(dim=0)
-
-
-def _kernels(image: Tensor) -> dict[str, Launch] | None:
-    """The kernel, on a GPU that can compile it."""
-    if not image.is_cuda:
-        return None
-    return kernels_where_possible(sweep_kernels, image.device, "a plane sweep runs as hundreds of kernels a direction")
 
 
 def _peaks(scores: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 import math
 import os
@@ -76,14 +77,14 @@ class TimeLeft:
         before, self._at = self._at, (done, now)
         if before is not None and done > before[0]:
             steps = done - before[0]
-            found = (now - before[1]) / steps
+            step_s = (now - before[1]) / steps
             if self.step_s is None:
-                self.step_s, self._steps = found, steps
+                self.step_s, self._steps = step_s, steps
             else:
-                found = min(max(found, self.step_s / self.MOST), self.step_s * self.MOST)
-                kept = self._steps * math.exp(-steps / max(self.SHARE * total, 1))
-                self.step_s = (kept * self.step_s + steps * found) / (kept + steps)
-                self._steps = kept + steps
+                step_s = min(max(step_s, self.step_s / self.MOST), self.step_s * self.MOST)
+                weight = self._steps * math.exp(-steps / max(self.SHARE * total, 1))
+                self.step_s = (weight * self.step_s + steps * step_s) / (weight + steps)
+                self._steps = weight + steps
         return None if self.step_s is None else (total - done) * self.step_s
 
 
@@ -105,7 +106,6 @@ def long_on_cpu(seconds: float, left: int) -> str | None:
 
 COMMANDS = ("ns-eval", "ns-render", "ns-export", "ns-viewer")
 """Commands that open a finished run; ns-train also has --load-config, and writes to the folder that it names."""
-_OPTION = "--load-config"
 
 
 def loaded_run(program: Sequence[str]) -> Path | None:
@@ -116,13 +116,10 @@ def loaded_run(program: Sequence[str]) -> Path | None:
     """
     if not program or Path(program[0]).stem not in COMMANDS:
         return None
-    values = [""]
-    for word, following in zip(program, [*program[1:], ""], strict=True):
-        name, equals, value = word.partition("=")
-        if name.replace("_", "-") == _OPTION:
-            values.append(value if equals else following)
-    config = Path(values[-1])
-    return config.absolute().parent if values[-1] and config.is_file() else None
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--load-config", "--load_config", nargs="?")
+    config = Path(parser.parse_known_args(program[1:])[0].load_config or "")
+    return config.absolute().parent if config.is_file() else None
 
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)

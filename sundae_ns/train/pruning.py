@@ -301,7 +301,7 @@ class ScheduledPruning(Callback):
         if due:
             log.info(f"step {state.step}: pruning {total:,} Gaussians, with passes over the training views")
         evaluate = due and self.evaluate and config.ends_growth_at is not None
-        before = _evaluated(run, "warm-up") if evaluate else {}
+        before = run.evaluate() if evaluate else {}
 
         def contribute(count: int | None) -> Tensor:
             return contribution(run.source, run.training_views(), run.background, run.settings, count)
@@ -323,7 +323,11 @@ class ScheduledPruning(Callback):
         log.info(summary(report))
         if report["dropped_nonfinite"]:
             log.warning(f"removed {report['dropped_nonfinite']} Gaussians that were not finite")
-        after = _evaluated(run, "pruned") if evaluate else {}
+        after = run.evaluate() if evaluate else {}
+        for label, results in (("warm-up", before), ("pruned", after)):
+            if results:
+                psnr, ssim = results["psnr"], results["ssim"]
+                log.info(f"{label}: PSNR {psnr:.2f} dB, SSIM {ssim:.4f} on all test views")
         run.log_scalars("Prune", {name: report[name] for name in ("before", "after", "seconds", "peak")})
         if run.folder is not None:
             path = run.folder / "prune.json"
@@ -377,13 +381,6 @@ def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int)
             return
 
 
-def _evaluated(run: TrainingRun, label: str) -> dict[str, float]:
-    results = run.evaluate()
-    if results:
-        log.info(f"{label}: PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f} on all test views")
-    return results
-
-
 class FloaterRemoval(Callback):
     """Removes what floats in front of a camera before anything is pruned, and before counts are compared.
 
@@ -417,11 +414,10 @@ class FloaterRemoval(Callback):
             return
         self._done = True
         assert self._points is not None
-        cameras = [view.camera for view in run.training_views()]
-        if not cameras:
+        eyes = [view.camera.center for view in run.training_views()]
+        if not eyes:
             return
-        eyes = torch.stack([camera.center for camera in cameras])
         pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
-        removed = pruner.drop(near_cameras(state.gaussians["means"], eyes, self._points), at_most=MOST)
+        removed = pruner.drop(near_cameras(state.gaussians["means"], torch.stack(eyes), self._points), at_most=MOST)
         if removed:
             log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")

@@ -30,10 +30,8 @@ log = logging.getLogger(__name__)
 
 DecayShape = Literal["exponential", "cosine"]
 
-SPARSE = 15_000
-"""In a pruned field of fewer Gaussians centres move faster: on surfaces, they are the root of the quotient farther
-apart."""
-MOST_FACTOR = 5.0  # Largest factor on the rate of the centres, that of 600 Gaussians; nothing smaller was measured
+SPARSE = 15_000  # With fewer Gaussians after the prune centres move faster: on surfaces they are farther apart
+MOST_FACTOR = 5.0  # Largest factor on the learning rate of the centres: fewer than 600 Gaussians were not measured
 
 
 @dataclass
@@ -73,10 +71,7 @@ class Decay:
 
 
 def fused_adam(groups: list[dict[str, Any]], **options: Any) -> torch.optim.Adam:
-    """Adam that updates each parameter by one fused kernel on CUDA instead of a dozen.
-
-    A field has seven parameters with an optimizer each, and launching their kernels takes much of a step.
-    """
+    """Adam that updates each parameter by one fused kernel on CUDA instead of a dozen."""
     fused = all(value.is_cuda for group in groups for value in group["params"])
     return torch.optim.Adam(groups, fused=fused, **options)
 
@@ -90,11 +85,10 @@ def network_groups(
 ) -> list[dict[str, Any]]:
     """Groups of parameters of a network without normalisation layers, whose loss bursts at usual settings of Adam.
 
-    The output is a product of layers, so aligned steps of all weights multiply it. Two measures keep such steps short.
-    With :data:`NETWORK_BETAS` the mean of squares forgets fast and follows gradients that suddenly grow: a weight moves
-    by up to 1.2 times the rate while they grow, and by 7.3 with the usual betas
+    With :data:`NETWORK_BETAS` the mean of squares follows gradients that suddenly grow: a weight moves by up to 1.2
+    times the learning rate while they grow, and by 7.3 with the usual betas
     (``(1 - b1) / sqrt((1 - b2) (1 - b1^2 / b2))``). Weights of layers with many inputs get a smaller rate, because
-    their sum grows with the inputs (Yang et al. 2022, "Tensor Programs V"). Weight decay shrinks weights, not biases.
+    their sum grows with the inputs (Yang et al. 2022, "Tensor Programs V"). Only weights decay.
 
     Args:
         params: weights and biases; a head that is resized in training keeps the rates of its first shapes.
@@ -110,15 +104,15 @@ def network_groups(
     return [{"params": values, "lr": rate, "weight_decay": decay} for (rate, decay), values in groups.items()]
 
 
-def sparse_factor(primitives: int) -> float:
-    """Factor on the rate of the centres of a pruned field."""
-    return min(max(1.0, math.sqrt(SPARSE / max(primitives, 1))), MOST_FACTOR)
+def sparse_factor(num_gaussians: int) -> float:
+    """Factor on the learning rate of the centres after a prune."""
+    return min(max(1.0, math.sqrt(SPARSE / max(num_gaussians, 1))), MOST_FACTOR)
 
 
 def notify_pruned(
     schedulers: Mapping[str, LRScheduler],
     step: int,
-    primitives: int,
+    num_gaussians: int,
     *,
     last: bool = True,
     ends_at: int | None = None,
@@ -128,7 +122,7 @@ def notify_pruned(
     Args:
         schedulers: by name.
         step: training step of the prune.
-        Gaussians: number of Gaussians that were kept. With fewer than :data:`SPARSE` the rate of the centres rises.
+        num_gaussians: number that was kept. With fewer than :data:`SPARSE` the rate of the centres rises.
         last: False while pruning goes on or the head is still disabled; rates that hold until then are left alone.
         ends_at: training step at which they reach their final value, as for a trial; None for that of the run.
     """
@@ -136,7 +130,7 @@ def notify_pruned(
         if decay.pruned_at is None and (last or not decay.hold_until_prune):
             decay.pruned_at, decay.ends_at = step, ends_at
             if name == "means":
-                decay.after_prune = sparse_factor(primitives)
+                decay.after_prune = sparse_factor(num_gaussians)
             _apply(scheduler)
 
 
@@ -167,8 +161,8 @@ def limit_rise(schedulers: Mapping[str, LRScheduler], steps: int) -> None:
 def _decays(schedulers: Mapping[str, LRScheduler]) -> Iterator[tuple[str, LRScheduler, Decay]]:
     """Name, scheduler and multiplier, each once: torch lists one for each group of parameters, which share theirs."""
     for name, scheduler in schedulers.items():
-        found = {id(one): one for one in getattr(scheduler, "lr_lambdas", []) if isinstance(one, Decay)}
-        yield from ((name, scheduler, decay) for decay in found.values())
+        decays = {id(decay): decay for decay in getattr(scheduler, "lr_lambdas", []) if isinstance(decay, Decay)}
+        yield from ((name, scheduler, decay) for decay in decays.values())
 
 
 def _apply(scheduler: LRScheduler) -> None:
@@ -211,15 +205,15 @@ def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
         ConfigError: the length is no number of steps.
     """
     usual = deepcopy(usual)
-    given, place = given_options(words), config.load_dir or config.load_checkpoint
-    if place is not None:
-        run = _resumed_run(config, place)
+    given, saved = given_options(words), config.load_dir or config.load_checkpoint
+    if saved is not None:
+        run = _resumed_run(config, saved)
         if run is not None and usual is not None:
             for line in take_options(config, run, usual, given):
                 log.warning(line + ("; a prune that is done is not repeated" if ".pruning." in line else ""))
             config.schedule_length = config.schedule_length or run.schedule_length or run.max_num_iterations
             if "max_num_iterations" not in given and config.max_num_iterations == usual.max_num_iterations:
-                config.max_num_iterations = _steps_left(config, place)
+                config.max_num_iterations = _steps_left(config, saved)
         # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
         config.schedule_length = config.schedule_length or config.max_num_iterations
         if run is not None and "max_num_iterations" not in given:
@@ -248,9 +242,9 @@ def _leave_finetune(config: Any, done: int) -> None:
         config.max_num_iterations = min(config.max_num_iterations, left)
 
 
-def _steps_left(config: Any, place: Path) -> int:
+def _steps_left(config: Any, saved: Path) -> int:
     """Steps from the checkpoint that is resumed to the end of the schedule."""
-    step = checkpoint.newest_step(place) if config.load_step is None else config.load_step
+    step = checkpoint.newest_step(saved) if config.load_step is None else config.load_step
     left: int = config.schedule_length if step is None else config.schedule_length - step - 1
     if left < 1:
         raise ConfigError(
@@ -260,9 +254,9 @@ def _steps_left(config: Any, place: Path) -> int:
     return left
 
 
-def _resumed_run(config: Any, place: Path) -> Any:
+def _resumed_run(config: Any, saved: Path) -> Any:
     """The configuration of the run that is resumed; None if it is not beside its checkpoints."""
-    path = find_config(place)
+    path = find_config(saved)
     try:
         run = None if path is None else load_config(path)
     except CheckpointError as error:
@@ -342,11 +336,11 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
     free = set(_free(config, usual, given, names))
     differing = []
     for name in dict.fromkeys(names):
-        theirs = option(run, name)
+        value = option(run, name)
         if name in free:
-            set_option(config, name, deepcopy(theirs))
-        elif option(config, name) != theirs:
-            line = f"--{name.replace('_', '-')} is {option(config, name)}; the run to resume has {theirs}"
+            set_option(config, name, deepcopy(value))
+        elif option(config, name) != value:
+            line = f"--{name.replace('_', '-')} is {option(config, name)}; the run to resume has {value}"
             # The state of a scheduler holds its options. Refused before config.yml is replaced.
             if name.removeprefix("pipeline.model.") in _SHAPES or name.startswith("optimizers."):
                 raise ConfigError(f"{line}, which cannot change; leave the option out")
@@ -356,52 +350,38 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
 
 def schedule_table(config: Any) -> list[tuple[str, str]]:
     """What happens when, for the log: pairs of a part of training and its steps."""
-    model = config.pipeline.model
-    warm, head = model.warm_start is not None, model.head
+    model, rows = config.pipeline.model, {}
+    warm, head, pruning = model.warm_start is not None, model.head, model.pruning
+    sizes = [
+        f"1/{2 ** (model.num_downscales - i)} until {(i + 1) * model.resolution_schedule:,}"
+        for i in range(0 if warm else model.num_downscales)
+    ]
+    rows["images"] = ", ".join([*sizes, "then full size"]) if sizes else "full size"
+    rows["densification"] = "none: warm start"
+    if not warm:
+        ends = pruning.stop if pruning.mode == "continuous" else pruning.ends_growth_at
+        last = model.stop_split_at if ends is None else min(model.stop_split_at, ends)
+        resets = model.reset_alpha_every * model.refine_every
+        reset = f"reset every {resets:,}" if resets < last else "never reset"
+        rows["densification"] = f"{model.warmup_length:,} to {last:,}, every {model.refine_every:,}; opacities {reset}"
+    rows["SH degree"] = f"{model.sh_degree}" if warm else f"+1 every {model.sh_degree_interval:,} steps"
+    rows["prune"] = {
+        "continuous": f"{pruning.start:,} to {pruning.stop:,}, every {pruning.every:,}",
+        "off": "none",
+        "one-shot": "at once" if warm else f"after {pruning.prune_at:,}",
+    }[pruning.mode]
+    if pruning.decides and not warm:
+        rows["prune"] += ", to as many as trials choose"
+    rows["head"] = "none"
+    if head.mode != "off":
+        at = pruning.settled_at if head.start_at is None else head.start_at
+        at = max(at - (pruning.prune_at if warm else 0), 0)
+        rows["head"] = f"after {at:,}" if at else "from the start"
+        rows["head"] += ", if trials favour it" if head.mode == "auto" else ""
     schedulers = (parts["scheduler"] for parts in config.optimizers.values())
-    ends = sorted({scheduler.max_steps for scheduler in schedulers if scheduler is not None})
-    rows = [
-        ("images", "full size" if warm else _resolution(model)),
-        ("densification", "none: warm start" if warm else _growth(model)),
-        ("SH degree", f"{model.sh_degree}" if warm else f"+1 every {model.sh_degree_interval:,} steps"),
-        ("prune", _prune(model.pruning, warm)),
-        ("head", "none" if head.mode == "off" else _head(model, warm)),
-    ]
-    if ends:
-        rows.append(("learning rates", f"decay until {', '.join(f'{end:,}' for end in ends)}"))
-    return rows
-
-
-def _resolution(model: Any) -> str:
-    parts = [
-        f"1/{2 ** (model.num_downscales - number)} until {(number + 1) * model.resolution_schedule:,}"
-        for number in range(model.num_downscales)
-    ]
-    return ", ".join([*parts, "then full size"]) if parts else "full size"
-
-
-def _growth(model: Any) -> str:
-    ends = model.pruning.stop if model.pruning.mode == "continuous" else model.pruning.ends_growth_at
-    last = model.stop_split_at if ends is None else min(model.stop_split_at, ends)
-    text = f"{model.warmup_length:,} to {last:,}, every {model.refine_every:,}"
-    resets = model.reset_alpha_every * model.refine_every
-    return text + (f"; opacities reset every {resets:,}" if resets < last else "; opacities never reset")
-
-
-def _prune(pruning: Any, warm: bool) -> str:
-    if pruning.mode == "continuous":
-        return f"{pruning.start:,} to {pruning.stop:,}, every {pruning.every:,}"
-    if pruning.mode == "off":
-        return "none"
-    after = "at once" if warm else f"after {pruning.prune_at:,}"
-    return f"{after}, to as many as trials choose" if pruning.decides and not warm else after
-
-
-def _head(model: Any, warm: bool) -> str:
-    at = model.pruning.settled_at if model.head.start_at is None else model.head.start_at
-    at = max(at - (model.pruning.prune_at if warm else 0), 0)
-    when = f"after {at:,}" if at else "from the start"
-    return f"{when}, if trials favour it" if model.head.mode == "auto" else when
+    if ends_at := sorted({scheduler.max_steps for scheduler in schedulers if scheduler is not None}):
+        rows["learning rates"] = f"decay until {', '.join(f'{end:,}' for end in ends_at)}"
+    return list(rows.items())
 
 
 def _free(config: Any, usual: Any, given: Collection[str], names: Iterable[str]) -> list[str]:

@@ -23,8 +23,6 @@ from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.rasterize.types import Backend
 from sundae_ns.scene.render import RenderSettings
 
-_HEAD = "head"
-
 
 @dataclass
 class TrainingState:
@@ -86,7 +84,7 @@ class TrainingState:
     @property
     def head(self) -> CompensationHead | None:
         """The head; None if the field has none."""
-        return self.networks[_HEAD] if _HEAD in self.networks else None  # type: ignore[return-value]
+        return self.networks["head"] if "head" in self.networks else None  # type: ignore[return-value]
 
     @property
     def head_enabled(self) -> bool:
@@ -95,8 +93,8 @@ class TrainingState:
 
     def remove_head(self) -> None:
         """Do without head and features from now on. Parameters stay the same objects, as optimizers need them."""
-        if _HEAD in self.networks:
-            del self.networks[_HEAD]
+        if "head" in self.networks:
+            del self.networks["head"]
         if FEATURES in self.gaussians:
             features = self.gaussians[FEATURES]
             features.data, features.grad = features.data[:, :0], None
@@ -130,19 +128,19 @@ class TrainingState:
         saved = {"field": snapshot(self.gaussians, self.optimizers)}
         if head:
             assert self.head is not None
-            saved[_HEAD] = module_snapshot(self.head.parameters(), self.optimizers["compensation"])
+            saved["head"] = module_snapshot(self.head.parameters(), self.optimizers["compensation"])
         return saved
 
     def restore(self, saved: Mapping[str, Snapshot]) -> None:
         """Restore a :meth:`snapshot`, with any number of Gaussians, and the width of its head."""
         self.restored += 1
         restore(self.gaussians, self.optimizers, saved["field"])
-        if _HEAD in saved:
+        if "head" in saved:
             assert self.head is not None
             width = self.gaussians[FEATURES].shape[1]
             if self.head.config.num_features != width:
                 self.head.resize(dataclasses.replace(self.head.config, num_features=width))
-            restore_module(self.head.parameters(), self.optimizers["compensation"], saved[_HEAD])
+            restore_module(self.head.parameters(), self.optimizers["compensation"], saved["head"])
 
     def running_states(self) -> dict[str, dict[str, Any]]:
         """Running states for a checkpoint."""

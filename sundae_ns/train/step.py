@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, cast
 
 import cv2
@@ -78,8 +78,7 @@ class StepLosses:
         return losses
 
     def prior_weight(self, state: TrainingState) -> float:
-        """Weight of opacities and scales at this step."""
-        # A prior counts once, and the loss is of one image: its weight falls with their number.
+        """Weight of opacities and scales at this step: a prior counts once, and the loss is of one image of many."""
         return self.options.prior_after_prune / max(self.num_images, 1) if state.pruned else 0.0
 
 
@@ -115,7 +114,7 @@ def _losses(
     image: Tensor, base: Tensor | None, target: Tensor, ssim: SSIM, weight: float, l1_weight: float
 ) -> tuple[Tensor, Tensor | None]:
     """``l1_weight L1 + weight (1 - SSIM)`` of an image, and the L1 loss of its base colours."""
-    single = all(one.dtype == torch.float32 for one in (image, target, base) if one is not None)
+    single = all(value.dtype == torch.float32 for value in (image, target, base) if value is not None)
     large = min(target.shape[:2]) >= SSIM_WINDOW
     if weight > 0 and large and single:
         if image.is_cuda and kernels_where_possible(loss_kernels, image.device, "SSIM runs as slower convolutions"):
@@ -184,7 +183,7 @@ def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_
     l1_weight = 1 - weight if l1_weight is None else l1_weight
     ssim.win = ssim.win.to(target.device)  # once; each call would copy it and wait
     # Contiguous planes: convolutions of a large image with interleaved colours take much longer.
-    planes, truth = (one.permute(2, 0, 1)[None].contiguous() for one in (image, target))
+    planes, truth = (value.permute(2, 0, 1)[None].contiguous() for value in (image, target))
     similarity: Tensor = ssim(planes, truth)
     return l1_weight * (image - target).abs().mean() + weight * (1 - similarity)
 
@@ -209,11 +208,13 @@ class StepInputs:
 
     def clone(self) -> StepInputs:
         """A copy, so that a recording reads it where it stays."""
-        copies = [value.clone(memory_format=torch.contiguous_format) for value in self._tensors()]
-        viewmat, K, target, background, *rest = copies
-        mask, rates, count = (None if one is None else rest.pop(0) for one in (self.mask, self.rates, self.count))
-        camera = self.camera._replace(viewmat=viewmat, K=K)
-        return StepInputs(camera, target, mask, background, self.crop, rates, count)
+
+        def copy(value: Tensor | None) -> Any:
+            return None if value is None else value.detach().clone(memory_format=torch.contiguous_format)
+
+        camera = self.camera._replace(viewmat=copy(self.camera.viewmat), K=copy(self.camera.K))
+        tensors = {name: copy(getattr(self, name)) for name in ("target", "mask", "background", "rates", "count")}
+        return replace(self, camera=camera, **tensors)
 
     def copy_to(self, other: StepInputs) -> None:
         """Write these into the inputs of a recording."""
@@ -230,12 +231,9 @@ class StepResult:
 
 
 def training_part(state: TrainingState, camera: Camera, at: StepResolution) -> tuple[Camera, Crop | None]:
-    """The part of a training view that a step shows, and its window; None for the whole image.
+    """The part of a camera that a step shows, and its crop; None for the whole image.
 
-    Args:
-        state: the field in training; it remembers the focal lengths that the head is trained on.
-        camera: the whole view.
-        at: resolution at this step.
+    The state remembers the focal lengths that the head is trained on.
     """
     if state.head_enabled and at.downscale == 1:
         low, high = state.trained_focal or (camera.focal, camera.focal)
@@ -253,12 +251,7 @@ class TrainingStep(NamedTuple):
     params: Mapping[str, Tensor]  # Trained parameters, for the terms that see them
 
     def images(
-        self,
-        camera: Camera,
-        background: Tensor,
-        settings: RenderSettings,
-        *,
-        depth: bool = False,
+        self, camera: Camera, background: Tensor, settings: RenderSettings, *, depth: bool = False
     ) -> tuple[dict[str, Any], Rasterization]:
         """The first half: Gaussians, one splatting pass, and the head; see :func:`render_view`."""
         return render_view(self.source, camera, background, settings, depth=depth)
@@ -279,5 +272,5 @@ class TrainingStep(NamedTuple):
             images, splatted = self.images(inputs.camera, inputs.background, settings)
             terms = self.terms(images, inputs.target, inputs.mask, inputs.count)
             loss = functools.reduce(torch.add, terms.values())
-        shown = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
-        return loss, splatted, StepResult(shown, {name: value.detach() for name, value in terms.items()}, loss.detach())
+        kept = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
+        return loss, splatted, StepResult(kept, {name: value.detach() for name, value in terms.items()}, loss.detach())

@@ -54,23 +54,21 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
-SHARES = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)
-"""Shares of the Gaussians that are tried, about a factor of 2 apart, largest first."""
-COUNT_SHARE = 0.02
-"""Length of a trial of a count, and of a window between two measurements of a length, as a share of the schedule."""
+SHARES = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)  # Of the Gaussians that are tried, about a factor of 2 apart
+COUNT_SHARE = 0.02  # Length of a trial of a count, and of a window of a length, as a share of the schedule
 MANY_VIEWS = 32
 """With fewer training views, those that could be held out are too few to compare counts. With as many, the length is
 not tried: captures of 43 views and more gain to the end."""
-FEWEST_VIEWS = 6  # fewer cannot judge a head; the field is then finished plain
-MOST_CONTRIBUTING = 32  # training views that the prune of a trial looks at
-MOST_TRIALS = 0.45  # largest share of the steps after the prune that trials of counts, and of a head in them, may take
-MEAN_SHARE = 0.25  # share of a trial, at its end, over which weights are averaged
-RISE_SHARE = 5 / 12  # share of a trial, at its beginning, over which the rate of the head may rise
-HOLD_SHARE = 0.1  # share of the schedule for which views are held out before trials of a head, so that it forgets them
-WATCHED_SHARE = 0.5  # longest watch of the length, as a share of the steps after the decision about the head
-MORE_FEATURES = 29  # of the last candidate: as many as are splatted without padding after the default 13
+FEWEST_VIEWS = 6  # Fewer cannot judge a head
+MOST_CONTRIBUTING = 32  # Training views that the prune of a trial looks at
+MOST_TRIALS = 0.45  # Largest share of the steps after the prune that trials of counts, and of a head in them, may take
+MEAN_SHARE = 0.25  # Share of a trial, at its end, over which weights are averaged
+RISE_SHARE = 5 / 12  # Share of a trial, at its beginning, over which the learning rate of the head may rise
+HOLD_SHARE = 0.1  # Share of the schedule for which views are held out before trials of a head, so that it forgets them
+WATCHED_SHARE = 0.5  # Longest watch of the length, as a share of the steps after the decision about the head
+MORE_FEATURES = 29  # Of the last candidate: as many as are splatted without padding after the default 13
 NAMES = {"plain": "no head", "head": "head", "features": f"head with {MORE_FEATURES} features"}
-SAMPLE = 1 << 13  # neighbouring Gaussians that are packed to estimate the bytes of a field
+SAMPLE = 1 << 13  # Neighbouring Gaussians that are packed to estimate the bytes of all
 _DISABLED = "so it stays disabled; train longer, or force it with --pipeline.model.head.mode residual"
 
 

@@ -1,7 +1,11 @@
-"""Lines of progress: share and time left of the whole run, quality and size."""
+"""Lines of progress, signals, the command that resumes, and which run a command opens."""
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +15,7 @@ from nerfstudio.utils import writer
 from sundae_ns.cli.process import percent_of
 from sundae_ns.plugin import optimizer_configs as nerfstudio_configs
 from sundae_ns.plugin.optimizer_configs import METRICS_EVENT, ProgressWriter
-from sundae_ns.train.progress import TimeLeft, duration, long_on_cpu
+from sundae_ns.train.progress import Interruption, TimeLeft, duration, loaded_run, long_on_cpu, resume_command
 
 
 def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
@@ -97,3 +101,75 @@ def test_a_training_of_hours_on_a_cpu_is_foretold() -> None:
     assert text is not None
     for part in ("at least 14 h 10 min", "1700 ms", "sundae-tiny", "--downscale-factor"):
         assert part in text
+
+
+def test_the_first_signal_is_noted_and_the_handlers_come_back() -> None:
+    before, asked = signal.getsignal(signal.SIGTERM), []
+    with Interruption(lambda: asked.append(True), quiet=True) as interruption:
+        assert interruption.number == 0
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)  # of a scheduler that asks again
+        assert (interruption.number, asked) == (signal.SIGTERM, [True])
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+TWICE = """
+import signal
+from sundae_ns.train.progress import Interruption
+with Interruption(lambda: None):
+    signal.raise_signal(signal.SIGINT)
+    print("saving", flush=True)
+    signal.raise_signal(signal.SIGINT)
+    print("too late")
+"""
+
+
+def test_a_second_one_leaves_at_once() -> None:
+    result = subprocess.run([sys.executable, "-c", TWICE], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout) == (130, "saving\n")
+    assert "Left without saving" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("started", "expected"),
+    [
+        ("sundae --data a --max-num-iterations 9", "sundae --load-dir run --data a"),
+        ("sundae --max-num-iterations=9 --vis viewer", "sundae --load-dir run --vis viewer"),
+        (
+            "sundae-1 --load-dir old --load-step 4 --data a colmap --colmap-path s",
+            "sundae-1 --load-dir run --data a colmap --colmap-path s",
+        ),
+    ],
+)
+def test_the_command_that_resumes(started: str, expected: str) -> None:
+    program = ["/usr/bin/ns-train", *started.split()]
+    assert resume_command(program, Path("run"), "sundae", "data") == f"ns-train {expected}"
+
+
+def test_the_command_that_resumes_what_another_program_started() -> None:
+    found = resume_command(["pytest", "--load-dir", "x"], Path("a run"), "sundae-1", Path("data"))
+    assert found == "ns-train sundae-1 --data data --load-dir 'a run'"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--load-config", "{}"], ["--load_config", "{}"], ["--load-config={}"], ["camera-path", "--load-config={}"]],
+)
+@pytest.mark.parametrize("program", ["ns-eval", "/usr/bin/ns-render", "ns-viewer", "ns-export"])
+def test_the_folder_of_the_config(tmp_path: Path, program: str, words: list[str]) -> None:
+    path = tmp_path / "run" / "config.yml"
+    words = [word.format(path) for word in words]
+    assert loaded_run([program, *words]) is None, "there is no such file"
+    path.parent.mkdir()
+    path.touch()
+    assert loaded_run([program, *words]) == path.parent
+
+
+def test_a_training_writes_where_it_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "config.yml"
+    path.touch()
+    assert loaded_run(["ns-train", "sundae", "--load-config", str(path)]) is None
+    assert loaded_run(["sundae", "report", str(path)]) is None
+    assert loaded_run(["ns-eval", "--load-config"]) is None
+    assert loaded_run(["ns-eval", "--output-path", str(path)]) is None
+    assert loaded_run([]) is None

@@ -1,4 +1,4 @@
-"""The training step: nerfstudio's two halves and the whole step, its inputs, and the views of its cameras."""
+"""The training step: both halves and the whole, its inputs, and the terms of its loss."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
+from pytorch_msssim import SSIM
 from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.plugin.model import SundaeModel
-from sundae_ns.train.step import StepInputs
+from sundae_ns.train.step import StepInputs, StepLosses, convolved_loss, image_losses, ssim_loss
 
 Build = Callable[..., SundaeModel]
 OPTIONS: tuple[dict[str, Any], ...] = ({}, {"head": {"mode": "off"}}, {"head": {"max_train_pixels": 20 * 24}})
@@ -96,3 +98,165 @@ def test_the_view_of_a_training_camera_is_made_once(
     for _ in range(2):
         model.get_outputs(known)
     assert made == [2, 2, 1, 1, 1, 1, 1, 1]
+
+
+Perturb = Callable[[SundaeModel], SundaeModel]
+MakeCamera = Callable[..., Cameras]
+MakeBatch = Callable[..., dict[str, Tensor]]
+TrainingOf = Callable[[SundaeModel], Any]
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_head_and_field_learn_together(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, mode: str
+) -> None:
+    model = perturb(build(head={"mode": mode}))
+    model.train()
+    outputs = model.get_outputs(camera())
+    losses = model.get_loss_dict(outputs, batch())
+    assert set(losses) == {"main_loss", "base_loss"}
+    assert all(isinstance(value, Tensor) for value in losses.values())
+    torch.stack(list(losses.values())).sum().backward()
+    for name, value in (*model.gauss_params.items(), *model.head.named_parameters()):  # type: ignore[union-attr]
+        assert value.grad is not None, name
+        assert torch.isfinite(value.grad).all(), name
+        assert value.grad.any(), name
+
+
+def test_masked_pixels_do_not_count(build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch) -> None:
+    model = perturb(build(ssim_lambda=0.0))
+    model.eval()
+    outputs, target = model.get_outputs(camera()), batch()
+    mask = torch.zeros(32, 40, 1, dtype=torch.bool)
+    mask[:, :20] = True
+    losses = model.get_loss_dict(outputs, {**target, "mask": mask})
+    target["image"][:, 20:] = 0
+    for name, value in model.get_loss_dict(outputs, {**target, "mask": mask}).items():
+        assert torch.equal(value, losses[name])
+    truth = target["image"].float() / 255
+    expected = (outputs["rgb"] - truth).abs()[:, :20].sum() / truth.numel()
+    torch.testing.assert_close(losses["main_loss"], expected)
+
+
+@pytest.mark.parametrize("term", ["rms", "l1"])
+def test_after_the_prune_the_root_of_the_mean_square_takes_the_place_of_l1(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, term: str
+) -> None:
+    model = perturb(build(loss_after_prune=term))
+    model.eval()
+    outputs, target = model.get_outputs(camera()), batch()
+    error = outputs["rgb"] - target["image"].float() / 255
+    l1, rms = error.abs().mean(), error.square().mean().sqrt()
+    before = model.get_loss_dict(outputs, target)
+    model.state.pruning["num_prunes"] = 1
+    after = model.get_loss_dict(outputs, target)
+    change = 0.8 * (rms - l1) if term == "rms" else torch.zeros(())
+    torch.testing.assert_close(after["main_loss"] - before["main_loss"], change, atol=1e-5, rtol=0)
+    assert change.abs() > 0.01 or term == "l1"
+    assert torch.equal(after["base_loss"], before["base_loss"])
+    model.state.densify_until = model.state.schedule_step + 1  # continuous pruning, while the field grows
+    assert torch.equal(model.get_loss_dict(outputs, target)["main_loss"], before["main_loss"])
+
+
+def test_a_pruned_field_has_a_prior_that_counts_once(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch
+) -> None:
+    """Twice as many training images halve its weight in the loss of one."""
+    model = perturb(build(prior_after_prune=0.6))
+    model.eval()
+    outputs, target = model.get_outputs(camera()), batch()
+    assert "opacity_loss" not in model.get_loss_dict(outputs, target)
+    model.state.pruning["num_prunes"] = 1
+    for count in (1, 2, 4):
+        model.losses = StepLosses(model.config, model.ssim, count)
+        found = model.get_loss_dict(outputs, target)
+        opacities, scales = model.gauss_params["opacities"].sigmoid(), model.gauss_params["scales"].exp()
+        torch.testing.assert_close(found["opacity_loss"], 0.6 / count * opacities.mean())
+        torch.testing.assert_close(found["scale_loss"], 0.6 / count * scales.mean())
+    model.losses = StepLosses(build(prior_after_prune=0.0).config, model.ssim, 1)
+    assert set(model.get_loss_dict(outputs, target)) == {"main_loss", "base_loss"}
+
+
+def test_equal_images_have_a_gradient_of_zero(build: Build) -> None:
+    image = torch.full((20, 20, 3), 0.5, requires_grad=True)
+    loss, _ = image_losses(image, None, image.detach(), build().ssim, 0.2, squares=True)
+    assert loss < 1e-3
+    assert torch.autograd.grad(loss, image)[0].abs().max() < 1e-6
+
+
+def test_images_smaller_than_the_window_of_ssim(build: Build, camera: MakeCamera, batch: MakeBatch) -> None:
+    model = build().eval()
+    outputs = model.get_outputs(camera(9, 8))
+    loss = model.get_loss_dict(outputs, batch(9, 8))["main_loss"]
+    truth = batch(9, 8)["image"].float() / 255
+    torch.testing.assert_close(loss, (outputs["rgb"] - truth).abs().mean())
+
+
+SIZES = [(11, 11), (11, 40), (40, 12), (37, 53), (64, 96)]
+
+
+def ssim() -> SSIM:
+    return SSIM(data_range=1.0, channel=3)
+
+
+def images(height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """An image, its base colours and the target."""
+    generator = torch.Generator().manual_seed(height * width)
+    target = torch.rand(height, width, 3, generator=generator)
+    image, base = (target + 0.05 * torch.randn(target.shape, generator=generator) for _ in range(2))
+    return image.requires_grad_(), base.requires_grad_(), target
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+@pytest.mark.parametrize("weight", [0.2, 1.0])
+def test_losses_of_a_step_and_gradients_are_those_of_convolutions(height: int, width: int, weight: float) -> None:
+    image, base, target = images(height, width)
+    ours = image_losses(image, base, target, ssim(), weight)
+    exact = image_losses(image.double(), base.double(), target.double(), ssim(), weight)
+    for value, wanted in zip(ours, exact):
+        assert value is not None
+        assert wanted is not None
+        torch.testing.assert_close(value.double(), wanted, rtol=1e-6, atol=1e-6)  # worst: 1.1e-7
+    grads, wanted_grads = (torch.autograd.grad(1.5 * pair[0] + 0.3 * pair[1], (image, base)) for pair in (ours, exact))
+    for grad, wanted in zip(grads, wanted_grads):
+        assert (grad - wanted).norm() < 5e-6 * wanted.norm()  # worst: 6e-7
+        assert (grad != 0).all()
+
+
+def test_it_rounds_as_convolutions_in_single_precision() -> None:
+    image, _, target = images(48, 48)
+    (wanted,) = torch.autograd.grad(convolved_loss(image.double(), target.double(), ssim(), 1.0), image)
+
+    def error(value: Tensor) -> Tensor:
+        return (torch.autograd.grad(value, image)[0] - wanted).norm() / wanted.norm()
+
+    assert error(ssim_loss(image, target)) < 1.5 * error(convolved_loss(image, target, ssim(), 1.0)) + 1e-7
+
+
+def test_equal_images_have_no_loss_and_no_gradient() -> None:
+    target = images(32, 24)[2]
+    image = target.clone().requires_grad_()
+    loss = ssim_loss(image, target)
+    (gradient,) = torch.autograd.grad(loss, image)
+    assert loss.item() == pytest.approx(0, abs=1e-7)
+    assert gradient.abs().max() < 1e-7
+
+
+def test_nan_propagates() -> None:
+    image, _, target = images(32, 24)
+    with torch.no_grad():
+        image[16, 12, 1] = torch.nan
+    loss = ssim_loss(image, target)
+    (gradient,) = torch.autograd.grad(loss, image)
+    assert loss.isnan()
+    assert gradient[16, 12, 1].isnan()
+    assert gradient[0, 0].isfinite().all()
+
+
+def test_images_of_any_layout() -> None:
+    image, _, target = images(40, 23)
+    planes = image.detach().permute(2, 0, 1).contiguous().requires_grad_()
+    losses = ssim_loss(planes.permute(1, 2, 0), target.repeat(1, 2, 1)[:, :23]), ssim_loss(image, target)
+    assert torch.equal(*losses)
+    grads = torch.autograd.grad(losses[0], planes)[0], torch.autograd.grad(losses[1], image)[0]
+    assert torch.equal(grads[0].permute(1, 2, 0), grads[1])

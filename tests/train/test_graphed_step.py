@@ -1,4 +1,4 @@
-"""Steps that a recording would replay, run kernel by kernel on the CPU, beside steps of nerfstudio's trainer."""
+"""Steps that a recording would replay, run kernel by kernel on the CPU, beside nerfstudio's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gains of photos: what differs from the neighbours is found and taken out, what the place explains is not."""
+"""Exposure compensation: what differs from the neighbours is taken out, what the place explains is not."""
 
 from __future__ import annotations
 

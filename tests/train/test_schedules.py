@@ -1,0 +1,445 @@
+"""Schedules that follow the length of the run, learning rates, and optimizers."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from torch.optim import Adam
+from torch.optim.lr_scheduler import ExponentialLR, LambdaLR
+
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.method_configs import sundae
+from sundae_ns.plugin.optimizer_configs import FusedAdamConfig, NetworkAdamConfig, PruneAwareDecayConfig
+from sundae_ns.train.pruning import PruningSchedule
+from sundae_ns.train.schedules import (
+    LEAST_IMAGES,
+    LEAST_RECOVERY,
+    MOST_FACTOR,
+    SPARSE,
+    Decay,
+    fit_to_length,
+    given_options,
+    limit_rise,
+    notify_pruned,
+    put_restarts,
+    restarts,
+    schedule_table,
+    step_options,
+    take_options,
+)
+
+OURS = sorted(name for name in all_methods if name.startswith("sundae"))
+
+
+def fitted(method: str, length: int, *words: str, **model: Any) -> Any:
+    """A configuration of ``length`` steps; ``words`` are options that keep their value, ``model`` are new values."""
+    config = deepcopy(all_methods[method])
+    config.max_num_iterations = config.schedule_length = length
+    for name, value in model.items():
+        setattr(config.pipeline.model, name, value)
+    fit_to_length(config, deepcopy(all_methods[method]), given_options(words))
+    return config
+
+
+def option(config: Any, name: str) -> Any:
+    """The value of an option with a dotted name."""
+    for part in name.split("."):
+        config = config[part] if isinstance(config, dict) else getattr(config, part)
+    return config
+
+
+@pytest.mark.parametrize("method", OURS)
+def test_the_methods_own_length_changes_nothing(method: str) -> None:
+    usual = deepcopy(all_methods[method])
+    config = fitted(method, usual.max_num_iterations)
+    usual.schedule_length = usual.max_num_iterations
+    assert config == usual
+    fitted(method, usual.max_num_iterations // 10)
+    usual.schedule_length = None
+    assert all_methods[method] == usual, "methods share nothing with what is scaled"
+
+
+@pytest.mark.parametrize("method", OURS)
+@pytest.mark.parametrize("share", [0.05, 0.4, 0.9, 2])
+def test_every_option_follows_and_once_is_enough(method: str, share: float) -> None:
+    usual = all_methods[method]
+    config = fitted(method, round(share * usual.max_num_iterations))
+    kept_apart = ("refine_every", "reset_alpha_every", "warmup_steps")
+    for name in step_options(usual):
+        if name.endswith(kept_apart):
+            continue
+        found, value = option(config, name), option(usual, name)
+        assert found == (round(share * value) if value else value), name
+    for parts in config.optimizers.values():
+        rise = getattr(parts["scheduler"], "warmup_steps", 0)
+        assert rise <= config.max_num_iterations / 12
+    again = deepcopy(config)
+    fit_to_length(again, deepcopy(usual), frozenset())
+    assert again == config, "as for a run that starts from its saved configuration"
+
+
+def test_a_twentieth_of_the_steps() -> None:
+    """The run of a user that stayed at a quarter of the resolution to its end."""
+    config = fitted("sundae", 1500)
+    model = config.pipeline.model
+    assert (model.resolution_schedule * model.num_downscales, model.pruning.prune_at) == (300, 600)
+    assert (model.stop_split_at, model.sh_degree_interval) == (600, 50)
+    assert {parts["scheduler"].max_steps for parts in config.optimizers.values() if parts["scheduler"]} == {1500}
+    # Densification needs images for its statistics, and opacities need time to recover.
+    assert model.refine_every == LEAST_IMAGES
+    assert model.reset_alpha_every * model.refine_every > model.stop_split_at
+    assert dict(schedule_table(config)) == {
+        "images": "1/4 until 150, 1/2 until 300, then full size",
+        "densification": "25 to 600, every 50; opacities never reset",
+        "SH degree": "+1 every 50 steps",
+        "prune": "after 600, to as many as trials choose",
+        "head": "after 600, if trials favour it",
+        "learning rates": "decay until 1,500",
+    }
+
+
+def test_resets_keep_their_share_of_a_run_that_has_time_for_them() -> None:
+    model = fitted("sundae", 15000).pipeline.model
+    assert model.reset_alpha_every * model.refine_every == 1500 >= LEAST_RECOVERY
+    resets = dict(schedule_table(fitted("sundae", 15000)))["densification"]
+    assert resets == "250 to 6,000, every 50; opacities reset every 1,500"
+
+
+def test_options_set_by_hand_keep_their_value() -> None:
+    words = ("--pipeline.model.pruning.prune-at", "12000", "--optimizers.means.scheduler.max_steps=30000")
+    config = fitted("sundae", 20000, *words, resolution_schedule=77)
+    assert config.pipeline.model.pruning.prune_at == 12000, "also where it equals the default"
+    assert config.optimizers["means"]["scheduler"].max_steps == 30000
+    assert config.optimizers["compensation"]["scheduler"].max_steps == 20000
+    assert config.pipeline.model.resolution_schedule == 77
+    assert config.pipeline.model.stop_split_at == 8000
+
+
+@pytest.mark.parametrize("length", [300, 1500, 7000, 50000])
+def test_continuous_pruning_keeps_its_number_of_prunes(length: int) -> None:
+    def prunes(config: Any) -> int:
+        schedule = PruningSchedule(config.pipeline.model.pruning)
+        state = schedule.initialize_state()
+        return sum(schedule.due(state, step, 1000) for step in range(config.max_num_iterations))
+
+    assert prunes(fitted("sundae-continuous", length)) == prunes(fitted("sundae-continuous", 30000)) == 7
+
+
+def test_a_resumed_run_keeps_its_schedule() -> None:
+    run, usual = fitted("sundae", 6000), deepcopy(all_methods["sundae"])
+    config = deepcopy(usual)
+    config.max_num_iterations = 2000
+    config.pipeline.model.sh_degree_interval = 9
+    run.pipeline.model.head.size, run.pipeline.model.pruning.keep_ratio = "tiny", 0.3
+    config.pipeline.model.pruning.keep_ratio = 0.2
+    lines = take_options(config, run, usual, given_options(["--pipeline.model.pruning.prune-at", "4000"]))
+    assert config.pipeline.model.head.size == "tiny"
+    assert lines == [
+        "--pipeline.model.sh-degree-interval is 9; the run to resume has 200",
+        "--pipeline.model.pruning.prune-at is 12000; the run to resume has 2400",
+        "--pipeline.model.pruning.keep-ratio is 0.2; the run to resume has 0.3",
+    ]
+    assert config.pipeline.model.resolution_schedule == run.pipeline.model.resolution_schedule == 600
+    assert config.optimizers["means"]["scheduler"].max_steps == 6000
+    assert (config.pipeline.model.pruning.prune_at, config.pipeline.model.sh_degree_interval) == (12000, 9)
+    assert all_methods["sundae"] == usual
+
+
+def test_schedulers_of_a_checkpoint_stay() -> None:
+    """Their options lie in its states, which a resumed run loads."""
+    run, usual = fitted("sundae", 6000), deepcopy(all_methods["sundae"])
+    with pytest.raises(ConfigError, match="the run to resume has 6000, which cannot change; leave the option out"):
+        take_options(deepcopy(usual), run, usual, given_options(["--optimizers.means.scheduler.max-steps"]))
+
+
+@pytest.mark.parametrize("option", ["sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle"])
+def test_options_that_a_checkpoint_cannot_follow_are_refused(option: str) -> None:
+    run, usual = fitted("sundae", 6000), deepcopy(all_methods["sundae"])
+    place, _, name = option.rpartition(".")
+    setattr(run.pipeline.model.head if place else run.pipeline.model, name, "tiny" if name == "size" else 1)
+    given = given_options([f"--pipeline.model.{option.replace('_', '-')}"])
+    with pytest.raises(ConfigError, match=r"the run to resume has (tiny|1), which cannot change; leave the option out"):
+        take_options(deepcopy(usual), run, usual, given)
+    take_options(deepcopy(usual), run, usual, given_options([]))
+
+
+def test_tables_of_other_kinds() -> None:
+    off = deepcopy(all_methods["sundae"])
+    off.pipeline.model.pruning.mode = off.pipeline.model.head.mode = "off"
+    off.pipeline.model.num_downscales = 0
+    rows = dict(schedule_table(off))
+    assert (rows["prune"], rows["head"], rows["images"]) == ("none", "none", "full size")
+    late = deepcopy(all_methods["sundae"])
+    late.pipeline.model.head.start_at, late.pipeline.model.warm_start = 25000, "field.ply"
+    rows = dict(schedule_table(late))
+    assert (rows["prune"], rows["densification"]) == ("at once", "none: warm start")
+    assert rows["head"] == "after 13,000, if trials favour it"
+    assert dict(schedule_table(all_methods["sundae-tiny"]))["head"] == "after 600"
+    assert dict(schedule_table(all_methods["sundae-continuous"]))["prune"] == "2,000 to 15,000, every 2,000"
+    deciding = deepcopy(all_methods["sundae"])
+    assert dict(schedule_table(deciding))["prune"] == "after 12,000, to as many as trials choose"
+    deciding.pipeline.model.warm_start = "field.ply"
+    assert dict(schedule_table(deciding))["prune"] == "at once"
+
+
+def scheduler(**options: object) -> LambdaLR:
+    config = PruneAwareDecayConfig(lr_final=1e-4, max_steps=100, **options)  # type: ignore[arg-type]
+    optimizer = Adam([torch.nn.Parameter(torch.zeros(1))], lr=1e-2)
+    made = config.setup().get_scheduler(optimizer, lr_init=1e-2)
+    assert isinstance(made, LambdaLR)
+    return made
+
+
+def rates(
+    made: LambdaLR, steps: int, prune_at: int | None = None, *, name: str = "means", primitives: int = SPARSE
+) -> list[float]:
+    """Rate that each step uses, the scheduler stepping after it as in nerfstudio's trainer."""
+    found = []
+    for step in range(steps):
+        found.append(made.optimizer.param_groups[0]["lr"])
+        made.optimizer.step()
+        made.step()
+        if step == prune_at:
+            notify_pruned({name: made}, step, primitives)
+    return found
+
+
+def test_exponential_from_first_to_last() -> None:
+    found = rates(scheduler(), 130)
+    assert found[0] == pytest.approx(1e-2)
+    assert found[50] == pytest.approx(1e-3)
+    assert found[100] == pytest.approx(1e-4)
+    assert found[129] == pytest.approx(1e-4)
+
+
+def test_half_a_cosine_from_first_to_last() -> None:
+    found = rates(scheduler(shape="cosine"), 130)
+    assert found[0] == pytest.approx(1e-2)
+    assert found[25] == pytest.approx(1e-4 + 0.99e-2 * (1 + 0.5**0.5) / 2)
+    assert found[50] == pytest.approx((1e-2 + 1e-4) / 2)
+    assert found[100] == found[129] == pytest.approx(1e-4)
+    restarted = rates(scheduler(shape="cosine", lr_restart=4e-3, warmup_steps=4), 130, prune_at=40)
+    assert restarted[:41] == pytest.approx(found[:41])
+    assert restarted[42] == pytest.approx(3 / 5 * 4e-3, rel=0.01)
+    assert restarted[70] == pytest.approx((4e-3 + 1e-4) / 2)
+    assert restarted[100] == pytest.approx(1e-4)
+
+
+def test_prune_restarts_the_decay() -> None:
+    found = rates(scheduler(lr_restart=4e-3), 130, prune_at=40)
+    plain = rates(scheduler(), 130)
+    assert found[:41] == pytest.approx(plain[:41])
+    assert found[41] == pytest.approx(4e-3, rel=0.1)
+    assert found[70] == pytest.approx((4e-3 * 1e-4) ** 0.5)
+    assert found[100] == pytest.approx(1e-4)
+
+
+@pytest.mark.parametrize(
+    ("primitives", "factor"), [(10 * SPARSE, 1), (SPARSE, 1), (SPARSE // 4, 2), (SPARSE // 9, 3), (1, MOST_FACTOR)]
+)
+def test_centres_of_few_primitives_move_faster_after_the_prune(primitives: int, factor: float) -> None:
+    usual = rates(scheduler(lr_restart=4e-3), 130, prune_at=40)
+    found = rates(scheduler(lr_restart=4e-3), 130, prune_at=40, primitives=primitives)
+    assert found[:41] == usual[:41]
+    assert found[41:] == pytest.approx([factor * rate for rate in usual[41:]], rel=1e-3)
+    head = rates(scheduler(lr_restart=4e-3), 130, prune_at=40, name="compensation", primitives=primitives)
+    assert head == usual
+    never = rates(scheduler(), 130, prune_at=40, primitives=primitives)
+    assert never == rates(scheduler(), 130)
+
+
+def test_held_until_the_prune_then_rising_and_falling() -> None:
+    found = rates(scheduler(lr_restart=1e-2, hold_until_prune=True, warmup_steps=9), 130, prune_at=40)
+    assert found[:41] == pytest.approx([1e-2] * 41)
+    assert found[41] == pytest.approx(2 / 10 * 1e-2, rel=0.1)
+    rising = found[41:50]
+    assert rising == sorted(rising)
+    assert found[49] > 0.5e-2
+    falling = found[52:101]
+    assert falling == sorted(falling, reverse=True)
+    assert found[100] == pytest.approx(1e-4)
+
+
+def test_only_the_first_prune_counts_and_others_are_left_alone() -> None:
+    made = scheduler(lr_restart=1e-2)
+    stock = ExponentialLR(Adam([torch.nn.Parameter(torch.zeros(1))]), gamma=0.9)
+    notify_pruned({"means": made, "other": stock}, 10, SPARSE)
+    notify_pruned({"means": made, "other": stock}, 20, SPARSE)
+    (decay,) = made.lr_lambdas
+    assert isinstance(decay, Decay)
+    assert decay.pruned_at == 10
+
+
+def head_scheduler() -> LambdaLR:
+    """Of a network with weights, which decay, and biases: two groups, and torch lists a multiplier for each."""
+    optimizer = NetworkAdamConfig(lr=1e-2, weight_decay=0.1).setup(
+        [torch.nn.Parameter(torch.zeros(2, 2)), torch.zeros(1)]
+    )
+    config = PruneAwareDecayConfig(
+        lr_final=1e-4, max_steps=100, lr_restart=1e-2, hold_until_prune=True, warmup_steps=9, shape="cosine"
+    )
+    made = config.setup().get_scheduler(optimizer, lr_init=1e-2)
+    assert isinstance(made, LambdaLR)
+    assert len(made.lr_lambdas) == 2
+    return made
+
+
+def test_a_trial_that_starts_again_has_the_rates_of_the_first() -> None:
+    made, trials = head_scheduler(), []
+    untouched = restarts({"compensation": made})
+    notify_pruned({"compensation": made}, 0, SPARSE)
+    began = restarts({"compensation": made})
+    for _ in range(3):
+        trials.append([])
+        for _ in range(12):
+            trials[-1].append([group["lr"] for group in made.optimizer.param_groups])
+            made.optimizer.step()
+            made.step()
+        put_restarts({"compensation": made}, began, 12 * len(trials))
+    first, *others = ([weights for weights, _ in trial] for trial in trials)
+    assert all(weights == biases for trial in trials for weights, biases in trial)
+    assert first[0] == pytest.approx(1 / 10 * 1e-2)
+    assert first[:10] == sorted(first[:10])
+    for other in others:
+        assert other[0] == pytest.approx(first[0])
+        # The decay has less time left.
+        assert other == pytest.approx(first, rel=0.06)
+    # A field that was not pruned yet has the rates of before the prune again.
+    put_restarts({"compensation": made}, untouched, 0)
+    assert made.optimizer.param_groups[0]["lr"] == 1e-2
+
+
+def test_the_rates_of_a_trial_decay_as_those_of_a_run() -> None:
+    decay = Decay(0.01, 1000, 1.0, False, 0, pruned_at=100, ends_at=200)
+    assert [decay(step) for step in (100, 150, 200, 500)] == pytest.approx([1, 0.1, 0.01, 0.01])
+    assert replace(decay, ends_at=None)(1000) == pytest.approx(0.01)
+    assert replace(decay, ends_at=None)(200) > 0.5
+
+
+def test_the_rise_of_a_rate_is_limited_before_it_begins() -> None:
+    made = head_scheduler()
+    limit_rise({"compensation": made}, 20)
+    limit_rise({"compensation": made}, 4)
+    notify_pruned({"compensation": made}, 0, SPARSE)
+    limit_rise({"compensation": made}, 1)
+    assert made.optimizer.param_groups[0]["lr"] == pytest.approx(1 / 5 * 1e-2)
+    assert {decay.warmup_steps for decay in made.lr_lambdas} == {4}
+
+
+def test_rates_are_python_floats() -> None:
+    made = scheduler(lr_restart=1e-3)
+    for step in (0, 7, 200):
+        assert type(made.lr_lambdas[0](step)) is float  # type: ignore[operator]
+    rates(made, 5, prune_at=2)
+    assert all(type(rate) is float for rate in made.get_last_lr())
+
+
+def trained(config: AdamOptimizerConfig, device: str = "cpu") -> torch.Tensor:
+    value = torch.nn.Parameter(torch.linspace(-1, 1, 7, device=device))
+    optimizer = config.setup([value])
+    for _ in range(20):
+        optimizer.zero_grad()
+        (value - 0.3).square().sum().backward()
+        optimizer.step()
+    return value.detach().cpu()
+
+
+def test_same_steps_as_nerfstudios_adam() -> None:
+    options = {"lr": 0.03, "eps": 1e-12, "weight_decay": 0.01}
+    assert torch.equal(trained(FusedAdamConfig(**options)), trained(AdamOptimizerConfig(**options)))
+
+
+def test_options_arrive_and_a_generator_of_parameters_will_do() -> None:
+    config = FusedAdamConfig(lr=0.03, eps=1e-12, weight_decay=0.01)
+    optimizer = config.setup(torch.nn.Linear(2, 2).parameters())
+    group = optimizer.param_groups[0]
+    assert (group["lr"], group["eps"], group["weight_decay"], group["fused"]) == (0.03, 1e-12, 0.01, False)
+    assert len(group["params"]) == 2
+
+
+def step_at_a_long_gradient(config: AdamOptimizerConfig) -> float:
+    """How far a weight moves, in rates, by the first long gradient after thousands of short ones."""
+    value = torch.nn.Parameter(torch.zeros(1))
+    optimizer = config.setup([value])
+    for step in range(5000):
+        value.grad = torch.full((1,), 1e-4 * (-1) ** step)
+        optimizer.step()
+    before, value.grad = value.item(), torch.ones(1)
+    optimizer.step()
+    return abs(value.item() - before) / config.lr
+
+
+def test_a_long_gradient_moves_a_networks_weights_by_less_than_the_rate() -> None:
+    assert step_at_a_long_gradient(FusedAdamConfig(lr=1e-3)) > 3
+    assert step_at_a_long_gradient(NetworkAdamConfig(lr=1e-3)) < 0.5
+
+
+def test_weights_of_many_inputs_have_smaller_rates() -> None:
+    head = CompensationHead(HeadConfig(size="regular", pixel_unshuffle=1))
+    optimizer = NetworkAdamConfig(lr=1e-3, full_rate_inputs=1152).setup(head.parameters())
+    rates = {value: group["lr"] for group in optimizer.param_groups for value in group["params"]}
+    assert len(rates) == len(list(head.parameters()))
+    for conv in (module for module in head.modules() if isinstance(module, torch.nn.Conv2d)):
+        inputs = conv.in_channels * conv.kernel_size[0] ** 2
+        assert rates[conv.weight] == pytest.approx(1e-3 * min(1, 1152 / inputs))
+        assert conv.bias is not None
+        assert rates[conv.bias] == 1e-3
+    assert min(rates.values()) == pytest.approx(1e-3 / 6)  # 3 x 3 of 512 + 256 channels
+
+
+def test_the_default_head_has_one_rate_and_its_biases_do_not_decay() -> None:
+    config = sundae.config.optimizers["compensation"]["optimizer"]
+    optimizer = config.setup(CompensationHead(HeadConfig()).parameters())
+    assert {(group["lr"], group["betas"]) for group in optimizer.param_groups} == {(1e-3, (0.9, 0.95))}
+    decays = {value.ndim > 1: group["weight_decay"] for group in optimizer.param_groups for value in group["params"]}
+    assert decays == {True: 0.15, False: 0}
+
+
+def test_a_networks_weights_decay_by_a_share_of_the_rate() -> None:
+    net = torch.nn.Linear(2, 2)
+    before = [value.detach().clone() for value in (net.weight, net.bias)]
+    optimizer = NetworkAdamConfig(lr=0.1, weight_decay=0.5).setup(net.parameters())
+    for value in net.parameters():
+        value.grad = torch.zeros_like(value)
+    optimizer.step()
+    torch.testing.assert_close(net.weight.detach(), 0.95 * before[0])
+    assert torch.equal(net.bias.detach(), before[1])
+
+
+def test_rates_of_all_layers_decay_alike_and_come_back_from_a_checkpoint() -> None:
+    def made() -> tuple[torch.optim.Optimizer, Any]:
+        head = CompensationHead(HeadConfig(size="regular"))
+        optimizer = NetworkAdamConfig(lr=1e-3).setup(head.parameters())
+        config = PruneAwareDecayConfig(lr_final=1e-5, max_steps=100, lr_restart=1e-3, hold_until_prune=True)
+        return optimizer, config.setup().get_scheduler(optimizer, 1e-3)
+
+    optimizer, scheduler = made()
+    highest = [group["lr"] for group in optimizer.param_groups]
+    assert len(highest) > 1
+    notify_pruned({"compensation": scheduler}, 0, 100)
+    for _ in range(50):
+        optimizer.step()
+        scheduler.step()
+    rates = [group["lr"] for group in optimizer.param_groups]
+    assert rates == pytest.approx([0.1 * rate for rate in highest])
+    again, schedule = made()
+    again.load_state_dict(optimizer.state_dict())
+    schedule.load_state_dict(scheduler.state_dict())
+    for each in (optimizer, scheduler, again, schedule):
+        each.step()
+    assert [group["lr"] for group in again.param_groups] == [group["lr"] for group in optimizer.param_groups]
+    assert optimizer.param_groups[0]["lr"] < rates[0]
+
+
+@pytest.mark.gpu
+def test_fused_on_cuda_takes_the_same_steps() -> None:
+    config = FusedAdamConfig(lr=0.03)
+    assert config.setup([torch.nn.Parameter(torch.zeros(1, device="cuda"))]).param_groups[0]["fused"]
+    torch.testing.assert_close(trained(config, "cuda"), trained(config), atol=1e-6, rtol=1e-5)
