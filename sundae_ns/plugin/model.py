@@ -366,7 +366,7 @@ class SundaeModel(SplatfactoModel):
     ) -> dict[str, Tensor]:
         """Loss of the image and, while the head is enabled, an L1 loss of the base colours."""
         target, mask = self.target(batch, outputs), self.mask(batch, outputs.get("window"))
-        losses = self.training_step.terms(outputs, target, mask)
+        losses = self.losses(self.state, self.state.gaussians, outputs["rgb"], outputs["base_rgb"], target, mask)
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
             self.exposure_compensation.observe(outputs["rgb"], target, mask, batch)

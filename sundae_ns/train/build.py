@@ -19,11 +19,7 @@ from sundae_ns.train.trials import AfterPrune, Trials
 
 
 def check(options: Any) -> None:
-    """Check options that cannot work, alone or together.
-
-    Raises:
-        ConfigError: the first such option, and its mend.
-    """
+    """Check options that cannot work, alone or together; raises a ConfigError with the first one and its remedy."""
     options.pruning.validate()
     if options.head.mode != "off":
         options.head.validate()

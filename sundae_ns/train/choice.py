@@ -90,12 +90,7 @@ def spread_cameras(indices: Sequence[int], count: int, half: int) -> list[int]:
 
 
 def plan_heads(indices: Sequence[int], steps: int) -> tuple[list[list[int]], int]:
-    """Folds of held-out views, each for a trial of every head, and the steps of such a trial.
-
-    Args:
-        indices: of the training views, at least two.
-        steps: length of the schedule.
-    """
+    """Folds of held-out views among at least two, each for a trial of every head, and the steps of such a trial."""
     few = len(indices) < FEW_VIEWS
     chosen = spread_cameras(indices, 2 if few else max(2, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY)), 1)
     length = LEAST_TRIAL * steps / 2 if few else max(LEAST_TRIAL * steps, min(HEAD_STEPS, MOST_TRIAL * steps))
@@ -116,11 +111,9 @@ def is_enough(psnr: float, ssim: float, doublings: float) -> bool:
 
 
 def best_head(tried: Sequence[Tried], folds: int) -> str:
-    """The largest head that gains enough over the best smaller one and loses no SSIM, by the trials of stage ``head``.
+    """The largest head that gains enough over the best smaller one and loses no SSIM.
 
-    Args:
-        tried: a row for each head and fold, heads in their order; a head whose folds have not all ended is left out.
-        folds: number of trials of a head.
+    ``tried`` has a row for each head and fold, heads in their order; a head whose folds have not all ended is left out.
     """
     best: list[Tried] = []
     for first in range(0, len(tried) - folds + 1, folds):
@@ -170,12 +163,7 @@ def head_pays(curve: Sequence[CurvePoint], gain: HeadGain, tolerance: Tolerance)
     """Whether a head gains enough for its bytes in a packed scene, in PSNR and in SSIM.
 
     Both scenes are compared as they would be kept: with a head quality levels off at fewer Gaussians, so the scene may
-    take fewer bytes in all. Gains count at the count that is kept with the head, since in a larger field it gains less.
-
-    Args:
-        curve: of the field without a head.
-        gain: what its trials have shown.
-        tolerance: by which the counts are chosen.
+    take fewer bytes in all. Gains count at the count that is kept with the head. The curve is without one.
     """
     kept, without = choose(with_head(curve, gain), tolerance), choose(curve, tolerance)
     added, doublings = gain.bytes_of(kept), 0.0
@@ -272,14 +260,10 @@ def is_lost(point: CurvePoint, tolerance: Tolerance) -> bool:
 
 
 def choose(curve: Sequence[CurvePoint], tolerance: Tolerance) -> int:
-    """The smallest count that is as good as the best one in PSNR and SSIM.
+    """The smallest count that is as good as the best one in PSNR and SSIM, from a curve with the largest count first.
 
     Between the smallest tried count that is and the next smaller one, the loss is interpolated over the logarithm of
     the count. If PSNR and SSIM ask for different counts, the one that loses least, in tolerances, is taken.
-
-    Args:
-        curve: largest count first.
-        tolerance: losses that nobody sees.
     """
     over = [excess(point, tolerance) for point in curve]
     good = [index for index, value in enumerate(over) if value <= 1]
@@ -332,10 +316,9 @@ def loss_of(views: Sequence[HeldOutQuality], ssim_weight: float) -> float:
 
 
 def best_length(losses: Sequence[float]) -> tuple[int, bool]:
-    """Number of windows of training after which the loss was least, and whether it has grown since by enough to stop.
+    """Windows of training after which the loss was least, and whether it has grown by enough since to stop.
 
-    Args:
-        losses: of the held-out views after each window, at least one; NaN if they could not be measured.
+    There is at least one loss, of the held-out views after each window; NaN if they could not be measured.
     """
     known = [math.inf if math.isnan(loss) else loss for loss in losses]
     best = known.index(min(known))

@@ -42,10 +42,7 @@ class CountCurve:
 
 
 def read_count_curve(folder: Path) -> CountCurve | None:
-    """The record of a run; None if trials have not decided about its number of Gaussians.
-
-    Args:
-        folder: of the run.
+    """The record in a run's folder; None if trials have not decided about its number of Gaussians.
 
     Raises:
         CheckpointError: the record is damaged.
@@ -74,10 +71,6 @@ def expected_change(points: Sequence[CurvePoint], count: int, other: int) -> tup
     """Change of PSNR (dB) and SSIM from one count to another, after training; None beyond the tried counts.
 
     Between two tried counts the losses are interpolated over the logarithm of the count.
-
-    Args:
-        points: of a curve, in any order.
-        count, other: numbers of Gaussians.
     """
     known = sorted((point for point in points if math.isfinite(point.psnr_loss)), key=lambda point: point.count)
     if not known or not all(known[0].count <= end <= known[-1].count for end in (count, other)):

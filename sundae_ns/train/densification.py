@@ -101,11 +101,7 @@ class CappedStrategy(DefaultStrategy):
 
 
 class Densification(Callback):
-    """Grows the field until the schedule's prune would undo it.
-
-    Args:
-        strategy: gsplat's verbs, on the parameters of the field.
-    """
+    """Grows the Gaussians by gsplat's strategy until the schedule's prune would undo it."""
 
     name = "densification"
 
@@ -133,12 +129,7 @@ class Densification(Callback):
 
 
 def make_strategy(options: Any, num_images: int) -> CappedStrategy:
-    """Strategy of the warm-up. It ends before the prune that would undo it.
-
-    Args:
-        options: of the model; those of pruning give the end of growth and, for continuous pruning, the cap.
-        num_images: training images. Each is seen once after opacities are reset, before anything grows.
-    """
+    """Strategy of the densification, which ends before the prune that would undo it, by the options of the model."""
     stop, cap, pruning = options.stop_split_at, None, options.pruning
     if pruning.mode == "continuous":
         stop, cap = min(stop, pruning.stop), pruning.max_gaussians

@@ -42,12 +42,7 @@ SAMPLE = 1 << 14  # Approximate number of measured pixels of an image
 
 
 class ExposureCompensation(Callback):
-    """Measures the gains of the training photos, and divides photos by them.
-
-    Args:
-        num_photos: number of training photos.
-        mode: divide photos, do not, or decide once they are measured.
-    """
+    """Measures the gains of photos, and divides photos by them; ``auto`` decides once they are measured."""
 
     name = "exposure-compensation"
 
@@ -71,8 +66,8 @@ class ExposureCompensation(Callback):
         return {"divides": self._divides, **values}
 
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
-        """Counterpart of :meth:`state_dict`; other photos, or none as in an earlier version, begin anew."""
-        if "divides" not in saved or len(saved["gains"]) != len(self._gains):
+        """Counterpart of :meth:`state_dict`; other photos begin anew."""
+        if len(saved.get("gains", ())) != len(self._gains):
             return
         if self._mode == "auto":
             self._divides = saved["divides"]
@@ -106,13 +101,9 @@ class ExposureCompensation(Callback):
 
     @torch.no_grad()
     def observe(self, image: Tensor, photo: Tensor, mask: Tensor | None, batch: Mapping[str, Any]) -> None:
-        """Measure an image of the field and its photo.
+        """Measure an image before its step ``[H, W, 3]`` and its photo, as :meth:`balanced` gave it ``[H, W, 3]``.
 
-        Args:
-            image: of the field before its step ``[H, W, 3]``.
-            photo: as :meth:`balanced` gave it ``[H, W, 3]``.
-            mask: pixels that count ``[H, W, 1]``; None for all.
-            batch: of the photo.
+        A mask ``[H, W, 1]`` has the pixels that count; None for all.
         """
         index = _index(batch)
         if index is None or self._smoother is None or self._state.step % MEASURED_EVERY:

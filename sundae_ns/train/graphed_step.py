@@ -144,11 +144,8 @@ class _Recording:
 class StepRecordings:
     """Runs training steps. The first of a kind runs kernel by kernel, because libraries choose and load kernels then.
 
-    Later ones replay. A step whose view has more tile/Gaussian pairs than fit changes nothing, and the next recording
-    has room for them.
-
-    Args:
-        record: False runs every step kernel by kernel, as a test does on a CPU.
+    Later ones replay. A step whose image has more tile/Gaussian pairs than fit changes nothing, and the next recording
+    has a larger capacity. Without ``record`` every step runs kernel by kernel, as a test does on a CPU.
     """
 
     def __init__(self, *, record: bool = True) -> None:
@@ -284,12 +281,7 @@ class _Held:
 
 
 class RecordedStep:
-    """Training steps of one field.
-
-    Args:
-        losses: terms of the loss.
-        record: False runs every step kernel by kernel, as a test does on a CPU.
-    """
+    """Training steps of one set of Gaussians; without ``record`` kernel by kernel, as a test does on a CPU."""
 
     def __init__(self, losses: StepLosses, *, record: bool = True) -> None:
         self._losses = losses

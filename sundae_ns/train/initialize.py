@@ -46,11 +46,7 @@ class Start:
     failure: CheckpointError | None = None  # Why the model could not start from its warm start
 
     def announce(self) -> None:
-        """Print the warnings.
-
-        Raises:
-            CheckpointError: the failure.
-        """
+        """Log the warnings, or raise the failure."""
         if self.failure is not None:
             raise self.failure
         for warning in self.warnings:
@@ -145,15 +141,7 @@ FILLED = {"cuda": 100_000, "cpu": 20_000}
 
 
 class DenseStart(Callback):
-    """Begins the training anew from sparse and dense points, before the first step.
-
-    Args:
-        options: ``SundaeModelConfig``.
-        points: sparse points of the capture; None or none at all leave the field as it is.
-        num_images: number of training images.
-        num_features: length of the feature vectors; 0 for none.
-        cap: highest number of Gaussians to start with; None for no cap.
-    """
+    """Begins the training anew from sparse and dense points, before the first step; see :func:`initial_gaussians`."""
 
     name = "dense-start"
 

@@ -59,8 +59,7 @@ def duration(seconds: float) -> str:
 class TimeLeft:
     """Smooths the time of a step: evaluations, saves and a busy machine change it by the minute.
 
-    Intervals between two lines count by their steps, those of the last :data:`SHARE` of a run the most. A step counts
-    :data:`MOST` times the usual one at most.
+    Steps of the last :data:`SHARE` of a run count the most. One counts :data:`MOST` times the usual one at most.
     """
 
     SHARE = 0.1
@@ -91,9 +90,7 @@ class TimeLeft:
 def long_on_cpu(seconds: float, left: int) -> str | None:
     """A warning if a training on a CPU takes more than half an hour; None otherwise.
 
-    Args:
-        seconds: time of one of the first steps, which use smaller images and fewer Gaussians than later ones.
-        left: number of steps to come.
+    The seconds are of one of the first steps, which use smaller images and fewer Gaussians than the ``left`` ones.
     """
     if seconds * left <= LONG:
         return None
@@ -109,11 +106,7 @@ COMMANDS = ("ns-eval", "ns-render", "ns-export", "ns-viewer")
 
 
 def loaded_run(program: Sequence[str]) -> Path | None:
-    """Folder of the run that a command opens by its ``config.yml``; None for other commands.
-
-    Args:
-        program: the command and its arguments, as in ``sys.argv``.
-    """
+    """Folder of the run that a command (as in ``sys.argv``) opens by its ``config.yml``; None for other commands."""
     if not program or Path(program[0]).stem not in COMMANDS:
         return None
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -127,11 +120,9 @@ _REPLACED = ("load_dir", "load_step", "load_checkpoint", "max_num_iterations", "
 
 
 class Interruption:
-    """While it is entered, the first signal is noted, and a second SIGINT leaves at once. Other threads are left alone.
+    """While it is entered, the first signal calls ``ask``, and a second SIGINT leaves at once; in the main thread only.
 
-    Args:
-        ask: called at the first signal, in the signal handler.
-        quiet: whether another process says what happens.
+    It says nothing if it is ``quiet``, as another process does.
     """
 
     def __init__(self, ask: Callable[[], None], *, quiet: bool = False) -> None:
@@ -168,13 +159,9 @@ class Interruption:
 
 
 def resume_command(program: Sequence[str], folder: Path, method: str, data: object) -> str:
-    """The command that trains the remaining steps of a run.
+    """The command that trains the remaining steps of the run whose checkpoints lie in a folder.
 
-    Args:
-        program: the command line that started the run; if it is not ``ns-train``'s, one is made from the others.
-        folder: the run's checkpoints.
-        method: its method.
-        data: the capture.
+    It follows the command line that started the run, if that was ``ns-train``'s.
     """
     if Path(program[0]).name != "ns-train" or len(program) < 2:
         return shlex.join(["ns-train", method, "--data", str(data), "--load-dir", str(folder)])

@@ -36,11 +36,7 @@ USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise; also 
 
 @dataclass
 class PruningConfig(PruneRule):
-    """When to prune and how many Gaussians to keep, beside the rule that says which.
-
-    One class, because ``config.yml`` and the command line have these options side by side. Code that prunes takes the
-    :class:`sundae_ns.pruning.rule.PruneRule` alone.
-    """
+    """When to prune and how many Gaussians to keep, beside the rule that says which."""
 
     score: ScoreName = "detail-contribution"
     """Importance of a Gaussian: its blending weight over the training views, with pixels weighted by the detail that
@@ -96,11 +92,7 @@ class PruningConfig(PruneRule):
         return self.stop if self.mode == "continuous" else self.prune_at
 
     def validate(self) -> None:
-        """Check every option of the schedule and of its rule.
-
-        Raises:
-            ConfigError: names the first invalid option and its valid values.
-        """
+        """Check every option; raises a ConfigError with the first that is invalid and its remedy."""
         super().validate()
         if self.keep_ratio is not None:
             check_share(self.keep_ratio)
@@ -265,12 +257,7 @@ def summary(report: Mapping[str, Any]) -> str:
 
 
 class ScheduledPruning(Callback):
-    """Prunes when the schedule says so.
-
-    Args:
-        schedule: when, and to how many Gaussians.
-        evaluate: whether to evaluate all test views before and after the one-shot prune.
-    """
+    """Prunes when the schedule says so; ``evaluate`` measures all test views on both sides of the one-shot prune."""
 
     name = "pruning"
 
@@ -360,14 +347,15 @@ def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int)
     # The head is enabled in the steps after that one.
     head_at = int(state.head_starts_at) + 1 - state.offset if idle else 0
     head_option = "head.start-at" if state.head_starts_at != pruning.settled_at else f"pruning.{ends}"
+    few, many = f"nothing is pruned{and_head}", f"more Gaussians are left than asked for{and_head}"
     rows = [
-        (prunes and last_step < first and not pruned, "first prune", first, f"pruning.{begins}", "nothing is pruned"),
+        (prunes and last_step < first and not pruned, "first prune", first, f"pruning.{begins}", few),
         (
             prunes and last_step < pruning.last_due and not reached,
             "last prune",
             pruning.last_due,
             f"pruning.{ends}",
-            "more Gaussians are left than asked for",
+            many,
         ),
         (idle, "head", head_at, head_option, "it stays disabled"),
     ]
@@ -375,8 +363,7 @@ def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int)
         if missed:
             log.warning(
                 f"training ends after {last_step + 1:,} steps, and the {event} needs more than {step:,} ({option}): "
-                f"{result}{'' if event == 'head' else and_head}; train longer, or "
-                f"{'enable it' if option.startswith('head') else 'prune'} earlier"
+                f"{result}; train longer, or {'enable it' if option.startswith('head') else 'prune'} earlier"
             )
             return
 
@@ -384,10 +371,8 @@ def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int)
 class FloaterRemoval(Callback):
     """Removes what floats in front of a camera before anything is pruned, and before counts are compared.
 
-    Afterwards no Gaussian is added, so what they showed is learnt by those that stay.
-
-    Args:
-        points: sparse points of the capture ``[P, 3]``; None if it has none, and then nothing is removed.
+    Afterwards no Gaussian is added, so what they showed is learnt by those that stay. Without sparse points of the
+    capture ``[P, 3]`` nothing is removed.
     """
 
     name = "floaters"
@@ -400,8 +385,8 @@ class FloaterRemoval(Callback):
         return {"done": self._done}
 
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
-        """Counterpart of :meth:`state_dict`; of a run without points, there is nothing to do."""
-        self._done = self._points is None or bool(saved.get("done", state.pruning["num_prunes"] > 0))
+        """Counterpart of :meth:`state_dict`; without points there is nothing to do."""
+        self._done = self._points is None or bool(saved.get("done"))
 
     def needs_all(self, run: TrainingRun) -> bool:
         """Whether this is the last step at which the field grows, so that a saved warm-up has no floaters."""

@@ -202,7 +202,7 @@ def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
         words: the command line; options in it keep their value.
 
     Raises:
-        ConfigError: the length is no number of steps.
+        ConfigError: no steps are left, or the length is no number of steps.
     """
     usual = deepcopy(usual)
     given, saved = given_options(words), config.load_dir or config.load_checkpoint
@@ -213,7 +213,14 @@ def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
                 log.warning(line + ("; a prune that is done is not repeated" if ".pruning." in line else ""))
             config.schedule_length = config.schedule_length or run.schedule_length or run.max_num_iterations
             if "max_num_iterations" not in given and config.max_num_iterations == usual.max_num_iterations:
-                config.max_num_iterations = _steps_left(config, saved)
+                step = checkpoint.newest_step(saved) if config.load_step is None else config.load_step
+                left = config.schedule_length - (0 if step is None else step + 1)
+                if left < 1:
+                    raise ConfigError(
+                        f"the run has trained all of its {config.schedule_length:,} steps; give the number of further "
+                        "ones with --max-num-iterations"
+                    )
+                config.max_num_iterations = left
         # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
         config.schedule_length = config.schedule_length or config.max_num_iterations
         if run is not None and "max_num_iterations" not in given:
@@ -240,18 +247,6 @@ def _leave_finetune(config: Any, done: int) -> None:
     left = config.schedule_length - tuned_steps(config.schedule_length, steps) - done
     if left > 0:
         config.max_num_iterations = min(config.max_num_iterations, left)
-
-
-def _steps_left(config: Any, saved: Path) -> int:
-    """Steps from the checkpoint that is resumed to the end of the schedule."""
-    step = checkpoint.newest_step(saved) if config.load_step is None else config.load_step
-    left: int = config.schedule_length if step is None else config.schedule_length - step - 1
-    if left < 1:
-        raise ConfigError(
-            f"the run has trained all of its {config.schedule_length:,} steps; give the number of further ones with "
-            "--max-num-iterations"
-        )
-    return left
 
 
 def _resumed_run(config: Any, saved: Path) -> Any:
@@ -391,14 +386,10 @@ def _free(config: Any, usual: Any, given: Collection[str], names: Iterable[str])
 
 def _leaves(config: Any, prefix: str) -> list[str]:
     """Dotted names of all options in a configuration and in those that it holds."""
-    names = []
-    for entry in dataclasses.fields(config):
-        name, value = f"{prefix}.{entry.name}", getattr(config, entry.name)
-        if dataclasses.is_dataclass(value):
-            names += _leaves(value, name)
-        elif entry.name != "_target":
-            names.append(name)
-    return names
+    if not dataclasses.is_dataclass(config):
+        return [prefix]
+    names = [entry.name for entry in dataclasses.fields(config) if entry.name != "_target"]
+    return [leaf for name in names for leaf in _leaves(getattr(config, name), f"{prefix}.{name}")]
 
 
 def option(config: Any, name: str) -> Any:

@@ -103,7 +103,7 @@ class TrainingState:
                 self.optimizers[name].state.clear()
 
     def reshape_head(self, config: HeadConfig) -> None:
-        """Give head and features the shapes of a configuration, in the same parameters; values are loaded later."""
+        """Give head and features the shapes of a configuration; values are loaded later."""
         assert self.head is not None
         self.head.resize(config)
         features = self.gaussians[FEATURES]

@@ -256,21 +256,12 @@ class TrainingStep(NamedTuple):
         """The first half: Gaussians, one splatting pass, and the head; see :func:`render_view`."""
         return render_view(self.source, camera, background, settings, depth=depth)
 
-    def terms(
-        self, images: Mapping[str, Tensor], target: Tensor, mask: Tensor | None, count: Tensor | None = None
-    ) -> dict[str, Tensor]:
-        """The second half: the terms of the loss by name, each ``[]``; see :class:`StepInputs` for the arguments."""
-        return self.losses(self.state, self.params, images["rgb"], images["base_rgb"], target, mask, count)
-
     def __call__(self, inputs: StepInputs, settings: RenderSettings) -> tuple[Tensor, Rasterization, StepResult]:
-        """Both halves.
-
-        Returns:
-            The loss ``[]`` with its graph, the rasteriser's result, and the detached result of the step.
-        """
+        """Both halves: the loss ``[]`` with its graph, the rasteriser's result, and the detached result of the step."""
         with torch.enable_grad():
             images, splatted = self.images(inputs.camera, inputs.background, settings)
-            terms = self.terms(images, inputs.target, inputs.mask, inputs.count)
+            rgb, base = images["rgb"], images["base_rgb"]
+            terms = self.losses(self.state, self.params, rgb, base, inputs.target, inputs.mask, inputs.count)
             loss = functools.reduce(torch.add, terms.values())
         kept = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
         return loss, splatted, StepResult(kept, {name: value.detach() for name, value in terms.items()}, loss.detach())

@@ -1,20 +1,19 @@
 """Trials: train candidates (count x head x length) for some steps, measure held-out training views, keep the best.
 
-The stages of a run follow each other. Each tries its candidates in turn, from the same field, until one does not pay:
+The stages of a run follow each other. Each tries its candidates in turn, from the same Gaussians, until one does not
+pay:
 
 ``count``
-    How many Gaussians the prune keeps (``pruning.keep_ratio`` left out). Views are held out from the first step: a
-    large field remembers for long what it has seen once. From the unpruned field each trial prunes to a smaller count.
+    How many Gaussians the prune keeps (``pruning.keep_ratio`` left out), smaller ones in turn. Views are held out from
+    the first step: many Gaussians remember for long what they have seen once.
 ``tenth``
-    Where quality levels off, a head is the only thing that gains more, and it shows what it gains the sooner, the fewer
-    Gaussians there are. So if more than the usual share is chosen, that share is trained without and with a head.
+    If more than the usual share is chosen, that share is trained without and with a head: there it gains the sooner.
 ``head``
-    How the pruned field is finished (``head.mode auto``), unless the stage before has told: plain, with a head, or with
-    one of more features. Where views are few or differ, a head fits their differences. The chosen trial goes on.
+    Whether training goes on plain, with a head, or with one of more features (``head.mode auto``), unless ``tenth`` has
+    told. Where views are few or differ, a head fits their differences. The chosen trial goes on.
 ``length``
-    How long a field on few views trains: other views get worse while training goes on. The views of the last trial stay
-    held out and are measured again and again. Once their loss grows, the field goes back (stage ``repeat``), trains on
-    all views for as many steps as were best, and training is paused.
+    How long few views are trained on. The views of the last trial stay held out. Once their loss grows, training goes
+    back (stage ``repeat``), takes as many steps on all views as were best, and is paused.
 
 The mean of the weights over the last steps of a trial renders the held-out views: the weights of a single step fit the
 last images best. Test views are never used. :mod:`sundae_ns.train.choice` has the rules.
@@ -104,11 +103,9 @@ def view_quality(image: Tensor, target: Tensor, mask: Tensor | None) -> HeldOutQ
 
 
 def packed_size(gaussians: Mapping[str, Tensor], head: torch.nn.Module | None = None) -> list[int] | None:
-    """Estimated bytes of the Gaussians and of the head in a packed scene; None if it cannot be packed.
+    """Estimated bytes of the Gaussians, without features if there is no head, and of the head in a packed scene.
 
-    Args:
-        gaussians: parameters by name ``[N, ...]``; neighbouring ones are packed as a sample.
-        head: the head that reads the features; None leaves them out.
+    Neighbouring ones are packed as a sample. None if they cannot be packed.
     """
     n = len(gaussians["means"])
     packed = {name: value.detach() for name, value in gaussians.items() if head is not None or name != FEATURES}
@@ -145,8 +142,7 @@ class Trial:
 class TrialEngine:
     """Runs trials on the Gaussians of a run, one after another, and keeps copies to go back to.
 
-    Args:
-        head_starts_at: step of the schedule after which an enabled head corrects images.
+    An enabled head corrects images after the step ``head_starts_at`` of the schedule.
     """
 
     def __init__(self, head_starts_at: float = -math.inf) -> None:

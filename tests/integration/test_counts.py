@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer
-from trial_runs import PRUNE_AT, STEPS, tidy, tiny_run, tiny_scene
+from trial_runs import PRUNE_AT, STEPS, records_of, served_views, tidy, tiny_run, tiny_scene, trials_of
 
 from sundae_ns.pruning.rule import kept_count
 from sundae_ns.train import trials
@@ -75,15 +75,6 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return fix
 
 
-def trials_of(model: Any) -> Any:
-    return next(callback for callback in model.train_callbacks if callback.name == "trials")
-
-
-def records_of(trainer: Trainer) -> Any:
-    path = trainer.base_dir / "trials.json"
-    return json.loads(path.read_text()) if path.exists() else {}
-
-
 def record_of(trainer: Trainer) -> dict[str, Any]:
     return dict(records_of(trainer)["count"])
 
@@ -95,14 +86,11 @@ def head_steps(model: Any) -> float:
 
 def watch(trainer: Trainer) -> tuple[list[int], dict[str, torch.Tensor]]:
     """Collects the views that are served by step, and the field before the trials and before the prune."""
-    manager, served, fields = trainer.pipeline.datamanager, [], {}
+    served: list[int] = served_views(trainer)
+    fields: dict[str, torch.Tensor] = {}
     model: Any = trainer.pipeline.model
     deciding, pruning = ({one.name: one for one in model.train_callbacks}[name] for name in ("trials", "pruning"))
-    serve, begin, prune = manager.view_of_step, deciding._begin_counts, pruning.after_step
-
-    def view_of_step(step: int) -> int:
-        served.append(serve(step))
-        return served[-1]
+    begin, prune = deciding._begin_counts, pruning.after_step
 
     def began(run: Any) -> None:
         fields["before"] = model.gauss_params["means"].detach().clone()
@@ -113,7 +101,7 @@ def watch(trainer: Trainer) -> tuple[list[int], dict[str, torch.Tensor]]:
             fields["after"] = model.gauss_params["means"].detach().clone()
         prune(run)
 
-    manager.view_of_step, deciding._begin_counts, pruning.after_step = view_of_step, began, pruned
+    deciding._begin_counts, pruning.after_step = began, pruned
     return served, fields
 
 

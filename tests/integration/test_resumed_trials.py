@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from trial_runs import STEPS, same, tidy, tiny_run, tiny_scene
+from trial_runs import STEPS, records_of, same, tidy, tiny_run, tiny_scene, trials_of
 
 from sundae_ns.train import choice, trials
 from sundae_ns.train.choice import HeldOutQuality
@@ -24,7 +23,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     losses = (0.0, 0.0, 0.05, 0.45, 0.65, 0.8)
 
     def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
-        progress = next(one for one in run.model.train_callbacks if one.name == "trials").progress
+        progress = trials_of(run.model).progress
         number = len(progress.of(progress.stage))
         gain = {
             "count": -losses[number % 6],
@@ -62,11 +61,10 @@ def test_a_run_resumed_at_any_step_is_the_run(
             config.pipeline.model.pruning = PruningConfig(keep_ratio=keep_ratio, prune_at=40)
 
         trainer: Any = tiny_run(scene, tmp_path, name=name, change=change, **options)
-        stages.add(next(one for one in trainer.model.train_callbacks if one.name == "trials").progress.stage)
+        stages.add(trials_of(trainer.model).progress.stage)
         trainer.train()
         path = trainer.checkpoint_dir / f"step-{STEPS - 1:09d}.ckpt"
-        records = json.loads((trainer.base_dir / "trials.json").read_text())
-        return trainer, torch.load(path, map_location="cpu", weights_only=True), records
+        return trainer, torch.load(path, map_location="cpu", weights_only=True), records_of(trainer)
 
     trainer, expected, records = run("whole", save_every=1)
     for stop in stops:

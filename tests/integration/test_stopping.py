@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
-from trial_runs import LENGTH, PRUNE_AT, STEPS, same, tidy, tiny_run, tiny_scene
+from trial_runs import LENGTH, PRUNE_AT, STEPS, records_of, same, served_views, tidy, tiny_run, tiny_scene
 
 from sundae_ns.plugin import optimizer_configs as nerfstudio_configs
 from sundae_ns.train import averaging, choice, trials
@@ -50,28 +49,21 @@ def curve(monkeypatch: pytest.MonkeyPatch) -> Curve:
     return fix
 
 
-def _records(trainer: Trainer) -> Any:
-    return json.loads((trainer.base_dir / "trials.json").read_text())
-
-
 def _watched(trainer: Trainer) -> tuple[list[int], dict[int, torch.Tensor], dict[int, float]]:
     """Collects the training views that are served, and the centres and their rate after the extensions of each step."""
     model: Any = trainer.pipeline.model
-    manager, cameras, centres, rates = trainer.pipeline.datamanager, [], {}, {}
-    serve, last = manager.view_of_step, model.train_callbacks[-1]
+    served, last = served_views(trainer), model.train_callbacks[-1]
+    centres: dict[int, torch.Tensor] = {}
+    rates: dict[int, float] = {}
     act = last.after_step
-
-    def view_of_step(step: int) -> int:
-        cameras.append(serve(step))
-        return cameras[-1]
 
     def after_step(run: Any) -> None:
         act(run)
         centres[run.state.step] = model.gauss_params["means"].detach().clone()
         rates[run.state.step] = run.state.schedulers["means"].lr_lambdas[0](run.state.step)
 
-    manager.view_of_step, last.after_step = view_of_step, after_step
-    return cameras, centres, rates
+    last.after_step = after_step
+    return served, centres, rates
 
 
 def test_the_field_goes_back_trains_as_long_as_was_best_and_pauses(make: Make, curve: Curve) -> None:
@@ -82,7 +74,7 @@ def test_the_field_goes_back_trains_as_long_as_was_best_and_pauses(make: Make, c
     trainer.train()
     # 0.08 dB below the best are 0.4% of the loss and noise, 0.16 are not.
     back, rest = best + 2 * WINDOW, best + 2 * WINDOW + 2 * WINDOW
-    record = _records(trainer)["length"]
+    record = records_of(trainer)["length"]
     held = set(record["held_out_views"])
     assert record["steps_per_measurement"] == WINDOW
     assert [one["psnr"] for one in record["measured"]] == pytest.approx([19.92, 20, 19.92, 19.84])
@@ -122,9 +114,9 @@ def test_views_that_a_trial_has_seen_are_not_watched(tmp_path: Path, curve: Curv
     curve(lambda _: 20.0, held_out=1)
     trainer.train()
     tidy()
-    (held,) = _records(trainer)["length"]["held_out_views"]
+    (held,) = records_of(trainer)["length"]["held_out_views"]
     length = LENGTH // 2
-    other, last = _records(trainer)["head"]["held_out_views"]
+    other, last = records_of(trainer)["head"]["held_out_views"]
     assert held == last
     chosen = served[PRUNE_AT + length + 1 : PRUNE_AT + 2 * length + 1]  # the second trial of no head
     assert held not in chosen
@@ -138,7 +130,7 @@ def test_a_field_that_loses_nothing_trains_to_the_end_on_all_views(make: Make, c
     trainer = make()
     served, centres, _ = _watched(trainer)
     trainer.train()
-    record = _records(trainer)["length"]
+    record = records_of(trainer)["length"]
     watched = (STEPS - DECIDED) // 2
     assert len(record["measured"]) == watched // WINDOW
     assert record["steps_on_all_views"] is None
@@ -155,8 +147,8 @@ def test_a_warm_start_is_not_watched(make: Make, curve: Curve) -> None:
     trainer.pipeline.model.state.offset = PRUNE_AT
     served, *_ = _watched(trainer)
     trainer.train()
-    assert "head" in _records(trainer)
-    assert "length" not in _records(trainer)
+    assert "head" in records_of(trainer)
+    assert "length" not in records_of(trainer)
     assert len(served) == STEPS
 
 

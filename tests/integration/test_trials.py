@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -14,7 +13,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.eval_utils import eval_setup
-from trial_runs import LENGTH, PRUNE_AT, tidy, tiny_run, tiny_scene
+from trial_runs import LENGTH, PRUNE_AT, records_of, served_views, tidy, tiny_run, tiny_scene, trials_of
 
 from sundae_ns.plugin.callbacks import NerfstudioRun
 from sundae_ns.plugin.finished_runs import load_run
@@ -68,36 +67,13 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def _record(trainer: Trainer) -> dict[str, Any]:
-    return dict(json.loads((trainer.base_dir / "trials.json").read_text())["head"])
-
-
-def _trials(model: Any) -> Any:
-    """The extension that decides about the head."""
-    return next(callback for callback in model.train_callbacks if callback.name == "trials")
-
-
-def _taken_back(model: Any) -> int:
-    """Steps of trials whose field was dropped."""
-    return int(_trials(model).engine.taken_back)
-
-
-def _served(trainer: Trainer) -> list[int]:
-    """Collects the training views that are served, by step."""
-    manager, views = trainer.pipeline.datamanager, []
-    real = manager.view_of_step
-
-    def view_of_step(step: int) -> int:
-        views.append(real(step))
-        return views[-1]
-
-    manager.view_of_step = view_of_step
-    return views
+    return dict(records_of(trainer)["head"])
 
 
 def test_a_head_that_pays_stays_and_all_views_are_trained_on_again(make: Make, judge: Any) -> None:
     judge(head=(0.5, 0.01))
     trainer = make()
-    served = _served(trainer)
+    served = served_views(trainer)
     trainer.train()
     model: Any = trainer.pipeline.model
     record = _record(trainer)
@@ -149,7 +125,7 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     judge(head=(head, 0.01), features=(features, 0.02))
     trainer = make()
     model: Any = trainer.pipeline.model
-    trial = _trials(model)
+    trial = trials_of(model)
     seen: dict[int, tuple[torch.Tensor, float]] = {}
     head_rates: dict[int, list[float]] = {}
     real = trial.after_prune
@@ -180,7 +156,7 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     record = _record(trainer)
     assert (record["decision"], record["step"], len(record["arms"])) == (chosen, decided, tried)
     # A head that was chosen has trained for one trial.
-    assert _taken_back(model) == (tried - 1) * LENGTH
+    assert trials_of(model).engine.taken_back == (tried - 1) * LENGTH
     width = {"plain": 0, "head": 5, "features": 29}[chosen]
     assert model.gauss_params["features"].shape[1] == width
     assert (model.head is None) == (chosen == "plain")
@@ -195,7 +171,7 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
 def test_with_few_views_two_are_held_out_in_turn(make: Make, judge: Any) -> None:
     judge(head=(0.5, 0.01))
     trainer = make(8)
-    served = _served(trainer)
+    served = served_views(trainer)
     trainer.train()
     first, second = _record(trainer)["held_out_views"]
     length = LENGTH // 2
@@ -239,7 +215,7 @@ def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, tria
     whole.train()
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=3)
     model: Any = resumed.pipeline.model
-    trials_of_run = _trials(model)
+    trials_of_run = trials_of(model)
     assert "start" in trials_of_run.engine.kept
     resumed.ranks.count = 2
     attributes = TrainingCallbackAttributes(resumed.optimizers, resumed.grad_scaler, resumed.pipeline, resumed)

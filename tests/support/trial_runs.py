@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
@@ -61,6 +62,29 @@ def tiny_run(
 
     made.pipeline.get_average_eval_image_metrics = evaluate
     return made
+
+
+def trials_of(model: Any) -> Any:
+    """The callback that decides."""
+    return next(callback for callback in model.train_callbacks if callback.name == "trials")
+
+
+def records_of(trainer: Trainer) -> Any:
+    path = trainer.base_dir / "trials.json"
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def served_views(trainer: Trainer) -> list[int]:
+    """Collects the training views that are served, by step."""
+    manager, views = trainer.pipeline.datamanager, []
+    serve = manager.view_of_step
+
+    def view_of_step(step: int) -> int:
+        views.append(serve(step))
+        return views[-1]
+
+    manager.view_of_step = view_of_step
+    return views
 
 
 def tidy() -> None:

@@ -83,13 +83,13 @@ def test_one_shot_prunes_once_and_training_goes_on() -> None:
     assert made[1]["means"].state[made[0]["means"]]["exp_avg"].shape == (25, 3)
 
 
-def test_continuous_keeps_a_share_on_schedule() -> None:
-    policy = PruningSchedule(
-        PruningConfig(mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, num_neighbors=4)
-    )
+@pytest.mark.parametrize(("cap", "kept"), [(None, [70, 49, 34]), (70, [70, 49, 34]), (60, [60, 42, 29])])
+def test_continuous_keeps_a_share_on_schedule(cap: int | None, kept: list[int]) -> None:
+    options: dict[str, Any] = {"start": 2, "every": 3, "stop": 9, "keep_ratio": 0.7, "num_neighbors": 4}
+    policy = PruningSchedule(PruningConfig(mode="continuous", max_gaussians=cap, **options))
     reports, state = run(policy, gaussians(), range(13))
     assert [report["step"] for report in reports] == [2, 5, 8]
-    assert [report["after"] for report in reports] == [70, 49, 34]
+    assert [report["after"] for report in reports] == kept
     assert {report["peak"] for report in reports} == {100}
     assert state["num_prunes"] == 3
     assert reports[0]["sigma"] != reports[1]["sigma"]
@@ -235,27 +235,13 @@ def test_a_report_says_in_one_line_what_happened_and_leaves_out_what_did_not() -
     assert summary(odd).split("; ")[2:] == ["1,200 were NaN or infinite", "sigma 0.0316, tau 0.009, 1,500 isolated"]
 
 
-@pytest.mark.parametrize(("cap", "expected"), [(200, [70, 49, 34]), (70, [70, 49, 34]), (60, [60, 42, 29])])
-def test_continuous_under_a_cap_keeps_the_share_too(cap: int, expected: list[int]) -> None:
-    config = PruningConfig(
-        mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, max_gaussians=cap, num_neighbors=4
-    )
-    reports, _ = run(PruningSchedule(config), gaussians(), range(13))
-    assert [report["step"] for report in reports] == [2, 5, 8]
-    assert [report["after"] for report in reports] == expected
-
-
-def test_a_field_above_the_cap_is_pruned_when_continuous_pruning_has_ended() -> None:
-    """As after a resume under a lower cap."""
+def test_continuous_prunes_a_step_once_and_above_the_cap_also_afterwards() -> None:
     policy = PruningSchedule(PruningConfig(mode="continuous", start=0, stop=10, every=20, max_gaussians=100))
     state = policy.initialize_state()
     assert [policy.due(state, step, 101) for step in (9, 10, 30)] == [False, True, True]
     assert not policy.due(state, 30, 100)
-
-
-def test_continuous_prunes_a_step_once() -> None:
     policy = PruningSchedule(PruningConfig(mode="continuous", start=0, stop=10, every=1))
-    assert [policy.due({**policy.initialize_state(), "pruned_at": 5}, step, 100) for step in (5, 6)] == [False, True]
+    assert [policy.due({**state, "pruned_at": 5}, step, 100) for step in (5, 6)] == [False, True]
 
 
 @pytest.mark.parametrize(
@@ -413,52 +399,33 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
     return [line for line in capsys.readouterr().out.splitlines() if " needs more than " in line]
 
 
+NONE = "nothing is pruned"
+MORE = "more Gaussians are left than asked for"
+REST = ", and the head stays disabled; train longer, or prune earlier"
+LATE = "it stays disabled; train longer, or enable it earlier"
+CONTINUOUS = {"mode": "continuous", "start": 1, "stop": 5}
+
+
 @pytest.mark.parametrize(
     ("pruning", "head", "ending"),
     [
-        (
-            {"prune_at": 3},
-            {},
-            "3 (pruning.prune-at): nothing is pruned, and the head stays disabled; train longer, or prune",
-        ),
-        ({"prune_at": 3}, {"mode": "off"}, "3 (pruning.prune-at): nothing is pruned; train longer, or prune earlier"),
-        ({"prune_at": 3}, {"start_at": 1}, "3 (pruning.prune-at): nothing is pruned; train longer, or prune earlier"),
-        ({"mode": "continuous", "start": 3}, {}, "3 (pruning.start): nothing is pruned, and the head stays disabled"),
-        (
-            {"mode": "continuous", "start": 1, "every": 3, "stop": 5},
-            {},
-            "4 (pruning.stop): more Gaussians are left than asked for, and the head stays disabled; train longer",
-        ),
-        (
-            {"mode": "continuous", "start": 1, "every": 5, "stop": 5},
-            {},
-            "6 (pruning.stop): it stays disabled; train longer, or prune earlier",
-        ),
-        (
-            {"mode": "continuous", "start": 1, "every": 5, "stop": 5, "max_gaussians": 40},
-            {},
-            "5 (pruning.stop): more Gaussians are left than asked for, and the head stays disabled; train longer",
-        ),
-        ({"prune_at": 1}, {"start_at": 4}, "5 (head.start-at): it stays disabled; train longer, or enable it earlier"),
-        ({"prune_at": 1}, {"start_at": 2}, "3 (head.start-at): it stays disabled; train longer, or enable it earlier"),
-        ({"mode": "off"}, {"start_at": 4}, "5 (head.start-at): it stays disabled; train longer, or enable it earlier"),
+        ({"prune_at": 3}, {}, f"3 (pruning.prune-at): {NONE}{REST}"),
+        ({"prune_at": 3}, {"mode": "off"}, f"3 (pruning.prune-at): {NONE}; train longer, or prune earlier"),
+        ({"prune_at": 3}, {"start_at": 1}, f"3 (pruning.prune-at): {NONE}; train longer, or prune earlier"),
+        ({"prune_at": 3}, {"start_at": 9}, f"3 (pruning.prune-at): {NONE}{REST}"),
+        ({"mode": "continuous", "start": 3}, {}, f"3 (pruning.start): {NONE}{REST}"),
+        ({**CONTINUOUS, "every": 3}, {}, f"4 (pruning.stop): {MORE}{REST}"),
+        ({**CONTINUOUS, "every": 5}, {}, "6 (pruning.stop): it stays disabled; train longer, or prune earlier"),
+        ({**CONTINUOUS, "every": 5, "max_gaussians": 40}, {}, f"5 (pruning.stop): {MORE}{REST}"),
+        ({"prune_at": 1}, {"start_at": 4}, f"5 (head.start-at): {LATE}"),
+        ({"prune_at": 1}, {"start_at": 2}, f"3 (head.start-at): {LATE}"),
+        ({"mode": "off"}, {"start_at": 4}, f"5 (head.start-at): {LATE}"),
         ({"mode": "off"}, {}, "4 (pruning.prune-at): it stays disabled; train longer, or prune earlier"),
         ({"prune_at": 2}, {}, "3 (pruning.prune-at): it stays disabled; train longer, or prune earlier"),
-        (
-            {"prune_at": 3},
-            {"start_at": 9},
-            "3 (pruning.prune-at): nothing is pruned, and the head stays disabled; train",
-        ),
     ],
 )
 def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_after(
-    build: Build,
-    training_of: TrainingOf,
-    capsys: pytest.CaptureFixture[str],
-    pruning: dict[str, Any],
-    head: dict[str, Any],
-    ending: str,
-    tmp_path: Path,
+    build: Build, training_of: TrainingOf, capsys: Any, pruning: Any, head: Any, ending: str, tmp_path: Path
 ) -> None:
     training = training_of(build(pruning=pruning, head=head), trainer_of(tmp_path))
     (before,) = said(capsys)
@@ -495,9 +462,7 @@ def test_a_run_that_prunes_or_is_not_to_says_nothing(
     assert said(capsys) == []
 
 
-def test_a_warm_start_counts_from_the_prune(
-    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_warm_start_counts_from_the_prune(build: Build, training_of: TrainingOf, capsys: Any) -> None:
     model = build(pruning={"prune_at": 100}, head={"start_at": 102}, warm_start=Path("anything"))
     model._start = Start()  # of a file that need not be there
     training_of(model, trainer_of())
@@ -558,13 +523,3 @@ def test_a_resumed_run_removes_them_only_if_that_was_still_due(
     resumed = training_of(model)
     resumed.step(saved_after + 1)
     assert near(resumed.model) == left
-
-
-def test_a_run_that_was_pruned_by_an_earlier_version_is_done(build: Build, training_of: TrainingOf) -> None:
-    model = with_floaters(build)
-    callback = {one.name: one for one in model.train_callbacks}["floaters"]
-    callback.load_state_dict(model.state, {})
-    assert callback.state_dict() == {"done": False}
-    model.state.pruning["num_prunes"] = 1
-    callback.load_state_dict(model.state, {})
-    assert callback.state_dict() == {"done": True}

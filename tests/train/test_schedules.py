@@ -28,9 +28,11 @@ from sundae_ns.train.schedules import (
     given_options,
     limit_rise,
     notify_pruned,
+    option,
     put_restarts,
     restarts,
     schedule_table,
+    set_option,
     step_options,
     take_options,
 )
@@ -45,13 +47,6 @@ def fitted(method: str, length: int, *words: str, **model: Any) -> Any:
     for name, value in model.items():
         setattr(config.pipeline.model, name, value)
     fit_to_length(config, deepcopy(all_methods[method]), given_options(words))
-    return config
-
-
-def option(config: Any, name: str) -> Any:
-    """The value of an option with a dotted name."""
-    for part in name.split("."):
-        config = config[part] if isinstance(config, dict) else getattr(config, part)
     return config
 
 
@@ -159,12 +154,11 @@ def test_schedulers_of_a_checkpoint_stay() -> None:
         take_options(deepcopy(usual), run, usual, given_options(["--optimizers.means.scheduler.max-steps"]))
 
 
-@pytest.mark.parametrize("option", ["sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle"])
-def test_options_that_a_checkpoint_cannot_follow_are_refused(option: str) -> None:
+@pytest.mark.parametrize("name", ["sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle"])
+def test_options_that_a_checkpoint_cannot_follow_are_refused(name: str) -> None:
     run, usual = fitted("sundae", 6000), deepcopy(all_methods["sundae"])
-    place, _, name = option.rpartition(".")
-    setattr(run.pipeline.model.head if place else run.pipeline.model, name, "tiny" if name == "size" else 1)
-    given = given_options([f"--pipeline.model.{option.replace('_', '-')}"])
+    set_option(run.pipeline.model, name, "tiny" if name == "head.size" else 1)
+    given = given_options([f"--pipeline.model.{name.replace('_', '-')}"])
     with pytest.raises(ConfigError, match=r"the run to resume has (tiny|1), which cannot change; leave the option out"):
         take_options(deepcopy(usual), run, usual, given)
     take_options(deepcopy(usual), run, usual, given_options([]))
@@ -211,34 +205,22 @@ def rates(
     return found
 
 
-def test_exponential_from_first_to_last() -> None:
-    found = rates(scheduler(), 130)
-    assert found[0] == pytest.approx(1e-2)
-    assert found[50] == pytest.approx(1e-3)
-    assert found[100] == pytest.approx(1e-4)
-    assert found[129] == pytest.approx(1e-4)
-
-
-def test_half_a_cosine_from_first_to_last() -> None:
-    found = rates(scheduler(shape="cosine"), 130)
-    assert found[0] == pytest.approx(1e-2)
-    assert found[25] == pytest.approx(1e-4 + 0.99e-2 * (1 + 0.5**0.5) / 2)
-    assert found[50] == pytest.approx((1e-2 + 1e-4) / 2)
-    assert found[100] == found[129] == pytest.approx(1e-4)
-    restarted = rates(scheduler(shape="cosine", lr_restart=4e-3, warmup_steps=4), 130, prune_at=40)
+@pytest.mark.parametrize(
+    ("shape", "middle"),
+    [
+        ("exponential", {50: 1e-3}),
+        ("cosine", {25: 1e-4 + 0.99e-2 * (1 + 0.5**0.5) / 2, 50: (1e-2 + 1e-4) / 2}),
+    ],
+)
+def test_from_first_to_last(shape: str, middle: dict[int, float]) -> None:
+    found = rates(scheduler(shape=shape), 130)
+    for step, rate in {0: 1e-2, **middle, 100: 1e-4, 129: 1e-4}.items():
+        assert found[step] == pytest.approx(rate)
+    restarted = rates(scheduler(shape=shape, lr_restart=4e-3, warmup_steps=4), 130, prune_at=40)
     assert restarted[:41] == pytest.approx(found[:41])
-    assert restarted[42] == pytest.approx(3 / 5 * 4e-3, rel=0.01)
-    assert restarted[70] == pytest.approx((4e-3 + 1e-4) / 2)
+    assert restarted[42] == pytest.approx(3 / 5 * 4e-3, rel=0.1)
+    assert restarted[70] == pytest.approx((4e-3 + 1e-4) / 2 if shape == "cosine" else (4e-3 * 1e-4) ** 0.5)
     assert restarted[100] == pytest.approx(1e-4)
-
-
-def test_prune_restarts_the_decay() -> None:
-    found = rates(scheduler(lr_restart=4e-3), 130, prune_at=40)
-    plain = rates(scheduler(), 130)
-    assert found[:41] == pytest.approx(plain[:41])
-    assert found[41] == pytest.approx(4e-3, rel=0.1)
-    assert found[70] == pytest.approx((4e-3 * 1e-4) ** 0.5)
-    assert found[100] == pytest.approx(1e-4)
 
 
 @pytest.mark.parametrize(
