@@ -215,17 +215,17 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
             continue
         if not isinstance(state.get(name), Tensor):
             raise CheckpointError(f"the checkpoint has no {name}; {remedy}")
-        per_gaussian = name.startswith(_PREFIX)
         theirs, ours = state[name].shape, value.shape
-        if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_gaussian else (theirs != ours):
+        rows = 1 if name.startswith(_PREFIX) else 0  # another number of Gaussians fits
+        if len(theirs) < rows or theirs[rows:] != ours[rows:]:
             hint = ", such as its --pipeline.model.head.size" if name.startswith("networks.head.") else ""
             raise CheckpointError(
                 f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {remedy}{hint}"
             )
-    rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
-    if len(rows) != 1 or rows[0] == 0:
-        raise CheckpointError(f"the checkpoint has parameters of {rows} Gaussians; give another")
-    extra, n = state[EXTRA_STATE], rows[0]
+    counts = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
+    if len(counts) != 1 or counts[0] == 0:
+        raise CheckpointError(f"the checkpoint has parameters of {counts} Gaussians; give another")
+    extra, n = state[EXTRA_STATE], counts[0]
     pruning, strategy = extra["running"].get("pruning"), extra["running"].get("densification")
     numbers = [extra.get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
     if not all(isinstance(value, int) for value in numbers) or not isinstance(strategy, Mapping):
@@ -245,7 +245,7 @@ def gaussians_of(loaded: Mapping[str, Any], path: Path) -> Gaussians:
     stored = {name: state.get(_PREFIX + name) for name in SPLAT_NAMES}
     gaussians = {name: value.float() for name, value in stored.items() if isinstance(value, Tensor)}
     if len(gaussians) < len(stored):
-        raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
+        raise CheckpointError(f"{path} holds no Gaussians; give a checkpoint of splatfacto or sundae")
     for odd in odd_shapes(gaussians):
         raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")
     return Gaussians(gaussians, _encoding(gaussians, state.get(EXTRA_STATE)))
@@ -265,13 +265,9 @@ def _encoding(gaussians: Mapping[str, Tensor], extra: Any) -> Encoding:
     if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
         return "logits" if gaussians["features_rest"].shape[1] == 0 else "harmonics"
     _check_format(extra)
-    for encoding in get_args(Encoding):
-        if extra.get("encoding") == encoding:
-            return encoding  # type: ignore[no-any-return]
-    raise CheckpointError("the checkpoint does not say how it stores colours; give another")
-
-
-# ------------------------------------------------------------------------------------------ archives of any torch.save
+    if extra.get("encoding") not in get_args(Encoding):
+        raise CheckpointError("the checkpoint does not say how it stores colours; give another")
+    return extra["encoding"]  # type: ignore[no-any-return]
 
 
 def damage_of(file: BinaryIO) -> str | None:
@@ -318,9 +314,6 @@ def _check_tensors(value: Any) -> None:
     elif isinstance(value, (Mapping, list, tuple)):
         for inner in value.values() if isinstance(value, Mapping) else value:
             _check_tensors(inner)
-
-
-# -------------------------------------------------------------------------------------------------- random generators
 
 
 def random_state() -> dict[str, Any]:

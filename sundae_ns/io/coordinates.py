@@ -1,4 +1,4 @@
-"""Similarity transforms of a field, and the order of its centres along a space-filling curve (Morton, 1966)."""
+"""Similarity transforms of Gaussians, and the order of their centres along a space-filling curve (Morton, 1966)."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tenso
 
 
 def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) -> dict[str, Tensor]:
-    """A field moved by ``x -> scale * (R x + t)``; ``transform`` ``[3, 4]`` holds rotation R and translation t.
+    """Gaussians moved by ``x -> scale * (R x + t)``; ``transform`` ``[3, 4]`` holds rotation R and translation t.
 
     Opacities, SH coefficients of degree 0 and features are the tensors of ``params``.
     """

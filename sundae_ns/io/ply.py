@@ -64,7 +64,7 @@ _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32":
 def check_gaussians(params: Mapping[str, Tensor], failure: type[SundaeError] = DataError) -> None:
     """Raise a ``failure`` unless there are all of ``SPLAT_NAMES``, in their shapes."""
     if missing := [name for name in SPLAT_NAMES if name not in params]:
-        raise failure(f"the field has no {', '.join(missing)}; it needs all of {', '.join(SPLAT_NAMES)}")
+        raise failure(f"the scene has no {', '.join(missing)}; it needs all of {', '.join(SPLAT_NAMES)}")
     for odd in odd_shapes(params):
         raise failure(odd)
 
@@ -73,12 +73,12 @@ def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The parameters that .spz, .sog and .glb store, float32 on the CPU; quaternions become unit ones.
 
     Raises:
-        DataError: the field has no Gaussians, values that are not finite, an SH degree above 3, or wrong shapes.
+        DataError: there are no Gaussians, values that are not finite, an SH degree above 3, or wrong shapes.
     """
     check_gaussians(params)
     gaussians = {name: params[name].detach().to("cpu", torch.float32).contiguous() for name in SPLAT_NAMES}
     if not len(gaussians["means"]):
-        raise DataError(f"the field has no Gaussians, which a {path.suffix} cannot store; check the run")
+        raise DataError(f"the scene has no Gaussians, which a {path.suffix} cannot store; check the run")
     if not all(bool(value.isfinite().all()) for value in gaussians.values()):
         raise DataError("some values are NaN or infinite; drop those Gaussians first (finite_mask)")
     if gaussians["features_rest"].shape[1] > (MAX_SH_DEGREE + 1) ** 2 - 1:
@@ -128,13 +128,10 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
 
 
 def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Tensor] | None = None) -> None:
-    """Copy a .ply with only some of its vertices; properties, comments and other elements are unchanged.
+    """Copy a .ply with only some of its vertices, atomically; properties, comments and other elements are unchanged.
 
-    Args:
-        source: a .ply that has its values as :func:`has_own_columns` says.
-        out: the file to write atomically.
-        mask: True for vertices to keep, bool ``[N]``.
-        params: new parameters of the kept Gaussians ``[M, ...]``; None to keep their values.
+    The ``source`` has its values as :func:`has_own_columns` says. ``mask`` is True for vertices to keep, bool ``[N]``;
+    ``params`` are new parameters of these ``[M, ...]``, None to keep their values.
 
     Raises:
         DataError: the file cannot be read, or has another number of vertices.
@@ -176,18 +173,19 @@ def _check_header(path: Path, primitives: bool) -> bytes:
     header = _header(path)
     lines = [line.split() for line in header.decode("latin-1").splitlines()]
     text = ["format", "ascii", "1.0"] in lines
-    elements: list[tuple[str, int]] = []
+    counts: list[int] = []
     sizes: list[int] = []  # least bytes of a row; in ascii, a value takes at least a digit and a space
     lists: list[tuple[str, str]] = []
+    element = ""
     for words in lines:
         if words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
-            elements.append((words[1], int(words[2])))
+            element = words[1]
+            counts.append(int(words[2]))
             sizes.append(0)
-        elif words[:1] == ["property"] and elements and len(words) >= 3:
+        elif words[:1] == ["property"] and counts and len(words) >= 3:
             is_list = words[1] == "list"
             sizes[-1] += 2 if text else _SIZES.get(words[2] if is_list else words[1], 1)
-            lists += [(elements[-1][0], words[-1])] if is_list else []
-    counts = [count for _, count in elements]
+            lists += [(element, words[-1])] if is_list else []
     least = sum(count * size for count, size in zip(counts, sizes, strict=True))
     available = path.stat().st_size - len(header)
     if lines[:1] != [["ply"]]:
@@ -218,7 +216,7 @@ def _load(path: Path, *, primitives: bool = False) -> PlyData:
 class _AsciiHeader(BufferedReader):
     """A .ply whose header plyfile can decode: a comment in UTF-8 reads as question marks.
 
-    A file, because plyfile maps it; from other streams it reads single vertices (90 s per million instead of 1 s).
+    A file, because plyfile maps it; from other streams it reads single vertices: 90 s per million, not 1 s.
     """
 
     def __init__(self, raw: FileIO, header_size: int) -> None:
@@ -370,7 +368,7 @@ def read_point_cloud(path: Path, *, precise: bool = False) -> tuple[Tensor, Tens
 
     Args:
         path: vertices with ``x y z`` and, optionally, colours under a name in use: ``red green blue``, ``r g b``,
-            ``diffuse_red ...``, or ``f_dc_0 ...`` of a field. Integers of 8 or 16 bits, floats to 1, 255 or 65,535.
+            ``diffuse_red ...``, or ``f_dc_0 ...`` of Gaussians. Integers of 8 or 16 bits, floats to 1, 255 or 65,535.
         precise: positions as float64, for coordinates far from the origin.
 
     Returns:

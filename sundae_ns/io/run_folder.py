@@ -44,9 +44,7 @@ def files_of(run: Path) -> list[Path]:
 def reserve(run: Path, busy: str = "trains in {}; wait for it, or give another --timestamp") -> int:
     """Make a run's folder, reserve it for this process, and remove files that killed processes left unfinished.
 
-    Args:
-        run: the folder.
-        busy: end of the error message, after the name of the other process; ``{}`` stands for the folder.
+    ``busy`` ends the error message, after the name of the other process; ``{}`` stands for the folder.
 
     Returns:
         Descriptor of the locked file. The lock lasts while a process has it open.

@@ -97,7 +97,7 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
     with replacing(path) as unfinished, zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as bundle:
-        # ZipInfo has a fixed date, so that equal fields give equal bytes.
+        # ZipInfo has a fixed date, so that equal scenes give equal bytes.
         bundle.writestr(zipfile.ZipInfo(META), json.dumps(meta))
         for name, pixels in images.items():
             image = io.BytesIO()

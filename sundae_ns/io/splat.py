@@ -151,12 +151,8 @@ def _section(
 def read_gsplat(path: Path) -> dict[str, Tensor]:
     """Read a checkpoint of gsplat's trainer, with those of the other ranks beside it. No code in it runs.
 
-    Args:
-        path: ``ckpt_29999_rank0.pt``; the Gaussians of a training on several GPUs are spread over ``_rank0``,
-            ``_rank1`` and so on.
-
-    Returns:
-        As :func:`read_splat`, in the coordinates of gsplat's training.
+    Training on several GPUs spreads the Gaussians over ``ckpt_29999_rank0.pt``, ``_rank1`` and so on. The result is as
+    that of :func:`read_splat`, in the coordinates of gsplat's training.
 
     Raises:
         DataError: a file is missing or damaged, or holds no Gaussians with SH colours.

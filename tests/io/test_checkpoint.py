@@ -228,7 +228,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "a step of words": (_save({"step": "3", "pipeline": {}}), "after which step it was saved"),
     "a number for a name": (_save({"step": 3, "pipeline": {3: torch.zeros(2)}}), "it holds no model"),
     "a list": (_save([1, 2]), "is not a nerfstudio checkpoint"),
-    "of another method": (_save({"step": 3, "pipeline": {"_model.field.weight": torch.zeros(2)}}), "no Gaussian field"),
+    "another method": (_save({"step": 3, "pipeline": {"_model.field.weight": torch.zeros(2)}}), "holds no Gaussians"),
 }
 
 

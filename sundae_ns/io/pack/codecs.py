@@ -35,22 +35,25 @@ _RUN = 16  # neighbours on the curve whose levels share a mean and a magnitude, 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Mean squared change of the images' pixels per unit change of values; see ``sundae_ns.scene.packing``."""
+    """Mean squared change of the images' pixels per unit change of values; see ``sundae_ns.scene.packing``.
+
+    ``rows`` are positive definite forms ``[C, C]``, float64, for changes of the rows ``[N, C]`` of attributes. ``head``
+    is for the weights of each pair of channels ``[O, I]``, float64, of each tensor with more than one dimension.
+    """
 
     rows: dict[str, Tensor]
-    """Positive definite forms ``[C, C]``, float64, for changes of the rows ``[N, C]`` of attributes."""
     head: dict[str, Tensor]
-    """For the weights of each pair of channels, float64 ``[O, I]``, of each tensor with more than one dimension."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeadCodec:
-    """Weights of the head in steps of their channels. One-dimensional tensors stay float32."""
+    """Weights of the head in steps of their channels. One-dimensional tensors stay float32.
+
+    Of each other tensor, ``rows`` has the steps of output channels ``[O]``, ``columns`` factors for inputs ``[I]``.
+    """
 
     rows: dict[str, Tensor]
-    """Steps of the output channels ``[O]`` of each tensor with more than one dimension."""
     columns: dict[str, Tensor]
-    """Factors of the steps for the input channels ``[I]`` of the same tensors."""
 
     def encode(self, head: Mapping[str, Tensor]) -> Coded:
         """Return the stored form, with the levels of all weights in one column.
@@ -101,13 +104,11 @@ class HeadCodec:
 
 @dataclass(frozen=True, eq=False)
 class Codecs:
-    """Codecs of a whole scene; see :func:`fit_codecs`."""
+    """Codecs of a whole scene; see :func:`fit_codecs`. ``blocks`` are the positions in their stored form."""
 
     config: PackConfig
     blocks: Blocks
-    """The positions in their stored form."""
     gaussians: dict[str, Rotations | Transform]
-    """Codecs of all other attributes."""
     head: HeadCodec | None
 
     def to(self, device: torch.device) -> Codecs:
@@ -133,7 +134,7 @@ class Codecs:
 
     @torch.no_grad()
     def rounded(self, gaussians: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The field that a reader decodes, for Gaussians in the order of these codecs; positions are unchanged."""
+        """The Gaussians that a reader decodes, in the order of these codecs; positions are unchanged."""
         result = dict(gaussians)
         for name, codec in self.gaussians.items():
             values = gaussians[name]
@@ -163,7 +164,7 @@ def fit_codecs(
     config: PackConfig,
     sensitivity: Sensitivity | None = None,
 ) -> tuple[dict[str, Tensor], Codecs]:
-    """The field in the stored order, with rounded positions, and codecs fitted to it and to a head; {} for none."""
+    """Gaussians in the stored order, with rounded positions, and codecs fitted to them and to a head; {} for none."""
     names = [name for name in (*SPLAT_NAMES, FEATURES) if name in gaussians]
     values = {name: as_matrix(gaussians[name]) for name in names}
     order = scene_order(values["means"])
@@ -231,11 +232,11 @@ def _on_cpu(values: Tensor) -> Tensor:
 
 
 def estimated_bits(codecs: Codecs, gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Estimate, with gradients, the bits of each attribute of a field, without positions, and of a head; {} for none.
+    """Estimate, with gradients, the bits of each attribute of Gaussians but positions, and of a head; {} for none.
 
     A rounded number of the distribution of Laplace with mean magnitude m takes about log2(1 + 2 e m) bits. The entropy
     coder's contexts know the magnitude nearby, so m is measured in runs along the curve. The codecs are on the device
-    of the field, whose Gaussians are in their order.
+    of the Gaussians, which are in their order.
     """
     bits = {}
     for name, codec in codecs.gaussians.items():

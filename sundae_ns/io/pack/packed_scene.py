@@ -77,7 +77,7 @@ def _check(params: Mapping[str, Tensor]) -> None:
     check_gaussians(params, PackError)
     n = num_gaussians(params)
     if n == 0:
-        raise PackError("the field has no Gaussians; there is nothing to pack")
+        raise PackError("the scene has no Gaussians; there is nothing to pack")
     features = params.get(FEATURES)
     if features is not None and not (
         features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MAX_WIDTH
@@ -85,7 +85,7 @@ def _check(params: Mapping[str, Tensor]) -> None:
         raise PackError(f"features has shape {list(features.shape)}; it must be [{n}, 1 to {_MAX_WIDTH}]")
     known = {name: params[name].float() for name in (*SPLAT_NAMES, FEATURES) if name in params}
     if broken := n - int(finite_mask(known).sum()):
-        raise PackError(f"{broken} of {n} Gaussians are not finite (NaN or infinite); prune the field first")
+        raise PackError(f"{broken} of {n} Gaussians are not finite (NaN or infinite); prune the scene first")
 
 
 def fit_scene(scene: PackedScene, config: PackConfig | None = None) -> tuple[PackedScene, Codecs]:

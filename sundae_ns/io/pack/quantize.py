@@ -156,14 +156,15 @@ def _normalized(quats: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Transform:
-    """Codec of rows ``[N, D]``; see :func:`fit_transform`."""
+    """Codec of rows ``[N, D]``; see :func:`fit_transform`.
+
+    ``mean`` ``[D]``, float32, is the row whose coefficients are all 0; ``basis`` ``[D, D]``, int8, the change of a row
+    per step of each coefficient, in 127ths of the step; ``inverse`` ``[D, D]``, float64, maps rows to coefficients.
+    """
 
     mean: Tensor
-    """The row whose coefficients are all 0, float32 ``[D]``."""
     basis: Tensor
-    """Change of a row per step of each coefficient, in 127ths of the step, int8 ``[D, D]``."""
     inverse: Tensor
-    """From rows to coefficients, float64 ``[D, D]``."""
     step: float
 
     @property

@@ -1,4 +1,4 @@
-// Makes the .ksplat files of this folder with GaussianSplats3D 0.4.7, from a .ply (test_ksplat.py says which):
+// Makes the .ksplat files of this folder with GaussianSplats3D 0.4.7, from a .ply (test_foreign_files.py says which):
 //
 //     cd web/tests && npm ci
 //     node ../../tests/storage/foreign/ksplat.mjs in.ply
