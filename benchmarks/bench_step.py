@@ -29,11 +29,13 @@ from nerfstudio.engine.optimizers import Optimizers
 from pytorch_msssim import SSIM
 from torch import Tensor
 
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.timing import median_ms
 from sundae_ns.cuda.cuda_graphs import record, warm_up
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.rasterize.interface import BackendName, rasterize, select_backend
+from sundae_ns.rasterize.types import Inputs
 from sundae_ns.train import step
 
 SIZES = ((533, 800), (824, 1240), (1893, 1061))
@@ -183,7 +185,8 @@ def rasterizers(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         viewmat, K = (value.to(device, dtype) for value in camera)
         means, quats, scales, opacities, colors = leaves
         backend = select_backend(name, device)
-        drawn = rasterize(means, quats, scales, opacities, colors, viewmat, K, size, size, backend=backend)
+        inputs = Inputs(means, quats, scales, opacities, colors, Camera(viewmat, K, size, size, float(size)))
+        drawn = rasterize(inputs, backend=backend)
         if not gradients:
             return [drawn.colors]
         return [drawn.colors.detach(), *torch.autograd.grad(drawn.colors, leaves, weights.to(device, dtype))]

@@ -32,29 +32,15 @@ def warm_up(device: torch.device) -> Iterator[None]:
     side = _side_stream(device)
     side.wait_stream(torch.cuda.current_stream(device))
     try:
-        with torch.cuda.stream(side), _mark_recording():
+        with torch.cuda.stream(side):
             yield
     finally:
         torch.cuda.current_stream(device).wait_stream(side)
 
 
-def is_recording() -> bool:
-    """Whether this thread is warming up or recording; code that it calls must not record a graph of its own."""
-    return getattr(_thread, "recording", False)
-
-
-@contextmanager
-def _mark_recording() -> Iterator[None]:
-    before, _thread.recording = is_recording(), True
-    try:
-        yield
-    finally:
-        _thread.recording = before
-
-
 @contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """Disable garbage collection: destroying a graph meanwhile would break the graph being recorded."""
+    """Disable garbage collection: destroying a graph would break a recording."""
     before = gc.isenabled()
     gc.disable()
     try:
@@ -97,7 +83,7 @@ def record(
     # Name the stream: torch's own belongs to the device that was current at its first recording.
     side = _side_stream(device)
     errors: list[RuntimeError] = []
-    with _one_at_a_time, torch.cuda.device(device), _mark_recording(), _no_garbage_collection():
+    with _one_at_a_time, torch.cuda.device(device), _no_garbage_collection():
         generator = torch.cuda.default_generators[torch.cuda.current_device()]
         before = generator.clone_state() if hasattr(generator, "clone_state") else None  # not in torch 2.1
         try:

@@ -100,17 +100,20 @@ def _search_host(
     indices, distances = np.empty((n, k), np.int64), np.empty((n, k), dtype)
     slots, nearest = np.arange(k + 1), np.arange(1, min(k + 1, len(starts)) + 1)
     for rows in np.array_split(order, -(-n // CHUNK)):
-        lengths, positions = (found.ravel() for found in tree.query(coordinates[rows], k=nearest, workers=-1))
-        # The first k + 1 points at these positions: slot s of row r is the first whose count ends above s. Rows are
-        # searched at once, so each is lifted above the one before.
-        lift = (k + 2) * np.arange(len(rows))[:, None]
-        ends = counts[positions].reshape(len(rows), -1).cumsum(axis=1)
-        used = np.searchsorted((ends.clip(max=k + 1) + lift).ravel(), slots + lift, side="right")
-        points = order[starts[positions[used]] + slots - ends.ravel()[used] + counts[positions[used]]]
+        lengths, positions = tree.query(coordinates[rows], k=nearest, workers=-1)
+        points = order[starts[positions]]
+        if len(starts) < n:
+            # The first k + 1 points at these positions: slot s of row r is the first whose count ends above s. Rows are
+            # searched at once, so each is lifted above the one before.
+            lift = (k + 2) * np.arange(len(rows))[:, None]
+            ends = counts[positions].cumsum(axis=1)
+            used = np.searchsorted((ends.clip(max=k + 1) + lift).ravel(), slots + lift, side="right")
+            positions, ends, lengths = positions.ravel()[used], ends.ravel()[used], lengths.ravel()[used]
+            points = order[starts[positions] + slots - ends + counts[positions]]
         # Without the point itself. Clones of lower index may fill the row; then the last one goes.
         others = points != rows[:, None]
         others[:, -1] &= ~others.all(axis=1)
-        indices[rows], distances[rows] = points[others].reshape(-1, k), lengths[used][others].reshape(-1, k)
+        indices[rows], distances[rows] = points[others].reshape(-1, k), lengths[others].reshape(-1, k)
     return indices, distances
 
 

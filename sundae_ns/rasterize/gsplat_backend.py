@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from sundae_ns.core.errors import BackendError
-from sundae_ns.rasterize.gsplat_kernels import TILE, Capacity, GsplatLists, Splats, blend, tile_lists
-from sundae_ns.rasterize.gsplat_kernels import harmonic_colors as harmonic_colors_by_our_kernels
+from sundae_ns.rasterize import gsplat_kernels
+from sundae_ns.rasterize.gsplat_kernels import TILE, Capacity, GsplatLists, Splats
 from sundae_ns.rasterize.reference import ReferenceBackend
-from sundae_ns.rasterize.types import Inputs, Rasterization, constant, result_of
+from sundae_ns.rasterize.types import Inputs, Rasterization, constant, is_gsplat_1_5, result_of
 
 _CHANNELS_PER_PASS = 32
 
@@ -31,28 +30,28 @@ class GsplatBackend:
         _check_kernels_take(inputs.means)
         if inputs.means.shape[0] == 0:  # CUDA refuses to launch a grid of no blocks
             return ReferenceBackend().rasterize(inputs)
-        splats = _project(inputs, inputs.viewmat[None], inputs.K[None])
-        lists = self._lists(splats, inputs.width, inputs.height)
+        camera = inputs.camera
+        splats = _project(inputs, camera.viewmat[None], camera.K[None])
+        lists = self._lists(splats, camera.width, camera.height)
         channels = inputs.colors
         if inputs.render_depth:
             channels = torch.cat([channels, splats.depths[0, :, None]], dim=1)
         # Each pass overwrites absgrad with that of its own channels, so absgrad allows one pass only.
         passes = [channels] if inputs.absgrad else channels.split(_CHANNELS_PER_PASS, dim=1)
         blended = [self._blend(splats, part[None], lists, inputs.absgrad) for part in passes]
-        alpha = blended[0][1][0]
         image = blended[0][0][0] if len(blended) == 1 else torch.cat([part[0] for part, _ in blended], dim=-1)
-        return result_of(image, alpha, splats.means2d, splats.radii, inputs)
+        return result_of(image, blended[0][1][0], splats.means2d, splats.radii, inputs)
 
-    def rasterize_cameras(self, inputs: Inputs, viewmats: Tensor, Ks: Tensor, colors: Tensor) -> Tensor:
-        """Render several views at once; one wait for the device in all.
+    def rasterize_cameras(self, inputs: Inputs, viewmats: Tensor, Ks: Tensor) -> Tensor:
+        """Render several cameras at once, with one wait for the device; colours are ``[V, N, C]``.
 
         Raises:
             BackendError: The tensors are not float32 on a CUDA device.
         """
         _check_kernels_take(inputs.means)
         splats = _project(inputs, viewmats, Ks)
-        lists = GsplatBackend._lists(self, splats, inputs.width, inputs.height)
-        parts = colors.split(_CHANNELS_PER_PASS, dim=2)
+        lists = GsplatBackend._lists(self, splats, inputs.camera.width, inputs.camera.height)
+        parts = inputs.colors.split(_CHANNELS_PER_PASS, dim=2)
         return torch.cat([GsplatBackend._blend(self, splats, part, lists, False)[0] for part in parts], dim=-1)
 
     def _lists(self, splats: Splats, width: int, height: int) -> GsplatLists:
@@ -102,24 +101,24 @@ class RecordableGsplat(GsplatBackend):
         self._capacity = capacity
 
     def _lists(self, splats: Splats, width: int, height: int) -> GsplatLists:
-        return tile_lists(splats, width, height, capacity=self._capacity)
+        return gsplat_kernels.tile_lists(splats, width, height, capacity=self._capacity)
 
     def _blend(self, splats: Splats, colors: Tensor, lists: GsplatLists, absgrad: bool) -> tuple[Tensor, Tensor]:
         values = (splats.means2d, splats.conics, colors, splats.opacities)
         if torch.is_grad_enabled() and any(value.requires_grad for value in values):
-            return blend(*values, lists, absgrad)
+            return gsplat_kernels.blend(*values, lists, absgrad)
         return super()._blend(splats, colors, lists, absgrad)  # frames stay gsplat's to the bit
 
     def harmonic_colors(
         self, degree: int, means: Tensor, center: Tensor, features_dc: Tensor, features_rest: Tensor
     ) -> Tensor:
-        """See :func:`sundae_ns.rasterize.interface.harmonic_colors`.
+        """See :func:`sundae_ns.rasterize.interface.harmonic_colors`; differentiable once, but not in ``center``.
 
         Raises:
             BackendError: The tensors are not float32 on a CUDA device, or the kernels cannot be compiled.
         """
         _check_kernels_take(means)
-        return harmonic_colors_by_our_kernels(degree, means, center, features_dc, features_rest)
+        return cast("Tensor", gsplat_kernels.harmonic_colors(degree, means, center, features_dc, features_rest))
 
 
 def _project(inputs: Inputs, viewmats: Tensor, Ks: Tensor) -> Splats:
@@ -129,22 +128,14 @@ def _project(inputs: Inputs, viewmats: Tensor, Ks: Tensor) -> Splats:
     opacities = inputs.opacities
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         *(inputs.means, None, _without_zeros(inputs.quats), inputs.scales),
-        *(viewmats, Ks, inputs.width, inputs.height),
+        *(viewmats, Ks, inputs.camera.width, inputs.camera.height),
         near_plane=inputs.near_plane,
         far_plane=inputs.far_plane,
         calc_compensations=inputs.antialiased,
-        **({"opacities": opacities} if _projection_takes_opacities() else {}),
+        **({"opacities": opacities} if is_gsplat_1_5() else {}),
     )
     opacities = opacities.expand(len(viewmats), -1) if compensations is None else opacities * compensations
     return Splats(radii, means2d, depths, conics, opacities)
-
-
-@functools.cache
-def _projection_takes_opacities() -> bool:
-    """Whether this gsplat (1.5 or newer) fits radii to opacities."""
-    from gsplat import fully_fused_projection
-
-    return "opacities" in inspect.signature(fully_fused_projection).parameters
 
 
 def _check_kernels_take(tensor: Tensor) -> None:

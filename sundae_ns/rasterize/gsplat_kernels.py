@@ -16,13 +16,13 @@ All run on torch's current stream and wait for nothing, so CUDA graphs can recor
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from sundae_ns.core.errors import SundaeError
-from sundae_ns.cuda.kernels import Argument, Launch, load_kernels
+from sundae_ns.cuda.kernels import Argument, load_kernels
 from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 TILE = 16
@@ -201,26 +201,6 @@ COLOR_OPTIONS = (f"-DPER_BLOCK={_PER_BLOCK}", "-DMOST_REST=72")  # 24 coefficien
 """Compiler options of ``colors.cu``."""
 
 
-def harmonic_colors(degree: int, means: Tensor, center: Tensor, features_dc: Tensor, features_rest: Tensor) -> Tensor:
-    """See :func:`sundae_ns.rasterize.interface.harmonic_colors`; differentiable once, but not in ``center``.
-
-    All tensors are float32 on a CUDA device.
-
-    Raises:
-        BackendError: the kernels cannot be compiled or loaded.
-    """
-    return cast("Tensor", _Colors.apply(degree, means, center, features_dc, features_rest))
-
-
-def _color_kernels(device: torch.device) -> dict[str, Launch]:
-    names = ("harmonic_colors", "harmonic_colors_backward")
-    return load_kernels("colors.cu", names, COLOR_OPTIONS, device, _PER_BLOCK)
-
-
-def _camera(degree: int, means: Tensor, center: Tensor) -> list[Argument]:
-    return [len(means), degree, means, center, int(center.ndim > 1)]
-
-
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
@@ -228,8 +208,10 @@ class _Colors(torch.autograd.Function):
     ) -> Tensor:
         means, center, dc, rest = (value.contiguous() for value in (means, center, dc, rest))
         colors = torch.empty_like(means)
-        arguments = [*_camera(degree, means, center), dc, rest, rest.shape[1], colors]
-        _color_kernels(means.device)["harmonic_colors"](colors.numel(), arguments)
+        names = ("harmonic_colors", "harmonic_colors_backward")
+        ctx.kernels = load_kernels("colors.cu", names, COLOR_OPTIONS, means.device, _PER_BLOCK)
+        numbers = [len(means), degree, means, center, int(center.ndim > 1)]
+        ctx.kernels["harmonic_colors"](colors.numel(), [*numbers, dc, rest, rest.shape[1], colors])
         ctx.save_for_backward(means, center, dc, rest, colors)
         ctx.degree = degree
         return colors
@@ -240,6 +222,11 @@ class _Colors(torch.autograd.Function):
         means, center, dc, rest, colors = ctx.saved_tensors
         grads = [torch.empty_like(value) for value in (means, dc, rest)]
         threads = -(-len(means) // _PER_BLOCK) * _PER_BLOCK
-        arguments = [*_camera(ctx.degree, means, center), rest, rest.shape[1], colors, gradient.contiguous(), *grads]
-        _color_kernels(means.device)["harmonic_colors_backward"](threads, arguments)
+        numbers = [len(means), ctx.degree, means, center, int(center.ndim > 1)]
+        arguments = [*numbers, rest, rest.shape[1], colors, gradient.contiguous(), *grads]
+        ctx.kernels["harmonic_colors_backward"](threads, arguments)
         return None, grads[0], None, grads[1], grads[2]
+
+
+harmonic_colors = _Colors.apply
+"""As :func:`sundae_ns.rasterize.interface.harmonic_colors`, for float32 tensors on a CUDA device."""

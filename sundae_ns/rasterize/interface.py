@@ -1,13 +1,15 @@
-"""The public functions: they check the arguments, and a backend computes. And the choice of a backend."""
+"""The public functions, which check the arguments and call a backend, and the choice of a backend."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, ConfigError, DataError
 from sundae_ns.core.gaussians import MAX_SH_DEGREE
 from sundae_ns.rasterize.gsplat_backend import GsplatBackend, RecordableGsplat
@@ -17,101 +19,58 @@ from sundae_ns.rasterize.types import Backend, Inputs, Rasterization, check_memo
 BackendName = Literal["auto", "gsplat", "cpu", "reference"]
 
 
-def rasterize(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor,  # [N, C]
-    viewmat: Tensor,  # [4, 4]
-    K: Tensor,  # [3, 3]
-    width: int,
-    height: int,
-    *,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    antialiased: bool = False,
-    absgrad: bool = False,
-    render_depth: bool = False,
-    backend: Backend,
-) -> Rasterization:
-    """Splat N Gaussians into one pinhole view (EWA splatting, front-to-back blending; Kerbl et al. 2023).
+def rasterize(inputs: Inputs, *, backend: Backend) -> Rasterization:
+    """Splat N Gaussians into one pinhole camera (EWA splatting, front-to-back blending; Kerbl et al. 2023).
 
-    Differentiable with respect to the Gaussians, and to ``viewmat`` except under gsplat; not to ``K``.
+    Differentiable with respect to the Gaussians, and to ``camera.viewmat`` except under gsplat; not to ``camera.K``.
 
     Args:
-        means: Centres in world units. ``[N, 3]``
-        quats: Rotations as wxyz quaternions of any length; all-zero ones are the identity. ``[N, 4]``
-        scales: Standard deviations in world units, post-activation. ``[N, 3]``
-        opacities: Opacities in [0, 1], post-activation. ``[N]``
-        colors: Vectors to blend, such as colours and features. ``[N, C]`` with C >= 1
-        viewmat: World-to-camera transform, OpenCV axes (x right, y down, z forward). ``[4, 4]``
-        K: Intrinsics in pixels. ``[3, 3]``
-        width: Image width in pixels.
-        height: Image height in pixels.
-        near_plane: Gaussians with a smaller camera z are culled. World units.
-        far_plane: Gaussians with a larger camera z are culled. World units.
-        antialiased: Scale opacities by the ratio of screen areas without and with blur (Mip-Splatting).
-        absgrad: Let the backward pass set ``info["means2d"].absgrad`` (AbsGS): absolute per-pixel gradients, summed.
-        render_depth: Also blend camera z.
+        inputs: Gaussians, camera and options.
         backend: From :func:`select_backend`.
 
     Raises:
         DataError: A tensor has the wrong shape, dtype or device, or the image is empty.
         MemoryExhaustedError: On a CPU, the image or its lists need more memory than there is, or without gradients the
-            view has more Gaussians than any real scene.
+            image has more Gaussians than that of any real scene.
     """
-    inputs = Inputs(
-        *(means, quats, scales, opacities, colors, viewmat, K, width, height),
-        *(near_plane, far_plane, antialiased, absgrad, render_depth),
-    )
     _check(inputs)
-    if means.device.type == "cpu":
-        size = (colors.shape[1] + 2) * width * height * means.element_size()
+    if inputs.means.device.type == "cpu":
+        width, height = inputs.camera.width, inputs.camera.height
+        size = (inputs.colors.shape[1] + 2) * width * height * inputs.means.element_size()
         check_memory(size, f"images of {width:,} x {height:,} pixels")
     return backend.rasterize(inputs)
 
 
-def rasterize_cameras(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor,  # [V, N, C]
-    viewmats: Tensor,  # [V, 4, 4]
-    Ks: Tensor,  # [V, 3, 3]
-    width: int,
-    height: int,
-    *,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    antialiased: bool = False,
-    backend: Backend,
-) -> Tensor:
-    """Splat N Gaussians into V views of one size; for many small images, whose launches would take most of the time.
+def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: Backend) -> Tensor:
+    """Splat N Gaussians into V cameras of one size; for many small images, whose launches would take most of the time.
 
-    Arguments are those of :func:`rasterize`, but for colours, transforms and intrinsics of each view.
+    Args:
+        inputs: As for :func:`rasterize`, but with colours for each camera ``[V, N, C]``. Of its camera only the size is
+            read; it has neither depth nor ``absgrad``.
+        viewmats: Of each camera ``[V, 4, 4]``.
+        Ks: Of each camera ``[V, 3, 3]``.
+        backend: From :func:`select_backend`.
 
     Returns:
         Blended colours ``[V, H, W, C]``, those of :func:`rasterize` up to rounding.
 
     Raises:
-        DataError: As :func:`rasterize`, or there is no view.
+        DataError: As :func:`rasterize`, or there is no camera.
     """
-    count = len(viewmats)
+    count, colors = len(viewmats), inputs.colors
     if not count:
         raise DataError("there is no view to rasterize; give at least one")
     _check_shapes((viewmats, "viewmats", (count, 4, 4)), (Ks, "Ks", (count, 3, 3)))
     if colors.dim() != 3 or colors.shape[0] != count:
-        raise DataError(f"colors has shape {list(colors.shape)}; pass [{count}, {len(means)}, C]")
-    cameras = [
-        Inputs(means, quats, scales, opacities, *camera, width, height, near_plane, far_plane, antialiased)
-        for camera in zip(colors, viewmats, Ks, strict=True)
+        raise DataError(f"colors has shape {list(colors.shape)}; pass [{count}, {len(inputs.means)}, C]")
+    singles = [
+        replace(inputs, colors=color, camera=inputs.camera._replace(viewmat=viewmat, K=K))
+        for color, viewmat, K in zip(colors, viewmats, Ks, strict=True)
     ]
-    _check(cameras[0])
-    if isinstance(backend, GsplatBackend) and len(means):
-        return backend.rasterize_cameras(cameras[0], viewmats, Ks, colors)
-    return torch.stack([backend.rasterize(camera).colors for camera in cameras])
+    _check(singles[0])
+    if isinstance(backend, GsplatBackend) and len(inputs.means):
+        return backend.rasterize_cameras(inputs, viewmats, Ks)
+    return torch.stack([backend.rasterize(single).colors for single in singles])
 
 
 def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, backend: Backend) -> Tensor:
@@ -169,29 +128,16 @@ def harmonic_colors(
     return (spherical_harmonics(degree, means - center, coeffs, backend=backend) + 0.5).clamp_min(0)
 
 
-def blending_weights(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    viewmat: Tensor,  # [4, 4]
-    K: Tensor,  # [3, 3]
-    width: int,
-    height: int,
-    *,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    antialiased: bool = False,
-    pixels: Tensor | None = None,
-    backend: Backend,
-) -> Tensor:
-    """Contribution of each Gaussian to one view: its alpha times transmittance, summed over the pixels.
+def blending_weights(inputs: Inputs, pixels: Tensor | None = None, *, backend: Backend) -> Tensor:
+    """Contribution of each Gaussian to one image: its alpha times transmittance, summed over the pixels.
 
     Blending is linear in the colours. So this is exactly the gradient of the summed image with respect to a one-channel
-    colour, and no backend needs code for it. Arguments are those of :func:`rasterize`, and:
+    colour, and no backend needs code for it.
 
     Args:
+        inputs: As for :func:`rasterize`; colours are ignored.
         pixels: Weight of each pixel; None for 1. ``[H, W]``
+        backend: From :func:`select_backend`.
 
     Returns:
         ``[N]``, in pixels, detached; 0 for Gaussians that are invisible.
@@ -199,34 +145,30 @@ def blending_weights(
     Raises:
         DataError: As :func:`rasterize`, or ``pixels`` has another size than the image.
     """
+    camera = inputs.camera
     if pixels is not None:
-        _check_shapes((pixels, "pixels", (height, width)))
-    means, quats, scales, opacities, viewmat, K = (
-        value.detach() for value in (means, quats, scales, opacities, viewmat, K)
-    )
+        _check_shapes((pixels, "pixels", (camera.height, camera.width)))
+    camera = camera._replace(viewmat=camera.viewmat.detach(), K=camera.K.detach())
+    fixed = {name: getattr(inputs, name).detach() for name in ("means", "quats", "scales", "opacities")}
     with torch.enable_grad():
-        ones = torch.ones_like(means[:, :1], requires_grad=True)
-        image = rasterize(
-            *(means, quats, scales, opacities, ones, viewmat, K, width, height),
-            near_plane=near_plane,
-            far_plane=far_plane,
-            antialiased=antialiased,
-            backend=backend,
-        ).colors
+        ones = torch.ones_like(fixed["means"][:, :1], requires_grad=True)
+        image = rasterize(replace(inputs, **fixed, colors=ones, camera=camera), backend=backend).colors
         (weights,) = torch.autograd.grad(image.sum() if pixels is None else (image[..., 0] * pixels).sum(), ones)
     return weights[:, 0]
 
 
 def _check(inputs: Inputs) -> None:
-    means, colors, n = inputs.means, inputs.colors, len(inputs.means)
-    if inputs.width < 1 or inputs.height < 1:
-        size = f"{inputs.width}x{inputs.height}"
+    camera, colors, n = inputs.camera, inputs.colors, len(inputs.means)
+    if camera.width < 1 or camera.height < 1:
+        size = f"{camera.width}x{camera.height}"
         raise DataError(f"an image of {size} pixels is empty; width and height must be at least 1")
-    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "viewmat": (4, 4), "K": (3, 3)}
-    _check_shapes(*((getattr(inputs, name), name, shape) for name, shape in shapes.items()))
+    gaussians = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    tensors = {name: getattr(inputs, name) for name in gaussians} | {"viewmat": camera.viewmat, "K": camera.K}
+    shapes = {**gaussians, "viewmat": (4, 4), "K": (3, 3)}
+    _check_shapes(*((value, name, shapes[name]) for name, value in tensors.items()))
     if colors.dim() != 2 or colors.shape[0] != n or colors.shape[1] < 1:
         raise DataError(f"colors has shape {list(colors.shape)}; pass [{n}, C] with at least one channel")
-    _check_alike("means", means, colors=colors, **{name: getattr(inputs, name) for name in shapes})
+    _check_alike("means", inputs.means, colors=colors, **tensors)
 
 
 def _check_shapes(*values: tuple[Tensor, str, tuple[int, ...]]) -> None:
@@ -309,8 +251,9 @@ def numba_problem() -> str | None:
     """
     try:
         ones = torch.ones(1, 4)
-        camera = (torch.eye(4), torch.eye(3), 1, 1)
-        rasterize(ones[:, :3], ones, ones[:, :3], ones[:, 0], ones[:, :1], *camera, backend=_cpu_backend())
+        camera = Camera(torch.eye(4), torch.eye(3), 1, 1, 1.0)
+        inputs = Inputs(ones[:, :3], ones, ones[:, :3], ones[:, 0], ones[:, :1], camera)
+        rasterize(inputs, backend=_cpu_backend())
     except ImportError as error:
         return f"numba does not import ({_first_line(error)}); pip install numba"
     except Exception as error:  # versions, processors and settings that numba refuses raise errors of many kinds

@@ -52,14 +52,14 @@ class ReferenceBackend:
         projection = project(inputs)
         opacities, colors = blended_values(inputs, projection)
         means2d = projection.means2d[None]
-        image, alpha = composite(
-            means2d, projection, opacities, colors, inputs.width, inputs.height, absgrad=inputs.absgrad
-        )
+        width, height = inputs.camera.width, inputs.camera.height
+        image, alpha = composite(means2d, projection, opacities, colors, width, height, absgrad=inputs.absgrad)
         return result_of(image, alpha, means2d, strategy_radii(projection.radii), inputs)
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""
-        return evaluate_harmonics(degree, directions, coeffs)
+        basis = harmonic_basis(degree, normalize(directions, dim=-1))
+        return (basis[..., None] * coeffs[:, : basis.shape[-1]]).sum(dim=-2)
 
 
 # ---------------------------------------------------------------------------------------------------------- projection
@@ -79,7 +79,8 @@ class Projection:
 
 def project(inputs: Inputs) -> Projection:
     """Project Gaussians into a pinhole view."""
-    rotation, translation = inputs.viewmat[:3, :3], inputs.viewmat[:3, 3]
+    viewmat, K, width, height, _ = inputs.camera
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     camera = inputs.means @ rotation.T + translation
     z = camera[:, 2]
     in_range = (z >= inputs.near_plane) & (z <= inputs.far_plane) & (z > 0)
@@ -87,7 +88,6 @@ def project(inputs: Inputs) -> Projection:
     camera = torch.where(in_range[:, None], camera, camera.new_tensor([0.0, 0.0, 1.0]))
     x, y, z = camera.unbind(-1)
 
-    K, width, height = inputs.K, inputs.width, inputs.height
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
 
@@ -295,9 +295,3 @@ def harmonic_basis(degree: int, directions: Tensor) -> Tensor:
     values: list[Any] = [None] * (degree + 1) ** 2
     write_basis(degree, x, y, z, values)
     return torch.stack([torch.full_like(x, values[0]), *values[1:]], dim=-1)
-
-
-def evaluate_harmonics(degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-    """Weighted sum ``[N, 3]`` of harmonics for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""
-    basis = harmonic_basis(degree, normalize(directions, dim=-1))
-    return (basis[..., None] * coeffs[:, : basis.shape[-1]]).sum(dim=-2)

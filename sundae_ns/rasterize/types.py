@@ -1,4 +1,4 @@
-"""Arguments and result of a rasterisation, the interface of a backend, and what all backends share."""
+"""Arguments and result of a rasterisation, the interface of a backend, and helpers of all backends."""
 
 from __future__ import annotations
 
@@ -11,27 +11,34 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import MemoryExhaustedError
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Arguments of :func:`sundae_ns.rasterize.interface.rasterize`, checked."""
+    """N Gaussians after activation and a pinhole camera. All tensors have one dtype and device."""
 
-    means: Tensor  # [N, 3]
-    quats: Tensor  # [N, 4]
-    scales: Tensor  # [N, 3]
-    opacities: Tensor  # [N]
-    colors: Tensor  # [N, C]
-    viewmat: Tensor  # [4, 4]
-    K: Tensor  # [3, 3]
-    width: int
-    height: int
-    near_plane: float
-    far_plane: float
-    antialiased: bool
+    means: Tensor
+    """Centres, world units ``[N, 3]``."""
+    quats: Tensor
+    """Rotations as wxyz quaternions of any length; all-zero ones are the identity ``[N, 4]``."""
+    scales: Tensor
+    """Standard deviations, world units ``[N, 3]``."""
+    opacities: Tensor
+    """Opacities in [0, 1] ``[N]``."""
+    colors: Tensor
+    """Vectors to blend, such as colours and features ``[N, C]`` with C >= 1."""
+    camera: Camera
+    near_plane: float = 0.01
+    """Gaussians with a smaller camera z are culled, world units."""
+    far_plane: float = 1e10
+    antialiased: bool = False
+    """Scale opacities by the ratio of screen areas without and with blur (Mip-Splatting)."""
     absgrad: bool = False
+    """Let the backward pass set ``info["means2d"].absgrad``: absolute gradients of each pixel, summed (AbsGS)."""
     render_depth: bool = False
+    """Also blend camera z."""
 
 
 @dataclass(frozen=True)
@@ -81,33 +88,25 @@ def result_of(image: Tensor, alpha: Tensor, means2d: Tensor, radii: Tensor, inpu
         alpha: Accumulated opacity ``[H, W, 1]``.
         means2d: Centres ``[1, N, 2]``.
         radii: ``[1, N]``, or one per axis ``[1, N, 2]``.
-        inputs: What was rendered.
+        inputs: Arguments of the rasterisation.
     """
     depth = None
     if inputs.render_depth:
         image, depth = image[..., :-1], image[..., -1:] / alpha.clamp(min=1e-10)  # less than any blended alpha
-    info = strategy_info(means2d, radii, inputs.width, inputs.height)
-    return Rasterization(colors=image, depth=depth, alpha=alpha, radii=largest_axis(radii[0]), info=info)
-
-
-def strategy_info(means2d: Tensor, radii: Tensor, width: int, height: int) -> dict[str, Any]:
-    """The ``info`` of a :class:`Rasterization`, from centres ``[1, N, 2]`` and radii ``[1, N]`` or ``[1, N, 2]``."""
-    counts = {"width": width, "height": height, "n_cameras": 1, "gaussian_ids": None}
-    return {"means2d": means2d, "radii": radii, **counts}
-
-
-def largest_axis(radii: Tensor) -> Tensor:
-    """Radii of either gsplat, ``[N]`` or ``[N, 2]``, as one per Gaussian ``[N]``."""
-    return radii if radii.dim() == 1 else radii.amax(dim=-1)
+    size = {"width": inputs.camera.width, "height": inputs.camera.height}
+    info = {"means2d": means2d, "radii": radii, **size, "n_cameras": 1, "gaussian_ids": None}
+    largest = radii[0] if radii.dim() == 2 else radii[0].amax(dim=-1)
+    return Rasterization(image, depth, alpha, largest, info)
 
 
 def strategy_radii(radii: Tensor) -> Tensor:
     """Radii ``[N]`` as strategies of the installed gsplat expect them: ``[1, N]``, or ``[1, N, 2]`` from 1.5 on."""
-    return (radii[:, None].expand(-1, 2) if _radii_per_axis() else radii)[None]
+    return (radii[:, None].expand(-1, 2) if is_gsplat_1_5() else radii)[None]
 
 
 @cache
-def _radii_per_axis() -> bool:
+def is_gsplat_1_5() -> bool:
+    """Whether gsplat 1.5 or newer is installed: a radius for each axis, fitted to the opacity."""
     try:
         major, minor = version("gsplat").split(".")[:2]
     except PackageNotFoundError:
@@ -124,13 +123,10 @@ def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device
 
 # Bounds of a view on a CPU, checked before memory is taken: a small file can describe a view of terabytes.
 MOST_PER_TILE = 8192
-"""Most Gaussians in a tile, on average over the image; a field of 504,143 has at most 400 in tiles of 8 x 8 pixels."""
-PER_GAUSSIAN = 4
-"""Pairs of a tile and a Gaussian allowed beside these for each Gaussian: a small one lies in up to four tiles."""
+"""Most Gaussians in a tile, on average over the image; a scene of 504,143 has at most 400 in tiles of 8 x 8 pixels."""
 ALWAYS = 1 << 22
 """Pairs beside these that any view may have, which take 40 MB."""
-_NEGLIGIBLE = 1 << 28
-"""Bytes that are taken without a look at the memory."""
+_NEGLIGIBLE = 1 << 28  # bytes that are taken without a look at the memory
 _CONTROL_GROUP, _MEMORY = Path("/sys/fs/cgroup"), Path("/proc/meminfo")
 
 
@@ -147,7 +143,8 @@ def check_pairs(pairs: int, gaussians: int, tiles: int, size: int, *, training: 
     Raises:
         MemoryExhaustedError: there are too many pairs.
     """
-    if not training and pairs > MOST_PER_TILE * tiles + PER_GAUSSIAN * gaussians + ALWAYS:
+    # A small Gaussian lies in up to four tiles.
+    if not training and pairs > MOST_PER_TILE * tiles + 4 * gaussians + ALWAYS:
         raise MemoryExhaustedError(
             f"the view has {pairs // tiles:,} Gaussians in each tile of its image, but a real scene has less than "
             f"{MOST_PER_TILE:,}; choose another camera"

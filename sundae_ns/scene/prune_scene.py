@@ -19,7 +19,7 @@ from sundae_ns.pruning.decision import prune_gaussians
 from sundae_ns.pruning.rule import PruneRule, kept_count
 from sundae_ns.rasterize.interface import rasterize_cameras
 from sundae_ns.scene.optimise import optimise
-from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamera, contribution, pass_options
+from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamera, contribution, pass_inputs
 from sundae_ns.scene.scene import Scene, measure
 from sundae_ns.scene.virtual_cameras import by_device, of_unit_size, resized, size_of, split, virtual_cameras
 
@@ -245,14 +245,11 @@ def _blended(gaussians: Gaussians, cameras: Sequence[Camera], settings: RenderSe
         return []
     primitives = [GaussianSource(gaussians).primitives(camera, settings, features=False) for camera in cameras]
     colors = torch.stack([each["colors"] for each in primitives])
-    options = pass_options(primitives[0], cameras[0], settings)
-    options |= {
-        "viewmats": torch.stack([camera.viewmat for camera in cameras]),
-        "Ks": torch.stack([camera.K for camera in cameras]),
-    }
-    del options["viewmat"], options["K"]
     # What blends to the accumulation is 1 everywhere.
-    return list(rasterize_cameras(colors=torch.cat([colors, torch.ones_like(colors[..., :1])], dim=2), **options))
+    channels = torch.cat([colors, torch.ones_like(colors[..., :1])], dim=2)
+    inputs = pass_inputs(primitives[0], cameras[0], settings, channels)
+    viewmats, Ks = torch.stack([camera.viewmat for camera in cameras]), torch.stack([camera.K for camera in cameras])
+    return list(rasterize_cameras(inputs, viewmats, Ks, backend=settings.backend))
 
 
 def count_for_drop(

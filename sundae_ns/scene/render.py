@@ -15,7 +15,7 @@ from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.head.head import CompensationHead, ScalePlan, plan, resize
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterize.interface import blending_weights, harmonic_colors, rasterize
-from sundae_ns.rasterize.types import Backend, Rasterization, check_memory
+from sundae_ns.rasterize.types import Backend, Inputs, Rasterization, check_memory
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -123,28 +123,26 @@ class RenderSettings(ColorSettings):
         return replace(self, head=None)
 
 
-def pass_options(params: Mapping[str, Tensor], camera: Camera, settings: RenderSettings) -> dict[str, Any]:
-    """Arguments of every pass over a view to the rasteriser: activated parameters, camera and settings."""
-    return {
-        "means": params["means"],
-        "quats": params["quats"],
-        "scales": params["scales"].exp(),
-        "opacities": params["opacities"].sigmoid().squeeze(-1),
-        "viewmat": camera.viewmat,
-        "K": camera.K,
-        "width": camera.width,
-        "height": camera.height,
-        "near_plane": NEAR_PLANE,
-        "antialiased": settings.antialiased,
-        "backend": settings.backend,
-    }
+def pass_inputs(
+    params: Mapping[str, Tensor],
+    camera: Camera,
+    settings: RenderSettings,
+    channels: Tensor | None = None,
+    **options: Any,
+) -> Inputs:
+    """Arguments of a splatting pass: activated parameters, channels ``[N, C]`` or 1, camera, settings and options."""
+    means = params["means"]
+    colors = torch.ones_like(means[:, :1]) if channels is None else channels
+    opacities = params["opacities"].sigmoid().squeeze(-1)
+    splats = (means, params["quats"], params["scales"].exp(), opacities, colors)
+    return Inputs(*splats, camera, near_plane=NEAR_PLANE, antialiased=settings.antialiased, **options)
 
 
 def splat(
     params: Mapping[str, Tensor], camera: Camera, channels: Tensor, settings: RenderSettings, **options: Any
 ) -> Rasterization:
-    """Splat values of the Gaussians ``[N, C]``; options are those of ``rasterize``."""
-    return rasterize(colors=channels, **pass_options(params, camera, settings), **options)
+    """Splat values of the Gaussians ``[N, C]``; arguments are those of :func:`pass_inputs`."""
+    return rasterize(pass_inputs(params, camera, settings, channels, **options), backend=settings.backend)
 
 
 def scale_plan(camera: Camera, trained_focal: tuple[float, float] | None) -> ScalePlan:
@@ -275,7 +273,7 @@ def contribution(
         primitives = source.primitives(camera, settings, features=False, colors=count is not None)
         pixels = None if mask is None else mask[..., 0].to(total)
         if count is None:
-            total += blending_weights(pixels=pixels, **pass_options(primitives, camera, settings))
+            total += blending_weights(pass_inputs(primitives, camera, settings), pixels, backend=settings.backend)
         else:
             share = count / source.total
             total += _detail_weights(primitives, camera, background.to(total.device), settings, share, pixels)

@@ -15,7 +15,7 @@ from sundae_ns.core.covariance import chunks
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import Gaussians, sanitise
 from sundae_ns.rasterize.interface import rasterize_cameras
-from sundae_ns.scene.render import pass_options
+from sundae_ns.scene.render import pass_inputs
 from sundae_ns.scene.scene import Scene
 
 FOV = 40.0
@@ -234,16 +234,15 @@ def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, even
     poses = poses_looking_at(eyes, targets, eyes.new_tensor([0.0, 0.0, 1.0]))
     eyes, viewmats = eyes.to(means), world_to_camera(poses.float()).to(scene.device)
     camera = Camera.from_fov(torch.eye(4), FOV, _PROBE_SIZE, _PROBE_SIZE).to(scene.device)
-    options = pass_options(scene.gaussians, camera, settings)
-    K = options.pop("K")
-    del options["viewmat"]
+    inputs = pass_inputs(scene.gaussians, camera, settings)
     for some in chunks(len(eyes), _PROBES):
         distances = (means - eyes[some, None]).norm(dim=2).clamp_min(1e-9)
         angles = (sizes - distances.log()).clamp_max(0)
         # Blending adds nothing where nothing is seen: the logarithm of one radian.
-        options |= {"viewmats": viewmats[some], "Ks": K.expand(len(distances), 3, 3)}
         powers = torch.stack([angles, angles.square()][: 2 if evenness else 1], dim=-1)
-        mean, *squares = rasterize_cameras(colors=powers, **options).mean(dim=(1, 2)).unbind(dim=1)
+        Ks, colored = camera.K.expand(len(powers), 3, 3), dataclasses.replace(inputs, colors=powers)
+        images = rasterize_cameras(colored, viewmats[some], Ks, backend=settings.backend)
+        mean, *squares = images.mean(dim=(1, 2)).unbind(dim=1)
         for square in squares:
             mean = mean + evenness * (square - mean.square()).clamp_min(0).sqrt()
         found.append(mean)

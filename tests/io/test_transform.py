@@ -8,9 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from sundae_ns.core.camera import Camera
 from sundae_ns.io.coordinates import rotate_spherical_harmonics, similarity
 from sundae_ns.rasterize.interface import rasterize, select_backend, spherical_harmonics
-from sundae_ns.rasterize.reference import evaluate_harmonics
+from sundae_ns.rasterize.reference import ReferenceBackend
+from sundae_ns.rasterize.types import Inputs
 
 SCALE = 1.7
 SIZE = 24
@@ -65,19 +67,10 @@ def image(params: dict[str, Tensor], camera: Tensor) -> tuple[Tensor, Tensor]:
     center = -camera[:3, :3].T @ camera[:3, 3]
     coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
     colors = spherical_harmonics(3, params["means"] - center, coeffs, backend=backend) + 0.5
-    rendered = rasterize(
-        params["means"],
-        params["quats"],
-        params["scales"].exp(),
-        params["opacities"].sigmoid().squeeze(1),
-        colors,
-        camera,
-        K,
-        SIZE,
-        SIZE,
-        render_depth=True,
-        backend=backend,
-    )
+    activated = params["scales"].exp(), params["opacities"].sigmoid().squeeze(1)
+    view = Camera(camera, K, SIZE, SIZE, 30.0)
+    inputs = Inputs(params["means"], params["quats"], *activated, colors, view, render_depth=True)
+    rendered = rasterize(inputs, backend=backend)
     assert rendered.depth is not None
     return rendered.colors, rendered.depth
 
@@ -96,9 +89,11 @@ def test_rotated_harmonics_are_the_rotated_function(degree: int) -> None:
     rest = gaussians(degree, n=4)["features_rest"]
     degree_0 = torch.zeros(4, 1, 3, dtype=torch.float64)
     directions = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=1)
-    before = evaluate_harmonics(degree, directions, torch.cat([degree_0, rest], dim=1))
+    before = ReferenceBackend().spherical_harmonics(degree, directions, torch.cat([degree_0, rest], dim=1))
     rotated = rotate_spherical_harmonics(rest, rotation())
-    after = evaluate_harmonics(degree, directions @ rotation().T, torch.cat([degree_0, rotated], dim=1))
+    after = ReferenceBackend().spherical_harmonics(
+        degree, directions @ rotation().T, torch.cat([degree_0, rotated], dim=1)
+    )
     torch.testing.assert_close(after, before, atol=1e-12, rtol=0)
 
 

@@ -28,6 +28,7 @@ from sundae_ns.plugin.distributed import BatchOptimizers, Ranks, ShardedSource, 
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.rasterize.interface import rasterize, select_backend
 from sundae_ns.rasterize.reference import project
+from sundae_ns.rasterize.types import Inputs
 from sundae_ns.scene.render import ColorSettings, GaussianSource
 from sundae_ns.train.state import Callback, TrainingState
 
@@ -71,14 +72,14 @@ def camera(rank: int, *, behind: bool = False) -> Camera:
 
 def draw(source: GaussianSource, camera: Camera) -> Any:
     params = source.primitives(camera, COLORS, features=True)
-    shown = rasterize(
+    inputs = Inputs(
         *(params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid().squeeze(-1)),
         torch.cat([params["colors"], params["features"]], dim=1),
-        *(camera.viewmat, camera.K, camera.width, camera.height),
+        camera,
         absgrad=True,
         render_depth=True,
-        backend=REFERENCE,
     )
+    shown = rasterize(inputs, backend=REFERENCE)
     if shown.info["means2d"].requires_grad:
         shown.info["means2d"].retain_grad()
     return shown

@@ -18,11 +18,11 @@ import torch
 from hard_scenes import CASES, NEAR, Scene, scene
 from hypothesis import given
 from hypothesis import strategies as st
-from splat_inputs import geometry
+from splat_inputs import blending_weights, geometry, rasterize
 from torch import Tensor
 
 from sundae_ns.core.errors import BackendError
-from sundae_ns.rasterize.interface import blending_weights, rasterize, select_backend, spherical_harmonics
+from sundae_ns.rasterize.interface import select_backend, spherical_harmonics
 from sundae_ns.rasterize.reference import project
 from sundae_ns.rasterize.types import Rasterization
 
@@ -510,12 +510,15 @@ def test_a_forked_process_rasterises(threads: None) -> None:
     """Data loaders fork; numba's own thread pools would end such a process."""
     code = """
 import os, sys, torch
+from sundae_ns.core.camera import Camera
 from sundae_ns.rasterize.interface import blending_weights, select_backend
+from sundae_ns.rasterize.types import Inputs
 torch.set_num_threads(2)
 scene = torch.rand(2000, 3) + torch.tensor([-0.5, -0.5, 2]), torch.ones(2000, 4), 0.02 * torch.ones(2000, 3)
-camera = torch.eye(4), torch.tensor([[90.0, 0, 40], [0, 90, 40], [0, 0, 1]]), 80, 80
+camera = Camera(torch.eye(4), torch.tensor([[90.0, 0, 40], [0, 90, 40], [0, 0, 1]]), 80, 80, 90.0)
+inputs = Inputs(*scene, torch.full((2000,), 0.5), torch.ones(2000, 1), camera)
 def work():
-    return blending_weights(*scene, torch.full((2000,), 0.5), *camera, backend=select_backend("auto", "cpu")).sum()
+    return blending_weights(inputs, backend=select_backend("auto", "cpu")).sum()
 before = work()
 child = os.fork()
 if child == 0:

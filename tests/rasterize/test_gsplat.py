@@ -12,19 +12,13 @@ from importlib.metadata import version
 
 import pytest
 import torch
-from splat_inputs import several_views
+from splat_inputs import blending_weights, rasterize, rasterize_cameras, several_views
 from torch import Tensor
 
 from sundae_ns.core.errors import BackendError
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
-from sundae_ns.rasterize.interface import (
-    blending_weights,
-    rasterize,
-    rasterize_cameras,
-    select_backend,
-    spherical_harmonics,
-)
+from sundae_ns.rasterize.interface import select_backend, spherical_harmonics
 from sundae_ns.rasterize.types import Rasterization
 
 pytestmark = pytest.mark.gpu

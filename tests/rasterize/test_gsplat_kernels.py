@@ -39,7 +39,7 @@ def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes], monkeyp
 
 
 def test_second_derivatives_are_refused() -> None:
-    primitives = ellipses(5, 3, 20, 20)
+    primitives = ellipses(5, 20, 20, largest=2.0)
     leaves = leaves_of(primitives, torch.float32)
     image, _ = blend(*leaves.values(), every_tile(primitives, 20, 20, spare=0), False)
     means, center, dc, rest = colors_inputs()
@@ -52,30 +52,50 @@ def test_second_derivatives_are_refused() -> None:
 # --------------------------------------------------------------------------------------------------------------- tiles
 
 
-def gaussians(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Gaussians:
-    """Footprints of all sizes and shapes, up to needles across the image, in and around it."""
+def ellipses(
+    n: int,
+    width: int,
+    height: int,
+    *,
+    largest: float = 4.0,
+    power: int = 1,
+    opacity: float = 1.0,
+    channels: int = 3,
+    seed: int = 0,
+) -> Gaussians:
+    """Footprints in and around an image, float64: of all shapes, some opaque, some too faint to be blended.
+
+    Variances of their axes are up to ``10 ** largest`` square pixels; a higher ``power`` makes most of them faint.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
+        return torch.rand(*shape, generator=generator).double()
 
     angle, sides = uniform(n) * 6.3, 10 ** (uniform(2, n) * (largest + 1) - 1)
     c, s = angle.cos(), angle.sin()
-    xx = sides[0] * c * c + sides[1] * s * s + 0.3
-    yy = sides[0] * s * s + sides[1] * c * c + 0.3
+    xx, yy = sides[0] * c * c + sides[1] * s * s + 0.3, sides[0] * s * s + sides[1] * c * c + 0.3
     xy = (sides[0] - sides[1]) * c * s
-    det = (xx.double() * yy.double() - xy.double() ** 2).float()
-    radii = (3 * sides.amax(0).add(0.3).sqrt()).ceil().int()
-    radii[::17] = 0
-    depths = uniform(n) + 0.1
-    depths[1::9] = depths[0]  # ties
+    opacities = (uniform(n) * 1.3).clamp(max=1) ** power * opacity
+    opacities[::13] = 1e-3
     return {
-        "means2d": (uniform(n, 2) * 1.4 - 0.2) * torch.tensor([float(width), float(height)]),
-        "conics": torch.stack([yy / det, -xy / det, xx / det], dim=1),
-        "opacities": uniform(n) ** 3,
-        "depths": depths,
-        "radii": radii,
+        "means2d": (uniform(n, 2) * 1.4 - 0.2) * torch.tensor([width, height]),
+        "covariances": torch.stack([xx, xy, yy], dim=1),
+        "conics": torch.stack([yy, -xy, xx], dim=1) / (xx * yy - xy * xy)[:, None],
+        "opacities": opacities,
+        "depths": uniform(n) + 0.1,
+        "colors": uniform(n, channels),
     }
+
+
+def gaussians(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Gaussians:
+    """Ellipses in float32, up to needles across the image, with radii; some are culled, and some equally deep."""
+    made = ellipses(n, width, height, largest=largest, power=3, seed=seed)
+    radii = (3 * (made["covariances"][:, 0] + made["covariances"][:, 2]).sqrt()).ceil().int()
+    radii[::17] = 0
+    made["depths"][1::9] = made["depths"][0]
+    fields = {name: made[name].float() for name in ("means2d", "conics", "opacities", "depths")}
+    return {**fields, "radii": radii}
 
 
 def in_square(primitives: Gaussians, column: int, row: int, columns: int, rows: int) -> Tensor:
@@ -124,11 +144,7 @@ def test_all_blended_primitives_are_listed_and_hardly_any_others(width: int, hei
         order = primitives["depths"][found] * 1000 + found  # by depth, and ties by index
         assert (primitives["depths"][found].diff() >= 0).all()
         assert (order.diff()[primitives["depths"][found].diff() == 0] > 0).all()
-        needed, listed, squares = (
-            needed + int(blended.sum()),
-            listed + len(found),
-            squares + int(square.sum()),
-        )
+        needed, listed, squares = needed + int(blended.sum()), listed + len(found), squares + int(square.sum())
     assert listed <= 1.02 * needed + 2
     if columns * rows > 1:  # gsplat's own lists would fail this test
         assert squares > 2 * listed
@@ -207,27 +223,7 @@ def test_more_tiles_than_16_bits_count() -> None:
 NAMES = ("means2d", "conics", "colors", "opacities")
 
 
-def ellipses(n: int, channels: int, width: int, height: int, *, opacity: float = 1.0) -> dict[str, Tensor]:
-    """Ellipses in and around an image, float64; some are opaque, and some are too faint to be blended."""
-    angle, sides = torch.rand(n) * 3.2, 10 ** (torch.rand(2, n) * 2.5 - 0.5)
-    c, s = angle.cos(), angle.sin()
-    xx, yy = sides[0] * c * c + sides[1] * s * s + 0.3, sides[0] * s * s + sides[1] * c * c + 0.3
-    xy = (sides[0] - sides[1]) * c * s
-    covariances = torch.stack([xx, xy, yy], dim=1).double()
-    det = covariances[:, 0] * covariances[:, 2] - covariances[:, 1] ** 2
-    opacities = (torch.rand(n).double() * 1.3).clamp(max=1) * opacity
-    opacities[::13] = 1e-3
-    return {
-        "covariances": covariances,
-        "depths": torch.rand(n).double() + 0.1,
-        "means2d": (torch.rand(1, n, 2).double() * 1.4 - 0.2) * torch.tensor([width, height]),
-        "conics": (covariances[:, [2, 1, 0]] * torch.tensor([1, -1, 1]) / det[:, None])[None],
-        "colors": torch.rand(1, n, channels).double(),
-        "opacities": opacities[None],
-    }
-
-
-def every_tile(primitives: dict[str, Tensor], width: int, height: int, spare: int) -> GsplatLists:
+def every_tile(primitives: Gaussians, width: int, height: int, spare: int) -> GsplatLists:
     """Every Gaussian in every tile, by depth, and a tile below the image with ``spare`` pairs."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     order = primitives["depths"].argsort(stable=True).int()
@@ -236,24 +232,18 @@ def every_tile(primitives: dict[str, Tensor], width: int, height: int, spare: in
     return GsplatLists(width, height, starts.view(1, -1, columns), pairs)
 
 
-def expected(
-    primitives: dict[str, Tensor], leaves: dict[str, Tensor], width: int, height: int, absgrad: bool
-) -> tuple[Tensor, Tensor]:
-    radii = (3 * primitives["covariances"][:, [0, 2]].amax(1).sqrt()).ceil() + 1000  # no squares: every tile
-    projection = Projection(
-        means2d=primitives["means2d"][0],
-        covars2d=primitives["covariances"],
-        conics=leaves["conics"][0],
-        depths=primitives["depths"],
-        compensations=torch.ones_like(primitives["depths"]),
-        radii=radii.int(),
-    )
-    opacities = leaves["opacities"][0]
-    return composite(leaves["means2d"], projection, opacities, leaves["colors"][0], width, height, absgrad=absgrad)
+def expected(primitives: Gaussians, leaves: Gaussians, width: int, height: int, absgrad: bool) -> tuple[Tensor, Tensor]:
+    n = len(primitives["depths"])
+    radii = torch.full((n,), 10_000, dtype=torch.int32)  # no squares: every tile
+    compensations, covariances = torch.ones(n).double(), primitives["covariances"]
+    conics, depths = leaves["conics"][0], primitives["depths"]
+    projection = Projection(primitives["means2d"], covariances, conics, depths, compensations, radii)
+    blended = leaves["opacities"][0], leaves["colors"][0]
+    return composite(leaves["means2d"], projection, *blended, width, height, absgrad=absgrad)
 
 
-def leaves_of(primitives: dict[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
-    return {name: primitives[name].to(dtype, copy=True).requires_grad_() for name in NAMES}
+def leaves_of(primitives: Gaussians, dtype: torch.dtype) -> Gaussians:
+    return {name: primitives[name][None].to(dtype, copy=True).requires_grad_() for name in NAMES}
 
 
 @pytest.mark.parametrize(
@@ -270,7 +260,7 @@ def leaves_of(primitives: dict[str, Tensor], dtype: torch.dtype) -> dict[str, Te
 def test_image_and_gradients_match_the_reference(
     n: int, channels: int, width: int, height: int, absgrad: bool, opacity: float
 ) -> None:
-    primitives = ellipses(n, channels, width, height, opacity=opacity)
+    primitives = ellipses(n, width, height, largest=2.0, channels=channels, opacity=opacity)
     ours, exact = leaves_of(primitives, torch.float32), leaves_of(primitives, torch.float64)
     lists = every_tile(primitives, width, height, spare=7 if absgrad else 0)
     image, alpha = blend(*ours.values(), lists, absgrad)
@@ -291,8 +281,8 @@ def test_image_and_gradients_match_the_reference(
 
 
 def test_gradients_flow_into_some_inputs_only() -> None:
-    primitives = ellipses(30, 3, 20, 20)
-    ours = {name: primitives[name].float() for name in NAMES}
+    primitives = ellipses(30, 20, 20, largest=2.0)
+    ours = {name: primitives[name][None].float() for name in NAMES}
     ours["colors"].requires_grad_()
     lists = every_tile(primitives, 20, 20, spare=0)
     image, _ = blend(*ours.values(), lists, False)
@@ -302,7 +292,7 @@ def test_gradients_flow_into_some_inputs_only() -> None:
 
 
 def test_an_empty_list_leaves_the_background() -> None:
-    ours = leaves_of(ellipses(5, 3, 20, 20), torch.float32)
+    ours = leaves_of(ellipses(5, 20, 20, largest=2.0), torch.float32)
     lists = GsplatLists(20, 20, torch.zeros(1, 2, 2, dtype=torch.int32), torch.zeros(0, dtype=torch.int32))
     image, alpha = blend(*ours.values(), lists, False)
     assert not image.any()

@@ -9,19 +9,12 @@ from typing import Any
 
 import pytest
 import torch
-from splat_inputs import several_views
+from splat_inputs import blending_weights, rasterize, rasterize_cameras, several_views
 from torch import Tensor
 
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, MemoryExhaustedError
 from sundae_ns.rasterize import types as limits
-from sundae_ns.rasterize.interface import (
-    BackendName,
-    blending_weights,
-    rasterize,
-    rasterize_cameras,
-    select_backend,
-    spherical_harmonics,
-)
+from sundae_ns.rasterize.interface import BackendName, select_backend, spherical_harmonics
 
 REFERENCE = select_backend("reference", "cpu")
 

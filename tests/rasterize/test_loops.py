@@ -165,7 +165,7 @@ def test_compiles_without_a_cache_folder() -> None:
 def test_a_notice_is_printed_for_long_compilation(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    parallel._print_once.cache_clear()
+    monkeypatch.setattr(parallel, "_noticed", [])
     monkeypatch.setattr(parallel, "_NOTICE_AFTER", 0.05)
     monkeypatch.setattr(parallel, "_ready", set())
 

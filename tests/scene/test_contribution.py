@@ -17,7 +17,7 @@ from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterize.interface import blending_weights, rasterize
-from sundae_ns.scene.render import GaussianSource, TrainingCamera, contribution, pass_options
+from sundae_ns.scene.render import GaussianSource, TrainingCamera, contribution, pass_inputs
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[[SundaeModel], Any]
@@ -86,12 +86,10 @@ def test_weights_by_detail_are_those_of_an_image_and_a_second_pass(masked: bool)
         GaussianSource(scene.gaussians), [TrainingCamera(camera, mask)], scene.background, settings, 20
     )
     image = sn.render(scene, camera)
-    visible = (
-        rasterize(colors=scene.gaussians["features_dc"], **pass_options(scene.gaussians, camera, settings)).radii > 0
-    )
+    visible = rasterize(pass_inputs(scene.gaussians, camera, settings), backend=settings.backend).radii > 0
     pixels = pixel_detail(image.rgb, 20 / 60 * float(visible.sum()))
     pixels = pixels if mask is None else pixels * mask[..., 0]
-    expected = blending_weights(pixels=pixels, **pass_options(scene.gaussians, camera, settings))
+    expected = blending_weights(pass_inputs(scene.gaussians, camera, settings), pixels, backend=settings.backend)
     assert float(expected.max()) > 0.1
     torch.testing.assert_close(found, expected)
     assert not any(value.requires_grad for value in scene.gaussians.values())

@@ -321,10 +321,9 @@ def test_the_page_counts_fragments_before_it_draws(tmp_path: Path) -> None:
         scene, counted = load(file), json.loads(line)
         gaussians, camera = scene.gaussians, scene.cameras[0]
         opacities = gaussians["opacities"].sigmoid()[:, 0]
-        K, size = camera.K, (camera.width, camera.height)
+        size = (camera.width, camera.height)
         shapes = (gaussians["means"], gaussians["quats"], gaussians["scales"].exp(), opacities, gaussians["means"])
-        flags = {"antialiased": False, "absgrad": False, "render_depth": False}
-        splats = project(Inputs(*shapes, camera.viewmat, K, *size, near_plane=0.01, far_plane=1e10, **flags))
+        splats = project(Inputs(*shapes, camera))
         reach = (2 * (255 * opacities).log()).clamp(min=0).sqrt().clamp(max=3.4)[:, None]
         reach = reach * splats.covars2d[:, [0, 2]].sqrt()
         low = (splats.means2d - reach).clamp(min=0)

@@ -1,4 +1,4 @@
-"""Arguments of the rasterisers' stages."""
+"""Arguments of the rasterisers by keyword."""
 
 from __future__ import annotations
 
@@ -7,16 +7,35 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.rasterize.types import Inputs
+from sundae_ns.core.camera import Camera
+from sundae_ns.rasterize import interface
+from sundae_ns.rasterize.types import Backend, Inputs, Rasterization
+
+
+def inputs_of(*, viewmat: Tensor, K: Tensor, width: int, height: int, **values: Any) -> Inputs:
+    """Inputs with a camera of these values; opacities and colours are 1 by default."""
+    ones = values["means"].new_ones(len(values["means"]), 1)
+    return Inputs(camera=Camera(viewmat, K, width, height, 1.0), **{"opacities": ones[:, 0], "colors": ones, **values})
 
 
 def geometry(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, **more: Any
+    means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int
 ) -> Inputs:
-    """Inputs of a projection; their opacities and colours are 1."""
-    ones = means.new_ones(len(means), 1)
-    defaults = {"near_plane": 0.01, "far_plane": 1e10, "antialiased": False, "absgrad": False, "render_depth": False}
-    return Inputs(means, quats, scales, ones[:, 0], ones, viewmat, K, width, height, **{**defaults, **more})
+    """Inputs of a projection."""
+    return inputs_of(means=means, quats=quats, scales=scales, viewmat=viewmat, K=K, width=width, height=height)
+
+
+def rasterize(*, backend: Backend, **values: Any) -> Rasterization:
+    return interface.rasterize(inputs_of(**values), backend=backend)
+
+
+def rasterize_cameras(*, viewmats: Tensor, Ks: Tensor, backend: Backend, **values: Any) -> Tensor:
+    inputs = inputs_of(viewmat=torch.eye(4), K=torch.eye(3), **values)
+    return interface.rasterize_cameras(inputs, viewmats, Ks, backend=backend)
+
+
+def blending_weights(*, backend: Backend, pixels: Tensor | None = None, **values: Any) -> Tensor:
+    return interface.blending_weights(inputs_of(**values), pixels, backend=backend)
 
 
 def several_views(n: int = 50, channels: int = 4) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -7,7 +7,7 @@ import torch
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from sundae_ns.rasterize.types import _radii_per_axis, strategy_info
+from sundae_ns.rasterize.types import is_gsplat_1_5
 from sundae_ns.train.densification import CappedStrategy, count_view, limit_growth, start_counting
 
 FIELD = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
@@ -59,7 +59,7 @@ def test_densification_stops_at_the_cap(cap: int | None, expected: int, wide: bo
     means2d.grad = torch.rand(1, N, 2) + 0.1
     info = {
         "means2d": means2d, "width": 10, "height": 10, "n_cameras": 1,
-        "radii": torch.ones((1, N, 2) if _radii_per_axis() else (1, N), dtype=torch.int32), "gaussian_ids": None,
+        "radii": torch.ones((1, N, 2) if is_gsplat_1_5() else (1, N), dtype=torch.int32), "gaussian_ids": None,
     }  # fmt: skip
     strategy.step_post_backward(params, optimizers, state, 1, info, packed=False)
     if wide and cap is None:
@@ -83,8 +83,8 @@ def test_statistics_are_those_of_gsplat(absgrad: bool) -> None:
             centers.absgrad = grads.abs()  # type: ignore[attr-defined]
         else:
             centers.grad = grads
-        shaped = radii[..., None].expand(-1, -1, 2) if _radii_per_axis() else radii
-        info = strategy_info(centers, shaped, 80, 60)
+        shaped = radii[..., None].expand(-1, -1, 2) if is_gsplat_1_5() else radii
+        info = {"means2d": centers, "radii": shaped, "width": 80, "height": 60, "n_cameras": 1, "gaussian_ids": None}
         strategy._update_state(params, theirs, info)
         count_view(ours, (grads.abs() if absgrad else grads)[0], radii[0], 80, 60)
     assert (ours["count"] < 3).any()
@@ -92,7 +92,7 @@ def test_statistics_are_those_of_gsplat(absgrad: bool) -> None:
         torch.testing.assert_close(ours[name], theirs[name])
 
 
-def test_statistics_of_radii_per_axis() -> None:
+def test_statistics_ofis_gsplat_1_5() -> None:
     running = {"grad2d": torch.zeros(3), "count": torch.zeros(3), "radii": torch.zeros(3)}
     count_view(running, torch.ones(3, 2), torch.tensor([[4, 8], [0, 8], [2, 2]]), 80, 40)
     assert running["count"].tolist() == [1, 0, 1]

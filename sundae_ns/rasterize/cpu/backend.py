@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 from sundae_ns.core.errors import BackendError
 from sundae_ns.rasterize import reference
 from sundae_ns.rasterize.cpu.compositing import composite
-from sundae_ns.rasterize.cpu.parallel import as_array, compiled, parallel_for
+from sundae_ns.rasterize.cpu.parallel import as_array, compiled, inlined, parallel_for
 from sundae_ns.rasterize.cpu.tiles import build_lists
 from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN, MAX_RADIUS, Projection, blended_values
 from sundae_ns.rasterize.types import Inputs, Rasterization, result_of, strategy_radii
@@ -46,7 +46,7 @@ class CpuBackend:
         projection = project(inputs)
         opacities, colors = blended_values(inputs, projection)
         means2d = projection.means2d[None]
-        lists = build_lists(projection, opacities, inputs.width, inputs.height)
+        lists = build_lists(projection, opacities, inputs.camera.width, inputs.camera.height)
         image, alpha = composite(means2d, projection.conics, opacities, colors, lists, inputs.absgrad)
         return result_of(image, alpha, means2d, strategy_radii(projection.radii), inputs)
 
@@ -57,7 +57,9 @@ class CpuBackend:
             BackendError: The tensors are not float32 or float64 on a CPU.
         """
         _check(directions)
-        return cast("Tensor", _Harmonics.apply(degree, directions, coeffs))
+        outputs = (torch.empty_like(directions, memory_format=torch.contiguous_format),)
+        loops = _evaluate, _evaluate_backward, _MIN_TO_EVALUATE
+        return cast("Tensor", _Loops.apply(loops, degree, outputs, 1, directions, coeffs)[0])
 
 
 def _check(tensor: Tensor) -> None:
@@ -68,40 +70,22 @@ def _check(tensor: Tensor) -> None:
         )
 
 
-# ---------------------------------------------------------------------------------------------------------- projection
+class _Loops(torch.autograd.Function):
+    """A function of N rows, once differentiable, from two compiled loops.
 
+    They are called as ``forward(begin, end, options, *inputs, outputs)`` and ``backward(begin, end, options, *inputs,
+    gradients, outputs)``. The first ``differentiable`` outputs have gradients.
+    """
 
-def project(inputs: Inputs) -> Projection:
-    """As the reference's, once differentiable; if a camera requires gradients, it is the reference's."""
-    if torch.is_grad_enabled() and (inputs.viewmat.requires_grad or inputs.K.requires_grad):
-        return reference.project(inputs)
-    means = inputs.means
-    matrix = as_array(inputs.viewmat.double())
-    lens = as_array(inputs.K)[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float64)
-    size = np.array([inputs.width, inputs.height], dtype=np.float64)
-    # Round the planes to the tensors' dtype, as torch does when it compares a tensor with a number.
-    planes = np.array([inputs.near_plane, inputs.far_plane], np.float32 if means.dtype == torch.float32 else np.float64)
-    camera = (matrix, lens, size, planes.astype(np.float64))
-    outputs = _Project.apply(means, inputs.quats, inputs.scales, camera)
-    means2d, conics, depths, compensations, covars2d, radii = outputs
-    return Projection(means2d, covars2d, conics, depths, compensations, radii)
-
-
-class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, camera: tuple[Any, Any, Any, Any]
+        ctx: Any, loops: Any, options: Any, outputs: tuple[Tensor, ...], differentiable: int, *inputs: Tensor
     ) -> tuple[Tensor, ...]:
-        n = means.shape[0]
-        means2d, conics, covars2d = means.new_empty(n, 2), means.new_empty(n, 3), means.new_empty(n, 3)
-        depths, compensations = means.new_empty(n), means.new_empty(n)
-        radii = torch.empty(n, dtype=torch.int32)
-        outputs = (means2d, conics, depths, compensations, covars2d, radii)
-        arguments = (*map(as_array, (means, quats, scales)), camera, tuple(map(as_array, outputs)))
-        parallel_for(_project, n, *arguments, min_per_thread=_MIN_PER_THREAD)
-        ctx.save_for_backward(means, quats, scales)
-        ctx.camera = camera
-        ctx.mark_non_differentiable(covars2d, radii)
+        ctx.loops, ctx.options, ctx.differentiable = loops, options, differentiable
+        arguments = (options, *map(as_array, inputs), tuple(map(as_array, outputs)))
+        parallel_for(loops[0], len(inputs[0]), *arguments, min_per_thread=loops[2])
+        ctx.save_for_backward(*inputs)
+        ctx.mark_non_differentiable(*outputs[differentiable:])
         return outputs
 
     @staticmethod
@@ -109,10 +93,40 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
         outputs = [torch.empty_like(value, memory_format=torch.contiguous_format) for value in inputs]
-        grads_in, grads_out = tuple(map(as_array, grads[:4])), tuple(map(as_array, outputs))
-        arguments = (*map(as_array, inputs), grads_in, ctx.camera, grads_out)
-        parallel_for(_project_backward, inputs[0].shape[0], *arguments, min_per_thread=_MIN_PER_THREAD)
-        return *outputs, None
+        gradients = tuple(map(as_array, grads[: ctx.differentiable]))
+        arguments = (ctx.options, *map(as_array, inputs), gradients, tuple(map(as_array, outputs)))
+        parallel_for(ctx.loops[1], len(inputs[0]), *arguments, min_per_thread=ctx.loops[2])
+        wanted = ctx.needs_input_grad[4:]
+        return None, None, None, None, *(output if want else None for output, want in zip(outputs, wanted))
+
+
+# ---------------------------------------------------------------------------------------------------------- projection
+
+
+def project(inputs: Inputs) -> Projection:
+    """As the reference's, once differentiable; if a camera requires gradients, it is the reference's."""
+    viewmat, K, width, height, _ = inputs.camera
+    if torch.is_grad_enabled() and (viewmat.requires_grad or K.requires_grad):
+        return reference.project(inputs)
+    means = inputs.means
+    lens = as_array(K)[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float64)
+    size = np.array([width, height], dtype=np.float64)
+    # Footprints are linearised at slopes x / z and y / z from limits[0] to limits[1].
+    focal, centre = lens[:2], lens[2:]
+    margin = FOV_MARGIN * 0.5 * size / focal
+    limits = np.stack([-centre / focal - margin, (size - centre) / focal + margin])
+    # Round the planes to the tensors' dtype, as torch does when it compares a tensor with a number.
+    planes = np.array([inputs.near_plane, inputs.far_plane], np.float32 if means.dtype == torch.float32 else np.float64)
+    camera = (as_array(viewmat.double()), lens, size, planes.astype(np.float64), limits)
+    n = len(means)
+    outputs = (
+        *(means.new_empty(n, 2), means.new_empty(n, 3), means.new_empty(n), means.new_empty(n), means.new_empty(n, 3)),
+        torch.empty(n, dtype=torch.int32),
+    )
+    loops = _project, _project_backward, _MIN_PER_THREAD
+    outputs = _Loops.apply(loops, camera, outputs, 4, means, inputs.quats, inputs.scales)
+    means2d, conics, depths, compensations, covars2d, radii = outputs
+    return Projection(means2d, covars2d, conics, depths, compensations, radii)
 
 
 @compiled
@@ -129,70 +143,62 @@ def _rotation(quats: Any, i: int, out: Any) -> float:
 
 
 @compiled
-def _slope_limits(lens: Any, size: Any) -> tuple[float, float, float, float]:
-    """Bounds of the slopes at which footprints are linearised: min and max of x / z, min and max of y / z."""
-    margin_x, margin_y = FOV_MARGIN * 0.5 * size[0] / lens[0], FOV_MARGIN * 0.5 * size[1] / lens[1]
-    return (
-        -lens[2] / lens[0] - margin_x,
-        (size[0] - lens[2]) / lens[0] + margin_x,
-        -lens[3] / lens[1] - margin_y,
-        (size[1] - lens[3]) / lens[1] + margin_y,
-    )
+def _to_camera(camera: Any, means: Any, i: int) -> tuple[float, float, float, bool]:
+    """Camera coordinates of a centre, and whether z, rounded to the dtype of the centres, is between the planes."""
+    matrix, _, _, planes, _ = camera
+    x = matrix[0, 0] * means[i, 0] + matrix[0, 1] * means[i, 1] + matrix[0, 2] * means[i, 2] + matrix[0, 3]
+    y = matrix[1, 0] * means[i, 0] + matrix[1, 1] * means[i, 1] + matrix[1, 2] * means[i, 2] + matrix[1, 3]
+    z = matrix[2, 0] * means[i, 0] + matrix[2, 1] * means[i, 1] + matrix[2, 2] * means[i, 2] + matrix[2, 3]
+    z = float(means.dtype.type(z))
+    return x, y, z, z >= planes[0] and z <= planes[1] and z > 0
 
 
 @compiled
-def _to_camera(camera: Any, means: Any, i: int) -> tuple[float, float, float]:
-    """Camera coordinates of a centre; z is rounded to the dtype of the centres, in which it is compared."""
-    x = camera[0, 0] * means[i, 0] + camera[0, 1] * means[i, 1] + camera[0, 2] * means[i, 2] + camera[0, 3]
-    y = camera[1, 0] * means[i, 0] + camera[1, 1] * means[i, 1] + camera[1, 2] * means[i, 2] + camera[1, 3]
-    z = camera[2, 0] * means[i, 0] + camera[2, 1] * means[i, 1] + camera[2, 2] * means[i, 2] + camera[2, 3]
-    return x, y, float(means.dtype.type(z))
+def _arrays() -> Any:
+    """Arrays that :func:`_footprint` fills for a Gaussian: rotation, axes, two rows before and after zoom, normal."""
+    return np.empty((4, 4)), np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty(3)
 
 
-@compiled
-def _to_view(camera: Any, rotation: Any, out: Any) -> None:
-    """Write a Gaussian's axes in camera coordinates ``[3, 3]``."""
-    for r in range(3):
-        for c in range(3):
-            out[r, c] = camera[r, 0] * rotation[0, c] + camera[r, 1] * rotation[1, c] + camera[r, 2] * rotation[2, c]
+@inlined
+def _footprint(camera: Any, quats: Any, scales: Any, i: int, x: float, y: float, z: float, arrays: Any) -> Any:
+    """Length of the quaternion, slopes, zooms, covariance before the blur, and its determinants before and after.
 
-
-@compiled
-def _footprint(row_x: Any, row_y: Any, normal: Any) -> tuple[float, float, float, float, float]:
-    """Covariance xx, xy, yy before the blur from the rows of its root, and its determinants before and after the blur.
-
-    ``normal`` receives the cross product of the rows.
+    The zoomed ``rows`` are a root of the covariance; ``normal`` is their cross product.
     """
-    xx = row_x[0] * row_x[0] + row_x[1] * row_x[1] + row_x[2] * row_x[2]
-    xy = row_x[0] * row_y[0] + row_x[1] * row_y[1] + row_x[2] * row_y[2]
-    yy = row_y[0] * row_y[0] + row_y[1] * row_y[1] + row_y[2] * row_y[2]
-    normal[0] = row_x[1] * row_y[2] - row_x[2] * row_y[1]
-    normal[1] = row_x[2] * row_y[0] - row_x[0] * row_y[2]
-    normal[2] = row_x[0] * row_y[1] - row_x[1] * row_y[0]
+    matrix, lens, _, _, limits = camera
+    rotation, axes, sharp, rows, normal = arrays
+    length = _rotation(quats, i, rotation)
+    slope_x, slope_y = min(max(x / z, limits[0, 0]), limits[1, 0]), min(max(y / z, limits[0, 1]), limits[1, 1])
+    zoom_x, zoom_y = lens[0] / z, lens[1] / z
+    for c in range(3):
+        for r in range(3):
+            axes[r, c] = matrix[r, 0] * rotation[0, c] + matrix[r, 1] * rotation[1, c] + matrix[r, 2] * rotation[2, c]
+        across, down, along = axes[0, c] * scales[i, c], axes[1, c] * scales[i, c], axes[2, c] * scales[i, c]
+        sharp[0, c], sharp[1, c] = across - slope_x * along, down - slope_y * along
+        rows[0, c], rows[1, c] = zoom_x * sharp[0, c], zoom_y * sharp[1, c]
+    xx = rows[0, 0] * rows[0, 0] + rows[0, 1] * rows[0, 1] + rows[0, 2] * rows[0, 2]
+    xy = rows[0, 0] * rows[1, 0] + rows[0, 1] * rows[1, 1] + rows[0, 2] * rows[1, 2]
+    yy = rows[1, 0] * rows[1, 0] + rows[1, 1] * rows[1, 1] + rows[1, 2] * rows[1, 2]
+    for k in range(3):
+        n, m = (k + 1) % 3, (k + 2) % 3
+        normal[k] = rows[0, n] * rows[1, m] - rows[0, m] * rows[1, n]
     sharp_det = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
-    return xx, xy, yy, sharp_det, sharp_det + BLUR * (xx + yy) + BLUR * BLUR
+    return length, slope_x, slope_y, zoom_x, zoom_y, xx, xy, yy, sharp_det, sharp_det + BLUR * (xx + yy) + BLUR * BLUR
 
 
 @compiled
-def _project(begin: int, end: int, means: Any, quats: Any, scales: Any, camera: Any, outputs: Any) -> None:
-    matrix, lens, size, planes = camera
+def _project(begin: int, end: int, camera: Any, means: Any, quats: Any, scales: Any, outputs: Any) -> None:
+    _, lens, size, _, _ = camera
     means2d, conics, depths, compensations, covars2d, radii = outputs
-    rotation, root, row_x, row_y, normal = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
-    min_x, max_x, min_y, max_y = _slope_limits(lens, size)
+    arrays = _arrays()
     for i in range(begin, end):
-        x, y, z = _to_camera(matrix, means, i)
-        if not (z >= planes[0] and z <= planes[1] and z > 0):
+        x, y, z, in_range = _to_camera(camera, means, i)
+        if not in_range:
             means2d[i], conics[i], covars2d[i] = 0, 0, 0
             depths[i], compensations[i], radii[i] = 0, 0, 0
             continue
         centre_x, centre_y = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
-        _rotation(quats, i, rotation)
-        _to_view(matrix, rotation, root)
-        slope_x, slope_y = min(max(x / z, min_x), max_x), min(max(y / z, min_y), max_y)
-        for c in range(3):
-            across, down, along = root[0, c] * scales[i, c], root[1, c] * scales[i, c], root[2, c] * scales[i, c]
-            row_x[c], row_y[c] = lens[0] / z * (across - slope_x * along), lens[1] / z * (down - slope_y * along)
-        xx, xy, yy, sharp_det, det = _footprint(row_x, row_y, normal)
+        _, _, _, _, _, xx, xy, yy, sharp_det, det = _footprint(camera, quats, scales, i, x, y, z, arrays)
         xx, yy = xx + BLUR, yy + BLUR
         means2d[i, 0], means2d[i, 1], depths[i] = centre_x, centre_y, z
         covars2d[i, 0], covars2d[i, 1], covars2d[i, 2] = xx, xy, yy
@@ -208,35 +214,26 @@ def _project(begin: int, end: int, means: Any, quats: Any, scales: Any, camera: 
 
 @compiled
 def _project_backward(
-    begin: int, end: int, means: Any, quats: Any, scales: Any, gradients: Any, camera: Any, outputs: Any
+    begin: int, end: int, camera: Any, means: Any, quats: Any, scales: Any, gradients: Any, outputs: Any
 ) -> None:
-    matrix, lens, size, planes = camera
+    matrix, _, _, _, limits = camera
     grad_means2d, grad_conics, grad_depths, grad_compensations = gradients
     grad_means, grad_quats, grad_scales = outputs
-    rotation, root, row_x, row_y = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3)
-    normal, sharp_x, sharp_y = np.empty(3), np.empty(3), np.empty(3)
-    grad_row_x, grad_row_y, grad_root, grad_rotation = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    min_x, max_x, min_y, max_y = _slope_limits(lens, size)
+    arrays = _arrays()
+    rotation, axes, sharp, rows, normal = arrays
+    grad_rows, grad_axes, g = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(begin, end):
         u, v, depth, blur = grad_means2d[i, 0], grad_means2d[i, 1], grad_depths[i], grad_compensations[i]
         a, b, c = float(grad_conics[i, 0]), float(grad_conics[i, 1]), float(grad_conics[i, 2])
-        x, y, z = _to_camera(matrix, means, i)
-        culled = not (z >= planes[0] and z <= planes[1] and z > 0)
+        x, y, z, in_range = _to_camera(camera, means, i)
         no_gradient = u == 0 and v == 0 and depth == 0 and blur == 0 and a == 0 and b == 0 and c == 0
-        if culled or no_gradient:
+        if no_gradient or not in_range:
             grad_means[i], grad_quats[i], grad_scales[i] = 0, 0, 0
             continue
 
         # Recompute the forward pass ...
-        length = _rotation(quats, i, rotation)
-        _to_view(matrix, rotation, root)
-        slope_x, slope_y = min(max(x / z, min_x), max_x), min(max(y / z, min_y), max_y)
-        zoom_x, zoom_y = lens[0] / z, lens[1] / z
-        for k in range(3):
-            sharp_x[k] = (root[0, k] - slope_x * root[2, k]) * scales[i, k]
-            sharp_y[k] = (root[1, k] - slope_y * root[2, k]) * scales[i, k]
-            row_x[k], row_y[k] = zoom_x * sharp_x[k], zoom_y * sharp_y[k]
-        xx, xy, yy, sharp_det, det = _footprint(row_x, row_y, normal)
+        footprint = _footprint(camera, quats, scales, i, x, y, z, arrays)
+        length, slope_x, slope_y, zoom_x, zoom_y, xx, xy, yy, sharp_det, det = footprint
 
         # ... and differentiate: from conic and compensation to the covariance and its determinants,
         grad_det = -(a * (yy + BLUR) - b * xy + c * (xx + BLUR)) / (det * det)
@@ -253,41 +250,38 @@ def _project_backward(
         # to the rows of its root (the sharp determinant is the squared length of their cross product),
         for k in range(3):
             n, m = (k + 1) % 3, (k + 2) % 3
-            grad_row_x[k] = 2 * grad_sharp_det * (row_y[n] * normal[m] - row_y[m] * normal[n])
-            grad_row_x[k] += 2 * row_x[k] * grad_xx + row_y[k] * grad_xy
-            grad_row_y[k] = 2 * grad_sharp_det * (normal[n] * row_x[m] - normal[m] * row_x[n])
-            grad_row_y[k] += 2 * row_y[k] * grad_yy + row_x[k] * grad_xy
+            grad_rows[0, k] = 2 * grad_sharp_det * (rows[1, n] * normal[m] - rows[1, m] * normal[n])
+            grad_rows[0, k] += 2 * rows[0, k] * grad_xx + rows[1, k] * grad_xy
+            grad_rows[1, k] = 2 * grad_sharp_det * (normal[n] * rows[0, m] - normal[m] * rows[0, n])
+            grad_rows[1, k] += 2 * rows[1, k] * grad_yy + rows[0, k] * grad_xy
         # to zoom, slopes, scales and the rotated axes,
         grad_zoom_x = grad_zoom_y = grad_slope_x = grad_slope_y = 0.0
         for k in range(3):
-            grad_zoom_x += grad_row_x[k] * sharp_x[k]
-            grad_zoom_y += grad_row_y[k] * sharp_y[k]
-            inner_x, inner_y = zoom_x * grad_row_x[k], zoom_y * grad_row_y[k]
+            grad_zoom_x += grad_rows[0, k] * sharp[0, k]
+            grad_zoom_y += grad_rows[1, k] * sharp[1, k]
+            inner_x, inner_y = zoom_x * grad_rows[0, k], zoom_y * grad_rows[1, k]
             inner_z = -(slope_x * inner_x + slope_y * inner_y)
-            grad_slope_x -= inner_x * root[2, k] * scales[i, k]
-            grad_slope_y -= inner_y * root[2, k] * scales[i, k]
-            grad_scales[i, k] = inner_x * root[0, k] + inner_y * root[1, k] + inner_z * root[2, k]
-            grad_root[0, k], grad_root[1, k], grad_root[2, k] = inner_x, inner_y, inner_z
+            grad_slope_x -= inner_x * axes[2, k] * scales[i, k]
+            grad_slope_y -= inner_y * axes[2, k] * scales[i, k]
+            grad_scales[i, k] = inner_x * axes[0, k] + inner_y * axes[1, k] + inner_z * axes[2, k]
+            grad_axes[0, k], grad_axes[1, k], grad_axes[2, k] = inner_x, inner_y, inner_z
         for r in range(3):
             for k in range(3):
-                grad_axis = (
-                    matrix[0, r] * grad_root[0, k] + matrix[1, r] * grad_root[1, k] + matrix[2, r] * grad_root[2, k]
-                )
-                grad_rotation[r, k] = grad_axis * scales[i, k]
+                along = matrix[0, r] * grad_axes[0, k] + matrix[1, r] * grad_axes[1, k] + matrix[2, r] * grad_axes[2, k]
+                g[r, k] = along * scales[i, k]
         # to the centre in camera and world coordinates,
         cam_x, cam_y = zoom_x * u, zoom_y * v
         cam_z = depth - (cam_x * x + cam_y * y + grad_zoom_x * zoom_x + grad_zoom_y * zoom_y) / z
-        if min_x <= x / z <= max_x:
+        if limits[0, 0] <= x / z <= limits[1, 0]:
             cam_x += grad_slope_x / z
             cam_z -= grad_slope_x * x / (z * z)
-        if min_y <= y / z <= max_y:
+        if limits[0, 1] <= y / z <= limits[1, 1]:
             cam_y += grad_slope_y / z
             cam_z -= grad_slope_y * y / (z * z)
         for k in range(3):
             grad_means[i, k] = matrix[0, k] * cam_x + matrix[1, k] * cam_y + matrix[2, k] * cam_z
         # and to the quaternion, through its unit form.
         w, p, q, s = rotation[3, 0], rotation[3, 1], rotation[3, 2], rotation[3, 3]
-        g = grad_rotation
         grad_w = 2 * (s * (g[1, 0] - g[0, 1]) + q * (g[0, 2] - g[2, 0]) + p * (g[2, 1] - g[1, 2]))
         grad_p = 2 * (q * (g[0, 1] + g[1, 0]) + s * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]))
         grad_p -= 4 * p * (g[1, 1] + g[2, 2])
@@ -303,28 +297,9 @@ def _project_backward(
 # ----------------------------------------------------------------------------------------------------------- harmonics
 
 
-class _Harmonics(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-        colors = torch.empty_like(directions, memory_format=torch.contiguous_format)
-        arrays = [as_array(value) for value in (directions, coeffs, colors)]
-        parallel_for(_evaluate, len(directions), degree, *arrays, min_per_thread=_MIN_TO_EVALUATE)
-        ctx.degree = degree
-        ctx.save_for_backward(directions, coeffs)
-        return colors
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_colors: Tensor) -> tuple[Tensor | None, ...]:
-        inputs = ctx.saved_tensors
-        outputs = [torch.empty_like(value, memory_format=torch.contiguous_format) for value in inputs]
-        arguments = (*map(as_array, (*inputs, grad_colors)), tuple(map(as_array, outputs)))
-        parallel_for(_evaluate_backward, len(inputs[0]), ctx.degree, *arguments, min_per_thread=_MIN_TO_EVALUATE)
-        return None, *(output if wanted else None for output, wanted in zip(outputs, ctx.needs_input_grad[1:]))
-
-
 @compiled
-def _evaluate(begin: int, end: int, degree: int, directions: Any, coeffs: Any, colors: Any) -> None:
+def _evaluate(begin: int, end: int, degree: int, directions: Any, coeffs: Any, outputs: Any) -> None:
+    (colors,) = outputs
     basis = np.empty(_TERMS)
     terms = (degree + 1) ** 2
     for i in range(begin, end):
@@ -340,8 +315,9 @@ def _evaluate(begin: int, end: int, degree: int, directions: Any, coeffs: Any, c
 
 @compiled
 def _evaluate_backward(
-    begin: int, end: int, degree: int, directions: Any, coeffs: Any, grad_colors: Any, outputs: Any
+    begin: int, end: int, degree: int, directions: Any, coeffs: Any, gradients: Any, outputs: Any
 ) -> None:
+    (grad_colors,) = gradients
     grad_directions, grad_coeffs = outputs
     basis, gains = np.empty(_TERMS), np.empty(_TERMS)
     terms = (degree + 1) ** 2
@@ -360,10 +336,10 @@ def _evaluate_backward(
         grad_coeffs[i, terms:] = 0
         grad_x, grad_y, grad_z = _slope(degree, x, y, z, gains)
         # Only the part across the direction turns it.
-        along = x * grad_x + y * grad_y + z * grad_z if length > _SHORTEST else 0.0
-        grad_directions[i, 0] = (grad_x - x * along) / length
-        grad_directions[i, 1] = (grad_y - y * along) / length
-        grad_directions[i, 2] = (grad_z - z * along) / length
+        radial = x * grad_x + y * grad_y + z * grad_z if length > _SHORTEST else 0.0
+        grad_directions[i, 0] = (grad_x - x * radial) / length
+        grad_directions[i, 1] = (grad_y - y * radial) / length
+        grad_directions[i, 2] = (grad_z - z * radial) / length
 
 
 @compiled

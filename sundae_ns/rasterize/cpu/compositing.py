@@ -82,9 +82,7 @@ class _Composite(torch.autograd.Function):
         parallel_for(_sum_slots, len(lists.ids), *summed, min_per_thread=_MIN_PER_THREAD_TO_SUM)
         if ctx.absgrad:
             means2d.absgrad = torch.from_numpy(absolute_grads) if absgrad else torch.zeros_like(means2d)
-        wanted = (needs_geometry, needs_geometry, needs_geometry, needs_colors)
-        grads = (torch.from_numpy(output) if want else None for output, want in zip(outputs, wanted))
-        return *grads, None, None
+        return *map(torch.from_numpy, outputs), None, None
 
 
 composite = _Composite.apply

@@ -27,10 +27,12 @@ from torch import Tensor
 _RANGES_PER_THREAD = 8  # enough for an even load, few enough to cost nothing
 _NOTICE_AFTER = 1.0  # seconds of compilation before a notice is printed
 
+# Sources of all functions that loops call.
 _FILES = (*sorted(Path(__file__).parent.glob("*.py")), Path(__file__).parents[1] / "reference.py")
-_SOURCES = "".join(path.read_text(encoding="utf-8") for path in _FILES)  # of all functions that loops call
+_SOURCES = "".join(path.read_text(encoding="utf-8") for path in _FILES)
 
 _ready: set[tuple[Any, ...]] = set()  # loops already called, with the dtypes of their arguments
+_noticed: list[Any] = []  # the loop whose compilation was announced: once for each process
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -66,7 +68,13 @@ def parallel_for(loop: Callable[..., None], count: int, *arguments: Any, min_per
     """
     types = (loop, *(argument.dtype for argument in arguments if isinstance(argument, np.ndarray)))
     if types not in _ready:
-        _compile_here(loop, arguments)
+        notice = Timer(_NOTICE_AFTER, _print_notice, [loop])
+        notice.daemon = True
+        notice.start()
+        try:
+            loop(0, 0, *arguments)  # compile on this thread: the stacks of the pool may be too small
+        finally:
+            notice.cancel()
         _ready.add(types)
     threads = min(torch.get_num_threads(), -(-count // min_per_thread))
     if threads <= 1:
@@ -88,26 +96,10 @@ def parallel_for(loop: Callable[..., None], count: int, *arguments: Any, min_per
         helper.result()
 
 
-def _compile_here(loop: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-    """Compile on the calling thread: threads of the pool may have too small a stack for the compiler."""
-    notice = Timer(_NOTICE_AFTER, _print_notice, [loop])
-    notice.daemon = True
-    notice.start()
-    try:
-        loop(0, 0, *arguments)
-    finally:
-        notice.cancel()
-
-
-def _print_notice(loop: Callable[..., None]) -> None:
-    """Print the notice once per process, unless the loop is only read from disk, which a busy machine does slowly."""
-    if loop.stats.cache_misses:  # type: ignore[attr-defined]
-        _print_once("sundae: compiling the CPU rasteriser, some ten seconds, once for each precision")
-
-
-@lru_cache(maxsize=1)
-def _print_once(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+def _print_notice(loop: Any) -> None:
+    if loop.stats.cache_misses and not _noticed:  # reading code from disk is slow too on a busy machine
+        _noticed.append(loop)
+        print("sundae: compiling the CPU rasteriser, some ten seconds, once for each precision", file=sys.stderr)
 
 
 @lru_cache(maxsize=1)

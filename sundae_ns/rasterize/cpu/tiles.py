@@ -87,8 +87,8 @@ def build_lists(projection: Projection, opacities: Tensor, width: int, height: i
     # A Gaussian touches at least one tile in each of its columns.
     check_pairs(int(first_intervals[-1]), count, columns * rows, _PAIR_BYTES, training=training)
     intervals = np.empty((first_intervals[-1], 2), np.int32)
-    found = (table, boxes, first_intervals, intervals, first_slots)
-    parallel_for(_find_intervals, count, *found, min_per_thread=_MIN_PER_THREAD)
+    touched = (table, boxes, first_intervals, intervals, first_slots)
+    parallel_for(_find_intervals, count, *touched, min_per_thread=_MIN_PER_THREAD)
     np.cumsum(first_slots, out=first_slots)
     check_pairs(int(first_slots[-1]), count, columns * rows, _PAIR_BYTES, training=training)
     starts, ranks, slots, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
