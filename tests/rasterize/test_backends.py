@@ -18,13 +18,15 @@ import torch
 from hard_scenes import CASES, NEAR, Scene, scene
 from hypothesis import given
 from hypothesis import strategies as st
-from splat_inputs import blending_weights, geometry, rasterize
+from splat_inputs import blending_weights, geometry, rasterize, rasterize_cameras, several_views
 from torch import Tensor
 
 from sundae_ns.core.errors import BackendError
+from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
+from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.rasterize.interface import select_backend, spherical_harmonics
 from sundae_ns.rasterize.reference import project
-from sundae_ns.rasterize.types import Rasterization
+from sundae_ns.rasterize.types import Rasterization, is_gsplat_1_5
 
 CPU, REFERENCE = select_backend("cpu", "cpu"), select_backend("reference", "cpu")
 each_backend = pytest.mark.parametrize("backend", [REFERENCE, CPU], ids=["reference", "cpu"])
@@ -240,10 +242,7 @@ def test_any_scene(
 @pytest.mark.parametrize("name", CASES)
 def test_hard_scenes(name: str, antialiased: bool) -> None:
     make, size, *bounds = CASES[name]
-    values, camera = (
-        make(),
-        make_view(size, size, turned=False),
-    )  # so that some lie on the near plane in both precisions
+    values, camera = make(), make_view(size, size, turned=False)  # some lie on the near plane in both precisions
     options = {"antialiased": antialiased, "near_plane": NEAR}
     exact = render(values, camera, F64, REFERENCE, **options)
     double = render(values, camera, F64, CPU, **options)
@@ -395,11 +394,9 @@ def test_gradients_of_some_inputs_by_some_outputs(wanted: tuple[str, ...], outpu
         assert deviation(ours, exact) < 1e-10  # measured: 1.5e-14
 
 
-@each_backend
-@pytest.mark.parametrize("absgrad", [False, True])
-def test_default_strategy_grows(backend: Any, absgrad: bool) -> None:
+def check_default_strategy(backend: Any, device: str, absgrad: bool) -> None:
     gsplat = pytest.importorskip("gsplat")
-    params = {name: torch.nn.Parameter(value) for name, value in scene(50).items()}
+    params = {name: torch.nn.Parameter(value.to(device)) for name, value in scene(50).items()}
     optimizers = {name: torch.optim.Adam([param], 1e-3) for name, param in params.items()}
     strategy = gsplat.DefaultStrategy(
         absgrad=absgrad, refine_start_iter=0, refine_every=2, grow_grad2d=1e-7, refine_scale2d_stop_iter=10
@@ -418,6 +415,12 @@ def test_default_strategy_grows(backend: Any, absgrad: bool) -> None:
     assert params["means"].shape[0] > 50
 
 
+@each_backend
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_default_strategy_grows(backend: Any, absgrad: bool) -> None:
+    check_default_strategy(backend, "cpu", absgrad)
+
+
 # ------------------------------------------------------------------------------------------------------------ harmonics
 
 
@@ -427,7 +430,8 @@ def harmonics(degree: int, directions: Tensor, coeffs: Tensor, backend: Any) -> 
     value = spherical_harmonics(degree, *leaves, backend=backend)
     weights = torch.randn(value.shape, generator=torch.Generator().manual_seed(7), dtype=F64)
     weights[::5] = 0  # Gaussians that no pixel sees
-    grads = torch.autograd.grad((value * weights).sum(), leaves, materialize_grads=True, allow_unused=True)
+    loss = (value * weights.to(value.device)).sum()
+    grads = torch.autograd.grad(loss, leaves, materialize_grads=True, allow_unused=True)
     return [value.detach(), *grads]
 
 
@@ -453,6 +457,118 @@ def test_only_what_needs_a_gradient_gets_one() -> None:
     assert coeffs.grad is not None
     with torch.no_grad():
         assert not spherical_harmonics(2, directions, coeffs, backend=CPU).requires_grad
+
+
+# ------------------------------------------------------------------------------------------------------------ on a GPU
+
+
+def crowd(opacity: float, channels: int = 16, n: int = 3000) -> tuple[Scene, dict[str, Any]]:
+    """Gaussians all around a camera, also behind it.
+
+    Faint ones end inside three standard deviations, where gsplat 1.4 and 1.5 bin alike. Of opaque ones, 1.5 also blends
+    the rim from 3 to 3.33 standard deviations (alphas up to 0.011), which 1.4 and the reference cut.
+    """
+    generator = torch.Generator().manual_seed(0)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    values = {
+        "means": (uniform(n, 3) - 0.5) * torch.tensor([5.0, 4.0, 5.0]) + torch.tensor([0.0, 0.0, 2.4]),
+        "quats": torch.randn(n, 4, generator=generator),
+        "scales": torch.log(0.01 + 0.1 * uniform(n, 3)),
+        "opacities": torch.logit(uniform(n) * opacity, 1e-6),
+        "colors": uniform(n, channels),
+    }
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
+    K = torch.tensor([[120.0, 0, 77.0], [0, 110.0, 48.0], [0, 0, 1]])
+    return values, {"viewmat": viewmat, "K": K, "width": 150, "height": 100}
+
+
+def on_gpu(name: str) -> Any:
+    return RecordableGsplat(Capacity()) if name == "recordable" else select_backend(name, "cuda")  # type: ignore[arg-type]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    ("opacity", "antialiased", "channels"),
+    [(0.33, False, 16), (0.33, True, 16), (1.0, False, 16), (0.33, False, 35)],
+    ids=["faint", "antialiased", "opaque", "35 channels"],
+)
+@pytest.mark.parametrize("name", ["gsplat", "recordable", "reference"])
+def test_a_gpu_matches_the_reference(name: str, opacity: float, antialiased: bool, channels: int) -> None:
+    """In float32; measured on an H100 with gsplat 1.4.0: 6.0e-6 and 2.0e-5, of the reference 3.8e-7 and 1.9e-6."""
+    values, camera = crowd(opacity, channels)
+    ours = render(values, camera, F32, on_gpu(name), "cuda", antialiased=antialiased)
+    exact = render(values, camera, F64, REFERENCE, antialiased=antialiased)
+    bounds = (1e-5, 1e-4) if name == "reference" else (1e-4, 1e-3)
+    if opacity > 0.35 and name != "reference" and is_gsplat_1_5():
+        bounds = (3e-2, 2e-1)
+    compare({key: value.cpu() for key, value in ours.items()}, exact, *bounds)
+
+
+@pytest.mark.gpu
+def test_radii_and_weights_of_gsplat() -> None:
+    values, camera = crowd(0.33)
+    radii, weights = [], []
+    for backend, device, dtype in ((on_gpu("gsplat"), "cuda", F32), (REFERENCE, "cpu", F64)):
+        placed = {name: value.to(device, dtype) for name, value in values.items()}
+        radii.append(splat(placed, camera, backend).radii.cpu())
+        as_given = {k: v.to(device, dtype) if isinstance(v, Tensor) else v for k, v in camera.items()}
+        weights.append(blending_weights(**activated(placed), **as_given, backend=backend).cpu())
+    assert deviation(*weights) < 1e-5  # measured: 3.8e-7
+    ours, exact = radii
+    assert ours.shape == exact.shape
+    assert (exact > 0).any()
+    assert (exact == 0).any()
+    if is_gsplat_1_5():  # fits the radius to the opacity and to each axis, and culls invisible Gaussians
+        assert (ours <= (exact * 1.12).ceil() + 1).all()
+    else:  # rounding up to whole pixels may turn float32 rounding into one pixel
+        assert (ours - exact).abs().max() <= 1
+        assert (ours != exact).float().mean() < 1e-2
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("channels", [1, 35])
+@pytest.mark.parametrize("name", ["gsplat", "recordable"])
+def test_several_cameras_of_a_gpu_are_those_of_single_passes(name: str, channels: int, antialiased: bool) -> None:
+    shared, cameras = ({k: v.cuda() for k, v in values.items()} for values in several_views(3000, channels))
+    options = {"width": 40, "height": 30, "antialiased": antialiased}
+    images = rasterize_cameras(**shared, **cameras, **options, backend=select_backend("gsplat", "cuda"))
+    for image, colors, viewmat, K in zip(images, *cameras.values(), strict=True):
+        single = rasterize(**shared, colors=colors, viewmat=viewmat, K=K, **options, backend=on_gpu(name)).colors
+        assert deviation(image, single) < 1e-6
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_harmonics_of_gsplat(degree: int) -> None:
+    directions, coeffs = torch.randn(500, 3), torch.randn(500, 25, 3)
+    directions[0] = 0
+    ours = harmonics(degree, directions.cuda(), coeffs.cuda(), on_gpu("gsplat"))
+    for value, exact in zip(ours, harmonics(degree, directions.double(), coeffs.double(), REFERENCE), strict=True):
+        assert value.isfinite().all()
+        assert deviation(value.cpu(), exact) < 2e-6  # measured: 2.4e-7
+
+
+@pytest.mark.gpu
+def test_no_gaussians_are_an_empty_image_and_float64_is_refused() -> None:
+    values, camera = crowd(1.0, n=0)
+    assert not render(values, camera, F32, on_gpu("gsplat"), "cuda")["image"].any()
+    assert select_backend("auto", "cuda").name == "gsplat"
+    with pytest.raises(BackendError, match="float32 on cuda"):
+        spherical_harmonics(
+            0, torch.ones(1, 3).cuda().double(), torch.ones(1, 1, 3).cuda().double(), backend=on_gpu("auto")
+        )
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize("name", ["gsplat", "reference"])
+def test_default_strategy_grows_on_a_gpu(name: str, absgrad: bool) -> None:
+    check_default_strategy(on_gpu(name), "cuda", absgrad)
 
 
 # ------------------------------------------------------------------------------------------ promises of compiled loops
