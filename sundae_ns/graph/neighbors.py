@@ -73,8 +73,8 @@ def knn(points: Tensor, k: int) -> Neighbors:
     kernel = _kernel(points.device, dtype, k) if points.is_cuda else None
     if kernel is None:
         coordinates = np.ascontiguousarray(points.detach().to(device="cpu", dtype=torch.float64).numpy())
-        found = _search_host(coordinates, k, str(dtype).removeprefix("torch."))
-        indices, distances = (torch.from_numpy(values).to(points.device) for values in found)
+        neighbors = _search_host(coordinates, k, str(dtype).removeprefix("torch."))
+        indices, distances = (torch.from_numpy(values).to(points.device) for values in neighbors)
     else:
         indices, distances = search_tree(build_tree(points.detach().to(dtype)), k, kernel)
     return Neighbors(indices, distances.to(points.dtype))
@@ -103,8 +103,7 @@ def _search_host(
         lengths, positions = tree.query(coordinates[rows], k=nearest, workers=-1)
         points = order[starts[positions]]
         if len(starts) < n:
-            # The first k + 1 points at these positions: slot s of row r is the first whose count ends above s. Rows are
-            # searched at once, so each is lifted above the one before.
+            # Slot s of a row is the first position whose count ends above s. A lift keeps rows apart in one search.
             lift = (k + 2) * np.arange(len(rows))[:, None]
             ends = counts[positions].cumsum(axis=1)
             used = np.searchsorted((ends.clip(max=k + 1) + lift).ravel(), slots + lift, side="right")
@@ -120,15 +119,13 @@ def _search_host(
 @functools.cache
 def _kernel(device: torch.device, dtype: torch.dtype, k: int) -> Kernel | None:
     """The kernel for this device, or None and one logged line if it cannot run. Cached: compiling takes 0.1 s."""
-    if k > MAX_NEIGHBORS:
-        reason = f"it supports at most {MAX_NEIGHBORS} neighbours, not {k}"
-    else:
-        try:
-            return load_kernel(device, dtype, k)
-        except BackendError as error:
-            reason = str(error)
-    _log.warning("neighbour search runs on the CPU, not on %s: %s", device, reason)
-    return None
+    try:
+        if k > MAX_NEIGHBORS:
+            raise BackendError(f"it supports at most {MAX_NEIGHBORS} neighbours, not {k}")
+        return load_kernel(device, dtype, k)
+    except BackendError as error:
+        _log.warning("neighbour search runs on the CPU, not on %s: %s", device, error)
+        return None
 
 
 def _check(points: Tensor) -> None:
