@@ -20,7 +20,6 @@ from sundae_ns.core.metrics import Lpips
 from sundae_ns.core.tables import number, table
 from sundae_ns.data.demo_capture import write_demo_capture
 from sundae_ns.io.run_folder import prunes_of
-from sundae_ns.report.measured import METRICS
 
 METHOD = "sundae-tiny"
 
@@ -68,20 +67,20 @@ def demo(
             write_page(out / "scene.html", finished, packed, title="sundae demo")
 
     (prune,) = prunes_of(run)[-1:] or [{"before": measured.primitives, "after": measured.primitives}]
-    stages = [
+    metrics = {"psnr": 2, "ssim": 4, "lpips": 4}
+    stages = (
         ("warm-up", prune["before"], prune.get("warm_up")),
         ("after the prune", prune["after"], prune.get("pruned")),
-    ]
-    for name, way in (("final, base colours", measured.base), ("final, compensated", measured.full)):
-        stages.append((name, prune["after"], {metric: way.mean(metric) for metric, _ in METRICS}))
-    metrics = [(metric, digits) for metric, digits in METRICS if metric in ("psnr", "ssim", "lpips")]
+        ("final, base colours", prune["after"], {metric: measured.base.mean(metric) for metric in metrics}),
+        ("final, compensated", prune["after"], {metric: measured.full.mean(metric) for metric in metrics}),
+    )
     rows = [
-        [name, number(primitives, 0), *(number(means.get(metric), digits) for metric, digits in metrics)]
+        [name, number(primitives, 0), *(number(means.get(metric), digits) for metric, digits in metrics.items())]
         for name, primitives, means in stages
         if means
     ]
     title = f"{measured.resolution} px, {device}, {len(measured.full.views)} test views"
-    lines = [title, *table(["stage", "primitives", "PSNR, dB", "SSIM", "LPIPS"], rows, words=1)]
+    lines = [title, *table(["stage", "Gaussians", "PSNR, dB", "SSIM", "LPIPS"], rows, words=1)]
     lines.append(
         f"Kept: {prune['after'] / max(prune['before'], 1):.1%} of the Gaussians. "
         f"Size: {measured.bytes_total / 1e6:.2f} MB, the head {measured.bytes_head / 1e6:.2f} MB of it; packed "

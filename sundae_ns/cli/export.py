@@ -72,19 +72,18 @@ def export(
     if started:
         raise ConfigError(f"{out.suffix} files hold neither a start view nor an up axis; leave them out")
     if copies:
-        found, usable = load_with_mask(scene)
-        rows = within(usable, cleaning.mask(found, ()))
+        opened, usable = load_with_mask(scene)
+        rows = within(usable, cleaning.mask(opened, ()))
         keep_vertices(scene, out, rows)
         print(f"{out}: {int(rows.sum()):,} of {len(rows):,} Gaussians")
         return 0
     # A run's cameras, which tell floaters, are in its capture.
-    found = open_packed(scene, data)[0] if cleaning.remove_floaters else load(scene)
-    found = cleaning.cleaned(found)
-    if upright and not found.in_model_frame:
+    opened = cleaning.cleaned(open_packed(scene, data)[0] if cleaning.remove_floaters else load(scene))
+    if upright and not opened.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
-    with Console(stderr=True).status(f"Writing {found.num_gaussians:,} Gaussians"):  # minutes for a .sog of a million
-        written = save_for_viewers(found, out, upright=upright)
-    mode = ", antialiased" if found.antialiased else ""
+    with Console(stderr=True).status(f"Writing {opened.num_gaussians:,} Gaussians"):  # a .sog takes minutes
+        written = save_for_viewers(opened, out, upright=upright)
+    mode = ", antialiased" if opened.antialiased else ""
     print(f"{out}: {written.primitives:,} Gaussians, degree {written.degree}{mode}, {written.bytes:,} bytes")
     if written.clamped:
         print(f"clamped scales or colours of {written.clamped:,} Gaussians to the range of a .spz; a .sog has none")

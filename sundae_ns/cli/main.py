@@ -15,10 +15,9 @@ from typing import NoReturn
 from sundae_ns.core.errors import ConfigError, SundaeError, writing
 
 ENVIRONMENT = {
-    # Where another program takes one of two cores, threads that spin while they wait make a training step on a CPU ten
-    # times as long.
+    # Threads that spin while they wait make a step on a busy CPU ten times as long.
     "OMP_WAIT_POLICY": "PASSIVE",
-    # glibc would return the memory of a step's images to the system and fetch it again, a thousand pages a step.
+    # glibc would return the memory of each step's images to the system.
     "MALLOC_MMAP_THRESHOLD_": str(2**25),
     "MALLOC_TRIM_THRESHOLD_": str(2**28),
 }
@@ -40,16 +39,13 @@ COMMANDS = {
 """Commands with their lines in ``sundae --help``. Each is the function of its name in the module of its name."""
 
 
-def _help() -> str:
-    lines = ["usage: sundae COMMAND ...", "", "Small 3D Gaussian scenes by pruning and a compensation head.", ""]
-    lines += [f"  {name:<8} {line}" for name, line in COMMANDS.items()]
-    return "\n".join([*lines, "", "sundae COMMAND --help shows the options of a command."])
-
-
 def _dispatch(words: Sequence[str]) -> int:
     """Run the command that the words name; its exit code."""
     if words[:1] in (["-h"], ["--help"]):
-        print(_help())
+        print("usage: sundae COMMAND ...\n\nSmall 3D Gaussian scenes by pruning and a compensation head.\n")
+        for name, line in COMMANDS.items():
+            print(f"  {name:<8} {line}")
+        print("\nsundae COMMAND --help shows the options of a command.")
         return 0
     if not words:
         raise ConfigError("no command is given; sundae --help lists them")
@@ -72,9 +68,8 @@ def exit_with(command: Callable[[], int], name: str) -> NoReturn:
     for variable, value in ENVIRONMENT.items():
         os.environ.setdefault(variable, value)
     try:
-        # Commands name the file that they cannot write; this covers the rest, such as a full disk behind stdout.
+        # Commands name the file that they cannot write; this covers others, such as a full disk behind stdout.
         with warnings.catch_warnings(), writing(f"{name} ended early"):
-            # Warnings of nerfstudio's imports, which users of sundae cannot fix.
             warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
             code = command()
             sys.stdout.flush()
@@ -95,9 +90,8 @@ def exit_with(command: Callable[[], int], name: str) -> NoReturn:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``sundae``."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if arguments is None:  # the process is the command's own
-        # Imports make a million objects that stay. To look for garbage among them takes a sixth of the start, and 0.6 s
-        # of the end.
+    if arguments is None:
+        # Looking for garbage among the million objects of imports takes a sixth of the start, and 0.6 s of the end.
         gc.set_threshold(100_000)
         atexit.register(gc.freeze)
     exit_with(lambda: _dispatch(words), " ".join(words[:1]))

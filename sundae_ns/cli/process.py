@@ -33,11 +33,8 @@ def quoted(path: Path) -> str:
 
 @contextmanager
 def _started(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[Any]]:
-    """Start a command without input in a process group of its own. On Linux it gets SIGTERM if this process dies.
-
-    Its program is looked for beside this interpreter first.
-    """
-
+    """Start a command without input in its own process group; on Linux it gets SIGTERM if this process dies."""
+    # Programs beside this interpreter come first.
     program = shutil.which(words[0], path=str(Path(sys.executable).parent)) or words[0]
     options |= {"stdin": subprocess.DEVNULL, "start_new_session": True}
     if sys.platform == "linux":
@@ -54,8 +51,8 @@ def _started(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[
 def run_command(words: Sequence[str]) -> int:
     """Print a command and run it on the terminal; returns its exit code, or 128 + n if signal n arrived.
 
-    Ctrl-C, SIGTERM and SIGHUP reach the command once, with all processes that it started; SIGHUP as SIGTERM, because a
-    training that loses its terminal saves itself too.
+    Ctrl-C, SIGTERM and SIGHUP reach the command and all processes that it started, once; SIGHUP as SIGTERM, so that a
+    training that loses its terminal saves itself.
     """
     print(shlex.join(words), flush=True)
     received: list[int] = []
@@ -79,12 +76,7 @@ def run_command(words: Sequence[str]) -> int:
 
 
 def run_logged(words: Sequence[str], log: Path, on_line: Callable[[str], object] = lambda line: None) -> None:
-    """Run a command with its output in ``log``, which is replaced.
-
-    Args:
-        words: the command.
-        log: file for stdout and stderr.
-        on_line: called with each line of output.
+    """Run a command with stdout and stderr in ``log``, which is replaced; ``on_line`` is called with each line.
 
     Raises:
         SundaeError: the command failed; the message ends with the last lines of its output.
@@ -109,5 +101,5 @@ def run_logged(words: Sequence[str], log: Path, on_line: Callable[[str], object]
 
 def percent_of(line: str) -> float | None:
     """Progress in per cent from a line of ns-train's output; None if the line has none."""
-    found = re.match(r"^\s*\d+ \(([\d.]+)%\)", line)
-    return float(found[1]) if found else None
+    match = re.match(r"^\s*\d+ \(([\d.]+)%\)", line)
+    return float(match[1]) if match else None

@@ -77,8 +77,8 @@ def render(
     views = [_resized(each, width, even=video) for each in cameras.cameras]
     opened = opened.to(fastest_device())
 
-    def rendered(view: Camera) -> Image.Image:
-        return image_of(render_view(opened, view, head=head).rgb)
+    def rendered(camera: Camera) -> Image.Image:
+        return image_of(render_view(opened, camera, head=head).rgb)
 
     if video:
         frames = track(views, "Rendering", transient=True, console=Console(stderr=True))
@@ -87,19 +87,17 @@ def render(
             count = write_video(partial, map(rendered, frames), frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
+    index, choices = view or 0, f"--view 0 to {len(views) - 1}"
     if view is None and len(views) > 1:
-        raise ConfigError(
-            f"there are {len(views)} cameras; choose one with --view 0 to {len(views) - 1}, or write an .mp4"
-        )
-    if not 0 <= (view or 0) < len(views):
-        raise ConfigError(f"there is no camera {view}; give --view 0 to {len(views) - 1}")
-    chosen = views[view or 0]
-    write_image(out, rendered(chosen))
-    print(f"{out}: {chosen.width} x {chosen.height} px")
+        raise ConfigError(f"there are {len(views)} cameras; choose one with {choices}, or write an .mp4")
+    if not 0 <= index < len(views):
+        raise ConfigError(f"there is no camera {view}; give {choices}")
+    write_image(out, rendered(views[index]))
+    print(f"{out}: {views[index].width} x {views[index].height} px")
     return 0
 
 
-def _resized(view: Camera, width: int | None, *, even: bool) -> Camera:
-    """The camera with images of another width, and with even sides for a video, whose colours have half the size."""
-    view = view if width is None else view.zoomed(width / view.width)
-    return view._replace(width=view.width // 2 * 2, height=view.height // 2 * 2) if even else view
+def _resized(camera: Camera, width: int | None, *, even: bool) -> Camera:
+    """The camera with another width, and with even sides for a video, whose colours have half the size."""
+    camera = camera if width is None else camera.zoomed(width / camera.width)
+    return camera._replace(width=camera.width // 2 * 2, height=camera.height // 2 * 2) if even else camera

@@ -128,7 +128,7 @@ class Measured:
 def heads_of(runs: Sequence[Measured]) -> list[str]:
     """Column heads of the table of a report; LPIPS names the nets of the runs."""
     nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})
-    heads = ["run", "rendered with", "primitives", "MB", "ms per frame", "PSNR, dB", "SSIM", "fitted, dB", "FLIP"]
+    heads = ["run", "rendered with", "Gaussians", "MB", "ms per frame", "PSNR, dB", "SSIM", "fitted, dB", "FLIP"]
     return [*heads, f"LPIPS ({', '.join(nets)})" if nets else "LPIPS"]
 
 

@@ -245,7 +245,7 @@ def _run(run: ShownRun, numbers: Mapping[str, int], group: Sequence[ShownRun]) -
         "steps": f"{measured.steps:,}",
         "seed": "" if measured.seed is None else str(measured.seed),
         "share kept": "" if measured.keep_ratio is None else f"{100 * measured.keep_ratio:.1f}%",
-        "primitives": f"{measured.primitives:,}",
+        "Gaussians": f"{measured.primitives:,}",
         "size": f"{measured.bytes_total / MEGABYTE:.2f} MB ({measured.bytes_total:,} bytes)",
         "test views": f"{len(measured.full.views)}, {measured.resolution} px",
         "head": f"on, {measured.precision}" if measured.has_head else "none",

@@ -5,20 +5,17 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
-from typing import Any
 
+import command_line
 import pytest
 import torch
 
 import sundae_ns as sn
-from sundae_ns.cli import main
 from sundae_ns.plugin.distill import Distillation
 
 
-def run(*words: Any) -> int:
-    with pytest.raises(SystemExit) as caught:
-        main(["distill", *map(str, words)])
-    return int(caught.value.code or 0)
+def run(*words: object) -> int:
+    return command_line.run("distill", *words)
 
 
 @pytest.fixture
@@ -67,6 +64,4 @@ def test_refusals_are_one_line(
     words: list[str], message: str, source: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(source.parent)
-    assert run("a.ply", *words) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert message in line
+    assert message in command_line.refusal(capsys, "distill", "a.ply", *words)

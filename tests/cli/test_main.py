@@ -1,4 +1,4 @@
-"""The ``sundae`` command itself: help, and errors as one line."""
+"""The ``sundae`` command itself, and ``sundae demo``: errors as one line; integration/ trains."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import run
+from command_line import refusal, run
 
 from sundae_ns.cli import main
+from sundae_ns.cli.demo import demo
+from sundae_ns.core.errors import SundaeError
 
 
 @pytest.mark.parametrize("wrong", ["foreign folder", "file", "option"])
@@ -23,11 +25,7 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str],
         out.write_text("years of work")
     else:
         more = ["--steps", "0"]
-    assert run("demo", out, *more) == 2
-    captured = capsys.readouterr()
-    (line,) = captured.err.strip().splitlines()
-    assert line.startswith("sundae: ")
-    assert "Traceback" not in captured.err
+    refusal(capsys, "demo", out, *more)
     if wrong == "foreign folder":
         assert [path.name for path in out.iterdir()] == ["thesis.txt"]
 
@@ -46,10 +44,7 @@ def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     [([], "sundae --help lists them"), (["fly"], "sundae --help lists them"), (["reprot"], "use report")],
 )
 def test_unknown_commands_are_one_line(words: list[str], remedy: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(*words) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("sundae: ")
-    assert line.endswith(remedy)
+    assert refusal(capsys, *words).endswith(remedy)
 
 
 def test_installed_command_and_its_exit_code(tmp_path: Path) -> None:
@@ -75,3 +70,17 @@ def test_threads_of_torch_do_not_spin_unless_the_user_chose(
 def test_torch_is_not_loaded_before_a_command_starts() -> None:
     code = "import sys, sundae_ns.cli; sys.exit(bool({'torch', 'numpy', 'nerfstudio'} & sys.modules.keys()))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(("steps", "message"), [(0, "steps is 0; give at least 1"), (300, "made"), (None, "made")])
+def test_a_demo_of_no_step_is_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int | None, message: str
+) -> None:
+    def make(scene: Path) -> None:
+        scene.mkdir(parents=True)
+        raise SundaeError("made")
+
+    monkeypatch.setattr("sundae_ns.cli.demo.write_demo_capture", make)
+    with pytest.raises(SundaeError, match=message):
+        demo(tmp_path / "demo", steps=steps)
+    assert (tmp_path / "demo").exists() == (message == "made")

@@ -6,12 +6,13 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from command_line import refusal, run
 
-from sundae_ns.cli import main
 from sundae_ns.cli.options import check_file, check_folder
 from sundae_ns.core.errors import StorageError
 from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
@@ -24,7 +25,7 @@ Refused = Callable[..., str]
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a field in two formats, as current folder."""
+    """A folder with a scene in two formats, as current folder."""
     monkeypatch.chdir(tmp_path)
     points = torch.rand(400, 3)
     gaussians = from_points(points, points, sh_degree=1, num_features=0)
@@ -37,22 +38,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
     """Run a command that fails; returns its error, one line."""
-
-    def run(*words: object) -> str:
-        with pytest.raises(SystemExit) as caught:
-            main([str(word) for word in words])
-        assert caught.value.code == 2
-        (line,) = capsys.readouterr().err.strip().splitlines()
-        assert line.startswith("sundae: ")
-        return line
-
-    return run
-
-
-def done(*words: object) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main([str(word) for word in words])
-    assert caught.value.code == 0
+    return partial(refusal, capsys)
 
 
 @pytest.mark.parametrize("link", [None, os.symlink, os.link])
@@ -66,7 +52,7 @@ def test_no_command_writes_onto_its_input(
         out = "b.ply"
         link("a.ply", out)
     if link is os.link and more:  # the other name stays
-        done("prune", "a.ply", "-o", out, "--num-cameras", "2", *more)
+        assert run("prune", "a.ply", "-o", out, "--num-cameras", "2", *more) == 0
     else:
         assert out in refused("prune", "a.ply", "-o", out, *more)
     assert (here / "a.ply").read_bytes() == before
@@ -81,11 +67,11 @@ def test_no_command_writes_onto_its_input(
     ],
 )
 def test_an_existing_output_needs_overwrite(here: Path, refused: Refused, words: list[str], out: str) -> None:
-    done(*words, "-o", out)
+    assert run(*words, "-o", out) == 0
     first = {path: path.stat().st_mtime_ns for path in [here / out, *(here / out).glob("*")]}
     assert "--overwrite" in refused(*words, "-o", out)
     assert {path: path.stat().st_mtime_ns for path in first} == first
-    done(*words, "-o", out, "--overwrite")
+    assert run(*words, "-o", out, "--overwrite") == 0
     assert all(path.stat().st_mtime_ns > earlier for path, earlier in first.items() if path.is_file())
 
 

@@ -1,19 +1,33 @@
-"""``sundae run``: its steps and what they get; integration/test_run.py trains."""
+"""``sundae run``: its steps, what is done again, and what is refused; integration/test_run.py trains."""
 
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import tyro
 from colmap_models import write_model
 from PIL import Image
-from run_commands import PHOTOS, STEPS, Commands, refusal, run, write_video
+from run_commands import NAMES, PHOTOS, STEPS, Commands, refusal, run, write_video
 
 from sundae_ns import method_configs
+
+RUN = "out/runs/photos/sundae/run"
+HOLDER = """
+import sys
+from pathlib import Path
+from sundae_ns.io.run_folder import reserve
+reserve(Path("out"))
+print(flush=True)
+sys.stdin.read()
+"""
 
 
 def test_photos_become_a_scene_and_a_report(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
@@ -138,3 +152,258 @@ def test_a_pack_that_fails_or_stops_with_a_fine_tune_ends(commands: Commands, co
     commands.codes["sundae pack"] = code
     assert run("photos", "-o", "out") == code
     assert commands.names[2:] == ["sundae pack"] * (1 if code == 130 else 2)
+
+
+# ---------------------------------------------------------------------------------------------- the same command again
+
+
+def test_what_is_done_is_skipped(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("photos", "-o", "out") == 0
+    commands.ran.clear()
+    capsys.readouterr()
+    assert run("photos", "-o", "out") == 0
+    assert commands.ran == []
+    assert capsys.readouterr().out.count(": done\n") == 5
+
+
+def cut(path: Path, size: int | None = None) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 if size is None else size])
+
+
+@pytest.mark.parametrize("harm", [cut, lambda path: cut(path, 0), Path.unlink], ids=["cut", "empty", "gone"])
+@pytest.mark.parametrize(
+    ("result", "step"),
+    [
+        ("out/capture/transforms.json", 0),
+        (f"{RUN}/config.yml", 1),
+        (f"{RUN}/nerfstudio_models/step-000000099.ckpt", 1),
+        ("out/scene.sundae", 2),
+        ("out/report/report.html", 3),
+        ("out/scene.html", 4),
+    ],
+)
+def test_half_a_result_is_made_again(
+    commands: Commands, result: str, step: int, harm: Callable[[Path], object]
+) -> None:
+    assert run("photos", "-o", "out") == 0
+    harm(Path(result))
+    commands.ran.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.names[0] == STEPS[step]
+    commands.ran.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.ran == []
+
+
+def test_a_checkpoint_before_a_damaged_one_is_resumed(commands: Commands) -> None:
+    commands.codes["ns-train"] = 130
+    assert run("photos", "-o", "out") == 130
+    commands.codes.clear()
+    Path(RUN, "nerfstudio_models", "step-000000099.ckpt").write_bytes(b"PK")
+    assert run("photos", "-o", "out") == 0
+    assert "--load-dir" in commands.ran[2]
+
+
+def test_a_training_without_its_options_starts_anew_and_is_kept(commands: Commands) -> None:
+    assert run("photos", "-o", "out") == 0
+    cut(Path(RUN, "config.yml"), 0)
+    commands.codes["ns-train"] = 130
+    assert run("photos", "-o", "out") == 130
+    assert "--load-dir" not in commands.ran[-1]
+    # Its last checkpoint is not taken for one of the new training.
+    assert Path(f"{RUN}.damaged/nerfstudio_models/step-000000099.ckpt").exists()
+    commands.codes.clear()
+    commands.ran.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.names[0] == "ns-train"
+    assert "--load-dir" in commands.ran[0]
+
+
+@pytest.mark.parametrize(("step", "name"), zip(STEPS, NAMES))
+def test_a_step_that_fails_ends_with_its_code_and_is_repeated(
+    commands: Commands, capsys: pytest.CaptureFixture[str], step: str, name: str
+) -> None:
+    commands.codes[step] = 3
+    assert run("photos", "-o", "out") == 3
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line == f"sundae: {name} ended with 3; the same command tries it again"
+    commands.codes.clear()
+    commands.ran.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.names == STEPS[STEPS.index(step) :]
+
+
+def test_an_interrupted_training_resumes(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    commands.codes["ns-train"] = 130
+    assert run("photos", "-o", "out", "--steps", "100") == 130
+    assert "the same command continues here" in capsys.readouterr().err
+    commands.codes.clear()
+    assert run("photos", "-o", "out", "--steps", "100") == 0
+    assert commands.names == ["sundae poses", "ns-train", *STEPS[1:]]
+    saved = "out/runs/photos/sundae/run/nerfstudio_models"
+    assert commands.option("--load-dir", 2) == saved
+    assert "--max-num-iterations" not in commands.ran[2]
+    # All else is the same, so that the run goes on in its folder.
+    assert [word for word in commands.ran[2] if word not in ("--load-dir", saved)] == [
+        word for word in commands.ran[1] if word not in ("--max-num-iterations", "100")
+    ]
+
+
+def test_a_fine_tune_ends_the_training_where_there_is_a_gpu(commands: Commands) -> None:
+    commands.gpu, commands.length, commands.saved_at[0] = True, 30000, 28499
+    assert run("photos", "-o", "out") == 0
+    commands.ran.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.ran == [], "the fine-tune took the place of the other steps"
+    commands.gpu, commands.saved_at[0] = False, 29999
+    assert run("photos", "-o", "out") == 0
+    assert commands.names[0] == "ns-train", "without one they are trained"
+    assert "--finetune-steps" not in commands.ran[0]
+    assert commands.option("--load-dir", 0) == f"{RUN}/nerfstudio_models"
+
+
+def test_a_training_without_a_checkpoint_starts_anew(commands: Commands) -> None:
+    commands.codes["ns-train"] = 137
+    assert run("photos", "-o", "out", "--steps", "100") == 137
+    commands.codes.clear()
+    assert run("photos", "-o", "out", "--steps", "100") == 0
+    assert commands.ran[2] == commands.ran[1]
+
+
+def test_results_of_an_older_training_are_made_again(commands: Commands) -> None:
+    assert run("photos", "-o", "out") == 0
+    shutil.rmtree("out/runs")
+    commands.ran.clear()
+    commands.codes["ns-train"] = 1
+    assert run("photos", "-o", "out") == 1
+    commands.codes.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.names == ["ns-train", *STEPS[1:]]
+
+
+# ------------------------------------------------------------------------------------------------------------ refusals
+
+
+@pytest.mark.parametrize(("placed", "enough"), [(2, False), (3, False), (4, True)])
+def test_too_few_placed_photos(
+    commands: Commands, capsys: pytest.CaptureFixture[str], placed: int, enough: bool
+) -> None:
+    commands.placed = placed
+    if enough:
+        assert run("photos", "-o", "out") == 0
+        return
+    for _ in range(2):  # the repeated command too, which finds the poses
+        line = refusal(capsys, "photos", "-o", "out")
+        assert f"COLMAP placed {placed} of {PHOTOS} photos; photograph the way from {placed - 1}.JPG to" in line
+        assert "sundae run out/capture -o OTHER" in line
+    assert commands.names == ["sundae poses"]
+    assert run("out/capture", "-o", "other") == 0
+
+
+def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    commands.silent = True
+    assert "camera poses ended without its result" in refusal(capsys, "photos", "-o", "out")
+
+
+@pytest.mark.parametrize(
+    ("words", "cause"),
+    [
+        (["gone", "-o", "out"], "gone does not exist"),
+        (["empty", "-o", "out"], "holds no photos"),
+        (["video.mp4", "-o", "out"], "video.mp4 is not a video that OpenCV decodes"),
+        (["photos/0.JPG", "-o", "out"], "photos/0.JPG is neither a folder of photos nor a video"),
+        (["photos", "-o", "out", "--frames", "2"], "frames is 2; give at least 3"),
+        (["model", "-o", "out"], "cameras.bin is not a complete cameras.bin of COLMAP"),
+        (["model/sparse/0", "-o", "out"], "is a COLMAP model without its images"),
+        (["undistorted", "-o", "out"], "undistorted has no image 0.png, which its model dense/sparse states"),
+        (["blender", "-o", "out"], "blender/transforms_train.json is not JSON"),
+        (["photos", "-o", "photos/out"], "lies in photos"),
+        (["photos", "-o", "."], "holds what the command reads"),
+        (["photos", "-o", "used"], "holds files"),
+        (["photos", "-o", "out", "--keep", "2"], "keep is 2.0"),
+        (["photos", "-o", "out", "--steps", "0"], "steps is 0"),
+        (["photos", "-o", "out", "--max-mb", "0"], "max-mb is 0; give at least 0.01"),
+        (["photos", "-o", "out", "--max-mb", "2", "--keep", "0.1"], "--max-mb needs a method that decides"),
+        (["photos", "-o", "out", "--quality", "best", "--method", "sundae-fast"], "--quality best needs a method that"),
+        (["photos", "-o", "out", "--quality", "draft", "--steps", "9"], "a draft has 3,000 steps"),
+        (["photos", "-o", "out", "--masks", "gone"], "gone is no folder of masks"),
+        (["photos", "-o", "out", "--masks", "empty"], "photos/0.JPG has no mask 0.png in empty"),
+    ],
+)
+def test_refusals_come_before_anything_is_written(
+    commands: Commands, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], cause: str
+) -> None:
+    Path("empty").mkdir()
+    for name in ("video.mp4", "model/sparse/0/cameras.bin", "blender/transforms_train.json", "used/thesis.txt"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).touch()
+    write_model(tmp_path / "undistorted" / "dense" / "sparse", ["0.png"], (20, 16))
+    before = sorted(tmp_path.rglob("*"))
+    assert cause in refusal(capsys, *words)
+    assert sorted(tmp_path.rglob("*")) == before
+    assert commands.ran == []
+
+
+def test_other_or_damaged_settings_are_refused(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("photos", "-o", "out") == 0
+    for more, cause in (
+        (["--steps", "200"], "steps left out, not 200"),
+        (["--keep", "0.5"], "keep left out, not 0.5"),
+        (["--method", "sundae-tiny"], "method sundae, not sundae-tiny"),
+    ):
+        assert cause in refusal(capsys, "photos", "-o", "out", *more)
+    for text in ("[]", "{"):
+        Path("out/run.json").write_text(text)
+        assert "out/run.json is damaged" in refusal(capsys, "photos", "-o", "out")
+
+
+def test_without_pycolmap_nothing_starts(
+    commands: Commands, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    line = refusal(capsys, "photos", "-o", "out")
+    assert line == 'sundae: camera poses need pycolmap; install it with pip install "sundae_ns[photos]"'
+    assert not Path("out").exists()
+    monkeypatch.delitem(sys.modules, "pycolmap")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    assert refusal(capsys, "photos", "-o", "out") == line
+
+
+def test_photos_are_judged_before_anything_starts(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo("photos/x.png")
+    assert "photos/x.png cannot be read (it is a pipe" in refusal(capsys, "photos", "-o", "out")
+    assert commands.ran == []
+    assert not Path("out").exists()
+    Path("photos/x.png").unlink()
+    assert run("photos", "-o", "out") == 0
+    # Photos are of no more use once there are poses.
+    shutil.rmtree("photos")
+    Path("photos").mkdir()
+    assert run("photos", "-o", "out") == 0
+
+
+def test_names_with_a_dash_are_no_options(commands: Commands) -> None:
+    shutil.copytree("photos", "-photos")
+    assert run("./-photos", "-o", "./-out") == 0
+    for words in commands.ran[1:]:
+        paths = [word for word in words if "photos" in word or "out" in word.replace("--out", "")]
+        assert paths
+        assert all(path.startswith(("./-", "--experiment-name=")) for path in paths), words
+    commands.ran.clear()
+    assert run("./-out/capture", "-o", "./-again", "--keep", "0.5") == 0
+    assert commands.option("--data", 0) == "./-out/capture"
+
+
+def test_one_command_works_in_a_folder(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    other = subprocess.Popen([sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        line = refusal(capsys, "photos", "-o", "out")
+        assert f"process {other.pid} on " in line
+        assert line.endswith(f"works in {Path('out').resolve()}; wait for it, or choose another folder")
+        assert commands.ran == []
+        other.kill()
+    # The other was killed before it wrote its settings.
+    assert os.listdir("out") == ["training.lock"]
+    assert run("photos", "-o", "out") == 0

@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ import torch
 import yaml
 
 from sundae_ns.core.errors import CheckpointError, DataError
-from sundae_ns.core.metrics import psnr
 from sundae_ns.io import checkpoint
 from sundae_ns.plugin import finished_runs as opening
 from sundae_ns.plugin.finished_runs import Opened, load_model
@@ -42,21 +40,6 @@ def test_figures_of_a_run(tiny: Any) -> None:
     # Before the head is enabled there is none to time.
     model.state.head_starts_at = 10**9
     assert frame_times(model, cameras[0], warmup=0, repeats=1).head == 0
-
-
-def test_the_timed_frames_are_those_compared_with_the_truth(tiny: Any) -> None:
-    run = load_model(tiny.config)
-    run = replace(run, cameras=run.cameras[:2], truths=run.truths[:2])
-    whole = figures_of(run)
-    height, width = run.truths[0].shape[:2]
-    assert whole.resolution == f"{width}x{height}"
-    assert len(whole.full.views) == 2
-    assert min(whole.full.ms, whole.base.ms, whole.ms_head) > 0
-    with torch.no_grad():
-        shown = [run.model.get_outputs_for_camera(camera) for camera in run.cameras]
-    for name, found in (("rgb", whole.full.mean("psnr")), ("base_rgb", whole.base.mean("psnr"))):
-        expected = [float(psnr(image[name], truth)) for image, truth in zip(shown, run.truths, strict=True)]
-        assert found == pytest.approx(sum(expected) / 2, abs=1e-4)
 
 
 def test_a_run_opens_while_its_training_replaces_the_checkpoint(
@@ -114,7 +97,7 @@ def test_a_capture_that_has_moved_is_found_or_named(tiny: Any, tmp_path: Path) -
     config.output_dir = lost / Path(config.output_dir).relative_to(root)
     config.data = config.pipeline.datamanager.data = lost / tiny.scene.relative_to(root)
     (run / "config.yml").write_text(yaml.dump(config))
-    with pytest.raises(DataError, match=f"the capture {lost}"):
+    with pytest.raises(DataError, match=f"the capture {lost}.* is missing; give its folder with --data"):
         load_model(run)
     assert load_model(run, data=tiny.scene).capture == tiny.scene
     shutil.copytree(tiny.scene, capture)

@@ -15,24 +15,17 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from command_line import run
 from csv_rows import read_rows
 from nerfstudio.configs.method_configs import method_configs
 from PIL import Image
 
-from sundae_ns.cli import main
 from sundae_ns.core.metrics import flip_available, quality_of
 from sundae_ns.io.pack.packed_scene import write_scene
 from sundae_ns.plugin.finished_runs import load_model, load_run
 from sundae_ns.report.measured import COLUMNS
 from sundae_ns.scene.packing import contents_of
 from sundae_ns.scene.render import render_view
-
-
-def sundae(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as caught:
-        main([str(argument) for argument in arguments])
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +50,7 @@ def stock(tiny: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def report(tiny: Any, stock: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("report")
-    assert sundae("report", tiny.folder, stock / "config.yml", "-o", out, "--warmup", 0, "--repeats", 1) == 0
+    assert run("report", tiny.folder, stock / "config.yml", "-o", out, "--warmup", 0, "--repeats", 1) == 0
     return out
 
 
@@ -84,19 +77,19 @@ def test_the_page_shows_the_views_with_their_figures(report: Path, tiny: Any) ->
     views = [(run, index) for run in (ours, theirs) for index in range(3)]
     assert len(cards) == len(views)
     photographs = sorted((tiny.scene / "images").iterdir())
-    for card, (run, index) in zip(cards, views, strict=True):
-        for way in run["configurations"]:
+    for card, (row, index) in zip(cards, views, strict=True):
+        for way in row["configurations"]:
             found = way["views"][index]
             assert f"PSNR {found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}" in card
         photo = photographs[(2, 7, 12)[index]]
         assert f">{photo.name}</h4>" in card
         data = [base64.b64decode(each) for each in re.findall(r'src="data:image/\w+;base64,([^"]+)"', card)]
-        assert len(data) == 2 + len(run["configurations"])
+        assert len(data) == 2 + len(row["configurations"])
         shown, rendering, *_ = (np.asarray(Image.open(BytesIO(each)), dtype=float) for each in data)
         truth = np.asarray(Image.open(photo), dtype=float)
         assert np.array_equal(shown, truth)
         psnr = 20 * np.log10(255 / np.sqrt(((rendering - truth) ** 2).mean()))
-        assert psnr == pytest.approx(run["configurations"][0]["views"][index]["psnr"], abs=0.01)
+        assert psnr == pytest.approx(row["configurations"][0]["views"][index]["psnr"], abs=0.01)
     assert len({*re.findall('<option value="(v[0-9-]+)">', text)}) == len(views)  # each stands beside the other run's
 
 
@@ -104,7 +97,7 @@ def test_the_page_of_many_views_is_limited(
     tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sundae_ns.report.report_page.MOST_VIEWS", 2)
-    assert sundae("report", tiny.folder, "-o", tmp_path / "out", "--repeats", 0) == 0
+    assert run("report", tiny.folder, "-o", tmp_path / "out", "--repeats", 0) == 0
     said, page = " ".join(capsys.readouterr().out.split()), tmp_path / "out" / "report.html"
     assert "MB, 2 of 3 views" in said
     assert "2 of 3 test views" in page.read_text(encoding="utf-8")
@@ -148,54 +141,34 @@ def one_line(capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
-def test_errors_are_one_line(
-    tiny: Any, stock: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert sundae("report", tmp_path / "nowhere", "-o", tmp_path / "out") == 2
-    assert "does not exist" in one_line(capsys)
-    assert sundae("report", tiny.scene, "-o", tmp_path / "out") == 2
-    assert "is no run" in one_line(capsys)
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "config.yml").write_text(yaml.dump(method_configs["nerfacto"]))
-    assert sundae("report", other, "-o", tmp_path / "out") == 2
-    assert "without Gaussians" in one_line(capsys)
-    (other / "config.yml").write_text("a: [")
-    assert sundae("report", other, "-o", tmp_path / "out") == 2
-    assert "is not a run's config.yml" in one_line(capsys)
+def test_errors_are_one_line(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    for name, text in (("other", yaml.dump(method_configs["nerfacto"])), ("damaged", "a: [")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yml").write_text(text)
     (tmp_path / "file").touch()
-    assert sundae("report", tiny.folder, "-o", tmp_path / "file") == 2
-    assert "choose another folder" in one_line(capsys)
-    assert sundae("report", tiny.folder, "-o", tmp_path / "out", "--repeats", -1) == 2
-    assert "repeats is -1; give at least 0" in one_line(capsys)
+    for words, message in (
+        ((tmp_path / "nowhere", "-o", out), "does not exist"),
+        ((tiny.scene, "-o", out), "is no run"),
+        ((tmp_path / "other", "-o", out), "without Gaussians"),
+        ((tmp_path / "damaged", "-o", out), "is not a run's config.yml"),
+        ((tiny.folder, "-o", tmp_path / "file"), "choose another folder"),
+        ((tiny.folder, "-o", out, "--repeats", -1), "repeats is -1; give at least 0"),
+    ):
+        assert run("report", *words) == 2
+        assert message in one_line(capsys)
 
 
 def test_a_run_that_cannot_be_opened_does_not_lose_the_others(
     tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     paths = (tmp_path / "nowhere", tiny.folder, tiny.scene)
-    assert sundae("report", *paths, "-o", tmp_path / "out", "--repeats", 0) == 1
+    assert run("report", *paths, "-o", tmp_path / "out", "--repeats", 0) == 1
     assert len(read_rows(tmp_path / "out" / "report.csv")) == 1
     said, page = capsys.readouterr().out, (tmp_path / "out" / "report.md").read_text()
     for text in ("does not exist", "is no run"):
         assert text in " ".join(said.split())
         assert text in page
-
-
-def test_a_capture_that_moved(tiny: Any, stock: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = tmp_path / "run"
-    (run / "nerfstudio_models").mkdir(parents=True)
-    (run / "nerfstudio_models" / "step-000006999.ckpt").symlink_to(stock / "nerfstudio_models" / "step-000006999.ckpt")
-    config = yaml.load((stock / "config.yml").read_text(), Loader=yaml.Loader)
-    config.data = config.pipeline.datamanager.data = tmp_path / "gone"
-    (run / "config.yml").write_text(yaml.dump(config))
-    assert sundae("report", run, "-o", tmp_path / "out") == 2
-    assert "is missing; give its folder with --data" in one_line(capsys)
-    options = ("--data", tiny.scene, "--repeats", 0)
-    assert sundae("report", run, "-o", tmp_path / "out", *options) == 0
-    (row,) = read_rows(tmp_path / "out" / "report.csv")
-    assert row.ms_frame is row.ms_splat is None
-    assert row.psnr is not None
 
 
 def test_a_packed_scene_counts_the_bytes_of_its_file(
@@ -204,10 +177,11 @@ def test_a_packed_scene_counts_the_bytes_of_its_file(
     packed = tmp_path / "tiny.sundae"
     with torch.no_grad():
         write_scene(packed, contents_of(load_run(tiny.folder)))
-    assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0) == 2
+    assert run("report", packed, "-o", tmp_path / "out", "--repeats", 0) == 2
     assert "give the capture with --data" in one_line(capsys)
-    assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0, "--data", tiny.scene) == 0
+    assert run("report", packed, "-o", tmp_path / "out", "--repeats", 0, "--data", tiny.scene) == 0
     (row,) = read_rows(tmp_path / "out" / "report.csv")
+    assert row.ms_frame is row.ms_splat is None, "nothing was timed"
     before = read_rows(report / "report.csv")[0]
     assert row.bytes_total == packed.stat().st_size < before.bytes_total
     assert (row.method, row.variant, row.steps) == ("sundae-tiny", "tiny.sundae", tiny.steps)
