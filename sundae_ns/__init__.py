@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from sundae_ns.plugin.distill import distill as distill
     from sundae_ns.pruning.rule import PruneRule as PruneRule
     from sundae_ns.scene.cameras import cameras_of as cameras_of
-    from sundae_ns.scene.cleaning import crop as crop
-    from sundae_ns.scene.cleaning import remove_floaters as remove_floaters
     from sundae_ns.scene.load_save import load as load
     from sundae_ns.scene.load_save import save as save
     from sundae_ns.scene.page import show as show
+    from sundae_ns.scene.prune_scene import crop as crop
     from sundae_ns.scene.prune_scene import prune as prune
+    from sundae_ns.scene.prune_scene import remove_floaters as remove_floaters
     from sundae_ns.scene.scene import Rendering as Rendering
     from sundae_ns.scene.scene import Scene as Scene
     from sundae_ns.scene.scene import measure as measure
@@ -50,12 +50,12 @@ _HOMES = {
     "Scene": "sundae_ns.scene.scene",
     "SundaeError": "sundae_ns.core.errors",
     "cameras_of": "sundae_ns.scene.cameras",
-    "crop": "sundae_ns.scene.cleaning",
+    "crop": "sundae_ns.scene.prune_scene",
     "distill": "sundae_ns.plugin.distill",
     "load": "sundae_ns.scene.load_save",
     "measure": "sundae_ns.scene.scene",
     "prune": "sundae_ns.scene.prune_scene",
-    "remove_floaters": "sundae_ns.scene.cleaning",
+    "remove_floaters": "sundae_ns.scene.prune_scene",
     "render": "sundae_ns.scene.scene",
     "save": "sundae_ns.scene.load_save",
     "show": "sundae_ns.scene.page",

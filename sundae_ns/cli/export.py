@@ -16,10 +16,10 @@ from sundae_ns.io.pack import container
 from sundae_ns.io.ply import keep_vertices
 from sundae_ns.io.run_folder import files_of
 from sundae_ns.scene.cameras import with_start
-from sundae_ns.scene.cleaning import within
 from sundae_ns.scene.load_save import load, load_with_mask, save_for_viewers
 from sundae_ns.scene.packing import packed_bytes, stated_start
 from sundae_ns.scene.page import write_page
+from sundae_ns.scene.prune_scene import within
 
 
 def export(

@@ -20,8 +20,8 @@ from sundae_ns.io.config_file import check_run, find_config
 from sundae_ns.io.formats import kind_of, kind_of_gaussians
 from sundae_ns.io.ply import has_own_columns
 from sundae_ns.scene.cameras import cameras_of
-from sundae_ns.scene.cleaning import crop_mask, floater_mask, kept
 from sundae_ns.scene.load_save import load, packed_file
+from sundae_ns.scene.prune_scene import crop_mask, floater_mask, kept
 from sundae_ns.scene.scene import Scene
 from sundae_ns.scene.virtual_cameras import VIEWS
 

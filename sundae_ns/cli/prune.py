@@ -15,8 +15,8 @@ from sundae_ns.io.ply import keep_vertices
 from sundae_ns.pruning.rule import PruneRule, ScoreName
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene import prune_scene as pruning
-from sundae_ns.scene.cleaning import kept, within
 from sundae_ns.scene.load_save import SUFFIXES, load_with_mask, save
+from sundae_ns.scene.prune_scene import kept, within
 from sundae_ns.scene.virtual_cameras import virtual_cameras
 
 

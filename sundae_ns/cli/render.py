@@ -14,8 +14,7 @@ from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.files import replacing, write_image
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.report.video import write_video
-from sundae_ns.scene.camera_path import film_views
-from sundae_ns.scene.cameras import CameraFile, camera_in_front, read_cameras, with_start
+from sundae_ns.scene.cameras import CameraFile, camera_in_front, film_views, read_cameras, with_start
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.scene import render as render_view

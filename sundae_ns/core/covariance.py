@@ -153,10 +153,7 @@ def outer_entries(vectors: Tensor) -> Tensor:
 def pair_overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor) -> Tensor:
     """Bhattacharyya coefficient of pairs of Gaussians ``[P]``, as :func:`overlap`; 0 for one that overflows.
 
-    Args:
-        means: world units ``[N, 3]``.
-        entries: of positive definite covariances, by :func:`lower_entries` ``[N, 6]``.
-        first, second: the pairs, int64 ``[P]``.
+    ``entries`` are those of positive definite covariances, by :func:`lower_entries` ``[N, 6]``.
     """
     result = means.new_empty(len(first))
     for chunk in chunks(len(first), PAIRS):

@@ -58,18 +58,11 @@ def psnr(pred: Tensor, target: Tensor) -> Tensor:
 def fitted_psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """PSNR after the affine map of colours (12 numbers) that brings an image nearest to its target.
 
-    It leaves out differences in light and exposure.
-
-    Args:
-        pred: ``[H, W, 3]``, nominally in [0, 1]; not clamped here.
-        target: ``[H, W, 3]`` in [0, 1].
-        mask: pixels that count, bool ``[H, W]``; None for all.
+    It leaves out differences in light and exposure. Images and errors as for :func:`psnr`; ``mask`` has the pixels that
+    count, bool ``[H, W]``.
 
     Returns:
         A float64 scalar on the inputs' device, dB, at most :data:`MOST_PSNR`; NaN if the image is not finite.
-
-    Raises:
-        DataError: the shapes differ, or are not ``[H, W, 3]``.
     """
     check_pair(pred, target)
     chosen = ... if mask is None else mask
@@ -103,13 +96,8 @@ def flip_available() -> bool:
 def flip(pred: Tensor, target: Tensor) -> Tensor | None:
     """Mean FLIP error (Andersson et al. 2020) of two sRGB images ``[H, W, 3]``, in [0, 1]; lower is better.
 
-    The authors' package computes it on the CPU, at 67 pixels per degree, from images clamped to [0, 1].
-
-    Returns:
-        A float32 scalar on the inputs' device; None if the package is not installed.
-
-    Raises:
-        DataError: the shapes differ, or are not ``[H, W, 3]``.
+    The authors' package computes it on the CPU, at 67 pixels per degree, from images clamped to [0, 1]. A float32
+    scalar on the inputs' device; None if the package is not installed. Raises as :func:`psnr`.
     """
     check_pair(pred, target)
     if not flip_available():
@@ -147,14 +135,10 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
-        """Distance of two images ``[H, W, 3]``, clamped to [0, 1]; lower is better.
+        """Distance of two images ``[H, W, 3]``, clamped to [0, 1], a float32 scalar; lower is better. Raises as `psnr`.
 
-        Returns:
-            A float32 scalar on the inputs' device. None if a side is shorter than 32 pixels, which a backbone pools to
-            nothing, or if the weights are missing; the first such call logs a warning.
-
-        Raises:
-            DataError: the shapes differ, or are not ``[H, W, 3]``.
+        None if a side is shorter than 32 pixels, which a backbone pools to nothing, or if the weights are missing; the
+        first such call logs a warning.
         """
         check_pair(pred, target)
         if self._failed or min(pred.shape[:2]) < 32:
@@ -201,13 +185,7 @@ class Quality:
 
 @torch.no_grad()
 def evaluate(render: Callable[[AnyCamera], Tensor], cameras: Iterable[AnyCamera], targets: Iterable[Tensor]) -> Quality:
-    """Compare rendered images with true ones.
-
-    Args:
-        render: gives the image of a camera ``[H, W, 3]``.
-        cameras: at least one.
-        targets: the true image in [0, 1] ``[H, W, 3]`` of each camera, on any device.
-    """
+    """Compare the images ``[H, W, 3]`` that ``render`` gives for cameras, at least one, with true ones in [0, 1]."""
     values = []
     for camera, target in zip(cameras, targets, strict=True):
         image = render(camera)

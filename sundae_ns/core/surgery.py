@@ -48,12 +48,9 @@ def replace_parameter(
     value: Tensor,
     state: Mapping[str, Any],
 ) -> None:
-    """Replace one parameter, and in its optimizer if it has one.
+    """Replace one parameter, and in its optimizer if it has one; ``requires_grad`` stays.
 
-    Args:
-        optimizers: by parameter name, with one parameter each.
-        value: the new values; ``requires_grad`` stays.
-        state: optimizer state of the new parameter; empty resets it.
+    ``state`` is the optimizer state of the new parameter; empty resets it.
     """
     new = Parameter(value, requires_grad=params[name].requires_grad)
     optimizer = optimizers.get(name)
@@ -91,7 +88,7 @@ def keep(
     states: Iterable[MutableMapping[str, Any]],
     mask: Tensor,
 ) -> None:
-    """Keep the Gaussians under a mask and remove all others, in place on the mappings.
+    """Keep the Gaussians under a mask, bool ``[N]`` on any device, and remove all others, in place on the mappings.
 
     Replaces every parameter by a new, shorter ``Parameter`` with the same ``requires_grad`` and without a gradient. The
     optimizer of the same name holds the new one, with Adam's moments sliced and the step count kept. New objects are
@@ -99,10 +96,8 @@ def keep(
     refresh other holders of the old objects, such as nerfstudio's ``Optimizers.parameters``.
 
     Args:
-        params: name to parameter ``[N, ...]``.
         optimizers: with one parameter each; names that are not in ``params`` are ignored.
         states: running states; their tensors with first dimension N are sliced, all else stays.
-        mask: True for Gaussians to keep, bool, any device ``[N]``.
 
     Raises:
         DataError: the mask has a wrong shape or dtype or keeps nothing, or the optimizers do not hold the parameters.
@@ -126,16 +121,11 @@ def keep(
 
 @torch.no_grad()
 def rewrite(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], values: Mapping[str, Tensor]) -> None:
-    """Overwrite parameters in place.
+    """Overwrite parameters in place with values of the same shapes.
 
     Where a value changes, Adam's first moment becomes 0, because it averages gradients at the old value. The second
     moment stays: if it were 0, the next step would be over three times the learning rate in every direction, for any
     gradient (``0.1 g / sqrt(0.001 g^2)``). Unchanged values keep both moments.
-
-    Args:
-        params: changed in place; the optimizers keep the same tensors.
-        optimizers: by parameter name.
-        values: new values by parameter name, each with the shape of its parameter.
 
     Raises:
         DataError: a name is unknown, a shape differs, or the optimizers do not hold the parameters.

@@ -107,8 +107,6 @@ def late_outputs(
         drawn: the Gaussians of these images.
         gaussians: all Gaussians. Both are kept, so their mappings must not change.
         mask: the Gaussians that were drawn, bool ``[N]``; None for all.
-        camera: the camera.
-        settings: of the render.
         values: gives the response of all Gaussians, in [0, 1] ``[N]``, or None.
         splattable: whether there are features that this process can splat; otherwise their image is black.
     """
@@ -170,12 +168,9 @@ def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Tensor, alpha: Tensor) -> Tensor:
-    """Rendered features as colours ``[H, W, 3]``; [0, 1] spans three standard deviations to each side of the mean.
+    """Rendered features ``[H, W, F]``, weighted by ``alpha``, as colours ``[H, W, 3]``; black where ``alpha`` is 0.
 
-    Args:
-        features: rendered features ``[H, W, F]``, already weighted by ``alpha``.
-        mean, basis, deviations: from :func:`principal_components` of the Gaussians' features.
-        alpha: accumulation ``[H, W, 1]``; colours are black where it is 0.
+    [0, 1] spans three standard deviations to each side of the mean; see :func:`principal_components`.
     """
     components = (features - alpha * mean) @ basis
     scaled = components / (6 * deviations.clamp_min(1e-8)) + 0.5 * alpha

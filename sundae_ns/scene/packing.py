@@ -1,4 +1,4 @@
-"""Between scenes and the contents of packed files. What a file states is checked."""
+"""Conversion between scenes and the contents of packed files, whose values are checked."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ def scene_of(packed: PackedScene) -> Scene:
 
 
 def contents_of(scene: Scene) -> PackedScene:
-    """The contents of a packed file for a scene on any device, with how much errors are seen in its views.
+    """The contents of a packed file for a scene on any device, with how much errors are seen by its cameras.
 
-    Gaussians that are not finite are left out (``gaussians.sanitise``).
+    Gaussians that are not finite are dropped (:func:`.sanitise`).
     """
     scene = scene.to("cpu")
     scene = replace(scene, gaussians=sanitise(scene.gaussians).gaussians)
@@ -92,7 +92,7 @@ def packed_bytes(scene: Scene) -> bytes:
 
 
 def stated_start(scene: Scene) -> dict[str, Any]:
-    """Entries ``up`` and ``start`` of a packed file's header; without those that the scene does not know.
+    """Entries ``up`` and ``start`` of a packed file's header, as far as the scene has them.
 
     Raises:
         ConfigError: readers would refuse them.
@@ -108,8 +108,7 @@ def stated_start(scene: Scene) -> dict[str, Any]:
             "size": [camera.width, camera.height],
         }
     for name, value in stated.items():
-        finite = not re.search("NaN|Infinity", json.dumps(value))
-        if not finite or fault(value, _PROPERTIES[name]) is not None:
+        if re.search("NaN|Infinity", json.dumps(value)) or fault(value, _PROPERTIES[name]) is not None:
             named = "start view" if name == "start" else "up axis"
             raise ConfigError(f"the {named} of the scene has values that readers refuse; give another one")
     return stated
@@ -117,17 +116,16 @@ def stated_start(scene: Scene) -> dict[str, Any]:
 
 def start_of(stated: Mapping[str, Any]) -> tuple[Direction | None, Camera | None]:
     """Up axis and start view of JSON values; None for one that is missing, or that the schema refuses."""
-    names = [name for name in ("up", "start") if name in stated and fault(stated[name], _PROPERTIES[name]) is None]
-    good = {name: stated[name] for name in names}
+    valid = [name for name in ("up", "start") if name in stated and fault(stated[name], _PROPERTIES[name]) is None]
     camera = None
-    if "start" in good:
-        start = good["start"]
+    if "start" in valid:
+        start = stated["start"]
         camera = Camera.from_pose(torch.tensor(start["pose"], dtype=torch.float64), start["intrinsics"], *start["size"])
-    return unit(good["up"]) if "up" in good else None, camera
+    return unit(stated["up"]) if "up" in valid else None, camera
 
 
 def cameras_of_arrays(cameras: Mapping[str, Tensor] | None) -> tuple[Camera, ...]:
-    """Cameras of a packed file as views, on the CPU; none for None."""
+    """Cameras of a packed file, on the CPU; none for None."""
     if cameras is None:
         return ()
     rows = zip(cameras["poses"], cameras["intrinsics"].tolist(), cameras["sizes"].tolist(), strict=True)
@@ -163,23 +161,18 @@ def refusal(reason: str) -> PackError:
 
 
 def sensitivity_of(scene: Scene, cameras: Sequence[Camera]) -> Sensitivity:
-    """Effect of quantisation errors on images, which decides where a pack spends its bits.
+    """Effect of quantisation errors on images, which decides where a pack spends its bits; the scene is on the CPU.
 
-    A camera sees a Gaussian from few directions, so some combinations of harmonics hardly show. Weights of the head
-    differ more: those of its finest level act on 64 times as many pixels as those of its coarsest. Derivatives of all
-    pixels are too many. With random signs r of the pixels, the mean square of the derivative of sum(r * image) is the
-    sum of the squared derivatives (Hutchinson, 1990). Views and signs are fixed, so that a run packs alike each time.
-
-    Args:
-        scene: on the CPU.
-        cameras: at least one.
+    A camera sees a Gaussian from few directions, so some combinations of harmonics hardly show. Weights of the head's
+    finest level act on 64 times as many pixels as those of its coarsest. Derivatives of all pixels are too many. With
+    random signs r of the pixels, the mean square of the derivative of sum(r * image) is the sum of the squared
+    derivatives (Hutchinson, 1990). Cameras and signs are fixed, so that a run packs alike each time.
     """
     rows = {}
     degree = scene.gaussians.sh_degree if scene.gaussians.encoding == "harmonics" else 0
     if degree > 0:
-        rows["features_rest"] = torch.kron(
-            _of_harmonics(scene.gaussians["means"].detach(), cameras, degree), torch.eye(3)
-        )
+        form = _of_harmonics(scene.gaussians["means"].detach(), cameras, degree)
+        rows["features_rest"] = torch.kron(form, torch.eye(3))
     head: dict[str, Tensor] = {}
     if scene.head is not None:
         rows[FEATURES], head = _of_head(scene, cameras)

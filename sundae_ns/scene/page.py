@@ -1,9 +1,9 @@
 """A packed scene as a web page that decodes and renders it, head included, alone or in a notebook.
 
-``page.html`` is built from the TypeScript in ``web/`` by ``make web``. It asks no host for anything: a scene is either
-in the page itself or in a file beside it. In a notebook it stands in a frame, which needs no server. That was seen to
-render in JupyterLab 4.6, in trusted notebooks: it removes frames from others. VS Code and Colab were not tried; VS
-Code's setting ``notebook.experimental.enableCsp`` would refuse the worker in which the page decodes.
+``page.html`` is built from the TypeScript in ``web/`` by ``make web``. It contacts no host: a scene is either in the
+page or in a file beside it. In a notebook it stands in a frame, which needs no server: this works in trusted notebooks
+of JupyterLab 4.6. VS Code and Colab were not tried; VS Code's setting ``notebook.experimental.enableCsp`` would refuse
+the worker in which the page decodes.
 """
 
 from __future__ import annotations
@@ -24,10 +24,8 @@ from sundae_ns.core.files import write_bytes, write_text
 from sundae_ns.scene.cameras import camera_in_front
 from sundae_ns.scene.scene import Scene, image_of, render
 
-SCENE_FILE = "scene.sundae"
-"""Name of the scene in a folder."""
-LARGE = 10_000_000
-"""Bytes of a page from which :func:`show` warns: notebooks keep their outputs, and load all of them at once."""
+SCENE_FILE = "scene.sundae"  # name of the scene in a folder
+LARGE = 10_000_000  # bytes of a page from which show() warns: notebooks load all of their outputs at once
 _log = logging.getLogger(__name__)
 
 
@@ -43,7 +41,6 @@ def write_page(path: Path, scene: Scene, packed: bytes, *, title: str) -> int:
         path: file with a suffix, or folder without one.
         scene: for the first image; rendered on its device.
         packed: the scene as a packed file.
-        title: title of the page.
 
     Returns:
         Bytes of the file or of both files.
@@ -65,19 +62,14 @@ def write_page(path: Path, scene: Scene, packed: bytes, *, title: str) -> int:
 
 def _filled(scene: Scene, title: str, *, inline: str = "", source: str = "") -> str:
     """The page with a scene in base64, or with the address of one."""
-    values = {
-        "TITLE": html.escape(title),
-        "POSTER": _poster(scene),
-        "SOURCE": source,
-        "SCENE": inline,
-    }
+    values = {"TITLE": html.escape(title), "POSTER": _poster(scene), "SOURCE": source, "SCENE": inline}
     page = resources.files("sundae_ns.scene").joinpath("page.html").read_text(encoding="utf-8")
-    # In one pass: a title may contain the name of another place.
-    return re.sub("@@([A-Z]+)@@", lambda place: values[place[1]], page)
+    # In one pass: a title may contain the name of another value.
+    return re.sub("@@([A-Z]+)@@", lambda name: values[name[1]], page)
 
 
 def _poster(scene: Scene) -> str:
-    """Address of the first image; of an empty one if it cannot be rendered."""
+    """Data address of the first image; of an empty one if it cannot be rendered."""
     try:
         image = render_first(scene)
     except MemoryExhaustedError as error:
@@ -89,7 +81,7 @@ def _poster(scene: Scene) -> str:
 
 
 def render_first(scene: Scene) -> Image.Image:
-    """The image of the scene's start view, else of its first one, head included, at most 640 pixels wide and high.
+    """The image of the start view, else of the first camera, head included, at most 640 pixels wide and high.
 
     Raises:
         MemoryExhaustedError: the view has more Gaussians than any real scene, or needs more memory than there is.
@@ -105,12 +97,10 @@ class Embedded:
     page: str = field(repr=False)
     """HTML of the page, the scene included."""
     title: str
-    """Title of the page and of the frame."""
     height: int
-    """Height of the frame in pixels; it is as wide as the notebook."""
+    """Of the frame, pixels; it is as wide as the notebook."""
 
-    def _repr_html_(self) -> str:
-        """The frame, by the name under which notebooks ask for HTML."""
+    def _repr_html_(self) -> str:  # notebooks call this
         # srcdoc, not an address: notebooks serve no files beside them, and browsers limit the length of data addresses.
         return (
             f'<iframe srcdoc="{html.escape(self.page)}" title="{html.escape(self.title)}" width="100%" '
@@ -144,8 +134,6 @@ def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
 
     page = page_of(scene, packed_bytes(scene), title=title)
     if len(page) > LARGE:
-        _log.warning(
-            "the notebook will hold a page of %.1f MB; prune the scene first, or save it as scene.html",
-            len(page) / 1e6,
-        )
+        size = len(page) / 1e6
+        _log.warning("the notebook will hold a page of %.1f MB; prune the scene first, or save it as scene.html", size)
     return Embedded(page, title, height)

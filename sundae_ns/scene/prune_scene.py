@@ -1,12 +1,14 @@
-"""Pruning of a scene by what views see of it, without photographs."""
+"""Pruning of a scene by what cameras see of it, without photographs; cuts by a box, and of floaters."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import Progress
@@ -15,6 +17,7 @@ from torch import Tensor
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import Gaussians, sanitise
+from sundae_ns.graph.neighbors import knn
 from sundae_ns.pruning.decision import prune_gaussians
 from sundae_ns.pruning.rule import PruneRule, kept_count
 from sundae_ns.rasterize.interface import rasterize_cameras
@@ -23,10 +26,8 @@ from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamer
 from sundae_ns.scene.scene import Scene, measure
 from sundae_ns.scene.virtual_cameras import by_device, of_unit_size, resized, size_of, split, virtual_cameras
 
-REFIT_STEPS, REFIT_VIEWS = {"cpu": 64, "cuda": 128}, 4
-"""Steps of a refit by the device, and the views of each."""
-REFIT_PIXELS = 512 * 512
-"""Most pixels of a view of a refit; larger ones are rendered smaller."""
+REFIT_STEPS, REFIT_VIEWS = {"cpu": 64, "cuda": 128}, 4  # steps of a refit by the device, and the images of each
+REFIT_PIXELS = 512 * 512  # most pixels of an image of a refit
 DEFAULT_RULE = PruneRule(selection="pairs")
 """Merges the pairs whose images differ least. Without training it loses less than the draws of ``ns-train sundae``."""
 
@@ -38,7 +39,7 @@ class PrunedScene(NamedTuple):
     mask: Tensor
     """True for kept Gaussians of the scene before the prune, bool ``[N]``."""
     seen: float | None = None
-    """Share of the finite Gaussians that the views see; None if no view was asked."""
+    """Share of the finite Gaussians that the cameras see; None if none was asked."""
 
 
 def prune(
@@ -50,10 +51,10 @@ def prune(
     rule: PruneRule | None = None,
     progress: bool = False,
 ) -> Scene:
-    """Keep the Gaussians that matter most to the views, and merge the others into them.
+    """Keep the Gaussians that matter most to the cameras, and merge the others into them.
 
-    Gaussians with NaN, or infinite values without a meaning, are dropped first. An opacity of 1, a width of 0 and the
-    like become finite. After a merge by pairs, a few steps fit the kept ones to the scene's own images of the views.
+    Gaussians with NaN or meaningless infinite values are dropped first (:func:`.sanitise`). After a merge by pairs, a
+    few steps fit the kept ones to the scene's own images.
 
     Args:
         scene: to prune; it does not change.
@@ -66,11 +67,11 @@ def prune(
 
     Returns:
         A scene of ``round(keep * N)`` or ``count`` Gaussians, on the same device. It keeps the head, which was
-        trained for the fuller field.
+        trained for all Gaussians.
 
     Raises:
         ConfigError: neither or both of ``keep`` and ``count`` are given, or they or an option are out of range.
-        DataError: no Gaussian is finite, or the views see none.
+        DataError: no Gaussian is finite, or the cameras see none.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
@@ -103,8 +104,7 @@ def prune_with_mask(
 ) -> PrunedScene:
     """As :func:`prune`, with the mask of the kept Gaussians.
 
-    Args:
-        fit: whether to fit merged Gaussians; a training that follows learns more from those that are not.
+    Without ``fit``, merged Gaussians are not fitted; a training that follows learns more from those.
     """
     check_amount(keep, count)
     rule, sanitised = rule or DEFAULT_RULE, sanitise(scene.gaussians)
@@ -125,9 +125,8 @@ def prune_with_mask(
         scaled = [camera.to(scene.device) for camera in scaled]
         gaussians = resized(small, 1 / size).gaussians
         fitted = refit(gaussians, full.gaussians, scaled, scene.settings(head=False), seed=rule.seed, console=console)
-        small = dataclasses.replace(
-            scene, gaussians=resized(dataclasses.replace(scene, gaussians=fitted), size).gaussians
-        )
+        fitted = resized(dataclasses.replace(scene, gaussians=fitted), size).gaussians
+        small = dataclasses.replace(scene, gaussians=fitted)
     mask = sanitised.mask.clone()
     mask[sanitised.mask] = pruned.decision.mask
     return PrunedScene(small, mask, None if weights is None else float((weights > 0).float().mean()))
@@ -136,14 +135,14 @@ def prune_with_mask(
 def weights_in(
     scene: Scene, cameras: Sequence[Camera], count: int | None = None, console: Console | None = None
 ) -> Tensor:
-    """Blending weight of each Gaussian of a finite scene, summed over the pixels of views ``[N]``.
+    """Blending weight of each Gaussian of a finite scene, summed over the pixels of cameras ``[N]``.
 
     Args:
-        count: weight pixels by the detail that so many Gaussians cannot show; None for no weights of pixels.
+        count: weight pixels by the detail that so many Gaussians cannot show; None for equal weights.
         console: shows a progress bar; None for none.
 
     Raises:
-        DataError: the views see none.
+        DataError: the cameras see none.
     """
     sized, scaled = of_unit_size(scene, cameras)
     weights = contribution(
@@ -172,26 +171,25 @@ def refit(
     seed: int = 0,
     console: Console | None = None,
 ) -> Gaussians:
-    """Fit centres, shapes, opacities and base colours of a field to the images of a fuller one.
+    """Fit centres, shapes, opacities and base colours of Gaussians to the images of more Gaussians.
 
     A merge keeps moments, not images: groups overlap, and hide what was behind them. Adam's steps (Kingma and Ba, 2015)
-    lower the squared error of the blended colours and of the accumulation, over a few views each, as in training.
+    lower the squared error of the blended colours and of the accumulation, over a few images each, as in training.
 
     Args:
-        small: the field to fit, finite; it does not change.
-        full: the field whose images are to be matched, on the same device.
-        cameras: cameras, on the device of the fields; of many, :data:`REFIT_STEPS` times :data:`REFIT_VIEWS` take part.
-        settings: how images are made.
-        seed: of the order of the views.
+        small: to fit, finite; it does not change.
+        full: the Gaussians whose images are to be matched.
+        cameras: on the device of both; at most :data:`REFIT_STEPS` times :data:`REFIT_VIEWS` are used.
+        seed: of the order of the cameras.
         console: shows a progress bar; None for none.
 
     Returns:
-        A field of as many Gaussians. It is ``small`` if the refit matches no better.
+        As many Gaussians; ``small`` itself if the refit matches no better.
     """
     device = small["means"].device
     cameras = [camera.zoomed(min(1.0, math.sqrt(REFIT_PIXELS / (camera.width * camera.height)))) for camera in cameras]
     order = torch.randperm(len(cameras), generator=torch.Generator().manual_seed(seed)).tolist()
-    # Eight views that no step uses judge, if there are twice as many.
+    # Eight cameras that no step uses judge, if there are twice as many.
     judges, trained = (order[:8], order[8:]) if len(order) >= 16 else (order, order)
     images: dict[int, Tensor] = {}
     size = small["scales"].exp().sort(dim=1).values[:, 1:].mean(dim=1, keepdim=True)
@@ -203,11 +201,11 @@ def refit(
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
 
     def fitted() -> Gaussians:
-        """The field with its changes; centres move in sizes of their Gaussian."""
+        # Centres move in sizes of their Gaussian.
         return small.replaced({n: small[n] + (size * step if n == "means" else step) for n, step in moved.items()})
 
     def error(gaussians: Gaussians, chosen: Sequence[int]) -> Tensor:
-        """Sum of the mean squared errors of some views."""
+        """Sum of the mean squared errors of some cameras."""
         new = [i for i in dict.fromkeys(chosen) if i not in images]
         with torch.no_grad():
             images.update(zip(new, _blended(full, [cameras[i] for i in new], settings), strict=True))
@@ -225,20 +223,15 @@ def refit(
     steps = by_device(REFIT_STEPS, device)
     with Progress(transient=True, console=console, disable=console is None) as progress:
         task = progress.add_task("Refit of Gaussians", total=steps)
-        optimise(
-            step,
-            {"field": optimizer},
-            steps,
-            lambda _, i: 1 - i / steps,
-            on_step=lambda done: progress.update(task, completed=done),
-        )
+        bar = partial(progress.update, task)
+        optimise(step, {"": optimizer}, steps, lambda _, i: 1 - i / steps, on_step=lambda done: bar(completed=done))
     gaussians = fitted()
     before, after = (error(each, judges) for each in (small, gaussians))
-    return gaussians if bool(after < before) else small  # also if the fitted field is not finite
+    return gaussians if bool(after < before) else small  # small too if the fitted ones are not finite
 
 
 def _blended(gaussians: Gaussians, cameras: Sequence[Camera], settings: RenderSettings) -> list[Tensor]:
-    """Blended colours and accumulation of each view, without background ``[H, W, 4]``."""
+    """Blended colours and accumulation for each camera, without background ``[H, W, 4]``."""
     if len({(camera.width, camera.height) for camera in cameras}) > 1:
         return [image for camera in cameras for image in _blended(gaussians, [camera], settings)]
     if not cameras:
@@ -257,11 +250,11 @@ def count_for_drop(
 ) -> tuple[int, list[tuple[int, float]]]:
     """The fewest Gaussians whose images lose at most ``drop`` dB, with the PSNR (dB) by counts that it follows from.
 
-    The field is pruned to a half, a quarter and so on, until every eighth view, held out, is too different from the
-    full field's. The error adds to that of the full field against photographs, which is taken to be that of 30 dB.
+    The scene is pruned to a half, a quarter and so on, until every eighth camera, held out, sees too much difference.
+    The error adds to that of the full scene against photographs, which is taken to be that of 30 dB.
 
     Raises:
-        ConfigError: ``drop`` is out of range, or there are fewer than two views.
+        ConfigError: ``drop`` is out of range, or there are fewer than two cameras.
         DataError: no Gaussian is finite.
     """
     if not 0 < drop < 100:
@@ -285,3 +278,116 @@ def count_for_drop(
             return math.ceil(n * (n // 2 / n) ** ((aim - low) / (high - low))), curve
         n, before = n // 2, error
     return n, curve
+
+
+REACH = 3.0  # Gaussians touch if they are nearer than this many times the sum of their largest standard deviations
+
+
+def crop(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Scene:
+    """The Gaussians whose centres are in a box, its faces included; everything else of the scene stays.
+
+    Args:
+        scene: to cut; it does not change.
+        low: lowest x, y and z of the box, world units.
+        high: highest x, y and z.
+
+    Raises:
+        ConfigError: the box is empty or not finite.
+        DataError: no Gaussian is in the box.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
+    >>> sn.crop(scene, (0, 0, 0), (1, 1, 2)).num_gaussians
+    200
+    """
+    return kept(scene, crop_mask(scene, low, high))
+
+
+def remove_floaters(scene: Scene, *, cameras: Sequence[Camera] | None = None) -> Scene:
+    """The scene without Gaussians that no surface supports.
+
+    These are small groups that touch no other Gaussian, and what no camera sees. Floaters that touch a surface stay.
+
+    Args:
+        scene: to clean; it does not change.
+        cameras: cameras of the photographs; by default those stored with the scene. Without any, groups alone count.
+
+    Raises:
+        DataError: no Gaussian is finite, or the cameras see none.
+
+    >>> import torch, sundae_ns as sn
+    >>> points = torch.cat([torch.rand(2000, 3), torch.tensor([[9.0, 9.0, 9.0]])])
+    >>> scene = sn.Scene.from_points(points, torch.rand(2001, 3))
+    >>> gaussians = scene.gaussians.replaced({"scales": scene.gaussians["scales"].clamp(max=-3)})
+    >>> sn.remove_floaters(sn.Scene(gaussians)).num_gaussians < 2001
+    True
+    """
+    return kept(scene, ~floater_mask(scene, scene.cameras if cameras is None else cameras))
+
+
+def kept(scene: Scene, mask: Tensor) -> Scene:
+    """The scene with the Gaussians under a mask, bool ``[N]``."""
+    return dataclasses.replace(scene, gaussians=scene.gaussians.rows(mask))
+
+
+def within(mask: Tensor | None, inner: Tensor) -> Tensor:
+    """A mask ``[N]`` of which only the entries under ``inner`` ``[M]`` stay, for its M true ones; None is all true."""
+    if mask is None:
+        return inner
+    narrowed = mask.clone()
+    narrowed[mask] = inner
+    return narrowed
+
+
+def crop_mask(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Tensor:
+    """True for the Gaussians in a box, bool ``[N]``; arguments and errors as for :func:`crop`."""
+    if len(low) != 3 or len(high) != 3 or not all(math.isfinite(value) for value in (*low, *high)):
+        raise ConfigError("the box is not six finite numbers; give its lowest x y z, then its highest")
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
+    means = scene.gaussians["means"].detach()
+    lowest, highest = (means.new_tensor(corner, dtype=torch.float64) for corner in (low, high))
+    inside = ((means.double() >= lowest) & (means.double() <= highest)).all(dim=1)  # exact in float64
+    if not bool(inside.any()):
+        finite = means[means.isfinite().all(dim=1)].double().cpu().numpy()
+        if not len(finite):
+            raise DataError("no Gaussian is in the box, because none is finite; export the scene again")
+        low, high = np.quantile(finite, (0.05, 0.95), axis=0)
+        corners = (" ".join(f"{value:.3g}" for value in corner) for corner in (low, high))
+        raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
+    return inside
+
+
+@torch.no_grad()
+def floater_mask(scene: Scene, cameras: Sequence[Camera], *, console: Console | None = None) -> Tensor:
+    """True for floaters, bool ``[N]``; arguments and errors as for :func:`remove_floaters`."""
+    sanitised = sanitise(scene.gaussians)
+    if not sanitised.gaussians.num_gaussians:
+        raise DataError("no Gaussian is finite; export the scene again")
+    usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
+    floats = _unsupported(usable)
+    if cameras:
+        small = [camera.zoomed(min(512 / max(camera.width, camera.height), 1.0)) for camera in cameras]
+        floats |= weights_in(usable, small, console=console) <= 0
+    mask = ~sanitised.mask
+    mask[sanitised.mask] = floats
+    return mask
+
+
+def _unsupported(scene: Scene) -> Tensor:
+    """True for Gaussians of small groups that touch no other one, bool ``[N]``."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    n = scene.num_gaussians
+    if n <= 1:
+        return torch.zeros(n, dtype=torch.bool, device=scene.device)
+    near = knn(scene.gaussians["means"].detach(), min(16, n - 1))
+    reach = REACH * scene.gaussians["scales"].detach().amax(dim=1).exp()
+    touching = near.distances < reach[:, None] + reach[near.indices]
+    rows = torch.arange(n, device=scene.device)[:, None].expand_as(touching)[touching].cpu().numpy()
+    columns = near.indices[touching].cpu().numpy()
+    graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(n, n))
+    groups = connected_components(graph, directed=False)[1]
+    small = np.bincount(groups) <= max(1, min(30, n // 1000))
+    return torch.from_numpy(small[groups]).to(scene.device)

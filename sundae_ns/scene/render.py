@@ -61,7 +61,6 @@ def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tens
         params: ``means`` ``[M, 3]``, ``features_dc`` and ``features_rest``.
         gaussians: those that the parameters belong to, for their encoding.
         center: camera centre ``[3]``, or one for each Gaussian ``[M, 3]``; world units.
-        settings: backend and SH degree.
     """
     if gaussians.encoding == "logits":
         return params["features_dc"].sigmoid()
@@ -153,14 +152,7 @@ def scale_plan(camera: Camera, trained_focal: tuple[float, float] | None) -> Sca
 def draw(
     primitives: Mapping[str, Tensor], camera: Camera, background: Tensor, settings: RenderSettings, *, depth: bool
 ) -> tuple[dict[str, Any], Rasterization]:
-    """Splat colours, features and depth in one pass.
-
-    Args:
-        primitives: from a :class:`GaussianSource`; with ``features`` if the head is enabled.
-        camera: the camera.
-        background: colour ``[3]``.
-        settings: everything else.
-        depth: whether to render depth.
+    """Splat colours, features and depth in one pass; ``primitives`` have ``features`` if the head is enabled.
 
     Returns:
         ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result. The head
@@ -179,11 +171,7 @@ def draw(
 def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, background: Tensor) -> Tensor:
     """The corrected image of one splatting pass ``[H, W, 3]``, not clamped. Only this function runs the head.
 
-    Args:
-        head: the head.
-        base: image without the head ``[H, W, 3]``.
-        splatted: colours and features without background.
-        background: colour ``[3]``.
+    ``base`` is the image without the head, ``splatted`` holds colours and features without background.
 
     Raises:
         MemoryExhaustedError: on a CPU, the layers of the head need more memory than there is.
@@ -203,17 +191,10 @@ def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, ba
 def render_view(
     source: GaussianSource, camera: Camera, background: Tensor, settings: RenderSettings, *, depth: bool = True
 ) -> tuple[dict[str, Any], Rasterization]:
-    """The images of one view: Gaussians, one splatting pass, and the head.
+    """The images of one view over a background ``[3]``: Gaussians, one splatting pass, and the head.
 
     An image of another scale than the head was trained at is rendered at the trained scale too, and gets the resized
     correction (:mod:`sundae_ns.head.head`).
-
-    Args:
-        source: of the Gaussians.
-        camera: the camera.
-        background: colour ``[3]``.
-        settings: everything else; ``head=None`` disables the head.
-        depth: whether to render depth.
 
     Returns:
         ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result.
@@ -249,10 +230,7 @@ def contribution(
     """Blending weight of each Gaussian, summed over the pixels of all views ``[N]``.
 
     Args:
-        source: of the Gaussians.
-        cameras: the training views.
         background: colour ``[3]``; fixed, so that the result does not depend on a random one.
-        settings: how images are made.
         count: number of Gaussians that a prune will keep. If given, pixels are weighted by the detail that these
             cannot show (:func:`sundae_ns.pruning.scores.pixel_detail`).
         console: shows a progress bar; None for none.
@@ -261,12 +239,12 @@ def contribution(
         DataError: a mask has another size than its view.
     """
     total = torch.zeros(source.gaussians.num_gaussians, device=source.gaussians["means"].device)
-    shown: Iterable[TrainingCamera] = cameras
+    tracked: Iterable[TrainingCamera] = cameras
     if console is not None:
         from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
 
-        shown = track(cameras, "Contribution of Gaussians", transient=True, console=console)
-    for camera, mask in shown:
+        tracked = track(cameras, "Contribution of Gaussians", transient=True, console=console)
+    for camera, mask in tracked:
         if mask is not None and tuple(mask.shape) != (camera.height, camera.width, 1):
             size = f"{camera.width} x {camera.height}"
             raise DataError(f"a mask is {list(mask.shape)} but its view is {size} px; give masks of their images' size")

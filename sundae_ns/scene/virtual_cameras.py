@@ -1,4 +1,4 @@
-"""Virtual cameras: views of a scene that comes without any, from the field alone."""
+"""Virtual cameras, for scenes that come without cameras: found from the Gaussians alone."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ from sundae_ns.scene.render import pass_inputs
 from sundae_ns.scene.scene import Scene
 
 FOV = 40.0
-VIEWS = {"cpu": 128, "cuda": 256}
-"""Default number of cameras by the device: a GPU has the time to look closer."""
-SIDE = 512
-"""Default width and height of their images, pixels."""
+VIEWS = {"cpu": 128, "cuda": 256}  # default number of cameras by the device
+SIDE = 512  # default width and height of their images, pixels
 T = TypeVar("T")
 
 # The search of virtual_cameras; distances are multiples of the median distance of the Gaussians from their middle.
 NEAREST, FARTHEST = 0.3, 2.0  # of the eyes from the middle
 FIRST, ROUNDS, MOVED = 4, 4, 3  # cameras drawn for each one that is kept; then rounds, and the moved ones of a round
 STEP = 0.3  # how far an eye moves in a round, as a share of its distance
-RESAMPLED = 3  # rounds before which the even half is drawn anew, in proportion to exp(-coarseness)
+RESAMPLED = 3  # rounds that begin by drawing the even half anew, in proportion to exp(-coarseness)
 EVENNESS = 4.0  # weight of the deviation of the angles beside their mean, for the half that sees all parts alike
 _PROBE_SIZE, _PROBES = 24, 64  # sides of the images that candidates are judged by, pixels, and images at once
 _PROBE_GAUSSIANS = 20_000  # most Gaussians of these images
@@ -43,16 +41,16 @@ def by_device(values: Mapping[str, T], device: torch.device) -> T:
 def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: int | None = None) -> list[Camera]:
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
-    A field shows where its photographs were taken: training splits Gaussians until each covers few pixels of the
-    images, so from there all of them look small, near and far ones alike. From elsewhere some are blobs, and so are
-    matter and floaters that are too near. Eyes are drawn in all directions from the middle of the scene, at 0.3 to 2
-    times the median distance of its Gaussians, and look at random Gaussians. Small images judge them by the logarithm
-    of the angle of the Gaussians that they show; where nothing is seen, that of one radian.
+    Gaussians show where the photographs were taken: training splits them until each covers few pixels, so from there
+    all of them look small. From elsewhere some are blobs, and so are matter and floaters that are too near. Eyes are
+    drawn in all directions from the middle of the scene, at 0.3 to 2 times the median distance of its Gaussians, and
+    look at random Gaussians. Small images judge them by the logarithm of the angle of the Gaussians that they show, or
+    of one radian where there are none.
 
     Of every two cameras, one seeks the finest Gaussians, by the mean: it is the best of four, and four times the best
     of three moved ones takes its place if it is better. The other seeks evenness too, by the mean and the deviation,
-    and those that have found little start again where others have found more. It then looks at a random Gaussian, so
-    that the cameras see what is around them.
+    and poor ones start again where others are better. It then looks at a random Gaussian, so that the cameras see what
+    is around them.
 
     Args:
         scene: its finite Gaussians count.
@@ -73,9 +71,9 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     size = SIDE if size is None else size
     if n < 1 or size < 1:
         raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
-    gaussians = _usable(scene)
+    gaussians = usable(scene)
     means = gaussians["means"]
-    middle, reach = _middle_and_reach(gaussians)
+    middle, reach = middle_and_reach(gaussians)
     generator = torch.Generator().manual_seed(seed)
     probe, sizes = _probe(gaussians, middle, reach, generator)
     judge = dataclasses.replace(scene, gaussians=probe)
@@ -102,7 +100,10 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         eyes, targets, coarseness = best_of(eyes, random_targets(FIRST * n))
         for done in range(ROUNDS):
             if evenness and done < RESAMPLED:
-                drawn = _resampled((-coarseness.double()).softmax(dim=0), generator)
+                # Systematic draws.
+                chances = (-coarseness.double()).softmax(dim=0)
+                points = torch.arange(n, dtype=torch.float64) + torch.rand(1, generator=generator, dtype=torch.float64)
+                drawn = torch.searchsorted(chances.cumsum(0), points / n).clamp_max(n - 1)
                 eyes, targets, coarseness = eyes[drawn], targets[drawn], coarseness[drawn]
             near, ahead = eyes.repeat(MOVED, 1), targets.repeat(MOVED, 1)
             moved = near + STEP / 3**0.5 * near.norm(dim=1, keepdim=True) * normal(len(near))
@@ -126,52 +127,50 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     ]
 
 
-def _resampled(chances: Tensor, generator: torch.Generator) -> Tensor:
-    """Indices of as many systematic draws as there are chances, which have the sum 1 ``[N]``."""
-    places = torch.arange(len(chances), dtype=chances.dtype) + torch.rand(1, generator=generator, dtype=chances.dtype)
-    return torch.searchsorted(chances.cumsum(0), places / len(chances)).clamp_max(len(chances) - 1)
-
-
 def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[Camera]]:
-    """A scene of another program scaled to a size of 1, and its views along with it; see :func:`size_of`.
+    """A scene of another program and its cameras, scaled to a size of 1; see :func:`size_of`.
 
     The near plane is at a fixed distance, and would hide a scene of millimetres.
     """
     cameras, size = list(cameras), size_of(scene)
     if size == 1:
         return scene, cameras
-    scaled = []
-    for camera in cameras:
+    for i, camera in enumerate(cameras):
         viewmat = camera.viewmat.clone()
         viewmat[:3, 3] /= size
-        scaled.append(camera._replace(viewmat=viewmat))
-    return resized(scene, 1 / size), scaled
+        cameras[i] = camera._replace(viewmat=viewmat)
+    return resized(scene, 1 / size), cameras
 
 
 def size_of(scene: Scene) -> float:
     """The median distance of the Gaussians from their middle; 1 for nerfstudio's model, which keeps its size."""
-    return 1.0 if scene.in_model_frame else middle_and_reach(scene)[1]
+    return 1.0 if scene.in_model_frame else middle_and_reach(usable(scene))[1]
 
 
-def middle_and_reach(scene: Scene) -> tuple[Tensor, float]:
-    """Median of the finite centres ``[3]``, float64 on the CPU, and the median distance of the Gaussians from it."""
-    return _middle_and_reach(_usable(scene))
+def middle_and_reach(gaussians: Gaussians) -> tuple[Tensor, float]:
+    """Median of the centres ``[3]``, float64 on the CPU, and their median distance from it; in one place, a size."""
+    means = gaussians["means"].double()
+    middle = means.median(dim=0).values
+    reach = float((means - middle).norm(dim=1).median())
+    if reach == 0:
+        reach = 3 * float(gaussians["scales"].double().amax(dim=1).median().exp())
+    return middle.cpu(), max(reach, 1e-30)
 
 
 def split(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
-    """The views that decide, and those that are held out: every eighth, from the first on."""
+    """The cameras that decide, and those that are held out: every eighth, from the first on."""
     return [camera for i, camera in enumerate(cameras) if i % 8], list(cameras[::8])
 
 
 def resized(scene: Scene, factor: float) -> Scene:
-    """The scene, without its stored views, ``factor`` times as large."""
+    """The scene, without its stored cameras, ``factor`` times as large."""
     if factor == 1:
         return scene
     values = {"means": scene.gaussians["means"] * factor, "scales": scene.gaussians["scales"] + math.log(factor)}
     return dataclasses.replace(scene, gaussians=scene.gaussians.replaced(values), cameras=())
 
 
-def _usable(scene: Scene) -> Gaussians:
+def usable(scene: Scene) -> Gaussians:
     """The finite Gaussians, detached."""
     gaussians = sanitise(scene.gaussians).gaussians
     if not gaussians.num_gaussians:
@@ -179,23 +178,10 @@ def _usable(scene: Scene) -> Gaussians:
     return Gaussians({name: value.detach() for name, value in gaussians.items()}, gaussians.encoding)
 
 
-def _middle_and_reach(gaussians: Gaussians) -> tuple[Tensor, float]:
-    """Median of the centres ``[3]``, float64 on the CPU, and the median distance from it; in one place, a size."""
-    means = gaussians["means"].detach().double()
-    middle = means.median(dim=0).values
-    reach = float((means - middle).norm(dim=1).median())
-    if reach == 0:
-        reach = 3 * float(gaussians["scales"].detach().double().amax(dim=1).median().exp())
-    return middle.cpu(), max(reach, 1e-30)
-
-
 def _probe(gaussians: Gaussians, middle: Tensor, reach: float, generator: torch.Generator) -> tuple[Gaussians, Tensor]:
-    """A field of a few Gaussians that looks alike from afar, of unit size and around the origin.
+    """Few Gaussians of unit size around the origin that look alike from afar, and logarithms of their sizes ``[M]``.
 
-    Gaussians are drawn by their size and opacity, and those drawn grow by as much as covers the others' area.
-
-    Returns:
-        The field of M Gaussians, and the logarithms of their sizes before they grew ``[M]``.
+    They are drawn by size and opacity, and grow to cover the area of the others; the sizes are those before.
     """
     sizes = gaussians["scales"].double().sort(dim=1).values[:, 1:].mean(dim=1) - math.log(reach)
     kept = gaussians
@@ -222,15 +208,12 @@ def _factor(values: Tensor, count: int) -> Tensor:
 
 @torch.no_grad()
 def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, evenness: float) -> Tensor:
-    """Of the logarithm of the angle of what the pixels of each camera show, at most 0: the mean ``[V]``.
+    """Mean logarithm of the angle of the Gaussians in the pixels of each camera, at most 0 ``[V]``; lower is finer.
 
-    Args:
-        sizes: logarithms of the Gaussians' sizes ``[N]``.
-        eyes: ``[V, 3]``.
-        targets: ``[V, 3]``.
-        evenness: factor of the standard deviation, which is added.
+    ``sizes`` are logarithms ``[N]``; ``evenness`` times the standard deviation is added.
     """
-    means, settings, found = scene.gaussians["means"], scene.settings(head=False), []
+    means, settings = scene.gaussians["means"], scene.settings(head=False)
+    coarseness: list[Tensor] = []
     poses = poses_looking_at(eyes, targets, eyes.new_tensor([0.0, 0.0, 1.0]))
     eyes, viewmats = eyes.to(means), world_to_camera(poses.float()).to(scene.device)
     camera = Camera.from_fov(torch.eye(4), FOV, _PROBE_SIZE, _PROBE_SIZE).to(scene.device)
@@ -245,5 +228,5 @@ def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, even
         mean, *squares = images.mean(dim=(1, 2)).unbind(dim=1)
         for square in squares:
             mean = mean + evenness * (square - mean.square()).clamp_min(0).sqrt()
-        found.append(mean)
-    return torch.cat(found).cpu()  # the one wait for a GPU
+        coarseness.append(mean)
+    return torch.cat(coarseness).cpu()  # the one wait for a GPU

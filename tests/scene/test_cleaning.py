@@ -12,7 +12,7 @@ from torch import Tensor
 import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import Gaussians
-from sundae_ns.scene.cleaning import crop_mask, floater_mask, within
+from sundae_ns.scene.prune_scene import crop_mask, floater_mask, within
 
 VIEWS = tuple(sn.Camera.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=96, height=72) for x in (-2.0, 0.0, 2.0))
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.scene.camera_path import MOST_FRAMES, film_views
+from sundae_ns.scene.cameras import MOST_FRAMES, film_views
 
 COUNT = 120
 
