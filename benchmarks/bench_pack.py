@@ -47,8 +47,8 @@ FIRST_IMAGE = """
 import sys
 import sundae_ns as sn
 scene = sn.load(sys.argv[1])
-views = scene.views or sn.virtual_cameras(scene, 1, size=640)
-sn.render(scene, views[0])
+cameras = scene.cameras or sn.virtual_cameras(scene, 1, size=640)
+sn.render(scene, cameras[0])
 """
 
 

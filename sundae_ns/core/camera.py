@@ -35,14 +35,13 @@ def world_to_camera_floats(pose: Sequence[float]) -> list[float]:
 
 
 class Crop(NamedTuple):
-    """A rectangle of an image, in pixels."""
+    """A rectangle of an image, in pixels; ``mirrored`` exchanges left and right."""
 
     left: int
     top: int
     width: int
     height: int
     mirrored: bool = False
-    """Whether left and right change places."""
 
 
 def camera_center(viewmat: Tensor) -> Tensor:
@@ -59,19 +58,17 @@ class Camera(NamedTuple):
     """Intrinsics in pixels ``[3, 3]``."""
     width: int
     height: int
-
     focal: float
     """Focal length in pixels, the mean of both axes. Kept beside K, because reading K back waits for the GPU."""
 
     @classmethod
     def from_pose(cls, pose: Tensor, intrinsics: Sequence[float], width: int, height: int) -> Camera:
-        """A pinhole camera from a pose as nerfstudio and Blender write it.
+        """A pinhole camera from a pose as nerfstudio and Blender write it; all sizes in pixels.
 
         Args:
             pose: camera-to-world with OpenGL axes (x right, y up, view along -z), ``[3, 4]`` or ``[4, 4]``.
-            intrinsics: focal lengths and principal point fx, fy, cx, cy, pixels.
-            width: of the image, pixels.
-            height: of the image, pixels.
+            intrinsics: focal lengths and principal point fx, fy, cx, cy.
+            width, height: of the image.
 
         >>> import torch, sundae_ns as sn
         >>> sn.Camera.from_pose(torch.eye(4), (50.0, 50.0, 32.0, 24.0), 64, 48).center
@@ -105,8 +102,7 @@ class Camera(NamedTuple):
             target: point in the middle of the image ``[3]``.
             up: direction that is upwards in the image ``[3]``; ignored if it is the viewing direction.
             fov: vertical field of view, degrees.
-            width: of the image, pixels.
-            height: of the image, pixels.
+            width, height: of the image, pixels.
 
         >>> import sundae_ns as sn
         >>> sn.Camera.look_at((0, -2, 0), (0, 0, 0)).center

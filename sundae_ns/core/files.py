@@ -22,10 +22,9 @@ _WINDOWS = os.name == "nt"  # renames no open file, opens no folder, and flushes
 
 
 def locked(file: IO[Any]) -> bool | None:
-    """Lock an open file without waiting; the system drops the lock when the last process that has it open ends.
+    """Whether this process gets the lock of an open file, without waiting; None if the file system has no locks.
 
-    Returns:
-        True if this process holds the lock, False if another one does, None if the file system has no locks.
+    The system drops the lock when the last process that has the file open ends.
     """
     try:
         return lock_descriptor(file.fileno(), blocking=False)

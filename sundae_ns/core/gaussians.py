@@ -195,16 +195,13 @@ def sanitise(params: Mapping[str, Any]) -> Sanitised:
     gaussians = as_gaussians(params)
     values: dict[str, Tensor] = {}
     opacities, scales, quats = (gaussians[name].detach() for name in ("opacities", "scales", "quats"))
-    n, device = gaussians.num_gaussians, gaussians["means"].device
-    nothing = torch.zeros(n, dtype=torch.bool, device=device)
-    limits, flat, unrotated = nothing, nothing, nothing
-    infinite = opacities.isinf()
-    if bool(infinite.any()):
-        limits = infinite.flatten(1).any(dim=1)
+    n = gaussians.num_gaussians
+    infinite, narrow = opacities.isinf(), scales.isneginf()
+    limits, flat = infinite.flatten(1).any(dim=1), narrow.any(dim=1)
+    unrotated = torch.zeros_like(flat)
+    if bool(limits.any()):
         values["opacities"] = torch.where(infinite, opacities.clamp(-LARGEST_LOGIT, LARGEST_LOGIT), opacities)
-    narrow = scales.isneginf()
-    if bool(narrow.any()):
-        flat = narrow.any(dim=1)
+    if bool(flat.any()):
         narrowest = torch.where(scales.isfinite(), scales, LEAST_SCALES[1]).amin().clamp(*LEAST_SCALES)
         values["scales"] = torch.where(narrow, narrowest, scales)
     if n:

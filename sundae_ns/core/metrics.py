@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
-from pytorch_msssim import ssim as _windowed_ssim
+from pytorch_msssim import ssim as windowed_ssim
 from torch import Tensor
 
 from sundae_ns.core.errors import DataError, one_line
@@ -38,14 +38,11 @@ def check_pair(pred: Tensor, target: Tensor) -> None:
 
 
 def psnr(pred: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio ``-10 log10(MSE)``, in dB; infinite for equal images.
+    """Peak signal-to-noise ratio ``-10 log10(MSE)``, in dB, a differentiable scalar; infinite for equal images.
 
     Args:
         pred: ``[H, W, 3]``, nominally in [0, 1]; not clamped here.
         target: ``[H, W, 3]`` in [0, 1].
-
-    Returns:
-        A scalar of the inputs' dtype and device; differentiable.
 
     Raises:
         DataError: the shapes differ, or are not ``[H, W, 3]``.
@@ -84,7 +81,7 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
     check_pair(pred, target)
     if min(pred.shape[:2]) < SSIM_WINDOW:
         return pred.new_full((), float("nan"))
-    return _windowed_ssim(pred.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], data_range=1.0)
+    return windowed_ssim(pred.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], data_range=1.0)
 
 
 def flip_available() -> bool:
@@ -198,14 +195,11 @@ def evaluate(render: Callable[[AnyCamera], Tensor], cameras: Iterable[AnyCamera]
 class ViewQuality:
     """Metrics of one image; None is a metric that was not measured."""
 
-    psnr: float
-    """dB."""
-    ssim: float
-    """NaN for images smaller than its window."""
+    psnr: float  # dB
+    ssim: float  # NaN for images smaller than its window
     flip: float | None = None
     lpips: float | None = None
-    psnr_fitted: float | None = None
-    """dB, after the affine map of colours that fits best (:func:`fitted_psnr`)."""
+    psnr_fitted: float | None = None  # dB, by fitted_psnr
 
 
 def quality_of(

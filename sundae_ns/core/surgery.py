@@ -13,17 +13,15 @@ from torch.optim import Optimizer
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import num_gaussians
 
+Change = Callable[[Tensor], Tensor]
 Snapshot = dict[str, dict[str, Tensor]]
 """By parameter: its ``value`` and the tensors of its optimizer state, all on the CPU."""
 
 
 def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> None:
-    """Check that parameters share their first dimension and that the optimizers of their names hold these tensors.
+    """Raise ``DataError`` unless parameters have one length and the optimizers of their names hold these tensors.
 
     Parameters without an optimizer and optimizers of other names, such as a network's, are allowed.
-
-    Raises:
-        DataError: a parameter has another length, or an optimizer holds another tensor or more than one.
     """
     n = num_gaussians(params)
     for name, value in params.items():
@@ -69,10 +67,7 @@ def moments_of(optimizers: Mapping[str, Optimizer], name: str, value: Tensor) ->
 
 
 def change_parameter(
-    params: MutableMapping[str, Parameter],
-    optimizers: Mapping[str, Optimizer],
-    name: str,
-    change: Callable[[Tensor], Tensor],
+    params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], name: str, change: Change
 ) -> None:
     """Replace a parameter ``[N, ...]`` and its moments by a function of them; other optimizer state stays."""
     old = params[name]
@@ -147,9 +142,9 @@ def snapshot(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) 
     """Copy parameters and the tensors of their optimizers, by name; a parameter may have no optimizer."""
     saved = {}
     for name, value in params.items():
-        state = optimizers[name].state.get(value, {}) if name in optimizers else {}
-        tensors = {"value": value, **{key: held for key, held in state.items() if isinstance(held, Tensor)}}
-        saved[name] = {key: held.detach().cpu().clone() for key, held in tensors.items()}
+        entries = {"value": value, **(optimizers[name].state.get(value, {}) if name in optimizers else {})}
+        tensors = {key: entry for key, entry in entries.items() if isinstance(entry, Tensor)}
+        saved[name] = {key: tensor.detach().cpu().clone() for key, tensor in tensors.items()}
     return saved
 
 
@@ -190,12 +185,9 @@ def restore_module(parameters: Iterable[Tensor], optimizer: Optimizer, saved: Ma
 def _state(entries: Mapping[str, Tensor], value: Tensor, optimizer: Optimizer) -> dict[str, Tensor]:
     """Optimizer state of a snapshot, on the device of ``value``."""
     # Adam keeps its step count on the CPU, unless it is fused.
-    on_host = () if optimizer.param_groups[0].get("fused") else ("step",)
-    return {
-        key: held.to("cpu" if key in on_host else value.device, copy=True)
-        for key, held in entries.items()
-        if key != "value"
-    }
+    count_device = value.device if optimizer.param_groups[0].get("fused") else "cpu"
+    devices = {key: count_device if key == "step" else value.device for key in entries if key != "value"}
+    return {key: entries[key].to(device, copy=True) for key, device in devices.items()}
 
 
 @torch.no_grad()
