@@ -50,8 +50,8 @@ def cameras_of(path: Path | str, scene: Scene | None = None) -> list[Camera]:
     Args:
         path: a ``transforms.json``, the folder with one, a COLMAP model (such as ``sparse/0``), or a camera path of
             nerfstudio's viewer (``.json``).
-        scene: whose coordinates the cameras are to have. A scene of a run needs it for the cameras of its capture,
-            because training has moved and scaled them.
+        scene: whose coordinates the cameras get. A scene of a run needs it for the cameras of its capture, because
+            training has moved and scaled them.
 
     Raises:
         DataError: the file is missing, damaged, or holds no cameras.
@@ -173,20 +173,17 @@ def unit(direction: Sequence[float]) -> Direction:
     """A direction scaled to unit length; ``ConfigError`` for one without a direction."""
     if len(direction) != 3 or not all(map(is_number, direction)):
         raise ConfigError("the up axis is not three finite numbers; give 0 0 1 for z")
-    length = math.hypot(*direction)
+    x, y, z = map(float, direction)
+    length = math.hypot(x, y, z)
     if not 0 < length < math.inf:
         raise ConfigError("the up axis has no direction; give 0 0 1 for z")
-    x, y, z = (float(value) / length for value in direction)
-    return x, y, z
+    return x / length, y / length, z / length
 
 
 def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None) -> Scene:
     """The scene with another start view or up axis, as a user names them; None keeps that of the scene.
 
-    Args:
-        scene: whose stored cameras an index counts.
-        start_view: index of a stored camera, or a file whose first camera it is (:func:`sundae_ns.cameras_of`).
-        up: direction ``[3]`` of any length.
+    ``start_view`` is the index of a stored camera, or a file whose first camera it is (:func:`sundae_ns.cameras_of`).
 
     Raises:
         ConfigError: there is no such view, or the direction is zero.
@@ -212,19 +209,12 @@ Array = NDArray[np.float64]
 
 
 def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float = 24.0) -> list[Camera]:
-    """Cameras of a film of a scene, along a closed and smooth path at an even speed; upright, without roll.
+    """Cameras of a film, one a frame, along a closed and smooth path at an even speed; upright, without roll.
 
     The path leads through up to eight stored cameras, from the start view, else the first, on the shortest way, and
     looks where they look. A scene with fewer than three cameras is seen from a circle around its middle. The speed is
-    that of motion and turning together.
-
-    Args:
-        scene: its up axis, else the mean of its cameras', else z, is upwards in the images.
-        seconds: length of the film.
-        frames_per_second: number of cameras a second.
-
-    Returns:
-        One camera a frame, with the lens and the shape of the first camera's images, at most 1,280 pixels a side.
+    that of motion and turning together. The scene's up axis, else the mean of its cameras', else z, is upwards. Lens
+    and shape of the images are those of the first camera, with at most 1,280 pixels a side.
 
     Raises:
         ConfigError: there is not even one frame, or there are more than :data:`MOST_FRAMES`.
@@ -255,11 +245,11 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
 
 
 def _up_of(scene: Scene) -> Array:
-    up = scene.up
-    if up is None and scene.cameras:
+    if scene.up is None and scene.cameras:
         mean = torch.stack([camera.pose[:, 1] for camera in scene.cameras]).double().mean(dim=0)
-        up = unit(mean.tolist()) if float(mean.norm()) > 1e-3 else None
-    return np.array(up or (0.0, 0.0, 1.0))
+        if float(mean.norm()) > 1e-3:
+            return np.array(unit(mean.tolist()))
+    return np.array(scene.up or (0.0, 0.0, 1.0))
 
 
 def _circle(scene: Scene, up: Array) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -103,8 +103,7 @@ def late_outputs(
     ``features`` shows principal components as colours, ``response`` the response of the visible Gaussians.
 
     Args:
-        images: ``rgb``, ``base_rgb`` and ``accumulation``.
-        drawn: the Gaussians of these images.
+        images: ``rgb``, ``base_rgb`` and ``accumulation`` of the Gaussians ``drawn``.
         gaussians: all Gaussians. Both are kept, so their mappings must not change.
         mask: the Gaussians that were drawn, bool ``[N]``; None for all.
         values: gives the response of all Gaussians, in [0, 1] ``[N]``, or None.
@@ -186,17 +185,15 @@ def response_values(response: Tensor) -> Tensor:
     return values
 
 
-@dataclass(frozen=True)
-class _Frame:
+class _Frame(NamedTuple):
+    """A graph, the tensors that it reads and writes, the pairs that fit, and those of the last replay, int64 ``[]``."""
+
     graph: torch.cuda.CUDAGraph
     inputs: tuple[Tensor, Tensor, Tensor]
-    """World-to-camera, intrinsics and background: the graph reads them here."""
+    """World-to-camera, intrinsics and background."""
     images: dict[str, Tensor]
-    """The graph writes them here."""
     capacity: int
-    """Pairs that fit."""
     needed: Tensor
-    """Pairs of the last replay, int64 ``[]``."""
 
 
 class FrameReplay:
@@ -256,8 +253,7 @@ class FrameReplay:
             self._gaussians = addresses
         head = settings.head
         of_head: tuple[object, ...] | None = None
-        if head is not None:
-            # The network itself and not its id, which a later network could reuse.
+        if head is not None:  # the network itself and not its id, which a later network could reuse
             options = tuple(vars(head.config).values())
             of_head = (head.net, head.addresses(), options, *scale_plan(camera, settings.trained_focal))
         degree = degree_in_use(gaussians.sh_degree, settings.active_sh_degree)

@@ -29,16 +29,11 @@ def random_points(n: int, extent: float, generator: torch.Generator | None = Non
 def from_points(
     points: Tensor, rgb: Tensor, *, sh_degree: int, num_features: int, generator: torch.Generator | None = None
 ) -> dict[str, Tensor]:
-    """Parameters of one Gaussian for each point, float32, on the device of ``points``.
+    """Parameters of one Gaussian for each point, float32, on the device of ``points`` ``[N, 3]``; ``rgb`` is in [0, 1].
 
     The standard deviation is the mean distance to the three nearest neighbours (3DGS, Kerbl et al. 2023). Coincident
-    points get the smallest positive one, where 3DGS would take the logarithm of zero.
-
-    Args:
-        points: ``[N, 3]`` world units; points that are not finite, in position or colour, are dropped.
-        rgb: ``[N, 3]`` colours in [0, 1].
-        sh_degree: of the coefficients, which are 0 from degree 1 on.
-        num_features: length F of the feature vectors; 0 for none.
+    points get the smallest positive one, where 3DGS would take the logarithm of zero. Points that are not finite, in
+    position or colour, are dropped.
 
     Raises:
         DataError: no point is finite.
@@ -69,8 +64,7 @@ def from_points(
 
 def initial_features(features_dc: Tensor, num_features: int, generator: torch.Generator | None = None) -> Tensor:
     """Initial feature vectors ``[N, F]``: small noise, plus ``features_dc`` ``[N, 3]`` in the first three channels."""
-    noise = 0.05 * torch.randn(features_dc.shape[0], num_features, generator=generator)
-    features = noise.to(features_dc)
-    color_channels = min(3, num_features)
-    features[:, :color_channels] += features_dc[:, :color_channels]
+    features = (0.05 * torch.randn(len(features_dc), num_features, generator=generator)).to(features_dc)
+    channels = min(3, num_features)
+    features[:, :channels] += features_dc[:, :channels]
     return features

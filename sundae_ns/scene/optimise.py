@@ -23,7 +23,6 @@ def optimise(
     Args:
         step: takes step ``i``: its loss, gradients and updates.
         optimizers: by name. The present rates are the initial ones, unless a group holds ``initial_lr``.
-        steps: number of steps in all.
         factor: of the initial rate of an optimizer (by name) at a step.
         first: number of steps that were taken before.
         on_step: called after each step with the number of steps taken; False stops.

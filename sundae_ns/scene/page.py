@@ -44,9 +44,6 @@ def write_page(path: Path, scene: Scene, packed: bytes, *, title: str) -> int:
 
     Returns:
         Bytes of the file or of both files.
-
-    Raises:
-        StorageError: the disk is full or not writable.
     """
     if path.suffix:
         write_text(path, page_of(scene, packed, title=title))

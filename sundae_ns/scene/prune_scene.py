@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -137,22 +136,13 @@ def weights_in(
 ) -> Tensor:
     """Blending weight of each Gaussian of a finite scene, summed over the pixels of cameras ``[N]``.
 
-    Args:
-        count: weight pixels by the detail that so many Gaussians cannot show; None for equal weights.
-        console: shows a progress bar; None for none.
-
-    Raises:
-        DataError: the cameras see none.
+    With ``count``, pixels are weighted by the detail that so many Gaussians cannot show. Raises ``DataError`` if the
+    cameras see none.
     """
     sized, scaled = of_unit_size(scene, cameras)
-    weights = contribution(
-        GaussianSource(sized.gaussians),
-        [TrainingCamera(camera.to(scene.device), None) for camera in scaled],
-        scene.background,
-        scene.settings(head=False),
-        count=count,
-        console=console,
-    )
+    views = [TrainingCamera(camera.to(scene.device), None) for camera in scaled]
+    source, settings = GaussianSource(sized.gaussians), scene.settings(head=False)
+    weights = contribution(source, views, scene.background, settings, count, console=console)
     if not bool((weights > 0).any()):
         raise DataError(
             f"{len(scaled)} views see none of {scene.num_gaussians:,} Gaussians; "
@@ -171,17 +161,11 @@ def refit(
     seed: int = 0,
     console: Console | None = None,
 ) -> Gaussians:
-    """Fit centres, shapes, opacities and base colours of Gaussians to the images of more Gaussians.
+    """Fit centres, shapes, opacities and base colours of Gaussians to the images of more Gaussians, ``full``.
 
     A merge keeps moments, not images: groups overlap, and hide what was behind them. Adam's steps (Kingma and Ba, 2015)
-    lower the squared error of the blended colours and of the accumulation, over a few images each, as in training.
-
-    Args:
-        small: to fit, finite; it does not change.
-        full: the Gaussians whose images are to be matched.
-        cameras: on the device of both; at most :data:`REFIT_STEPS` times :data:`REFIT_VIEWS` are used.
-        seed: of the order of the cameras.
-        console: shows a progress bar; None for none.
+    lower the squared error of the blended colours and of the accumulation, over a few images each, as in training. At
+    most :data:`REFIT_STEPS` times :data:`REFIT_VIEWS` cameras are used; ``seed`` orders them.
 
     Returns:
         As many Gaussians; ``small`` itself if the refit matches no better.
@@ -223,8 +207,11 @@ def refit(
     steps = by_device(REFIT_STEPS, device)
     with Progress(transient=True, console=console, disable=console is None) as progress:
         task = progress.add_task("Refit of Gaussians", total=steps)
-        bar = partial(progress.update, task)
-        optimise(step, {"": optimizer}, steps, lambda _, i: 1 - i / steps, on_step=lambda done: bar(completed=done))
+
+        def show(done: int) -> None:
+            progress.update(task, completed=done)
+
+        optimise(step, {"field": optimizer}, steps, lambda _, i: 1 - i / steps, on_step=show)
     gaussians = fitted()
     before, after = (error(each, judges) for each in (small, gaussians))
     return gaussians if bool(after < before) else small  # small too if the fitted ones are not finite
@@ -251,11 +238,8 @@ def count_for_drop(
     """The fewest Gaussians whose images lose at most ``drop`` dB, with the PSNR (dB) by counts that it follows from.
 
     The scene is pruned to a half, a quarter and so on, until every eighth camera, held out, sees too much difference.
-    The error adds to that of the full scene against photographs, which is taken to be that of 30 dB.
-
-    Raises:
-        ConfigError: ``drop`` is out of range, or there are fewer than two cameras.
-        DataError: no Gaussian is finite.
+    The error adds to that of the full scene against photographs, which is taken to be that of 30 dB. Raises
+    ``ConfigError`` for an impossible ``drop`` or fewer than two cameras.
     """
     if not 0 < drop < 100:
         raise ConfigError(f"target-drop is {drop}; give a positive number of dB, 0.5 for half a decibel")
@@ -288,8 +272,7 @@ def crop(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Scene:
 
     Args:
         scene: to cut; it does not change.
-        low: lowest x, y and z of the box, world units.
-        high: highest x, y and z.
+        low, high: lowest and highest x, y and z of the box, world units.
 
     Raises:
         ConfigError: the box is empty or not finite.

@@ -62,8 +62,7 @@ class Scene:
             DataError: shapes do not fit, or there are no points.
 
         >>> import torch, sundae_ns as sn
-        >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))
-        >>> scene.num_gaussians
+        >>> sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3)).num_gaussians
         100
         """
         if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape or not len(points):
@@ -101,14 +100,9 @@ class Scene:
         return dataclasses.replace(self, gaussians=self.gaussians.to(device), head=head)
 
     def settings(self, backend: BackendName = "auto", *, head: bool = True) -> RenderSettings:
-        """Settings that render the scene with all of its SH degrees.
+        """Settings that render the scene with all of its SH degrees; ``auto`` is gsplat on CUDA, else compiled loops.
 
-        Args:
-            backend: the rasteriser; ``auto`` takes gsplat on CUDA, compiled loops on a CPU.
-            head: whether the head corrects images.
-
-        Raises:
-            BackendError: the rasteriser cannot run on the device of the scene.
+        Raises ``BackendError`` if the rasteriser cannot run on the device of the scene.
         """
         rasteriser, enabled = select_backend(backend, self.device), self.head if head else None
         return RenderSettings(rasteriser, antialiased=self.antialiased, head=enabled, trained_focal=self.trained_focal)

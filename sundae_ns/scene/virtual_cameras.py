@@ -42,15 +42,10 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
     Gaussians show where the photographs were taken: training splits them until each covers few pixels, so from there
-    all of them look small. From elsewhere some are blobs, and so are matter and floaters that are too near. Eyes are
-    drawn in all directions from the middle of the scene, at 0.3 to 2 times the median distance of its Gaussians, and
-    look at random Gaussians. Small images judge them by the logarithm of the angle of the Gaussians that they show, or
-    of one radian where there are none.
-
-    Of every two cameras, one seeks the finest Gaussians, by the mean: it is the best of four, and four times the best
-    of three moved ones takes its place if it is better. The other seeks evenness too, by the mean and the deviation,
-    and poor ones start again where others are better. It then looks at a random Gaussian, so that the cameras see what
-    is around them.
+    all of them look small, and from elsewhere some are blobs. Eyes around the middle of the scene look at random
+    Gaussians; small images judge them by the logarithm of the angle of the Gaussians that they show. Half of the
+    cameras are the best of a few draws and moves by its mean. The others are found by mean and deviation, poor ones
+    start again where others are better, and in the end they look at random Gaussians, to see what is around them.
 
     Args:
         scene: its finite Gaussians count.
@@ -67,8 +62,7 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     >>> len(sn.virtual_cameras(scene, 8))
     8
     """
-    n = by_device(VIEWS, scene.device) if n is None else n
-    size = SIDE if size is None else size
+    n, size = by_device(VIEWS, scene.device) if n is None else n, SIDE if size is None else size
     if n < 1 or size < 1:
         raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
     gaussians = usable(scene)
