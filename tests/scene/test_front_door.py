@@ -91,7 +91,7 @@ def test_names_are_imported_on_first_use() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.parametrize("name", [*FUNCTIONS, "Scene", "View"])
+@pytest.mark.parametrize("name", [*FUNCTIONS, "Scene", "Camera"])
 def test_doctests(name: str) -> None:
     """Each public function has an example, and all examples run."""
     module = importlib.import_module(getattr(sn, name).__module__)
