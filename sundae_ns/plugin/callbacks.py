@@ -38,6 +38,14 @@ class NerfstudioRun:
         self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
         self._trainer = cast(Any, attributes.trainer)
         self._ranks: Ranks = getattr(self._trainer, "ranks", None) or Ranks()
+        self.images_per_step = self._ranks.count  # Each image of a batch counts as a step
+        self.last_step: int | None = None  # None without a trainer, as the next two
+        self.schedule_length: int | None = None  # Number of steps for which the schedule is made
+        self.folder: Path | None = None  # Folder for records; None on every rank but the first
+        if self._trainer is not None:
+            self.last_step = self._trainer.last_step
+            self.schedule_length = self._trainer.config.schedule_length or self._trainer.last_step + 1
+            self.folder = self._trainer.base_dir if self._ranks.rank == 0 else None
 
     @property
     def source(self) -> GaussianSource:
@@ -48,26 +56,6 @@ class NerfstudioRun:
     def settings(self) -> RenderSettings:
         """Settings of images that are not trained on, at this step."""
         return cast(RenderSettings, self.model.render_settings(training=False))
-
-    @property
-    def last_step(self) -> int | None:
-        """Step at which training ends; None without a trainer."""
-        return None if self._trainer is None else self._trainer.last_step
-
-    @property
-    def schedule_length(self) -> int | None:
-        """Number of steps for which the schedule is made, at least those of the run; None without a trainer."""
-        return None if self._trainer is None else self._trainer.config.schedule_length or self._trainer.last_step + 1
-
-    @property
-    def images_per_step(self) -> int:
-        """Number of images in a batch: the number of ranks. Each counts as a step."""
-        return self._ranks.count
-
-    @property
-    def folder(self) -> Path | None:
-        """Folder for records; None without a trainer, and on every rank but the first."""
-        return None if self._trainer is None or self._ranks.rank > 0 else self._trainer.base_dir
 
     @property
     def _datamanager(self) -> SundaeDatamanager:
@@ -128,17 +116,12 @@ class NerfstudioRun:
 
     # -------------------------------------------------------------------------------------------------------- callbacks
 
-    def callbacks(self) -> list[TrainingCallback]:
-        """Callbacks that set the step, call ours after each step, and let them report at the end."""
-        places = TrainingCallbackLocation
-        return [
-            TrainingCallback([places.BEFORE_TRAIN_ITERATION], self._begin_step),
-            TrainingCallback([places.AFTER_TRAIN_ITERATION], lambda step: self.act(self.model.train_callbacks)),
-            TrainingCallback([places.AFTER_TRAIN], self._finish),
-        ]
+    def start(self) -> list[TrainingCallback]:
+        """Hand the optimizers to the state, take over records, and let our callbacks check the run.
 
-    def start(self) -> None:
-        """Hand the optimizers to the state, take over records, and let the callbacks check the run."""
+        Returns:
+            nerfstudio's callbacks, which set the step, call ours after each step, and let them report at the end.
+        """
         assert self._optimizers is not None
         self.state.optimizers, self.state.schedulers = self._optimizers.optimizers, self._optimizers.schedulers
         if self.folder is not None:
@@ -148,6 +131,12 @@ class NerfstudioRun:
         for callback in self.model.train_callbacks:
             callback.before_training(self)
         self._hand_over()
+        at = TrainingCallbackLocation
+        return [
+            TrainingCallback([at.BEFORE_TRAIN_ITERATION], self._begin_step),
+            TrainingCallback([at.AFTER_TRAIN_ITERATION], lambda step: self.act(self.model.train_callbacks)),
+            TrainingCallback([at.AFTER_TRAIN], self._finish),
+        ]
 
     def _begin_step(self, step: int) -> None:
         self.state.step = step
@@ -159,7 +148,7 @@ class NerfstudioRun:
         self._hand_over()
 
     def _hand_over(self) -> None:
-        """Give nerfstudio's own list the parameters of the field: surgery makes new ones."""
+        """Give nerfstudio's own list the parameters of the Gaussians: surgery makes new ones."""
         assert self._optimizers is not None
         for name, value in self.state.gaussians.items():
             self._optimizers.parameters[name] = [value]
@@ -169,13 +158,12 @@ class NerfstudioRun:
             if first:
                 for callback in self.model.train_callbacks:
                     callback.finish(self)
-                self._summarize()
+                if self.folder is not None:
+                    self._summarize(self.folder)
         writer.write_out_storage()
 
-    def _summarize(self) -> None:
+    def _summarize(self, folder: Path) -> None:
         """Print quality, size and the next command."""
-        if self.folder is None:
-            return
         results = self.evaluate() if self.model.config.evaluate_prune else {}
         if results:
             quality = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
@@ -184,7 +172,7 @@ class NerfstudioRun:
         size = bytes_of(self.state.gaussians) + (0 if head is None else bytes_of_module(head))
         with_head = f"{'without' if head is None else 'with'} a head"
         _say(f"{self.source.total:,} Gaussians, {with_head}: {size / 1e6:.2f} MB before packing")
-        _say(f"next: {shlex.join(['sundae', 'pack', str(self.folder), '-o', 'scene.sundae'])}")
+        _say(f"next: {shlex.join(['sundae', 'pack', str(folder), '-o', 'scene.sundae'])}")
 
 
 def _say(line: str) -> None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -42,8 +41,8 @@ def view_index(camera: Cameras) -> int | None:
 def _shows_something(batch: Mapping[str, Tensor]) -> bool:
     """Whether a pixel of an image is neither fully transparent nor masked."""
     image, mask = batch["image"], batch.get("mask")
-    shown = image[..., 3:] > 0 if image.shape[-1] == 4 else torch.ones_like(image[..., :1], dtype=torch.bool)
-    return bool((shown if mask is None else shown & (mask > 0).to(shown.device)).any())
+    opaque = image[..., 3:] > 0 if image.shape[-1] == 4 else torch.ones_like(image[..., :1], dtype=torch.bool)
+    return bool((opaque if mask is None else opaque & (mask > 0).to(opaque.device)).any())
 
 
 class CheckedDataset(InputDataset):
@@ -54,21 +53,10 @@ class CheckedDataset(InputDataset):
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         super().__init__(dataparser_outputs, scale_factor)
-        self.lenses = self.cameras.camera_type
-        """Camera types of the files, by which images are undistorted."""
+        self.lenses = self.cameras.camera_type  # Camera types of the files, by which images are undistorted
         self.cameras.camera_type = torch.full_like(self.lenses, CameraType.PERSPECTIVE.value)
-        self.turned: dict[int, int] = {}
-        """EXIF orientations of images that their cameras see turned."""
+        self.turned: dict[int, int] = {}  # EXIF orientations of images that their cameras see turned
         self._checked = False
-
-    @contextmanager
-    def as_photographed(self) -> Iterator[None]:
-        """Cameras with the types of their files, while nerfstudio loads and undistorts images."""
-        perspective, self.cameras.camera_type = self.cameras.camera_type, self.lenses
-        try:
-            yield
-        finally:
-            self.cameras.camera_type = perspective
 
     def check_images(self) -> None:
         """Check the files once: undistortion, which comes with loading, crops the cameras.
@@ -124,16 +112,11 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
         """Path of the capture."""
         return Path(self.dataparser.data if self.data is None else self.data)
 
-    def check(self) -> None:
-        """Check the capture before anything else of a training; see :func:`check_capture`."""
-        check_capture(self.dataparser, self.capture, ("train", "val"))
-
 
 class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     """The stock datamanager of whole images, which also caches them on machines without CUDA and can hold out views.
 
-    The view of a step is a function of seed and step, so a resumed run continues in the same order. Training cameras
-    stay on the CPU, where reading their sizes does not wait for the GPU.
+    Training cameras stay on the CPU, where reading their sizes does not wait for the GPU.
     """
 
     config: SundaeDatamanagerConfig
@@ -168,29 +151,18 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             raise DataError(f"{data} cannot be parsed ({one_line(error)}); check the capture") from error
         self.hold_back(())
         self._cameras: dict[int, Cameras] = {}
-        self.rank = 0
-        """Rank of this process: at a step, rank r trains on the view that one process takes r steps later."""
+        self.rank = 0  # Rank of this process: at a step, rank r trains on the view that one process takes r steps later
 
     def create_train_dataset(self) -> CheckedDataset:
         """Training set, with the transform from the capture's coordinates to the model's in its metadata."""
-        outputs = self.train_dataparser_outputs
+        outputs, parser = self.train_dataparser_outputs, cast(Any, self.config.dataparser)
         if len(outputs.image_filenames) == 0:
-            raise DataError(f"no training images in {self.config.dataparser.data}; check the path and the split")
+            raise DataError(f"no training images in {parser.data}; check the path and the split")
         points = outputs.metadata.get("points3D_xyz")
         if (warning := check_cameras(outputs.cameras, outputs.image_filenames, points)) is not None:
             warn(warning)
         if points is not None:
             warn_of_cloud(points, outputs.cameras)
-        self._remark(outputs)
-        transform = outputs.dataparser_transform.clone()
-        # nerfstudio states the translation after the scale that a capture has been given.
-        transform[:, 3] /= getattr(self.dataparser, "applied_scale", 1.0)
-        outputs.metadata[DATASET_FRAME] = (transform, float(outputs.dataparser_scale))
-        return super().create_train_dataset()
-
-    def _remark(self, outputs: DataparserOutputs) -> None:
-        """Name what lies in the capture and is not used."""
-        parser: Any = self.config.dataparser
         folder, is_colmap = self.config.capture, isinstance(parser, ColmapDataParserConfig)
         folder = folder.parent if folder.is_file() else folder
         if outputs.mask_filenames is None and (masks := unused_masks(folder)) is not None:
@@ -198,25 +170,30 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             warn(f"{folder / masks} is not used; to leave out what its masks hide, give {how}")
         if is_colmap and (larger := larger_model(folder, parser.colmap_path)) is not None:
             warn(larger)
+        transform = outputs.dataparser_transform.clone()
+        # nerfstudio states the translation after the scale that a capture has been given.
+        transform[:, 3] /= getattr(self.dataparser, "applied_scale", 1.0)
+        outputs.metadata[DATASET_FRAME] = (transform, float(outputs.dataparser_scale))
+        return super().create_train_dataset()
 
     def create_eval_dataset(self) -> CheckedDataset:
         """Test set."""
         dataset = super().create_eval_dataset()
-        names = dataset.image_filenames
-        warning = stray_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names) if names else None
-        if warning is not None:
-            warn(warning)
+        if names := dataset.image_filenames:
+            warning = stray_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names)
+            if warning is not None:
+                warn(warning)
         return dataset
 
     @property
     def holdout_indices(self) -> list[int]:
         """Indices of the training views that are held out now."""
-        return sorted({*range(len(self.train_dataset))}.difference(self._served))
+        return sorted(set(self.train_indices).difference(self._served))
 
     @property
     def train_indices(self) -> list[int]:
         """Indices of all training views."""
-        return list(range(len(self.train_dataset)))
+        return [*range(len(self.train_dataset))]
 
     def hold_back(self, indices: Iterable[int]) -> None:
         """Hold these training views out, from the next step on, until the next call."""
@@ -264,11 +241,6 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         """Camera (on the CPU) and batch of ``step``."""
         return self._camera(self.view_of_step(step + self.rank))
 
-    def _fill_the_gpu(self, cameras: Cameras) -> bool:
-        """Whether images, three bytes a pixel, leave less than half of a GPU's free memory for the training."""
-        device, size = torch.device(self.device), 3 * int((cameras.width * cameras.height).sum())
-        return device.type == "cuda" and size > torch.cuda.mem_get_info(device)[0] / 2
-
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> list[dict[str, torch.Tensor]]:
@@ -276,19 +248,25 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         dataset.check_images()
         if split == "train" and self.eval_dataset:
             self.eval_dataset.check_images()  # report a damaged test view now, not at the prune
+        device, cameras = torch.device(self.device), dataset.cameras
+        size = 3 * int((cameras.width * cameras.height).sum())
+        full = device.type == "cuda" and size > torch.cuda.mem_get_info(device)[0] / 2
         if cache_images_device == "cpu" and not torch.cuda.is_available():
             # The stock "cpu" cache pins memory, which needs a driver; "gpu" means the model's device.
             cache_images_device = "gpu"
-        elif cache_images_device == "gpu" and self._fill_the_gpu(dataset.cameras):
+        elif cache_images_device == "gpu" and full:
             CONSOLE.print(
                 f"the {split} images need more than half of the free GPU memory: they stay in main memory, and each "
                 "step copies one",
                 soft_wrap=True,
             )
             cache_images_device = "cpu"
-        with dataset.as_photographed():
-            load = rebound(FullImageDatamanager._load_images, _undistort_image=undistorting(dataset.image_filenames))
+        load = rebound(FullImageDatamanager._load_images, _undistort_image=undistorting(dataset.image_filenames))
+        perspective, cameras.camera_type = cameras.camera_type, dataset.lenses  # undistort by the types of the files
+        try:
             loaded: list[dict[str, torch.Tensor]] = load(self, split, cache_images_device)
+        finally:
+            cameras.camera_type = perspective
         if split == "train" and loaded and not any(map(_shows_something, loaded)):
             raise DataError(
                 f"all {len(loaded)} training images are fully transparent or masked, so there is nothing to train on; "

@@ -81,8 +81,7 @@ class LightNerfstudioParser(Nerfstudio):
 
     def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
         self.placing = Placing(getattr(self.config, "robust", False))
-        self.applied_scale = 1.0
-        """Scale from the original coordinates of a capture to those of its file."""
+        self.applied_scale = 1.0  # Scale from the original coordinates of a capture to those of its file
         generate = rebound(
             Nerfstudio._generate_dataparser_outputs, load_from_json=self._read, camera_utils=self.placing.camera_utils
         )
@@ -127,7 +126,7 @@ class LightNerfstudioParser(Nerfstudio):
     ) -> dict[str, Tensor] | None:
         if not ply_file_path.exists():
             raise DataError(f"{ply_file_path} does not exist; correct ply_file_path in transforms.json, or remove it")
-        far = self.placing.offset is not None
+        offset = self.placing.offset
         if ply_file_path.is_dir():
             if not any(ply_file_path.glob("points3D.*")):
                 return None
@@ -135,11 +134,18 @@ class LightNerfstudioParser(Nerfstudio):
             points = torch.from_numpy(positions @ self._applied[:, :3].T + self._applied[:, 3])
             rgb = torch.from_numpy(colours)
         else:
-            points, rgb = read_point_cloud(ply_file_path, precise=far)
+            points, rgb = read_point_cloud(ply_file_path, precise=offset is not None)
         if len(points) == 0:
             return None
-        if far:
-            _warn_of_rounded_cloud(points, self.placing.offset, ply_file_path.name)
+        if offset is not None:
+            finite = points[torch.isfinite(points).all(dim=1)].numpy()
+            rounded = len(finite) > 0 and np.array_equal(finite, finite.astype(np.float32))
+            if rounded and float32_step(finite) > COARSE_STEP:
+                step = np.spacing(np.float32(np.abs(offset).max()))
+                warn(
+                    f"{ply_file_path.name} has float32 coordinates that are {step:.2g} apart, as it lies far from the "
+                    "origin; export it with double coordinates, or shifted"
+                )
         # nerfstudio multiplies by applied_scale again, but the file's cloud is in the coordinates of its cameras.
         scale = scale_factor / self.applied_scale
         return {
@@ -209,16 +215,3 @@ class CarefulColmapParser(ColmapDataParser):
         points = torch.from_numpy(positions).float()
         points = torch.cat([points, torch.ones_like(points[:, :1])], dim=1) @ transform_matrix.T * scale_factor
         return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(colours)}
-
-
-def _warn_of_rounded_cloud(points: Tensor, offset: Array | None, name: str) -> None:
-    """Warn of a cloud far from the origin that was written in float32: its points are already rounded."""
-    finite = points[torch.isfinite(points).all(dim=1)].numpy()
-    if offset is None or not len(finite) or not np.array_equal(finite, finite.astype(np.float32)):
-        return
-    if float32_step(finite) > COARSE_STEP:
-        step = np.spacing(np.float32(np.abs(offset).max()))
-        warn(
-            f"{name} has float32 coordinates that are {step:.2g} apart, as it lies far from the origin; export it with "
-            "double coordinates, or shifted"
-        )

@@ -41,12 +41,9 @@ from sundae_ns.train.step import StepInputs, StepLosses, TrainingStep
 
 _log = logging.getLogger(__name__)
 
-STEPS = {"cpu": 3000, "cuda": 8000}
-"""Steps by the device."""
-SIDES = {"cpu": 128, "cuda": 512}
-"""Sides of the images by the device, pixels."""
-CAMERAS, HELD_OUT = 256, 16
-"""Virtual cameras that the steps begin from, and most held-out cameras."""
+STEPS = {"cpu": 3000, "cuda": 8000}  # Steps by the device
+SIDES = {"cpu": 128, "cuda": 512}  # Sides of the images by the device, pixels
+CAMERAS, HELD_OUT = 256, 16  # Virtual cameras that the steps begin from, and most held-out cameras
 
 
 class Distillation:
@@ -92,17 +89,14 @@ class Distillation:
         self._teacher, scaled = of_unit_size(teacher, [*trained, *held_out])
         scaled = [camera.to(teacher.device) for camera in scaled]
         self.cameras, self.held_out = scaled[: len(trained)], scaled[len(trained) :][:HELD_OUT]
-        self.steps, self._seed = steps, seed
-        """Number of steps to train."""
+        self.steps, self._seed = steps, seed  # Number of steps to train
         scored_by = self.cameras[: by_device(VIEWS, teacher.device)]
         cut = prune_with_mask(self._teacher, keep, count, scored_by, None, progress=progress, fit=False)
         config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
         tiny = {"size": "tiny", "pixel_unshuffle": 1, "num_features": 5} if teacher.device.type == "cpu" else {}
         self.state = self._start(cut.scene.gaussians, HeadConfig(mode="residual", **cast(Any, tiny)) if head else None)
-        self.step = 0
-        """Number of steps that were trained."""
-        self.gain: float | None = None
-        """PSNR that the head gained in its trial, dB; None before it, and without one."""
+        self.step = 0  # Number of steps that were trained
+        self.gain: float | None = None  # PSNR that the head gained in its trial, dB; None before it, and without one
         self._mean = RunningMean()
         self._losses = StepLosses(config, SSIM(data_range=1.0, size_average=True, channel=3), 0)
         self._settings = self._teacher.settings(head=False)
@@ -180,13 +174,9 @@ class Distillation:
         state, quality = self.state, list[float]()
         assert state.head is not None
         start = state.snapshot(head=True)
-        for trial, starts_at in enumerate((math.inf, -math.inf)):
+        for before, starts_at in ((0, math.inf), (steps, -math.inf)):
             state.head_starts_at = starts_at
-
-            def on_trial_step(done: int, before: int = trial * steps) -> bool:
-                return on_step(before + done)
-
-            if not self._optimise(steps, 0, on_trial_step):
+            if not self._optimise(steps, 0, lambda done, before=before: on_step(before + done)):  # type: ignore[misc]
                 return False
             quality.append(self.quality())
             state.restore(start)

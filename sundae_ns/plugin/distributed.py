@@ -7,11 +7,7 @@
 
 A batch of R images counts as R steps: the first of them trains, the others only move clock and schedules. So options,
 checkpoints and records mean the same on any number of GPUs. What is not a training step (prune, evaluation, checkpoint)
-is done by the first rank alone, on the gathered field, by the code of one GPU.
-
-gsplat 1.4's ``rasterization(distributed=True)`` exchanges projected Gaussians instead. It cannot serve here: all images
-must have one size, absolute gradients (the default of densification) are refused, and colours by spherical harmonics
-and features take two passes with an exchange each.
+is done by the first rank alone, on all Gaussians, by the code of one GPU.
 
 All ranks must call a function marked "Collective" together. ``docs/several_gpus.md`` describes the product.
 """
@@ -46,46 +42,31 @@ from sundae_ns.train.densification import COUNTED, start_counting
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.state import Callback, TrainingState
 
-HEAD = "compensation"
-"""Name of the head's optimizer: every rank holds a copy of the head."""
-
-
-# ----------------------------------------------------------------------------------------------- before the ranks start
+HEAD = "compensation"  # Name of the head's optimizer: every rank holds a copy of the head
 
 
 def check_options(config: Any) -> None:
-    """Refuse options of a ``SundaeTrainerConfig`` that several ranks cannot use.
-
-    Raises:
-        ConfigError: the first option that does not fit.
-    """
-    model = config.pipeline.model
-    pruning = model.pruning
+    """Raise ``ConfigError`` for the first option of a ``SundaeTrainerConfig`` that several ranks cannot use."""
+    model, pruning = config.pipeline.model, config.pipeline.model.pruning
     counted = pruning.max_gaussians is not None or pruning.target_gaussians is not None
-    refused = {
-        "continuous pruning to a count or under a cap": pruning.mode == "continuous" and counted,
-        "a camera optimizer": model.camera_optimizer.mode != "off",
-        "--mixed-precision": config.mixed_precision or config.use_grad_scaler,
-        "--gradient-accumulation-steps": bool(config.gradient_accumulation_steps),
-    }
-    for name, given in refused.items():
+    for name, given in (
+        ("continuous pruning to a count or under a cap", pruning.mode == "continuous" and counted),
+        ("a camera optimizer", model.camera_optimizer.mode != "off"),
+        ("--mixed-precision", config.mixed_precision or config.use_grad_scaler),
+        ("--gradient-accumulation-steps", config.gradient_accumulation_steps),
+    ):
         if given:
             raise ConfigError(f"{name} does not work on several GPUs; leave it out, or use --machine.num-devices 1")
 
 
 def check_machine(ranks: int, device_type: str) -> None:
-    """Refuse more ranks than ``ns-train`` can start on this machine.
-
-    Raises:
-        ConfigError: the device type is not CUDA, or there are fewer GPUs than ranks.
-    """
+    """Raise ``ConfigError`` if the device type is not CUDA, or there are fewer GPUs than ranks."""
     if device_type != "cuda":
         raise ConfigError(
             f"--machine.num-devices {ranks} needs GPUs, and --machine.device-type is {device_type}; "
             "give --machine.num-devices 1"
         )
-    gpus = torch.cuda.device_count()
-    if ranks > gpus:
+    if ranks > (gpus := torch.cuda.device_count()):
         raise ConfigError(
             f"--machine.num-devices is {ranks} and there are {gpus} GPUs; give --machine.num-devices {max(gpus, 1)}"
         )
@@ -148,12 +129,9 @@ class ShardedSource(GaussianSource):
 
     def __init__(self, gaussians: Gaussians) -> None:
         super().__init__(gaussians, whole=False)
-        self.sizes: list[int] = []
-        """Gaussians of each rank."""
-        self._rows = torch.empty(0)
-        """Rows of the shard in the order in which they were sent ``[S]``."""
-        self._sent: list[int] = []
-        """Number of rows sent to each rank in the last step; the sum is S."""
+        self.sizes: list[int] = []  # Gaussians of each rank
+        self._rows = torch.empty(0)  # Rows of the shard in the order in which they were sent [S]
+        self._sent: list[int] = []  # Number of rows sent to each rank in the last step; the sum is S
         self._received: list[int] = []
 
     @property
@@ -247,7 +225,7 @@ class BatchOptimizers(Optimizers):
 
 
 class Ranks:
-    """The processes that train one field. For a single one, every method leaves things as they are.
+    """The processes that train one scene. For a single one, every method leaves things as they are.
 
     Args:
         rank: of this process.
@@ -256,15 +234,10 @@ class Ranks:
 
     def __init__(self, rank: int = 0, count: int = 1) -> None:
         self.rank, self.count = rank, count
-        self._whole = count == 1
-        """Whether the field is gathered now."""
+        self._whole = count == 1  # Whether the Gaussians are gathered now
 
     def configured(self, config: Any) -> Any:
-        """A copy of a trainer's configuration without the viewer, which could show one shard only.
-
-        Raises:
-            ConfigError: several ranks cannot train with these options.
-        """
+        """A copy of a trainer's configuration without the viewer, which could show one shard only."""
         if self.count == 1:
             return config
         check_options(config)
@@ -288,12 +261,7 @@ class Ranks:
         self._scatter()
 
     def agreed(self, number: int, batch: int) -> int:
-        """The signal after which all ranks stop with this batch; 0 for none. Collective at every 16th batch.
-
-        Args:
-            number: the signal that this process got; 0 for none.
-            batch: number of this batch.
-        """
+        """The signal after which all ranks stop with this batch; 0 for none. Collective at every 16th batch."""
         if self.count == 1:
             return number
         if batch % 16:  # asking waits for the GPU
@@ -301,21 +269,21 @@ class Ranks:
         return int(_summed(torch.tensor(number, device=self._model.device), dist.ReduceOp.MAX))
 
     def after_step(self, callback: Callback, run: Any) -> None:
-        """Let an extension act after a step, on the first rank alone if it needs all Gaussians. Collective."""
+        """Let a callback act after a step, on the first rank alone if it needs all Gaussians. Collective."""
         if self._whole or not callback.needs_all(run):
             callback.after_step(run)
             return
         with self.whole() as first:
             if first:
                 callback.after_step(run)
-        saved = self._announced(callback.state_dict())
+        saved = _announced(callback.state_dict())
         if not first:
             callback.load_state_dict(run.state, saved)
             callback.after_step(run)  # it is done; the rest, such as learning rates, follows on all ranks
 
     @contextlib.contextmanager
     def whole(self) -> Iterator[bool]:
-        """Gather the field on the first rank, and afterwards share what it has become. Collective.
+        """Gather the Gaussians on the first rank, and afterwards share what they have become. Collective.
 
         Yields:
             Whether this is the first rank, which acts; the others wait. An error of it ends the run.
@@ -351,9 +319,9 @@ class Ranks:
         self._model.source = GaussianSource(state.gaussians)
 
     def _scatter(self) -> None:
-        """Give each rank its rows of the first rank's field, and that rank's head and notes."""
+        """Give each rank its rows of the first rank's Gaussians, and that rank's head and notes."""
         state: TrainingState = self._model.state
-        total, pruning = self._announced((state.gaussians.num_gaussians, dict(state.pruning)))
+        total, pruning = _announced((state.gaussians.num_gaussians, dict(state.pruning)))
         state.pruning.update(pruning)
         bounds = [total * rank // self.count for rank in range(self.count + 1)]
         self.sharded.sizes = [end - start for start, end in pairwise(bounds)]
@@ -379,11 +347,12 @@ class Ranks:
             self._optimizers.parameters[name] = [state.gaussians[name]]
         running.update({key: change(value) for key, value in running.items() if per_gaussian(value, n)})
 
-    def _announced(self, value: Any) -> Any:
-        """A plain value of the first rank, on every rank."""
-        box = [value]
-        dist.broadcast_object_list(box, src=0)
-        return box[0]
+
+def _announced(value: Any) -> Any:
+    """A plain value of the first rank, on every rank."""
+    box = [value]
+    dist.broadcast_object_list(box, src=0)
+    return box[0]
 
 
 def _send(rows: Tensor, rank: int) -> None:

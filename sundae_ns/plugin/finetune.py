@@ -43,8 +43,7 @@ RATES = {
 }
 """Peak rates of Adam, about a fifth of the initial rates of a run. Positions are rounded once and fixed: at the end of
 training they hardly move."""
-RATE = 0.025
-"""Loss for each bit per stored number: about what a bit less costs in quality at the steps of ``FINETUNED``."""
+RATE = 0.025  # Loss for each bit per stored number: about what a bit less costs in quality at the steps of FINETUNED
 
 
 def finetune(

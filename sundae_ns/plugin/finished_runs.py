@@ -1,4 +1,4 @@
-"""Finished scenes as models with the test views of their captures: runs of sundae or splatfacto, and packed scenes.
+"""Finished scenes as models with their test views: runs of sundae or splatfacto, and packed scenes.
 
 A ``config.yml`` can run code in nerfstudio, so no part of it is packed. A packed scene states plain values of its
 capture; each one is checked, and a new configuration is made from them.
@@ -51,8 +51,7 @@ _PARSERS: dict[str, type[DataParserConfig]] = {
     "colmap": ColmapDataParserConfig,
     "nerfstudio-data": NerfstudioDataParserConfig,
 }
-_ALPHA_COLORS = ("white", "black", None)
-"""Colours that a packed scene may name for what is transparent in its images."""
+_ALPHA_COLORS = ("white", "black", None)  # Colours that a packed scene may name for what is transparent in its images
 _FOLDER = re.compile(r"(?!.*\.\.)[\w.-]+(/[\w.-]+)*")
 """Paths that a packed scene may name: below the capture, and without special characters of a shell, because nerfstudio
 passes paths of images to ffmpeg through one."""
@@ -74,8 +73,7 @@ class Opened:
     prune_s: float | None = None  # Seconds of its prunes
     packed_bytes: int | None = None  # Size of the packed file; None for a run
     pipeline: Any = None  # nerfstudio's pipeline of a run
-    cameras: list[Cameras] = field(default_factory=list)
-    """Test cameras, each of shape ``(1,)``, on the model's device."""
+    cameras: list[Cameras] = field(default_factory=list)  # Test cameras, each of shape (1,), on the model's device
     truths: list[Tensor] = field(default_factory=list)
     """True images ``[H, W, 3]`` in [0, 1], over the model's background, on the model's device."""
 

@@ -1,4 +1,4 @@
-"""The SUNDAE model for nerfstudio: it connects state, extensions and rendering to splatfacto's interface.
+"""The SUNDAE model for nerfstudio: it connects state, callbacks and rendering to splatfacto's interface.
 
 Module path and class names are written into every run's ``config.yml``, so moving them breaks saved runs.
 """
@@ -67,7 +67,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     dense_start_views: int = 300
     """With at most this many training images, a plane sweep fills a sparse cloud to start from; 0 turns it off."""
     warm_start: Path | None = None
-    """Start from a finished field, without a warm-up: a splatfacto or sundae .ckpt, its folder, a .sundae or .ply."""
+    """Start from Gaussians that are finished: a splatfacto or sundae .ckpt, its folder, a .sundae or .ply."""
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"
     """Coordinates of the warm start: nerfstudio's model, or the capture (COLMAP). auto decides by the kind of file."""
     stop_split_at: int = 12000
@@ -93,15 +93,12 @@ class SundaeModel(SplatfactoModel):
     """
 
     config: SundaeModelConfig
-    state: TrainingState
-    """Field, head, optimizers, running states, and the clock."""
-    source: GaussianSource
-    """Where views get their Gaussians from."""
-    train_callbacks: list[Callback]
-    """Parts of training beside the step, in the order in which they act."""
+    state: TrainingState  # Gaussians, head, optimizers, running states, and the clock
+    source: GaussianSource  # Where views get their Gaussians from
+    train_callbacks: list[Callback]  # Parts of training beside the step, in the order in which they act
 
     def populate_modules(self) -> None:
-        """Build field, head and extensions. The device of the model is not known yet."""
+        """Build Gaussians, head and callbacks. The device of the model is not known yet."""
         config = self.config
         frame = (self.kwargs.get("metadata") or {}).get(DATASET_FRAME)
         self.state, self.train_callbacks, self._start = build(config, self.num_train_data, self.seed_points, frame)
@@ -115,13 +112,12 @@ class SundaeModel(SplatfactoModel):
         self.crop_box: OrientedBox | None = None
         self.background_color = torch.tensor(SHOWN_BACKGROUNDS[config.background_color])
         self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution, self.count_curve)
-        self.compensated = True
-        """Whether images outside of a viewer get the head's correction."""
+        self.compensated = True  # Whether images outside of a viewer get the head's correction
         self._response, self._replay = ShownResponse(), FrameReplay()
         self._cameras: dict[tuple[int | None, int], Camera] = {}
         """Views of training cameras that do not move, by index and divisor of their sides."""
 
-    # ---------------------------------------------------------------------------------------------------- the field
+    # ------------------------------------------------------------------------------------------------ the Gaussians
 
     def train(self, mode: bool = True) -> SundaeModel:
         """Switch between training and evaluation; a walk over all modules at each step would take time."""
@@ -138,7 +134,7 @@ class SundaeModel(SplatfactoModel):
 
     @property
     def head(self) -> CompensationHead | None:
-        """The head; None if the field has none."""
+        """The head; None without one."""
         return self.state.head
 
     @cached_property
@@ -151,11 +147,11 @@ class SundaeModel(SplatfactoModel):
         return select_backend(self.config.rasterizer, self.device)
 
     def get_gaussian_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
-        """One group for each parameter of the field, features included."""
+        """One group for each parameter of the Gaussians, features included."""
         return {name: [value] for name, value in self.gauss_params.items()}
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
-        """Groups of the field, of the head (``compensation``) and of the cameras."""
+        """Groups of the Gaussians, of the head (``compensation``) and of the cameras."""
         groups = super().get_param_groups()
         if self.head is not None:
             groups["compensation"] = list(self.head.parameters())
@@ -164,7 +160,7 @@ class SundaeModel(SplatfactoModel):
     # -------------------------------------------------------------------------------------------------- checkpoints
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Everything beside tensors that a resumed run needs: clock, running states, states of the extensions."""
+        """Everything beside tensors that a resumed run needs: clock, running states, states of the callbacks."""
         state = self.state
         return checkpoint.extra_state(
             step=state.step,
@@ -177,7 +173,7 @@ class SundaeModel(SplatfactoModel):
         )
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
-        """Counterpart of :meth:`get_extra_state`; tensors move to the device of the field."""
+        """Counterpart of :meth:`get_extra_state`; tensors move to the device of the Gaussians."""
         self.state.step = int(state["step"])
         focal = state["trained_focal"]
         self.state.trained_focal = None if focal is None else (float(focal[0]), float(focal[1]))
@@ -236,8 +232,8 @@ class SundaeModel(SplatfactoModel):
             camera: of shape ``(1,)``.
 
         Returns:
-            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``crop``, the
-            part that the images show, or None. See ``rendering.frames.late_outputs`` for those outside of training.
+            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``window``, the
+            crop that the images show, or None. See ``scene.frames.late_outputs`` for those outside of training.
         """
         with naming_full_memory(lambda: self.num_points):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
@@ -318,13 +314,11 @@ class SundaeModel(SplatfactoModel):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Callbacks that call the extensions."""
+        """Callbacks that call ours."""
         self._start.announce()
         CONSOLE.log(f"rasteriser: {self.backend.name} on {self.device}")  # or an error, before the first step
         self.viewer_controls.training_gaussians = True
-        run = NerfstudioRun(self, training_callback_attributes)
-        run.start()
-        return run.callbacks()
+        return NerfstudioRun(self, training_callback_attributes).start()
 
     # --------------------------------------------------------------------------------------------- losses and metrics
 

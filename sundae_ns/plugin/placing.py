@@ -29,14 +29,13 @@ Array = NDArray[np.float64]
 
 TYPES = {name: CAMERA_MODEL_TO_TYPE[name].value for name in (PERSPECTIVE, FISHEYE, FISHEYE624)}
 """nerfstudio's camera type of each kind of lens."""
-STRAY = 10.0
-"""A camera is stray if it stands more than this many times as far from the middle as the others."""
+STRAY = 10.0  # A camera is stray if it stands more than this many times as far from the middle as the others
 FINE_STEP, COARSE_STEP = 1e-5, 1e-3
 """Steps of float32 at the cameras, as shares of their distances: coordinates are shifted from the first one on, and
 cannot be used from the second one on."""
 
 
-def distances_of(centres: Array) -> tuple[Array, Array]:
+def _distances_of(centres: Array) -> tuple[Array, Array]:
     """The middle ``[3]`` of camera centres ``[N, 3]`` and the distance ``[N]`` of each from it."""
     middle = np.median(centres, axis=0)
     return middle, np.linalg.norm(centres - middle, axis=1)
@@ -54,16 +53,13 @@ def stray_cameras(centres: Array, points: Callable[[], Array | None] = lambda: N
     Returns:
         Flags ``[N]``; of fewer than four cameras none.
     """
-    none = np.zeros(len(centres), dtype=bool)
     if len(centres) < 4:
-        return none
-    middle, distances = distances_of(centres)
+        return np.zeros(len(centres), dtype=bool)
+    middle, distances = _distances_of(centres)
     # Up to one camera in five is a stray one; where there are more, they are part of the capture.
     usual = float(np.sort(distances)[len(centres) - 1 - max(1, len(centres) // 5)])
-    far = distances > STRAY * usual
-    if usual <= 0 or not far.any():
-        return none
-    cloud = points()
+    far = (distances > STRAY * usual) & (usual > 0)
+    cloud = points() if far.any() else None
     if cloud is not None and len(cloud):
         far &= distances > STRAY * float(np.median(np.linalg.norm(cloud - middle, axis=1)))
     return far
@@ -71,7 +67,7 @@ def stray_cameras(centres: Array, points: Callable[[], Array | None] = lambda: N
 
 def float32_step(centres: Array) -> float:
     """Step between float32 numbers at the coordinates of camera centres ``[N, 3]``, as a share of their distances."""
-    middle, distances = distances_of(centres)
+    middle, distances = _distances_of(centres)
     usual = float(np.median(distances)) or float(distances.max())
     step = float(np.spacing(np.float32(np.abs(middle).max())))
     return step / usual if usual > 0 else 0.0
@@ -95,7 +91,6 @@ class _FarOutputs(DataparserOutputs):
     """A parsed capture whose transform has float64 numbers, as it leads away from survey coordinates."""
 
     def transform_poses_to_original_space(self, poses: Tensor, *args: Any, **options: Any) -> Tensor:
-        """As nerfstudio's, in float64."""
         return super().transform_poses_to_original_space(poses.double(), *args, **options)
 
 
@@ -111,8 +106,7 @@ class Placing:
         self.robust = robust
         self.offset: Array | None = None
         """Subtracted from coordinates of the file in float64, before anything becomes float32; None for nothing."""
-        self.lenses: dict[Path, Lens] = {}
-        """Lens by the path of an image."""
+        self.lenses: dict[Path, Lens] = {}  # Lens by the path of an image
         self.transform = torch.eye(4)[:3]
         """Rotation and translation ``[3, 4]`` of the shifted coordinates, before their scale."""
         self._growth = 1.0
@@ -138,12 +132,12 @@ class Placing:
         centres = np.array([matrix[:3, 3] for matrix in matrices])
         step = float32_step(centres) if self.robust else 0.0
         if step > COARSE_STEP and center_method == "none":
-            farthest = np.abs(distances_of(centres)[0]).max()
+            farthest = np.abs(_distances_of(centres)[0]).max()
             raise DataError(
                 f"{where}: the cameras stand {farthest:.3g} from the origin, where float32 numbers are "
                 f"{np.spacing(np.float32(farthest)):.2g} apart; leave out --center-method none"
             )
-        self.offset = distances_of(centres)[0] if step > FINE_STEP and center_method != "none" else None
+        self.offset = _distances_of(centres)[0] if step > FINE_STEP and center_method != "none" else None
         self._points = points
         for frame, matrix in zip(frames, matrices, strict=True):
             if self.offset is not None:
@@ -156,22 +150,19 @@ class Placing:
         return replaced(camera_utils, auto_orient_and_center_poses=self._oriented)
 
     def _oriented(self, poses: Tensor, **methods: Any) -> tuple[Tensor, Tensor]:
-        oriented, transform = camera_utils.auto_orient_and_center_poses(poses, **methods)
-        near = np.ones(len(poses), dtype=bool)
-        if self.robust:
-            near = ~stray_cameras(poses[:, :3, 3].double().numpy(), self._near_points)
-        self._growth = 1.0
-        if not near.all():
-            kept, transform = camera_utils.auto_orient_and_center_poses(poses[torch.from_numpy(near)], **methods)
-            oriented = transform @ poses
-            # nerfstudio divides by the largest coordinate of all cameras.
-            self._growth = float(oriented[:, :3, 3].abs().max() / kept[:, :3, 3].abs().max())
-        self.transform = transform
-        return oriented, transform
+        def points() -> Array | None:
+            cloud = self._points()
+            return cloud if cloud is None or self.offset is None else cloud - self.offset
 
-    def _near_points(self) -> Array | None:
-        points = self._points()
-        return points if points is None or self.offset is None else points - self.offset
+        oriented, self.transform = camera_utils.auto_orient_and_center_poses(poses, **methods)
+        self._growth = 1.0
+        far = stray_cameras(poses[:, :3, 3].double().numpy(), points) if self.robust else np.zeros(len(poses), bool)
+        if far.any():
+            near, self.transform = camera_utils.auto_orient_and_center_poses(poses[torch.from_numpy(~far)], **methods)
+            oriented = self.transform @ poses
+            # nerfstudio divides by the largest coordinate of all cameras.
+            self._growth = float(oriented[:, :3, 3].abs().max() / near[:, :3, 3].abs().max())
+        return oriented, self.transform
 
     def points_in_model(self, points: Tensor, transform: Tensor, scale: float) -> Tensor:
         """Points ``[N, 3]`` of a capture after its offset, ``transform`` ``[3, 4]`` and ``scale``, float32."""

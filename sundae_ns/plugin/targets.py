@@ -23,8 +23,7 @@ from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.plugin.finished_runs import load_model, place
 from sundae_ns.train.choice import GAIN_PER_DOUBLING
 
-FINEST, COARSEST = -3.0, 4.0
-"""Ends of the search: powers of two of the factor."""
+FINEST, COARSEST = -3.0, 4.0  # Ends of the search: powers of two of the factor
 
 
 class Judge:
@@ -34,11 +33,9 @@ class Judge:
         opened = load_model(run, data)
         self._model, self.all_cameras = opened.model, len(opened.cameras)
         chosen = torch.linspace(0, self.all_cameras - 1, min(8, self.all_cameras)).round().long().unique().tolist()
-        self.cameras = len(chosen)
-        """Number of test views that are measured, of :attr:`all_cameras`."""
+        self.cameras = len(chosen)  # Number of test views that are measured, of all_cameras
         self._cameras, self._truths = ([each[i] for i in chosen] for each in (opened.cameras, opened.truths))
-        self.before = self._quality()
-        """Of the run itself."""
+        self.before = self._quality()  # Of the run itself
 
     def quality(self, scene: PackedScene, codecs: Codecs) -> Quality:
         """Quality of a pack."""

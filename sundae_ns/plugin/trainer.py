@@ -32,6 +32,7 @@ from sundae_ns.io.config_file import find_capture
 from sundae_ns.plugin import distributed
 from sundae_ns.plugin.camera_models import other_frame
 from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.plugin.dataparsers import check_capture
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.plugin.viewer import stop_rendering
@@ -52,23 +53,18 @@ class SundaeTrainerConfig(TrainerConfig):
     """Steps at the end of the schedule, at most a twentieth of it, that are left to sundae pack RUN --finetune."""
 
     def print_to_terminal(self) -> None:
-        """Check the capture, make the schedule and log it; ``ns-train`` calls this first of all.
-
-        Raises:
-            DataError: the capture cannot be used.
-            ConfigError: the length of the run is no number of steps.
-        """
+        """Check the capture, make the schedule and log it; ``ns-train`` calls this first of all."""
         if self.machine.num_devices > 1:
             distributed.forward_signals()
         self.make_paths_absolute()
         datamanager = self.pipeline.datamanager
         if isinstance(datamanager, SundaeDatamanagerConfig):
-            datamanager.check()
+            check_capture(datamanager.dataparser, datamanager.capture, ("train", "val"))
         from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
 
         set_schedule(self, all_methods.get(str(self.method_name)), sys.argv[1:])
-        scaled = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
-        title = f"{self.max_num_iterations:,}{scaled} steps"
+        whole = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
+        title = f"{self.max_num_iterations:,}{whole} steps"
         table = Table("part of training", "steps", title=title, title_justify="left")
         for row in schedule_table(self):
             table.add_row(*row)
@@ -99,12 +95,7 @@ class SundaeTrainerConfig(TrainerConfig):
             self.timestamp = run_folder.new_name()
 
     def save_config(self) -> None:
-        """Write ``config.yml`` into the run's folder atomically.
-
-        Raises:
-            StorageError: no space or no right to write.
-            ConfigError: there are fewer GPUs than ranks, or several ranks cannot use these options.
-        """
+        """Write ``config.yml`` into the run's folder atomically, once several ranks can use these options."""
         if self.machine.num_devices > 1:
             distributed.check_machine(self.machine.num_devices, self.machine.device_type)
             distributed.check_options(self)
@@ -132,7 +123,7 @@ class SundaeTrainer(Trainer):
 
     def __init__(self, config: SundaeTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         self.ranks = distributed.Ranks(local_rank, world_size)
-        # nerfstudio sees one process. For more it would use DDP, which breaks when the field changes its size.
+        # nerfstudio sees one process. For more it would use DDP, which breaks when the number of Gaussians changes.
         super().__init__(self.ranks.configured(config), local_rank, world_size=1)
         with writing(f"cannot make the run's folder {self.base_dir}"):
             self.base_dir.mkdir(parents=True, exist_ok=True)  # nerfstudio's own way fails if two ranks do so at once
@@ -228,23 +219,21 @@ class SundaeTrainer(Trainer):
     def _recordable(self) -> bool:
         """Whether a CUDA graph can hold a training step under these options."""
         model, config = self.model, self.config
-        adam = all(
-            isinstance(config.optimizers[name]["optimizer"], FusedAdamConfig)
-            and config.optimizers[name]["optimizer"].max_norm is None
-            for name in self.optimizers.optimizers
+        adams = [config.optimizers[name]["optimizer"] for name in self.optimizers.optimizers]
+        return (
+            model.device.type == "cuda"
+            and model.backend.name == "gsplat"
+            and model.source.replayable
+            and all(isinstance(adam, FusedAdamConfig) and adam.max_norm is None for adam in adams)
+            and model.camera_optimizer.config.mode == "off"
+            and not model.config.output_depth_during_training
+            and max(self.gradient_accumulation_steps.values(), default=1) == 1
+            and not self.mixed_precision
+            and not config.log_gradients
         )
-        varying = (
-            model.camera_optimizer.config.mode != "off"
-            or model.config.output_depth_during_training
-            or max(self.gradient_accumulation_steps.values(), default=1) > 1
-            or self.mixed_precision
-            or config.log_gradients
-        )
-        on_gpu = model.device.type == "cuda" and model.backend.name == "gsplat" and model.source.replayable
-        return on_gpu and adam and not varying
 
     def _recorded_iteration(self, step: int) -> Any:
-        """Train one step by a recording: loss, its terms, and metrics; None if it has to run kernel by kernel."""
+        """Train one step by a CUDA graph: loss, its terms, and metrics; None if it has to run kernel by kernel."""
         if self._recorded is None:
             return None
         model = self.model
@@ -266,7 +255,7 @@ class SundaeTrainer(Trainer):
         return result.loss, result.losses, model.get_metrics_dict(outputs, batch)
 
     def _step_schedulers(self) -> None:
-        # nerfstudio's method also writes every rate at every step, which takes longer than a recorded step.
+        # nerfstudio's method also writes every learning rate at every step, which takes longer than a captured step.
         for scheduler in self.optimizers.schedulers.values():
             scheduler.step()
 
@@ -311,7 +300,7 @@ class SundaeTrainer(Trainer):
             super()._train_complete_viewer()
 
     def save_checkpoint(self, step: int) -> None:
-        """Save model, optimizers, schedules and random state; older checkpoints are removed afterwards.
+        """Save model, optimizers, schedules and random state; only then remove older checkpoints.
 
         Raises:
             StorageError: no space or no right to write; older checkpoints stay.
@@ -358,9 +347,8 @@ class SundaeTrainer(Trainer):
             ) from error
         CONSOLE.print(f"Resuming after step {loaded['step']} from {path}")
         outputs = self._datamanager.train_dataparser_outputs
-        other = other_frame(path.parent.parent, outputs.dataparser_transform, outputs.dataparser_scale)
-        if other is not None:
-            warn(other)
+        if line := other_frame(path.parent.parent, outputs.dataparser_transform, outputs.dataparser_scale):
+            warn(line)
 
     def _source(self) -> Path | None:
         """The checkpoint to resume from; None for a new run."""

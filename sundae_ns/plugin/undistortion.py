@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from sundae_ns.core.errors import DataError, one_line
 
-Result = tuple[NDArray[Any], NDArray[Any], Any]
-"""Intrinsics ``[3, 3]``, image ``[H, W, C]`` and mask."""
+Result = tuple[NDArray[Any], NDArray[Any], Any]  # Intrinsics [3, 3], image [H, W, C] and mask
 
 
 def undistorting(paths: Sequence[Path]) -> Callable[..., Result]:
@@ -30,32 +29,30 @@ def undistorting(paths: Sequence[Path]) -> Callable[..., Result]:
     """
 
     def undistort(camera: Any, distortion_params: Any, data: Any, image: Any, K: Any) -> Result:
-        path, intrinsics = paths[int(data["image_idx"])], K.copy()
-        if int(camera.camera_type) == CameraType.PERSPECTIVE.value and distortion_params[3]:
-            found = _of_brown(intrinsics, distortion_params, image, data.get("mask"))
-            if found is None:
-                raise DataError(f"{path.name} has a distortion that leaves no image; {_check(distortion_params)}")
-            return found
-        try:
-            new, result, mask = full_images_datamanager._undistort_image(camera, distortion_params, data, image, K)
-        except (AssertionError, LookupError, TypeError, ValueError, cv2.error) as error:
+        intrinsics, mask, kind = K.copy(), data.get("mask"), int(camera.camera_type)
+        result, cause = None, "has a distortion that leaves no image"
+        if kind == CameraType.PERSPECTIVE.value and distortion_params[3]:
+            result = _of_brown(intrinsics, distortion_params, image, mask)
+        else:
+            try:
+                stock = full_images_datamanager._undistort_image(camera, distortion_params, data, image, K)
+                ratio = float(stock[0][0, 0]) / max(stock[1].shape[1], 1)
+                # A view of more than 157 degrees (a ratio of 0.1) shows a smear.
+                if np.isfinite(stock[0]).all() and 0.1 <= ratio <= 1000 and (stock[1].any() or not image.any()):
+                    result = stock
+                elif kind == CameraType.FISHEYE.value and _is_lens(distortion_params, intrinsics, image):
+                    result = _middle(intrinsics, distortion_params, image, mask)
+            except (AssertionError, LookupError, TypeError, ValueError, cv2.error) as error:
+                cause = f"cannot be undistorted ({one_line(error)})"
+        if result is None:
+            values = ", ".join(f"{float(value):.3g}" for value in distortion_params)
             raise DataError(
-                f"{path.name} cannot be undistorted ({one_line(error)}); {_check(distortion_params)}"
-            ) from error
-        share = float(new[0, 0]) / max(result.shape[1], 1)
-        # A view of more than 157 degrees (a share of 0.1) shows a smear.
-        if np.isfinite(new).all() and 0.1 <= share <= 1000 and (result.any() or not image.any()):
-            return new, result, mask
-        if int(camera.camera_type) != CameraType.FISHEYE.value or not _is_lens(distortion_params, intrinsics, image):
-            raise DataError(f"{path.name} has a distortion that leaves no image; {_check(distortion_params)}")
-        return _middle(intrinsics, distortion_params, image, data.get("mask"))
+                f"{paths[int(data['image_idx'])].name} {cause}; check its k1 ... p2 ({values}), which are of "
+                "coordinates in focal lengths, not in pixels"
+            )
+        return result
 
     return undistort
-
-
-def _check(distortion: Any) -> str:
-    values = ", ".join(f"{float(value):.3g}" for value in distortion)
-    return f"check its k1 ... p2 ({values}), which are of coordinates in focal lengths, not in pixels"
 
 
 def _of_brown(K: NDArray[Any], distortion: Any, image: NDArray[Any], mask: Any) -> Result | None:
@@ -104,16 +101,16 @@ def _middle(K: NDArray[Any], distortion: Any, image: NDArray[Any], mask: Any) ->
     """The perspective image of the middle of a fisheye photo, to 60 degrees at the middles of its edges."""
     height, width = image.shape[:2]
     # OpenCV's pixels have whole numbers at their middles.
-    own = K.astype(np.float64)
-    own[:2, 2] -= 0.5
+    old = K.astype(np.float64)
+    old[:2, 2] -= 0.5
     k = np.array(distortion[:4], dtype=np.float64)
     focal = max(width, height) / 2 / np.tan(np.radians(60))
     new = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]])
-    maps = cv2.fisheye.initUndistortRectifyMap(own, k, np.eye(3), new, (width, height), cv2.CV_32FC1)
-    seen = (maps[0] > -0.5) & (maps[0] < width - 0.5) & (maps[1] > -0.5) & (maps[1] < height - 0.5)
+    maps = cv2.fisheye.initUndistortRectifyMap(old, k, np.eye(3), new, (width, height), cv2.CV_32FC1)
+    valid = (maps[0] > -0.5) & (maps[0] < width - 0.5) & (maps[1] > -0.5) & (maps[1] < height - 0.5)
     if mask is not None:
-        seen &= _remapped(mask, image.shape, maps) > 127
-    drawn = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR)
+        valid &= _remapped(mask, image.shape, maps) > 127
+    image = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR)
     new[:2, 2] += 0.5
-    whole = None if mask is None and seen.all() else torch.from_numpy(seen)[..., None]
-    return new.astype(np.float32), drawn, whole
+    mask = None if mask is None and valid.all() else torch.from_numpy(valid)[..., None]
+    return new.astype(np.float32), image, mask

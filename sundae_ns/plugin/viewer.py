@@ -1,8 +1,8 @@
 """Controls of nerfstudio's viewer: the head's check box, and a preview of what a prune would keep.
 
-The preview never touches the field, nor the images of training and evaluation. It shows what the prune itself leaves,
-by the same decision; under a rule that merges, with the merged values. The head is disabled in a preview, because it
-was trained on all Gaussians of the field.
+The preview changes neither the Gaussians nor the images of training and evaluation. It shows what the prune itself
+leaves, by the same decision; under a rule that merges, with the merged values. The head is disabled in a preview,
+because it was trained on all Gaussians.
 """
 
 from __future__ import annotations
@@ -16,13 +16,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
-from nerfstudio.viewer.viewer_elements import (
-    ViewerCheckbox,
-    ViewerControl,
-    ViewerDropdown,
-    ViewerSlider,
-    ViewerText,
-)
+from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerControl, ViewerDropdown, ViewerSlider, ViewerText
 from torch import Tensor
 
 from sundae_ns.core.errors import ConfigError, SundaeError, one_line
@@ -51,13 +45,7 @@ def in_viewer() -> bool:
 
 
 def stop_rendering(viewer: Any) -> None:
-    """End the threads that render for browsers.
-
-    A thread that still renders when Python exits aborts the process (seen on CUDA, after everything was saved).
-
-    Args:
-        viewer: nerfstudio's; None without one.
-    """
+    """End the threads of nerfstudio's viewer: one that still renders when Python exits aborts the process."""
     machines = [] if viewer is None else list(getattr(viewer, "render_statemachines", {}).values())
     for machine in machines:
         machine.running = False
@@ -79,14 +67,12 @@ class Visible(NamedTuple):
     """What an image shows."""
 
     source: GaussianSource
-    mask: Tensor | None
-    """Gaussians of the field in it, bool ``[N]``; None for all."""
-    compensate: bool
-    """Whether the head may correct the image."""
+    mask: Tensor | None  # The Gaussians in it, bool [N]; None for all
+    compensate: bool  # Whether the head may correct the image
 
 
 class _GaussiansVersion:
-    """Identifies a field without keeping it alive: exactly, or to within a hundred steps while it is trained."""
+    """Identifies Gaussians without keeping them alive: exactly, or to within a hundred steps in training."""
 
     def __init__(self, state: TrainingState, training: bool) -> None:
         values = list(state.gaussians.values())
@@ -96,18 +82,17 @@ class _GaussiansVersion:
         self._version = [state.gaussians.num_gaussians, *steps]
 
     def matches(self, other: _GaussiansVersion) -> bool:
-        """Whether both are of one field, which is still alive."""
         pairs = zip(self._parameters, other._parameters)
         return self._version == other._version and all(mine() is not None and mine() is its() for mine, its in pairs)
 
 
 class ViewerControls(torch.nn.Module):
-    """The controls, and what the preview has computed of the present field.
+    """The controls, and what the preview has computed of the present Gaussians.
 
     A module without parameters, because nerfstudio looks for viewer elements in modules only.
 
     Args:
-        state: the field.
+        state: of the model.
         configured: the rule of the run's prune.
         contribute: computes contributions.
         curve: the curve by which trials have chosen the number of Gaussians; empty without them.
@@ -129,8 +114,7 @@ class ViewerControls(torch.nn.Module):
         rules, hint = list(get_args(RuleName)), "Rule of the previewed prune; the head is disabled in a preview"
         self.rule = ViewerDropdown("Rule", rules[0], rules, hint=hint)
         self.control = ViewerControl()  # gives access to the viewer, and so to the training views
-        self.training_gaussians = False
-        """Whether a trainer changes the field."""
+        self.training_gaussians = False  # Whether a trainer changes the field
         self._state, self._configured, self._contribute, self._curve = state, configured, contribute, curve
         self._lock = threading.Lock()
         self._seen: _GaussiansVersion | None = None
@@ -140,7 +124,7 @@ class ViewerControls(torch.nn.Module):
 
     @property
     def gaussians_key(self) -> GaussiansKey | None:
-        """Identifies the present field; None while it is densified."""
+        """Identifies the present Gaussians; None during densification."""
         if self.training_gaussians and self._state.densifying:
             return None
         return self._state.gaussians.num_gaussians, self._state.pruning["num_prunes"]
@@ -170,44 +154,42 @@ class ViewerControls(torch.nn.Module):
             compensate = self.compensate.value
         if crop is None:
             return Visible(source, None, compensate)
-        return (
-            Visible(GaussianSource(source.gaussians.rows(crop), whole=False), crop, compensate) if crop.any() else None
-        )
+        rows = GaussianSource(source.gaussians.rows(crop), whole=False)
+        return Visible(rows, crop, compensate) if crop.any() else None
 
     def preview(self) -> Pruned | None:
         """The previewed prune; None outside of the viewer, with the slider at 1, or if the rule cannot be applied.
 
-        Graphs are built once for a field. The pass over the training views is repeated if the rule weights pixels by
-        the count that stays. The caller holds nerfstudio's lock on the field, so training in another thread waits.
+        Graphs are built once. The pass over the training views is repeated if the rule weights pixels by the count that
+        stays. The caller holds nerfstudio's lock on the model, so training in another thread waits.
         """
-        name, share = self.rule.value, round(float(self.keep_ratio.value), 6)
-        if share >= 1 or not in_viewer():
+        name, ratio = self.rule.value, round(float(self.keep_ratio.value), 6)
+        if ratio >= 1 or not in_viewer():
             return None
         with self._lock:
             version = _GaussiansVersion(self._state, self.training_gaussians)
             if self._seen is None or not self._seen.matches(version):
                 self._seen = version
                 self._graphs, self._contributions, self._previews = {}, {}, {}
-            if (name, share) not in self._previews:
+            if (name, ratio) not in self._previews:
                 pruned: Pruned | None = None
                 try:
-                    pruned = self._prune(previewed_rule(self._configured, name), share)
+                    pruned = self._prune(previewed_rule(self._configured, name), ratio)
                 except (SundaeError, torch.cuda.OutOfMemoryError) as error:
                     # An exception in the viewer's thread would end all rendering.
                     CONSOLE.log(f"[yellow]No preview of {name}: {one_line(error)}")
-                self._previews = {(name, share): pruned}
-            return self._previews[name, share]
+                self._previews = {(name, ratio): pruned}
+            return self._previews[name, ratio]
 
     @torch.no_grad()
-    def _prune(self, rule: PruneRule, share: float) -> Pruned:
+    def _prune(self, rule: PruneRule, ratio: float) -> Pruned:
         gaussians = self._state.gaussians
         usable = sanitise(gaussians).gaussians
-        n = usable.num_gaussians
-        count = kept_count(share, n)
+        count = kept_count(ratio, usable.num_gaussians)
         if rule.uses_graph and rule.edges not in self._graphs:
             self._graphs[rule.edges] = gaussian_graph(usable, rule)
         weights = None
-        if rule.uses_contribution and count < n:
+        if rule.uses_contribution and count < usable.num_gaussians:
             detail = count if rule.uses_detail else None
             if detail not in self._contributions:
                 viewer: Any = getattr(self.control, "viewer", None)

@@ -14,6 +14,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from sundae_ns.head.head import HeadConfig
 from sundae_ns.plugin.datamanager import SundaeDatamanager
 from sundae_ns.plugin.model import SundaeModel
+from sundae_ns.plugin.trainer import SundaeTrainer
 
 METHODS = {
     "sundae": None,
@@ -52,6 +53,8 @@ def test_configuration(name: str) -> None:
     assert method.description
     config = method.config
     assert config.method_name == name
+    assert config._target is SundaeTrainer
+    assert config.viewer.quit_on_train_completion
     model, paper = config.pipeline.model, name == "sundae-paper"
     assert model._target is SundaeModel
     assert config.pipeline.datamanager._target is SundaeDatamanager

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from models import as_the_viewer
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils import colormaps
 from nerfstudio.utils.eval_utils import eval_setup
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerElement
 
@@ -30,20 +29,6 @@ def camera(pipeline: Any, height: int, aspect: float) -> Cameras:
     return Cameras(known.camera_to_worlds, fx=1.2 * height, fy=1.2 * height, cx=width / 2, cy=height / 2).to(
         pipeline.device
     )
-
-
-def as_the_viewer(call: Callable[[], Any]) -> Any:
-    """What a function returns to a thread of the viewer, which is where the viewer renders."""
-
-    class Renderer(RenderStateMachine):
-        def run(self) -> None:
-            with torch.no_grad():
-                self.output_keys = call()
-
-    thread = Renderer(None, 1.0, None)  # type: ignore[arg-type]
-    thread.start()
-    thread.join()
-    return thread.output_keys
 
 
 @pytest.mark.parametrize(("height", "aspect"), [(30, 1.0), (31, 1.7), (75, 0.6)])
@@ -78,15 +63,6 @@ def test_check_box_switches_the_head_off(pipeline: Any) -> None:
     assert set(on) == set(off)
     # What a viewer shows must not change what the trainer measures.
     assert torch.equal(evaluated["rgb"], on["rgb"])
-
-
-@torch.no_grad()
-def test_training_state_of_the_viewer_does_not_show(pipeline: Any) -> None:
-    model, cam = pipeline.model, camera(pipeline, 40, 1.0)
-    expected = model.eval().get_outputs_for_camera(cam)["rgb"]
-    model.train()
-    model.eval()
-    assert torch.equal(model.get_outputs_for_camera(cam)["rgb"], expected)
 
 
 def listening(port: int) -> set[str]:

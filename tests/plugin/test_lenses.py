@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -368,65 +367,28 @@ def test_two_kinds_of_lenses_of_a_colmap_model(capture: Path, load: Load) -> Non
 LENS = {"fl_x": 33.0, "fl_y": 33.5, "cx": 12.25, "cy": 11.75, "w": 24, "h": 24}
 
 
-def rewritten(data: Path, top: dict[str, Any], own: Callable[[int], dict[str, Any]]) -> None:
-    frames = json.loads((data / "transforms.json").read_text())["frames"]
-    kept = [{"file_path": f["file_path"], "transform_matrix": f["transform_matrix"]} for f in frames]
-    meta = {**top, "frames": [{**frame, **own(index)} for index, frame in enumerate(kept)]}
-    (data / "transforms.json").write_text(json.dumps(meta))
-
-
-AXES = [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]
-NO_DISTORTION = {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+OPENCV = {"camera_model": "OPENCV"}
+AXES = {"applied_transform": [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]}
+METASHAPE = {**LENS, "k1": 0.02, "k2": -0.01, "k3": 0.001, "k4": 0.0, "p1": 1e-4, "p2": 1e-4}
 WRITERS: dict[str, tuple[dict[str, Any], Callable[[int], dict[str, Any]]]] = {
     "ns-process-data": (
-        {**LENS, "k1": 0.01, "k2": -0.01, "p1": 1e-4, "p2": 2e-4, "camera_model": "OPENCV", "applied_transform": AXES},
+        {**LENS, **OPENCV, **AXES, "k1": 0.01, "k2": -0.01, "p1": 1e-4, "p2": 2e-4},
         lambda index: {"colmap_im_id": index + 1},
     ),
     "ns-process-data, several cameras": (
-        {"applied_transform": AXES},
-        lambda index: {
-            **LENS,
-            **NO_DISTORTION,
-            "fl_x": 33.0 + index,
-            "cx": 12.0 + 0.1 * index,
-            "k1": 0.01 * index,
-            "camera_model": "OPENCV",
-            "colmap_im_id": index,
-        },
+        AXES,
+        lambda index: {**LENS, **OPENCV, "fl_x": 33.0 + index, "cx": 12.0 + 0.1 * index, "k1": 0.01 * index, "k2": 0.0},
     ),
     "ns-process-data, a fisheye video": (
         {**LENS, "k1": 0.03, "k2": 0.01, "k3": 0.0, "k4": 0.002, "camera_model": "OPENCV_FISHEYE"},
         lambda index: {},
     ),
-    "Polycam": (
-        {"camera_model": "OPENCV", "orientation_override": "none"},
-        lambda index: {**LENS, "fl_x": 33.0 + 0.1 * index},
-    ),
-    "Record3D": ({**LENS, "camera_model": "OPENCV", "k1": 0, "k2": 0, "p1": 0, "p2": 0}, lambda index: {}),
-    "Metashape": (
-        {"camera_model": "OPENCV", "applied_transform": AXES},
-        lambda index: {**LENS, "fl_y": 33.0, "k1": 0.02, "k2": -0.01, "k3": 0.001, "k4": 0.0, "p1": 1e-4, "p2": 1e-4},
-    ),
-    "Metashape, k4": (
-        {"camera_model": "OPENCV"},
-        lambda index: {**LENS, "k1": 0.02, "k2": -0.01, "k3": 0.001, "k4": 0.004, "p1": 1e-4, "p2": 1e-4},
-    ),
-    "RealityScan": (
-        {"camera_model": "OPENCV"},
-        lambda index: {**LENS, "k1": -0.05, "k2": 0.02, "k3": 0.0, "k4": 0.0, "p1": 0.0, "p2": 0.0},
-    ),
+    "Polycam": ({**OPENCV, "orientation_override": "none"}, lambda index: {**LENS, "fl_x": 33.0 + 0.1 * index}),
+    "Record3D": ({**LENS, **OPENCV, "k1": 0, "k2": 0, "p1": 0, "p2": 0}, lambda index: {}),
+    "Metashape": ({**OPENCV, **AXES}, lambda index: METASHAPE),
+    "Metashape, k4": (OPENCV, lambda index: {**METASHAPE, "k4": 0.004}),
     "instant-ngp": (
-        {
-            **LENS,
-            "camera_angle_x": 0.7,
-            "camera_angle_y": 0.7,
-            "k1": 0.01,
-            "k2": 0.0,
-            "p1": 0.0,
-            "p2": 0.0,
-            "is_fisheye": False,
-            "aabb_scale": 16,
-        },
+        {**LENS, "camera_angle_x": 0.7, "camera_angle_y": 0.7, "k1": 0.01, "is_fisheye": False, "aabb_scale": 16},
         lambda index: {"sharpness": 30.0 + index},
     ),
 }
@@ -434,10 +396,13 @@ WRITERS: dict[str, tuple[dict[str, Any], Callable[[int], dict[str, Any]]]] = {
 
 @pytest.mark.parametrize("writer", WRITERS)
 def test_files_of_other_programs(capture: Path, load: Load, writer: str) -> None:
-    top, own = WRITERS[writer]
-    rewritten(capture, top, own)
+    top, entries = WRITERS[writer]
+    frames = [
+        {"file_path": frame["file_path"], "transform_matrix": frame["transform_matrix"], **entries(index)}
+        for index, frame in enumerate(meta_of(capture)["frames"])
+    ]
+    (capture / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
     made = load(capture)
-    frames = json.loads((capture / "transforms.json").read_text())["frames"]
     stated = {Path(frame["file_path"]).name: {**top, **frame} for frame in frames}
     lens = made.train_dataparser_outputs.cameras
     for at, path in enumerate(made.train_dataset.image_filenames):
@@ -457,29 +422,19 @@ def test_files_of_other_programs(capture: Path, load: Load, writer: str) -> None
     torch.testing.assert_close(found, ratio, atol=1e-5, rtol=1e-4)
 
 
-def _rigs(model: Path) -> None:
-    """Files that COLMAP writes beside its model from 3.12 on."""
-    (model / "rigs.bin").write_bytes(struct.pack("<Q", 0))
-    (model / "frames.bin").write_bytes(struct.pack("<Q", 0))
-
-
-def _project(model: Path) -> None:
-    (model / "project.ini").write_text("log_to_stderr=false\n")
-
-
-LAYOUTS: dict[str, tuple[str, Callable[[Path], None]]] = {
-    "COLMAP 3.6": ("sparse/0", _project),
-    "COLMAP 3.12": ("sparse/0", _rigs),
-    "the undistorter": ("sparse", lambda _: None),
-    "ns-process-data": ("colmap/sparse/0", _project),
-}
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_models_of_colmap(capture: Path, load: Load, layout: str) -> None:
-    place, add = LAYOUTS[layout]
+@pytest.mark.parametrize(
+    ("place", "beside"),
+    [
+        ("sparse/0", ["project.ini"]),  # COLMAP 3.6
+        ("sparse/0", ["rigs.bin", "frames.bin"]),  # COLMAP 3.12
+        ("sparse", []),  # the undistorter
+        ("colmap/sparse/0", ["project.ini"]),  # ns-process-data
+    ],
+)
+def test_models_of_colmap(capture: Path, load: Load, place: str, beside: list[str]) -> None:
     write_model(capture / place, names_of(capture), (24, 24), lenses=[(2, [33.0, 12.0, 12.0, 0.02])])
-    add(capture / place)
+    for name in beside:
+        (capture / place / name).write_bytes(bytes(8))
     (capture / "transforms.json").unlink()
     made = load(capture, colmap=place)
     lens = made.train_dataparser_outputs.cameras

@@ -6,7 +6,6 @@ import fcntl
 import os
 import random
 import re
-import subprocess
 import sys
 import zipfile
 from copy import deepcopy
@@ -21,11 +20,9 @@ import torch
 import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.engine.trainer import Trainer
-from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from harness.still_life import write_still_life
-from sundae_ns import method_configs
 from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, StorageError
 from sundae_ns.io import checkpoint
 from sundae_ns.io.checkpoint import random_state, set_random_state
@@ -175,15 +172,6 @@ def test_a_second_training_in_a_folder_changes_nothing_there(tmp_path: Path) -> 
     assert sorted(os.listdir(run)) == ["config.yml", "training.lock"]
 
 
-def test_methods_train_with_it_and_end_by_themselves() -> None:
-    for method in vars(method_configs).values():
-        if isinstance(method, MethodSpecification):
-            config = method.config
-            assert isinstance(config, SundaeTrainerConfig)
-            assert config._target is SundaeTrainer
-            assert config.viewer.quit_on_train_completion, config.method_name
-
-
 def test_config_in_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
     config = SundaeTrainerConfig(method_name="m", experiment_name="e", timestamp="t", output_dir=tmp_path)
     config.set_timestamp()  # the user's own stays
@@ -224,54 +212,38 @@ def test_faults_while_training(
 
 
 HOOK = """
-import sys
-sys.argv = [{program!r}]
-from sundae_ns.core.errors import {error}, show_in_one_line
+import os, sys
+os.environ.update({variables})
+sys.argv = ["/usr/bin/{program}"]
+from sundae_ns.core.errors import DataError, passed_on, show_in_one_line
+from torch.multiprocessing.spawn import ProcessExitedException
 show_in_one_line()
-raise {error}("the cause; the mend")
+{error}
 """
+STOPPED = "raise ProcessExitedException('rank', error_index=1, error_pid=2, exit_code={})"
 
 
 @pytest.mark.parametrize(
-    ("program", "error", "variables", "lines"),
+    ("program", "error", "code", "traceback"),
     [
-        ("/usr/bin/ns-train", "DataError", {}, ["sundae: the cause; the mend"]),
-        ("/usr/bin/ns-train", "DataError", {"SUNDAE_TRACEBACK": "1"}, None),
-        ("/usr/bin/other", "DataError", {}, None),
-        ("/usr/bin/ns-train", "os", {}, None),
+        ("ns-train", "raise DataError('the cause; the remedy')", 1, False),
+        ("other", "raise DataError('the cause; the remedy')", 1, True),
+        ("ns-train", "raise DataError('with a traceback')", 1, True),
+        ("ns-train", "raise OSError", 1, True),
+        ("ns-viewer", "raise KeyboardInterrupt", 130, False),
+        ("ns-viewer", STOPPED.format(143), 143, False),
+        ("ns-viewer", f"passed_on.append(2); {STOPPED.format(-15)}", 130, False),
     ],
 )
-def test_one_line_in_nerfstudios_commands_only(
-    program: str, error: str, variables: dict[str, str], lines: list[str] | None
-) -> None:
-    code = HOOK.format(program=program, error=error)
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **variables}, check=False
-    )
-    assert result.returncode == 1
-    if lines is None:
-        assert "Traceback" in result.stderr
-    else:
-        assert result.stderr.splitlines() == lines
-
-
-@pytest.mark.parametrize(
-    ("error", "code"),
-    [
-        ("KeyboardInterrupt()", 130),
-        ("ProcessExitedException('rank', error_index=1, error_pid=2, exit_code=143)", 143),
-        ("passed_on.append(2) or ProcessExitedException('rank', 1, 2, exit_code=-15, signal_name='SIGTERM')", 130),
-    ],
-)
-def test_a_stopped_command_ends_without_a_traceback(tmp_path: Path, error: str, code: int) -> None:
-    text = HOOK[: HOOK.index("raise")].format(program="/usr/bin/ns-viewer", error="DataError")
-    text += "from sundae_ns.core.errors import passed_on\n"
-    text += f"from torch.multiprocessing.spawn import ProcessExitedException\nraise {error}"
-    (tmp_path / "program").write_text(text)
-    found, printed = forked.run(tmp_path / "program")
-    assert found == code
-    assert "Traceback" not in printed
-    assert len(printed.splitlines()) <= 2
+def test_how_commands_of_nerfstudio_end(tmp_path: Path, program: str, error: str, code: int, traceback: bool) -> None:
+    variables = {"SUNDAE_TRACEBACK": "1"} if "with a traceback" in error else {}
+    (tmp_path / "program").write_text(HOOK.format(program=program, error=error, variables=variables))
+    ended, printed = forked.run(tmp_path / "program")
+    assert ended == code
+    assert ("Traceback" in printed) == traceback
+    assert traceback or len(printed.splitlines()) <= 2
+    if "remedy" in error and not traceback:
+        assert printed.splitlines() == ["sundae: the cause; the remedy"]
 
 
 def configured(tmp_path: Path, *words: str) -> Any:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, get_args
 
 import pytest
 import torch
+from models import as_the_viewer
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox, SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from torch import Tensor
@@ -81,21 +81,6 @@ def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:
     pipeline = SimpleNamespace(model=model, datamanager=cameras)
     model.viewer_controls.control._setup(SimpleNamespace(pipeline=pipeline, viser_server=None))  # type: ignore[arg-type]
     return model.eval(), cameras
-
-
-def as_the_viewer(call: Callable[[], Any]) -> Any:
-    """What a function returns to a thread of the viewer."""
-    found: list[Any] = []
-
-    class Renderer(RenderStateMachine):
-        def run(self) -> None:
-            with torch.no_grad():
-                found.append(call())
-
-    thread = Renderer(None, 1.0, None)  # type: ignore[arg-type]
-    thread.start()
-    thread.join()
-    return found[0]
 
 
 def shown(model: SundaeModel, rule: RuleName, keep_ratio: float) -> Tensor | None:
@@ -178,7 +163,7 @@ def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None
         lambda count: model.contribution(cameras, count),  # type: ignore[arg-type]
     )
     assert report is not None
-    assert report.after == int(preview.decision.mask.sum()) == 18
+    assert report["after"] == int(preview.decision.mask.sum()) == 18
     assert all(torch.equal(value, preview.gaussians[name]) for name, value in model.state.gaussians.items())
     # A merge and growth show in the picture too.
     settings = model.render_settings(training=False).without_head()

@@ -14,6 +14,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils import writer
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from torch import Tensor
 
 from sundae_ns.head.head import HeadConfig
@@ -198,3 +199,18 @@ def training_of() -> Callable[..., Training]:
 def no_leftovers() -> Iterator[None]:
     yield
     writer.EVENT_STORAGE.clear()
+
+
+def as_the_viewer(call: Callable[[], Any]) -> Any:
+    """What a function returns to a thread of the viewer."""
+    found: list[Any] = []
+
+    class Renderer(RenderStateMachine):
+        def run(self) -> None:
+            with torch.no_grad():
+                found.append(call())
+
+    thread = Renderer(None, 1.0, None)  # type: ignore[arg-type]
+    thread.start()
+    thread.join()
+    return found[0]

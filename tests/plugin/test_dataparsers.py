@@ -1,4 +1,4 @@
-"""Where a capture's cameras and points stand: strays, survey coordinates and scales leave the scene as it is."""
+"""Captures as our parsers read them: stray cameras, survey coordinates, scales, clouds and images."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 import torch
 from colmap_models import write_model
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image, ImageOps
 from plyfile import PlyData, PlyElement
 
 from sundae_ns.core.errors import DataError
@@ -27,6 +28,14 @@ Load = Callable[..., Any]
 Edit = Callable[..., None]
 SURVEY = np.array([431_250.25, 5_412_330.5, 212.125])
 """Coordinates of a place in UTM, metres."""
+
+
+def said(capsys: Any) -> str:
+    return " ".join(capsys.readouterr().out.split())
+
+
+def names_of(data: Path) -> list[str]:
+    return sorted(path.name for path in (data / "images").iterdir())
 
 
 def meta_of(data: Path) -> dict[str, Any]:
@@ -86,8 +95,8 @@ def test_a_stray_camera_does_not_shrink_the_scene(
 ) -> None:
     name = stray(capture, times, edit)
     made = load(capture)
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"the camera of {name} is " in said
+    printed = said(capsys)
+    assert f"the camera of {name} is " in printed
     without(capture, 4, edit)
     alone = load(capture)
     assert "times as far away" not in capsys.readouterr().out
@@ -114,25 +123,22 @@ def test_a_stray_test_view_is_named(capture: Path, load: Load, edit: Edit, capsy
     assert float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].abs().max()) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_earlier_runs_keep_the_frame_that_they_were_trained_in(capture: Path, load: Load, edit: Edit) -> None:
+def test_earlier_runs_keep_the_frame_that_they_were_trained_in(
+    capture: Path, load: Load, edit: Edit, tmp_path: Path
+) -> None:
+    """A run that is resumed in other coordinates is named."""
     stray(capture, 100.0, edit)
     made = load(capture, robust=False)
     everywhere = made.train_dataset.cameras.camera_to_worlds[:, :, 3]
     assert float(everywhere.abs().max()) == pytest.approx(1.0)  # as nerfstudio scales
     assert float(everywhere.norm(dim=1).median()) < 0.2
-
-
-def test_a_run_that_is_resumed_in_other_coordinates_is_named(
-    capture: Path, load: Load, edit: Edit, tmp_path: Path
-) -> None:
-    stray(capture, 100.0, edit)
-    before = load(capture, robust=False).train_dataparser_outputs
-    before.save_dataparser_transform(tmp_path / "run" / "dataparser_transforms.json")
-    assert other_frame(tmp_path / "run", before.dataparser_transform, before.dataparser_scale) is None
+    before, run = made.train_dataparser_outputs, tmp_path / "run"
+    before.save_dataparser_transform(run / "dataparser_transforms.json")
+    assert other_frame(run, before.dataparser_transform, before.dataparser_scale) is None
     now = load(capture).train_dataparser_outputs
-    said = other_frame(tmp_path / "run", now.dataparser_transform, now.dataparser_scale)
-    assert said is not None
-    assert "resume it with --pipeline.datamanager.robust-frame False" in said
+    line = other_frame(run, now.dataparser_transform, now.dataparser_scale)
+    assert line is not None
+    assert "resume it with --pipeline.datamanager.robust-frame False" in line
     assert other_frame(tmp_path / "none", now.dataparser_transform, now.dataparser_scale) is None
 
 
@@ -263,12 +269,12 @@ def test_a_cloud_that_was_rounded_before_is_named(capture: Path, load: Load, edi
     narrow = vertex.astype([(name, "f4" if name in "xyz" else kind) for name, kind in vertex.dtype.descr])
     PlyData([PlyElement.describe(narrow, "vertex")]).write(str(capture / "sparse_pc.ply"))
     load(capture)
-    assert "sparse_pc.ply has float32 coordinates that are 0.5 apart" in " ".join(capsys.readouterr().out.split())
+    assert "sparse_pc.ply has float32 coordinates that are 0.5 apart" in said(capsys)
 
 
 @pytest.mark.parametrize("axes", [True, False])
 def test_a_colmap_model_in_survey_coordinates(capture: Path, load: Load, axes: bool) -> None:
-    names = sorted(path.name for path in (capture / "images").iterdir())
+    names = names_of(capture)
     write_model(capture / "sparse" / "0", names, (24, 24))
     options: dict[str, Any] = {"assume_colmap_world_coordinate_convention": axes}
     near = load(capture, colmap="sparse/0", **options)
@@ -283,7 +289,7 @@ def test_a_colmap_model_in_survey_coordinates(capture: Path, load: Load, axes: b
 
 
 def test_a_stray_camera_of_a_colmap_model(capture: Path, load: Load) -> None:
-    names = sorted(path.name for path in (capture / "images").iterdir())
+    names = names_of(capture)
     write_model(capture / "sparse" / "0", names, (24, 24))
     usual = load(capture, colmap="sparse/0")
     write_model(capture / "sparse" / "0", names, (24, 24), stray=(5, 4000.0))
@@ -314,15 +320,8 @@ def test_applied_scale_leaves_the_cloud_beside_its_cameras(capture: Path, load: 
 def test_colours_of_a_cloud_reach_the_model(capture: Path, load: Load) -> None:
     _, expected = cloud_of(load(capture))
     vertex = PlyData.read(str(capture / "sparse_pc.ply"))["vertex"].data
-    kinds = [
-        ("x", "f4"),
-        ("y", "f4"),
-        ("z", "f4"),
-        ("diffuse_red", "f4"),
-        ("diffuse_green", "f4"),
-        ("diffuse_blue", "f4"),
-    ]
     names = ("x", "y", "z", "red", "green", "blue")
+    kinds = [(name if len(name) == 1 else f"diffuse_{name}", "f4") for name in names]
     rows = np.array([tuple(float(row[name]) for name in names) for row in vertex], dtype=kinds)
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(capture / "sparse_pc.ply"))
     assert torch.equal(cloud_of(load(capture))[1], expected)
@@ -336,14 +335,18 @@ def test_a_cloud_that_the_views_do_not_show_is_named(capture: Path, load: Load, 
     cloud["vertex"]["x"] += 50
     cloud.write(str(path))
     load(capture)
-    said = " ".join(capsys.readouterr().out.split())
-    assert "views show no point of the sparse cloud, so cloud and cameras are probably in different coordinates" in said
+    printed = said(capsys)
+    assert (
+        "views show no point of the sparse cloud, so cloud and cameras are probably in different coordinates" in printed
+    )
 
 
 def test_an_old_capture_takes_the_cloud_of_its_colmap_model(capture: Path, load: Load, edit: Edit) -> None:
     """Made before ns-process-data wrote clouds; nerfstudio asks, and writes into the capture."""
     (capture / "sparse_pc.ply").unlink()
     edit(capture, ply_file_path=None)
+    (capture / "colmap" / "sparse" / "0").mkdir(parents=True)
+    assert "points3D_xyz" not in load(capture).train_dataparser_outputs.metadata
     write_model(capture / "colmap" / "sparse" / "0", [f"{index}.png" for index in range(4)], (24, 24))
     before = (capture / "transforms.json").read_bytes()
     made = load(capture)
@@ -365,7 +368,121 @@ def test_an_old_capture_takes_the_cloud_of_its_colmap_model(capture: Path, load:
     assert not (capture / "sparse_pc.ply").exists()
 
 
-def test_an_old_capture_without_points_starts_without_them(capture: Path, load: Load, edit: Edit) -> None:
-    (capture / "colmap" / "sparse" / "0").mkdir(parents=True)
-    edit(capture, ply_file_path=None)
-    assert "points3D_xyz" not in load(capture).train_dataparser_outputs.metadata
+@pytest.mark.parametrize("colmap", [None, "sparse/0"])
+def test_masks_beside_the_images(capture: Path, load: Load, edit: Edit, capsys: Any, colmap: str | None) -> None:
+    if colmap is not None:
+        write_model(capture / colmap, names_of(capture), (24, 24))
+    load(capture, colmap=colmap)
+    assert "masks" not in said(capsys)
+    (capture / "masks").mkdir()
+    for name in names_of(capture):
+        Image.new("L", (24, 24), 255).save(capture / "masks" / name)
+    load(capture, colmap=colmap)
+    remedy = "mask_path in each frame" if colmap is None else "colmap --masks-path masks"
+    assert f"is not used; to leave out what its masks hide, give {remedy}" in said(capsys)
+    frames = meta_of(capture)["frames"]
+    edit(capture, frames=[{**frame, "mask_path": frame["file_path"].replace("images", "masks")} for frame in frames])
+    options = {} if colmap is None else {"masks_path": Path("masks")}
+    assert "mask" in load(capture, colmap=colmap, **options).cached_train[0]
+    assert "is not used" not in said(capsys)
+
+
+def test_a_larger_model_beside_the_given_one(capture: Path, load: Load, capsys: Any) -> None:
+    names = names_of(capture)
+    write_model(capture / "sparse" / "0", names[:4], (24, 24))
+    write_model(capture / "sparse" / "1", names, (24, 24))
+    load(capture, colmap="sparse/0")
+    assert f"sparse/0 has 4 images and sparse/1 has {len(names)}" in said(capsys)
+    load(capture, colmap="sparse/1")
+    assert "to train on those" not in said(capsys)
+    advice = "give `colmap --colmap-path sparse/1 --downscale-factor 1`"
+    with pytest.raises(DataError, match=advice):
+        load(capture, colmap="colmap/sparse/0")
+
+
+def test_a_missing_image_is_named_with_the_one_beside_it(capture: Path, load: Load, edit: Edit) -> None:
+    frames = meta_of(capture)["frames"]
+    first, last = (capture / frames[index]["file_path"] for index in (0, -1))
+    last.rename(last.with_name(last.name + ".png"))
+    with pytest.raises(DataError, match=rf"{last.name} cannot be read .*there is {last.name}\.png"):
+        load(capture).next_train(0)
+    first.rename(first.with_suffix(".PNG"))
+    with pytest.raises(DataError, match=rf"{first.name} does not exist \(there is {first.stem}\.PNG\)"):
+        load(capture)
+    write_model(capture / "sparse" / "0", [first.name], (24, 24))
+    with pytest.raises(DataError, match=rf"{first.name} does not exist \(there is {first.stem}\.PNG\)"):
+        load(capture, colmap="sparse/0")
+    (capture / "sparse" / "0" / "cameras.bin").rename(capture / "sparse" / "0" / "Cameras.bin")
+    with pytest.raises(DataError, match=r"nor cameras.txt \(there is Cameras\.bin\)"):
+        load(capture, colmap="sparse/0")
+
+
+def test_a_capture_that_has_gone(tmp_path: Path, load: Load) -> None:
+    with pytest.raises(DataError, match="correct data in the run's config.yml"):
+        load(tmp_path / "gone")
+
+
+def as_photos(data: Path, edit: Edit, orientation: int, *, size: tuple[int, int] = (24, 16)) -> None:
+    """Turn the images of a capture into JPEG files with an EXIF entry, of another shape than their cameras state."""
+    frames = meta_of(data)["frames"]
+    for frame in frames:
+        path = data / frame["file_path"]
+        with Image.open(path) as image:
+            entries = Image.Exif()
+            entries[0x0112] = orientation
+            image.convert("RGB").resize(size).save(path.with_suffix(".jpg"), exif=entries, quality=95)
+        path.unlink()
+        frame["file_path"] = str(Path(frame["file_path"]).with_suffix(".jpg"))
+    gone: dict[str, Any] = dict.fromkeys(("train_filenames", "val_filenames", "test_filenames"))
+    edit(data, frames=frames, **{**gone, "w": size[1], "h": size[0], "cx": size[1] / 2, "cy": size[0] / 2})
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_photos_are_turned_as_their_cameras_see_them(capture: Path, load: Load, edit: Edit, orientation: int) -> None:
+    as_photos(capture, edit, orientation)
+    made = load(capture)
+    assert len(made.cached_train) > 5
+    for path, batch in zip(made.train_dataset.image_filenames, made.cached_train, strict=True):
+        with Image.open(path) as image:
+            seen = np.array(ImageOps.exif_transpose(image))
+        assert batch["image"].shape == (24, 16, 3)
+        assert np.array_equal(batch["image"].numpy(), seen)
+
+
+def test_photos_of_the_size_of_their_cameras_stay(capture: Path, load: Load, edit: Edit) -> None:
+    """Also those of a program that has estimated the cameras of the pixels as they are stored."""
+    as_photos(capture, edit, 6)
+    edit(capture, w=24, h=16, cx=12.0, cy=8.0)
+    made = load(capture)
+    for path, batch in zip(made.train_dataset.image_filenames, made.cached_train, strict=True):
+        with Image.open(path) as image:
+            assert np.array_equal(batch["image"].numpy(), np.array(image))
+
+
+@pytest.mark.parametrize(
+    ("orientation", "advice"), [(6, "turned by its EXIF entry"), (1, "give each size its own camera")]
+)
+def test_photos_that_fit_neither_way(capture: Path, load: Load, edit: Edit, orientation: int, advice: str) -> None:
+    as_photos(capture, edit, orientation)
+    edit(capture, w=10, h=20)
+    with pytest.raises(DataError, match=f"24 x 16 px but its camera says 10 x 20; .*{advice}"):
+        load(capture).next_train(0)
+
+
+def test_masks_of_turned_photos(capture: Path, load: Load, edit: Edit) -> None:
+    as_photos(capture, edit, 6)
+    frames = meta_of(capture)["frames"]
+    mask = Image.new("L", (16, 24), 255)
+    mask.paste(0, (0, 0, 16, 4))
+    mask.save(capture / "mask.png")
+    edit(capture, frames=[{**frame, "mask_path": "mask.png"} for frame in frames])
+    batch = load(capture).cached_train[0]
+    assert batch["mask"].shape[:2] == batch["image"].shape[:2] == (24, 16)
+    assert not batch["mask"][:4].any()
+    assert batch["mask"][4:].all()
+
+
+def test_a_size_that_was_rounded_the_other_way(capture: Path, load: Load, edit: Edit) -> None:
+    edit(capture, w=23)
+    with pytest.raises(DataError, match="--downscale-rounding-mode round"):
+        load(capture).next_train(0)

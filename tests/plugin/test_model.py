@@ -1,0 +1,324 @@
+"""The model: what it is to nerfstudio, its checkpoints, prunes and metrics."""
+
+from __future__ import annotations
+
+import re
+import weakref
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import torchmetrics.image
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.models.splatfacto import SplatfactoModel
+from torch import Tensor
+
+from sundae_ns.core.camera import crop_image
+from sundae_ns.core.errors import BackendError, CheckpointError, ConfigError
+from sundae_ns.core.gaussians import Gaussians, sh_to_rgb
+from sundae_ns.core.metrics import psnr
+from sundae_ns.plugin.model import SundaeModel
+from sundae_ns.pruning.decision import decide
+
+Build = Callable[..., SundaeModel]
+TrainingOf = Callable[[SundaeModel], Any]
+
+
+def test_it_is_a_splatfacto_whose_groups_have_features_and_head(build: Build) -> None:
+    model = build()
+    assert isinstance(model, SplatfactoModel)
+    groups = model.get_param_groups()
+    assert set(groups) == {*model.gauss_params, "compensation"}
+    assert "features" in groups
+    assert set(build(head={"mode": "off"}).get_param_groups()) == set(groups) - {"compensation", "features"}
+
+
+@pytest.mark.parametrize(
+    ("options", "cause"),
+    [
+        ({"pruning": {"keep_ratio": 0.0}}, "keep_ratio"),
+        ({"pruning": {"keep_ratio": 1.2}}, "keep_ratio"),
+        ({"pruning": {"gamma": -0.1}}, "gamma"),
+        ({"pruning": {"gamma": 1.5}}, "gamma"),
+        ({"head": {"num_features": 0}}, "num-features"),
+        ({"base_loss_weight": -1.0}, "base-loss-weight"),
+        ({"use_bilateral_grid": True}, "bilateral"),
+    ],
+)
+def test_options_that_cannot_work(build: Build, options: dict[str, Any], cause: str) -> None:
+    with pytest.raises(ConfigError, match=cause) as caught:
+        build(**options)
+    assert "\n" not in str(caught.value)
+
+
+def test_gsplat_without_cuda(build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    model = build(rasterizer="gsplat")
+    with pytest.raises(BackendError, match="CUDA is not available") as caught:
+        training_of(model)
+    assert "\n" not in str(caught.value)
+    assert build(rasterizer="auto").backend.name == "cpu"
+
+
+def saved(model: SundaeModel, path: Path) -> dict[str, Any]:
+    torch.save(model.state_dict(), path)
+    return torch.load(path, weights_only=True)
+
+
+def test_round_trip_into_another_count_keeps_optimizers_alive(
+    build: Build, training_of: TrainingOf, tmp_path: Path
+) -> None:
+    source = training_of(build())
+    for step in range(5):
+        source.step(step)
+    state = saved(source.model, tmp_path / "a.pt")
+    assert source.model.num_points == 30
+
+    target = training_of(build(n=25))
+    held = dict(target.model.gauss_params.items())
+    target.model.load_state_dict(state)
+    for name, value in target.model.gauss_params.items():
+        assert value is held[name]
+        assert torch.equal(value, source.model.gauss_params[name])
+    assert target.model.step == 4
+    assert target.model.state.pruning == source.model.state.pruning
+    assert target.model.state.head_enabled
+    for (_, ours), (_, theirs) in zip(
+        target.model.head.named_parameters(),  # type: ignore[union-attr]
+        source.model.head.named_parameters(),  # type: ignore[union-attr]
+        strict=True,
+    ):
+        assert torch.equal(ours, theirs)
+    target.optimizers.load_optimizers(deepcopy({k: v.state_dict() for k, v in source.optimizers.optimizers.items()}))
+    assert target.live()
+    torch.manual_seed(5)
+    expected = source.step(5)
+    torch.manual_seed(5)
+    found = target.step(5)
+    assert target.model.num_points == 30
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value)
+    for name, value in target.model.gauss_params.items():
+        torch.testing.assert_close(value, source.model.gauss_params[name])
+
+
+def test_state_of_densification_is_kept(build: Build, training_of: TrainingOf, tmp_path: Path) -> None:
+    source = training_of(build())
+    source.step(0)
+    assert source.model.state.densification["grad2d"].any()
+    target = build(n=25)
+    target.load_state_dict(saved(source.model, tmp_path / "a.pt"))
+    assert torch.equal(target.state.densification["grad2d"], source.model.state.densification["grad2d"])
+    assert target.state.densification["scene_scale"] == source.model.state.densification["scene_scale"]
+
+
+def _stock(state: dict[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in state.items() if k.startswith("gauss_params.") and not k.endswith(".features")}
+
+
+@pytest.mark.parametrize(
+    ("options", "change", "cause"),
+    [
+        ({}, _stock, "splatfacto checkpoint.*warm-start"),
+        ({"head": {"num_features": 1}}, None, "length 1"),
+        ({"head": {"mode": "off"}}, None, "length 0"),
+        ({"head": {"size": "compact"}}, None, "head"),
+        ({"head": {"mode": "features"}}, None, "head"),
+        ({"sh_degree": 2}, None, "features_rest"),
+    ],
+)
+def test_other_checkpoints_are_refused_and_nothing_changes(
+    build: Build, options: dict[str, Any], change: Callable[[dict[str, Any]], dict[str, Any]] | None, cause: str
+) -> None:
+    state = build(n=25, **options).state_dict()
+    model = build()
+    before = {name: value.detach().clone() for name, value in model.named_parameters()}
+    with pytest.raises(CheckpointError, match=cause) as caught:
+        model.load_state_dict(change(state) if change else state)
+    assert isinstance(caught.value, ValueError)
+    assert "\n" not in str(caught.value)
+    assert all(torch.equal(value, before[name]) for name, value in model.named_parameters())
+
+
+N = 60
+"""Gaussians of a model that is built without a count."""
+
+
+@pytest.mark.parametrize("head_start", [None, 2])
+def test_continuous_pruning_and_densification_share_a_field(
+    build: Build, training_of: TrainingOf, head_start: int | None
+) -> None:
+    model = build(
+        head={"start_at": head_start},
+        pruning={
+            "mode": "continuous",
+            "start": 4,
+            "stop": 12,
+            "every": 4,
+            "target_gaussians": 40,
+            "max_gaussians": 70,
+        },
+        warmup_length=0,
+        refine_every=3,
+        reset_alpha_every=100,
+        densify_grad_thresh=1e-9,
+        stop_split_at=14,
+    )
+    training = training_of(model)
+    training.train_callbacks["densification"].strategy.pause_refine_after_reset = 0
+    counts = []
+    for step in range(15):
+        training.step(step)
+        counts.append(model.num_points)
+        if step > 3:
+            assert training.live()
+        assert all(
+            len(value) == model.num_points
+            for value in model.state.densification.values()
+            if isinstance(value, Tensor) and value.ndim
+        )
+    assert [counts[step] for step in (4, 8, 12)] == [40, 40, 40]
+    assert max(counts) > 40
+    # The cap holds at every step, and between growing and culling; densification ends with the last prune.
+    assert 40 < model.state.pruning["peak"] <= 70
+    assert counts[12:] == [40, 40, 40]
+    assert model.state.head_enabled
+
+
+def test_continuous_pruning_merges_and_leaves_adam_in_order(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+) -> None:
+    densified = {"warmup_length": 0, "refine_every": 3, "reset_alpha_every": 100, "stop_split_at": 9}
+    model = build(
+        pruning={"mode": "continuous", "start": 4, "stop": 10, "every": 4},
+        densify_grad_thresh=1e-9,
+        **densified,
+    )
+    training = training_of(model)
+    training.train_callbacks["densification"].strategy.pause_refine_after_reset = 0
+    for step in range(13):
+        training.step(step)
+        assert training.live() or step < 4
+        assert all(value.isfinite().all() for value in model.gauss_params.values())
+        if model.state.pruning["pruned_at"] == step:
+            scales = model.gauss_params["scales"]
+            direction = training.optimizers.optimizers["scales"].state[scales]["exp_avg"]
+            # What was merged starts without one, and what stayed as it is keeps its own.
+            assert 0 < int((direction == 0).all(dim=1).sum()) < model.num_points
+    counts = [tuple(map(int, pair)) for pair in re.findall(r"kept (\d+) of (\d+)", capsys.readouterr().out)]
+    assert len(counts) == 2
+    assert all(after == round(before / 2) for after, before in counts)
+    assert counts[0][1] > N
+
+
+@pytest.mark.parametrize("prune_at", [0, 4])
+def test_nothing_grows_after_the_prune(build: Build, training_of: TrainingOf, prune_at: int) -> None:
+    """Not even where the prune is the first thing that happens, as it may be after a warm start."""
+    grows = {"warmup_length": 0, "refine_every": 3, "reset_alpha_every": 100, "densify_grad_thresh": 1e-9}
+    model = build(pruning={"prune_at": prune_at}, stop_split_at=14, **grows)
+    training, counts = training_of(model), []
+    training.train_callbacks["densification"].strategy.pause_refine_after_reset = 0
+    for step in range(11):
+        training.step(step)
+        counts.append(model.num_points)
+    assert (max(counts[:prune_at], default=0) > N) == (prune_at > 0)
+    assert len(set(counts[prune_at:])) == 1
+    assert counts[-1] == round(0.5 * (N if prune_at == 0 else counts[prune_at - 1]))
+
+
+def test_a_prune_merges_colours(build: Build, training_of: TrainingOf, datamanager: Any) -> None:
+    """Without harmonics the first band holds logits of colours; prunes work on the colours."""
+    model = build(sh_degree=0)
+    training = training_of(model)
+    with torch.no_grad():
+        model.gauss_params["features_dc"].mul_(4)
+    assert model.state.gaussians.encoding == "logits"
+    harmonics = Gaussians(
+        {name: value.detach().clone() for name, value in model.state.gaussians.as_harmonics().items()}
+    )
+    count = model.num_points // 2
+    expected = decide(harmonics, model.config.pruning, count, model.contribution(datamanager, count)).values
+    assert expected is not None
+    training.act("pruning", 3)
+    assert torch.equal(model.means, expected["means"])
+    found = model.gauss_params["features_dc"].detach().sigmoid()
+    torch.testing.assert_close(found, sh_to_rgb(expected["features_dc"]), rtol=0, atol=2e-3)
+
+
+Perturb = Callable[[SundaeModel], SundaeModel]
+MakeCamera = Callable[..., Cameras]
+MakeBatch = Callable[..., dict[str, Tensor]]
+
+
+def test_metrics_with_and_without_the_head(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = perturb(build()).eval()
+    monkeypatch.setattr(model.lpips, "_failed", True)
+    with torch.no_grad():
+        outputs = model.get_outputs_for_camera(camera())
+    metrics, images = model.get_image_metrics_and_images(outputs, batch())
+    assert set(metrics) == {"gaussian_count"} | {a + b for a in ("psnr", "psnr_fitted", "ssim") for b in ("", "_base")}
+    assert all(type(value) is float for value in metrics.values())
+    truth = batch()["image"].float() / 255
+    for suffix, name in (("", "rgb"), ("_base", "base_rgb")):
+        mse = ((outputs[name] - truth) ** 2).mean()
+        assert metrics["psnr" + suffix] == pytest.approx(float(-10 * mse.log10()), abs=1e-4)
+    assert metrics["psnr"] != metrics["psnr_base"]
+    assert metrics["psnr_fitted"] > metrics["psnr"]
+    assert images["img"].shape == (32, 80, 3)
+    # A picture with alpha is composited over the background that it was rendered with.
+    assert torch.isfinite(torch.tensor(model.get_image_metrics_and_images(outputs, batch(channels=4))[0]["psnr"]))
+
+
+def test_metrics_of_a_step_cost_nothing_until_they_are_looked_at(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = perturb(build()).train()
+    outputs, asked = model.get_outputs(camera()), []
+    monkeypatch.setattr("sundae_ns.plugin.model.psnr", lambda *pictures: asked.append(pictures) or psnr(*pictures))
+    metrics = model.get_metrics_dict(outputs, batch())
+    assert set(metrics) == {"psnr", "psnr_base", "gaussian_count"}
+    assert not asked
+    rgb, graph = outputs["rgb"].detach().clamp(0, 1), weakref.ref(outputs["rgb"])
+    truth = crop_image(batch()["image"].float() / 255, outputs["window"])  # as mirrored as the picture
+    del outputs  # what the picture was made from goes with it
+    assert graph() is None
+    mse = ((rgb - truth) ** 2).mean()
+    assert float(metrics["psnr"]) == pytest.approx(float(-10 * mse.log10()), abs=1e-4)
+    assert metrics["psnr"] != metrics["psnr_base"]
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_late_metrics_are_of_the_step_they_were_asked_in(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, training: bool
+) -> None:
+    options = {"num_downscales": 2, "resolution_schedule": 3000, "background_color": "black"}
+    model = perturb(build(**options)).train(training)
+
+    def asked() -> Any:
+        with torch.no_grad():
+            return model.get_metrics_dict(model.get_outputs(camera()), batch())
+
+    at_once, later = asked(), asked()
+    expected = [float(at_once[name]) for name in ("psnr", "psnr_base")]
+    model.train(not training)  # a viewer's thread, or an evaluation, in between
+    model.step = 9000
+    assert [float(later[name]) for name in ("psnr", "psnr_base")] == expected
+
+
+def test_lpips_is_not_built_and_not_saved(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("LPIPS was built")
+
+    monkeypatch.setattr(torchmetrics.image.LearnedPerceptualImagePatchSimilarity, "__init__", refuse)
+    model = build()
+    assert not [name for name in model.state_dict() if "lpips" in name]
+    assert not [name for name, _ in model.named_modules() if "lpips" in name]
+    # The field, the head and nerfstudio's empty marker of the device; nothing else costs bytes.
+    known = ("gauss_params.", "networks.head.", "device_indicator_param", "_extra_state", "ssim.", "camera_optimizer.")
+    assert not [name for name in model.state_dict() if not name.startswith(known)]
