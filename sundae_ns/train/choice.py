@@ -130,9 +130,9 @@ def best_head(tried: Sequence[Tried], folds: int) -> str:
 
 
 class HeadGain(NamedTuple):
-    """What a head has gained in trials with this number of Gaussians."""
+    """What a head has gained in its trials."""
 
-    primitives: int
+    num_gaussians: int  # In the trials
     psnr: float  # dB
     ssim: float
     ssim_db: float | None = None  # By how much 1 - SSIM has fallen, dB; None where images are too small for SSIM
@@ -152,11 +152,11 @@ class HeadGain(NamedTuple):
 
     def falls_by(self, count: int, power: float) -> float:
         """Factor of the gain at another count; below that of the trials it is not known to rise."""
-        return (self.primitives / max(count, self.primitives)) ** power
+        return (self.num_gaussians / max(count, self.num_gaussians)) ** power
 
     def bytes_of(self, count: int) -> int | None:
         """Estimated bytes of features and head with this number of Gaussians; None if unknown."""
-        return None if self.features is None else round(self.features * count / self.primitives) + self.head
+        return None if self.features is None else round(self.features * count / self.num_gaussians) + self.head
 
 
 def head_pays(curve: Sequence[CurvePoint], gain: HeadGain, tolerance: Tolerance) -> bool:

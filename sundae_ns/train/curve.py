@@ -92,7 +92,7 @@ def curve_table(points: Sequence[CurvePoint]) -> list[str]:
         ]
         for point in points
     ]
-    heads = ["primitives", "packed, MB", "PSNR, dB", "below the best", "SSIM", "below the best"]
+    heads = ["Gaussians", "packed, MB", "PSNR, dB", "below the best", "SSIM", "below the best"]
     return table(heads, rows, words=0)
 
 

@@ -138,7 +138,7 @@ class _Recording:
     graph: torch.cuda.CUDAGraph
     inputs: StepInputs  # The graph reads them here
     result: StepResult  # The graph writes it here
-    pairs: int  # Tile/primitive pairs that fit
+    pairs: int  # Tile/Gaussian pairs that fit
 
 
 class StepRecordings:

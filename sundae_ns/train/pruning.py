@@ -326,9 +326,9 @@ class ScheduledPruning(Callback):
     def finish(self, run: TrainingRun) -> None:
         """Report the peak, and warn if nothing was pruned."""
         state = run.state
-        primitives, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
-        log.info(f"peak: {primitives:,} Gaussians, {memory:,.0f} MB of {state.device.type} memory")
-        run.log_scalars("Peak", {"primitives": primitives, "memory_mb": memory})
+        peak, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
+        log.info(f"peak: {peak:,} Gaussians, {memory:,.0f} MB of {state.device.type} memory")
+        run.log_scalars("Peak", {"gaussians": peak, "memory_mb": memory})
         _warn_if_too_short(run, self.schedule.config, run.state.step)
 
 

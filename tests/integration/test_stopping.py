@@ -11,7 +11,7 @@ import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
-from trial_runs import LENGTH, PRUNE_AT, STEPS, records_of, same, served_views, tidy, tiny_run, tiny_scene
+from trial_runs import LENGTH, PRUNE_AT, STEPS, records_of, served_views, tidy, tiny_run, tiny_scene
 
 from sundae_ns.plugin import optimizer_configs as nerfstudio_configs
 from sundae_ns.train import averaging, choice, trials
@@ -177,11 +177,6 @@ def test_a_run_resumed_while_training_is_paused_has_figures(
     assert len(losses) == 2
     assert all(0 < loss < 1 for loss in losses)
     assert "PSNR" in capsys.readouterr().out
-    last = f"step-{STEPS - 1:09d}.ckpt"
-    a, b = (torch.load(one.checkpoint_dir / last, map_location="cpu", weights_only=True) for one in (whole, resumed))
-    for part in ("pipeline", "optimizers", "schedulers"):
-        same(a[part], b[part])
-    assert torch.equal(a["random"]["torch"], b["random"]["torch"])
 
 
 def test_a_run_trains_again_after_the_end_of_its_schedule(make: Make, curve: Curve) -> None:

@@ -307,9 +307,17 @@ def check_warm(tiny: Any, params: dict[str, Tensor], start: dict[str, Tensor], t
     assert load(trainer.checkpoint_dir / "step-000000002.ckpt")["step"] == 2
 
 
-def test_warm_start_from_a_checkpoint(tiny: Any, trainer_of: Any) -> None:
+@pytest.mark.parametrize("source", ["checkpoint", "ply", "exported"])
+def test_warm_start(tiny: Any, trainer_of: Any, tmp_path: Any, source: str, request: pytest.FixtureRequest) -> None:
     params = gaussians(load(tiny.checkpoint(119)))
-    check_warm(tiny, params, *warm(trainer_of, tiny.checkpoints))
+    params = {name: value for name, value in params.items() if name in SPLAT_NAMES}
+    path = tiny.checkpoints
+    if source == "exported":
+        path = request.getfixturevalue("exported")
+    elif source == "ply":
+        path = tmp_path / "a.ply"
+        write_ply(path, params, comments=[MODEL_FRAME])
+    check_warm(tiny, params, *warm(trainer_of, path))
 
 
 def test_warm_start_from_a_stock_checkpoint(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
@@ -325,17 +333,6 @@ def test_warm_start_from_a_stock_checkpoint(tiny: Any, trainer_of: Any, tmp_path
     with pytest.raises(Exception, match="[Ww]eights.only"):
         load(path)
     check_warm(tiny, params, *warm(trainer_of, path))
-
-
-def test_warm_start_from_a_ply(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
-    params = {name: value for name, value in gaussians(load(tiny.checkpoint(30))).items() if name in SPLAT_NAMES}
-    write_ply(tmp_path / "a.ply", params, comments=[MODEL_FRAME])
-    check_warm(tiny, params, *warm(trainer_of, tmp_path / "a.ply"))
-
-
-def test_warm_start_from_the_exported_ply(tiny: Any, trainer_of: Any, exported: Any) -> None:
-    params = {name: value for name, value in gaussians(load(tiny.checkpoint(119))).items() if name in SPLAT_NAMES}
-    check_warm(tiny, params, *warm(trainer_of, exported))
 
 
 def test_a_splatfacto_checkpoint_is_refused(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -28,7 +28,7 @@ def run_of(cameras: list[Camera], *, ranks: int = 1) -> TrainingRun:
     indices = list(range(len(cameras)))
     shown = [SimpleNamespace(camera=camera, mask=None) for camera in cameras]
     members = {"view_indices": lambda: indices, "training_views": lambda: shown, "images_per_step": ranks}
-    return cast(TrainingRun, SimpleNamespace(state=SimpleNamespace(step=0), **members))
+    return SimpleNamespace(state=SimpleNamespace(step=0), **members)
 
 
 def begin(mode: Literal["auto", "on", "off"] = "on") -> tuple[ExposureCompensation, TrainingRun]:

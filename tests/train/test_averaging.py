@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import torch
@@ -13,15 +13,12 @@ from sundae_ns.core.errors import ConfigError
 from sundae_ns.train import averaging
 from sundae_ns.train.averaging import Averaging
 from sundae_ns.train.build import check
-from sundae_ns.train.state import TrainingRun
 
 LAST = 99
 
 
-def run_of(state: Any, *, images: int = 1, last: int = LAST) -> TrainingRun:
-    return cast(
-        TrainingRun, SimpleNamespace(state=state, last_step=last, schedule_length=LAST + 1, images_per_step=images)
-    )
+def run_of(state: Any, *, images: int = 1, last: int = LAST, length: int = LAST + 1) -> Any:
+    return SimpleNamespace(state=state, last_step=last, schedule_length=length, images_per_step=images)
 
 
 @pytest.fixture
@@ -84,7 +81,7 @@ def test_unfinished_schedules_and_growing_fields_keep_their_weights(state: Any) 
     for mean, length in ((Averaging(0.1, settled_at=1000), LAST + 1), (Averaging(0.1, settled_at=0), 2 * LAST)):
         state.step = LAST
         before = state.gaussians["means"].detach().clone()
-        mean.after_step(cast(TrainingRun, SimpleNamespace(state=state, last_step=LAST, schedule_length=length)))
+        mean.after_step(run_of(state, length=length))
         assert torch.equal(state.gaussians["means"], before)
 
 

@@ -45,7 +45,7 @@ class FakeRun:
         for number in range(1, most + 1):
             self.state.step += 1
             self.state.gaussians["means"].data += 1
-            if trials.after_step(self):  # type: ignore[arg-type]
+            if trials.after_step(self):
                 return number
         return most
 
@@ -76,21 +76,21 @@ def test_trials_of_several_lengths_go_back_to_any_kept_field(run: FakeRun) -> No
         return state.step - (decay.pruned_at or 0)
 
     trials.keep("first", state, head=False)
-    trials.start(run, Trial(5, held_out=[2]))  # type: ignore[arg-type]
+    trials.start(run, Trial(5, held_out=[2]))
     assert run.held_out == [2]
     assert run.train(trials) == 5
     trials.keep("second", state, head=False)
-    trials.start(run, Trial(3, held_out=[4]))  # type: ignore[arg-type]
+    trials.start(run, Trial(3, held_out=[4]))
     assert (run.train(trials), run.held_out, height(run)) == (3, [4], 8.0)
     trials.go_back("second", state)
     assert (height(run), trials.taken_back, age()) == (5.0, 3, 5)
-    trials.start(run, Trial(4))  # type: ignore[arg-type]
+    trials.start(run, Trial(4))
     run.train(trials, most=2)
     trials.go_back("first", state)
     assert (height(run), trials.taken_back, age()) == (0.0, 3 + 2 + 5, 0)
     trials.go_back("second", state)  # its five steps count again
     assert (height(run), trials.taken_back, age()) == (5.0, 5, 5)
-    trials.end(run, "count")  # type: ignore[arg-type]
+    trials.end(run, "count")
     assert (run.held_out, trials.trial, trials.kept) == ([], None, {})
 
 
@@ -106,19 +106,19 @@ def test_the_mean_of_the_last_weights_is_measured(
 
     monkeypatch.setattr(trials_module, "measure_heldout", measured)
     trials = TrialEngine()
-    trials.start(run, Trial(5, averaged=averaged))  # type: ignore[arg-type]
+    trials.start(run, Trial(5, averaged=averaged))
     run.train(trials)
-    assert trials.measure(run) == [VIEW]  # type: ignore[arg-type]
+    assert trials.measure(run) == [VIEW]
     assert (seen, height(run)) == ([shown], own)
 
 
 def test_a_field_is_provisional_until_the_trials_end(run: FakeRun) -> None:
     state, trials = run.state, TrialEngine(head_starts_at=2)
-    trials.start(run, Trial(5, num_features=5, counts=False))  # type: ignore[arg-type]
+    trials.start(run, Trial(5, num_features=5, counts=False))
     run.train(trials)
     assert state.head_enabled
     assert state.provisional
-    trials.end(run, "count")  # type: ignore[arg-type]
+    trials.end(run, "count")
     assert not state.provisional
     assert state.schedule_step - state.head_starts_at - trials.taken_back == 3
 
@@ -127,10 +127,10 @@ def test_another_width_begins_with_a_fresh_head_and_a_kept_one_comes_back(run: F
     state, trials = run.state, TrialEngine()
     weights = {name: value.clone() for name, value in state.head.named_parameters()}
     trials.keep("start", state, head=True)
-    trials.start(run, Trial(2, num_features=29))  # type: ignore[arg-type]
+    trials.start(run, Trial(2, num_features=29))
     assert (state.head.config.num_features, state.gaussians["features"].shape) == (29, (20, 29))
     trials.go_back("start", state)
-    trials.start(run, Trial(2, num_features=0))  # type: ignore[arg-type]
+    trials.start(run, Trial(2, num_features=0))
     assert not state.head_enabled
     assert (state.head.config.num_features, state.gaussians["features"].shape) == (5, (20, 5))
     assert all(torch.equal(value, weights[name]) for name, value in state.head.named_parameters())
@@ -139,14 +139,14 @@ def test_another_width_begins_with_a_fresh_head_and_a_kept_one_comes_back(run: F
 def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun) -> None:
     trials, other, state = TrialEngine(), TrialEngine(), run.state
     trials.keep("first", state, head=False)
-    trials.start(run, Trial(6, held_out=[1, 3], averaged=5, counts=False))  # type: ignore[arg-type]
+    trials.start(run, Trial(6, held_out=[1, 3], averaged=5, counts=False))
     run.train(trials, most=4)
     saved = copy.deepcopy(trials.state_dict())
     state.provisional = False
     other.load_state_dict(state, saved)
     assert state.provisional
     run.held_out = []
-    other.hold_out(run)  # type: ignore[arg-type]
+    other.hold_out(run)
     assert run.held_out == [1, 3]
     assert run.train(other) == 2
     other.take_mean(state)
@@ -163,17 +163,13 @@ def test_the_mode_auto_adds_a_trial_and_the_others_do_not(build: Build) -> None:
     assert names.index("trials") < names.index("pruning") < names.index("after-prune")
 
 
-def test_an_undecided_head_is_residual_and_disabled(build: Build) -> None:
+def test_a_head_is_undecided_by_default_and_then_residual_and_disabled(build: Build) -> None:
+    assert HeadConfig().mode == "auto"
     model = build(head={"mode": "auto"})
     model.step = 10**6
     assert model.head is not None
     assert model.head.config.mode == "residual"
     assert not model.state.head_enabled
-
-
-def test_a_head_is_undecided_by_default_and_then_residual() -> None:
-    assert HeadConfig().mode == "auto"
-    assert CompensationHead(HeadConfig()).config.mode == "residual"
 
 
 def test_a_removed_head_leaves_no_values_and_no_moments(build: Build) -> None:
