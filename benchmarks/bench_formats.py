@@ -114,13 +114,24 @@ def place_of(row: dict[str, Any]) -> tuple[str, ...]:
 def merge_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Write rows into a file, in place of those that they measure again."""
     measured = set(map(place_of, rows))
-    old = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines())) if path.exists() else []
+    replace_rows(path, [*(row for row in read_rows(path) if place_of(row) not in measured), *rows], COLUMNS)
+
+
+def read_rows(path: Path | None) -> list[dict[str, Any]]:
+    """The rows of a table; none if there is none yet."""
+    if path is None or not path.exists():
+        return []
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+def replace_rows(path: Path, rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
+    """Write a table atomically."""
     with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        write_rows(file, [*(row for row in old if place_of(row) not in measured), *rows])
+        write_rows(file, rows, columns)
 
 
-def write_rows(file: TextIO, rows: Sequence[dict[str, Any]]) -> None:
-    writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+def write_rows(file: TextIO, rows: Sequence[dict[str, Any]], columns: Sequence[str] = COLUMNS) -> None:
+    writer = csv.DictWriter(file, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
 

@@ -61,10 +61,8 @@ def _scene(path: Path, degree: int, kind: tuple[Any, int, int] | None) -> bytes:
     torch.manual_seed(degree)
     points = torch.rand(POINTS, 3) - 0.5
     width = kind[2] if kind else 1
-    gaussians = {
-        k: v.detach()
-        for k, v in from_points(points, torch.rand(POINTS, 3), sh_degree=degree, num_features=width).items()
-    }
+    made = from_points(points, torch.rand(POINTS, 3), sh_degree=degree, num_features=width)
+    gaussians = {name: value.detach() for name, value in made.items()}
     gaussians["features_rest"] = 0.2 * torch.randn(POINTS, (degree + 1) ** 2 - 1, 3)
     gaussians["quats"] = torch.randn(POINTS, 4)
     head, stated = {}, None
@@ -73,14 +71,11 @@ def _scene(path: Path, degree: int, kind: tuple[Any, int, int] | None) -> bytes:
     else:
         gaussians["features"] = torch.randn(POINTS, width)
         config = HeadConfig(mode=kind[0], size="tiny", pixel_unshuffle=kind[1], num_features=width)
+        weights = CompensationHead(config).state_dict()
         # Few weights that are not zero: zeros decode fast.
-        head = {
-            name: value * (torch.rand_like(value) < 0.002)
-            for name, value in CompensationHead(config).state_dict().items()
-        }
-        stated = {
-            name: getattr(config, name) for name in ("mode", "size", "pixel_unshuffle", "num_features", "precision")
-        }
+        head = {name: value * (torch.rand_like(value) < 0.002) for name, value in weights.items()}
+        names = ("mode", "size", "pixel_unshuffle", "num_features", "precision")
+        stated = {name: getattr(config, name) for name in names}
     poses = torch.eye(4)[:3].repeat(2, 1, 1)
     poses[:, 2, 3] = torch.tensor([2.0, 0.3])
     lens = torch.tensor([[20.0, 21.0, 12.0, 9.0]]).double().repeat(2, 1)
@@ -92,11 +87,8 @@ def _scene(path: Path, degree: int, kind: tuple[Any, int, int] | None) -> bytes:
         "head": stated,
         "trained_focal": [20.0, 21.0] if stated else None,
     }
-    meta = {
-        "model": model,
-        "source": {"method": "sundae", "step": 9},
-        "frame": {"transform": torch.eye(4).tolist(), "scale": 1.0},
-    }
+    frame = {"transform": torch.eye(4).tolist(), "scale": 1.0}
+    meta = {"model": model, "source": {"method": "sundae", "step": 9}, "frame": frame}
     if degree % 2:
         meta["up"] = [0.6, 0.0, -0.8]
         meta["start"] = {"pose": poses[1].tolist(), "intrinsics": lens[1].tolist(), "size": [24, 18]}
@@ -131,11 +123,7 @@ def python_verdict(path: Path) -> Verdict:
     digest = hashlib.sha256(packed.gaussians["means"].numpy().tobytes())
     for name in sorted(packed.head):
         digest.update(packed.head[name].contiguous().numpy().tobytes())
-    cameras = packed.cameras or {
-        "poses": torch.zeros(0, 3, 4),
-        "intrinsics": torch.zeros(0, 4),
-        "sizes": torch.zeros(0, 2),
-    }
+    cameras = packed.cameras or dict.fromkeys(("poses", "intrinsics", "sizes"), torch.zeros(0))
     for pose, lens, size in zip(cameras["poses"], cameras["intrinsics"], cameras["sizes"], strict=True):
         digest.update(torch.cat([pose.reshape(-1).double(), lens, size.double()]).numpy().tobytes())
     rest, start = packed.gaussians["features_rest"].shape[1], packed.meta.get("start")
@@ -231,19 +219,8 @@ def main() -> None:
     started = time.perf_counter()
     tally, problems = run(options.count, options.seed, options.keep)
     print("\n".join(problems), file=sys.stderr)
-    seconds = round(time.perf_counter() - started)
-    print(
-        json.dumps(
-            {
-                "benchmark": "fuzz_packs",
-                "files": options.count,
-                "seed": options.seed,
-                **tally,
-                "differences": len(problems),
-                "seconds": seconds,
-            }
-        )
-    )
+    row = {"benchmark": "fuzz_packs", "files": options.count, "seed": options.seed, **tally}
+    print(json.dumps({**row, "differences": len(problems), "seconds": round(time.perf_counter() - started)}))
     sys.exit(1 if problems else 0)
 
 

@@ -2,18 +2,17 @@
 
     python benchmarks/kill_and_resume.py                       # all kinds on a CPU: 20 + 10 + 24 kills
     python benchmarks/kill_and_resume.py --kinds training --kills 3 --seed 1
-    python benchmarks/kill_and_resume.py --kinds training trials --device cuda             # recorded steps
+    python benchmarks/kill_and_resume.py --kinds training trials --device cuda             # captured steps
     python benchmarks/kill_and_resume.py --kinds training --device cuda --gpus 2           # at any time, any process
 
 - ``training``: while saving, while pruning, at any time.
 - ``trials``: the same in the trials of a head and of a length.
 - ``commands``: prune, pack and export over an older result: while the file is written, before it is renamed, at any
-  time. Afterwards the older result or the whole new one must be there, and the same command must succeed.
+  time. Afterwards the older result or the new one must be complete, and the same command must succeed.
 
-Every run is nerfstudio's own training command, or one of sundae, on a ray-traced scene, in a process of its own. A
-server process without threads imports nerfstudio once and forks the runs. Exits with 1 if anything was lost. On a CPU a
-resumed run must be the same bit for bit. On CUDA sums have no fixed order, so that runs of one seed differ and may even
-decide differently: there its test views must be as good as those of two undisturbed runs, less ``SPREAD`` dB.
+Every run is nerfstudio's own training command, or one of sundae, on a ray-traced scene, in a process of its own. Exits
+with 1 if anything was lost. On a CPU a resumed run must be the same bit for bit. On CUDA sums have no fixed order, so
+its test views must be as good as those of two undisturbed runs, less ``SPREAD`` dB.
 """
 
 from __future__ import annotations
@@ -25,11 +24,9 @@ import shutil
 import signal
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass
 from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -43,7 +40,7 @@ from rich.progress import track
 
 import sundae_ns as sn
 from harness import killing
-from harness.processes import Bench, command_here, train_here
+from harness.killing import Bench, command_here, train_here
 from harness.still_life import write_still_life
 from sundae_ns.core.errors import CheckpointError
 from sundae_ns.io import checkpoint
@@ -53,42 +50,41 @@ from sundae_ns.plugin.finished_runs import load_model
 SPREAD = 3.0
 """Decibels that a resumed run on CUDA may be below the worse of two undisturbed ones."""
 ANY = "any time"
-
-
-@dataclass(frozen=True)
-class Training:
-    """A training that is killed."""
-
-    steps: int
-    save_every: int
-    places: dict[str, killing.Place]
-    options: str
-
-    def words(self, scene: Path) -> list[str]:
-        """Arguments of ``ns-train``."""
-        own = f"--max-num-iterations {self.steps} --steps-per-save {self.save_every} {self.options}"
-        return ["sundae-tiny", "--data", str(scene), *COMMON.split(), *own.split()]
-
-
+KILLS = {"training": 20, "trials": 10, "commands": 24}
 COMMON = """
 --experiment-name e --timestamp t --viewer.quit-on-train-completion True --viewer.websocket-host 127.0.0.1
 --steps-per-eval-image 25 --pipeline.model.warmup-length 5 --pipeline.model.refine-every 10
---pipeline.model.densify-grad-thresh 0.0004 --pipeline.model.sh-degree-interval 20
+--pipeline.model.densify-grad-thresh 0.0004 --pipeline.model.sh-degree-interval 20 --vis tensorboard
 """
-TRAININGS = {
-    "training": Training(70, 12, killing.TRAINING, "--vis tensorboard --pipeline.model.pruning.prune-at 36"),
+# Steps, steps between saves, places of kills, further options.
+TRAININGS: dict[str, tuple[int, int, dict[str, killing.Place], str]] = {
+    "training": (70, 12, killing.TRAINING, "--pipeline.model.pruning.prune-at 36"),
     # Trials begin at the prune. With eight views each candidate is tried twice, for four steps.
-    "trials": Training(
-        160,
-        9,
-        killing.TRIALS,
-        "--vis tensorboard --pipeline.model.pruning.prune-at 40 --pipeline.model.head.mode auto",
-    ),
+    "trials": (160, 9, killing.TRIALS, "--pipeline.model.pruning.prune-at 40 --pipeline.model.head.mode auto"),
 }
-KILLS = {"training": 20, "trials": 10, "commands": 24}
+COMMANDS = {
+    "pruned.ply": ["prune", "PLY", "--num-cameras", "8"],
+    "pruned.sundae": ["prune", "RUN", "--num-cameras", "8"],
+    "packed.sundae": ["pack", "RUN"],
+    "tuned.sundae": ["pack", "RUN", "--finetune", "10"],
+    "page.html": ["export", "RUN"],
+    "page": ["export", "RUN"],
+    "viewers.spz": ["export", "RUN"],
+    "viewers.sog": ["export", "PLY"],
+}
+"""Commands that write, by the name of their output."""
 
 
-# ------------------------------------------------------------------------------------------------------------ trainings
+def config_of(kind: str, options: argparse.Namespace, folder: Path) -> TrainerConfig:
+    """Configuration of a training on a small scene, which is written to the folder if it is not there."""
+    steps, save_every, _, more = TRAININGS[kind]
+    scene = folder / "scene"
+    if not scene.exists():
+        write_still_life(scene, train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
+    words = f"--max-num-iterations {steps} --steps-per-save {save_every} {COMMON} {more}".split()
+    config: TrainerConfig = tyro.cli(AnnotatedBaseConfigUnion, args=["sundae-tiny", "--data", str(scene), *words])
+    config.machine.device_type, config.machine.num_devices = options.device, options.gpus
+    return config
 
 
 def run_folder(config: TrainerConfig) -> Path:
@@ -109,8 +105,11 @@ def outcome(folder: Path, steps: int) -> dict[str, Any]:
     }
 
 
-def same_tensors(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    """Whether two runs have the same tensors and records."""
+    tensors = a["tensors"].keys() == b["tensors"].keys()
+    tensors = tensors and all(torch.equal(a["tensors"][name], b["tensors"][name]) for name in a["tensors"])
+    return bool(tensors and a["prunes"] == b["prunes"] and a["trials"] == b["trials"])
 
 
 def quality(run: Path) -> float:
@@ -121,110 +120,71 @@ def quality(run: Path) -> float:
 
 
 def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: Path, kills: int) -> dict[str, Any]:
-    """Kill trainings of one kind; what came of it, with ``lost`` for the number of those that ended otherwise."""
-    what, rng = TRAININGS[kind], random.Random(options.seed)
-    scene = root / "scene"
-    if not scene.exists():
-        write_still_life(scene, train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
-    parsed = tyro.cli(AnnotatedBaseConfigUnion, args=what.words(scene))
-    parsed.machine.device_type, parsed.machine.num_devices = options.device, options.gpus
-    exact = options.device == "cpu"
+    """Kill trainings of one kind; counts of the outcomes, with ``lost`` for those that differ."""
+    (steps, save_every, inner, _), rng = TRAININGS[kind], random.Random(options.seed)
+    parsed, exact = config_of(kind, options, root), options.device == "cpu"
 
     def configured(name: str) -> TrainerConfig:
         config = deepcopy(parsed)
         config.output_dir = root / kind / name
         return config
 
-    def started(config: TrainerConfig, place: str | None = None, nth: int = 1) -> BaseProcess:
-        return bench.start(train_here, config, bench.log, place, nth)
-
-    def trained(config: TrainerConfig) -> float:
-        began = time.monotonic()
-        bench.finish(started(config))
-        return time.monotonic() - began
-
-    whole, second = configured("whole"), configured("again")
-    trained(whole)
-    seconds = trained(second)  # again: the time of a run, and whether the same seed gives the same
-    reference, repeated = (outcome(run_folder(config), what.steps) for config in (whole, second))
-    repeatable = not exact or all(
-        (same_tensors(reference["tensors"], repeated["tensors"]), reference["prunes"] == repeated["prunes"])
-    )
-    undisturbed = [] if exact else [quality(run_folder(config)) for config in (whole, second)]
+    undisturbed = [configured("first"), configured("second")]
+    seconds = [bench.finish(train_here, config) for config in undisturbed][1]
+    reference, repeated = (outcome(run_folder(config), steps) for config in undisturbed)
+    repeatable = not exact or same(reference, repeated)
+    psnr = [] if exact else [quality(run_folder(config)) for config in undisturbed]
 
     tally: Counter[str] = Counter()
-    lost = 0
-    resumed_psnr: list[float] = []
     decisions: Counter[str] = Counter()
+    resumed_psnr: list[float] = []
+    lost = 0
     # One kill at each place, then random ones; half of the rest at any time. Ranks have modules of their own.
-    every = [ANY, *(what.places if options.gpus == 1 else ())]
+    every = [ANY, *(inner if options.gpus == 1 else ())]
     # A seed starts where those before it end, so that short calls reach every place.
     numbers = range(options.seed * kills, (options.seed + 1) * kills)
     places = [every[i] if i < len(every) else ANY if i % 2 else rng.choice(every) for i in numbers]
     for number, place in enumerate(track(places, description=f"Killing: {kind}", transient=True)):
-        config = configured(f"killed-{number}")
+        config, nth = configured(f"killed-{number}"), rng.randint(1, 5)
         folder = run_folder(config)
         models = folder / "nerfstudio_models"
-        nth = rng.randint(1, 5)
         if place == ANY:
-            again = partial(shutil.rmtree, folder)
-            killed = bench.killed_at_any_time(partial(started, config), again, seconds, rng)
+            start, again = partial(bench.start, train_here, config), partial(shutil.rmtree, folder)
+            killed = bench.killed_at_any_time(start, again, seconds, rng)
         else:
-            killed = bench.ended(started(config, place, nth)) == -signal.SIGKILL
+            killed = bench.ended(bench.start(train_here, config, place, nth)) == -signal.SIGKILL
         tally["killed"] += killed
         tally[f"at {place}"] += killed
         try:
             done = int(checkpoint.newest_whole(models)[0].stem.partition("-")[2]) + 1
-            tally["resumed" if done < what.steps else "killed after the last save"] += 1
+            tally["resumed" if done < steps else "killed after the last save"] += 1
         except CheckpointError:
             done = 0
             tally["killed before the first save, so started anew"] += 1
-        if done < what.steps:
-            resumed = configured(f"killed-{number}")
-            resumed.max_num_iterations = what.steps - done
-            resumed.load_dir = models if done else None
-            trained(resumed)
-        found = outcome(folder, what.steps)
-        one_prune = len(found["prunes"]) == 1 and found["prunes"][0]["step"] == reference["prunes"][0]["step"]
-        clean = done == what.steps or found["files"] == reference["files"]
-        if exact:
-            same = same_tensors(found["tensors"], reference["tensors"])
-            same = same and found["prunes"] == reference["prunes"] and found["trials"] == reference["trials"]
-        else:
+        if done < steps:
+            config.max_num_iterations, config.load_dir = steps - done, models if done else None
+            bench.finish(train_here, config)
+        result = outcome(folder, steps)
+        one_prune = len(result["prunes"]) == 1 and result["prunes"][0]["step"] == reference["prunes"][0]["step"]
+        clean = done == steps or result["files"] == reference["files"]
+        if not exact:
             resumed_psnr.append(quality(folder))
-            same = resumed_psnr[-1] > min(undisturbed) - SPREAD
-        decisions[found["trials"].get("trials.json", {}).get("head", {}).get("decision", "")] += 1
-        for name, held in (("one prune", one_prune), ("the same result", same), ("nothing left lying", clean)):
+        equal = same(result, reference) if exact else resumed_psnr[-1] > min(psnr) - SPREAD
+        decisions[result["trials"].get("trials.json", {}).get("head", {}).get("decision", "")] += 1
+        for name, held in (("one prune", one_prune), ("the same result", equal), ("nothing left lying", clean)):
             tally[name] += held
-        lost += not (killed and one_prune and same and clean)
+        lost += not (killed and one_prune and equal and clean)
         shutil.rmtree(config.output_dir)
     about = {
-        "steps": what.steps,
-        "save_every": what.save_every,
+        "steps": steps,
+        "save_every": save_every,
         "primitives": [reference["prunes"][0]["before"], reference["prunes"][0]["after"]],
         **({"decision": reference["trials"]["trials.json"]["head"]["decision"]} if kind == "trials" else {}),
         **({"decisions after kills": decisions} if kind == "trials" and not exact else {}),
         "same seed, same result": repeatable if exact else None,
-        **({} if exact else {"psnr, undisturbed": undisturbed, "psnr, resumed": resumed_psnr}),
+        **({} if exact else {"psnr, undisturbed": psnr, "psnr, resumed": resumed_psnr}),
     }
     return {**about, **tally, "lost": lost + (not repeatable)}
-
-
-# ------------------------------------------------------------------------------------------------------------- commands
-
-
-def commands(run: Path, ply: Path) -> dict[str, list[str]]:
-    """Commands that write, without their output, by its name."""
-    return {
-        "pruned.ply": ["prune", str(ply), "--num-cameras", "8"],
-        "pruned.sundae": ["prune", str(run), "--num-cameras", "8"],
-        "packed.sundae": ["pack", str(run)],
-        "tuned.sundae": ["pack", str(run), "--finetune", "10"],
-        "page.html": ["export", str(run)],
-        "page": ["export", str(run)],
-        "viewers.spz": ["export", str(run)],
-        "viewers.sog": ["export", str(ply)],
-    }
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -248,61 +208,55 @@ def is_whole(path: Path) -> bool:
         return False
 
 
-def kill_commands(options: argparse.Namespace, bench: Bench, root: Path, kills: int) -> dict[str, Any]:
+def kill_commands(kind: str, options: argparse.Namespace, bench: Bench, root: Path, kills: int) -> dict[str, Any]:
     """Kill commands that write over older results; as :func:`kill_trainings`."""
-    rng, folder, exact = random.Random(options.seed), root / "commands", not torch.cuda.is_available()
-    scene = write_still_life(folder / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=TRAININGS["training"].words(scene))
-    config.output_dir, config.machine.device_type = folder / "out", options.device
-    bench.finish(bench.start(train_here, config, bench.log, None, 1))
-    ply = folder / "scene.ply"
-    bench.finish(bench.start(command_here, ["export", str(run_folder(config)), "-o", str(ply)], bench.log, None))
-    jobs = commands(run_folder(config), ply)
+    rng, folder, exact = random.Random(options.seed), root / kind, not torch.cuda.is_available()
+    config = config_of("training", options, folder)
+    config.output_dir = folder / "out"
+    bench.finish(train_here, config)
+    inputs = {"RUN": str(run_folder(config)), "PLY": str(folder / "scene.ply")}
+    bench.finish(command_here, ["export", inputs["RUN"], "-o", inputs["PLY"]])
+    outputs = {name: folder / "written" / name.replace(".", "-") for name in COMMANDS}
 
-    def place_of(name: str) -> Path:
-        return folder / "written" / name.replace(".", "-")
-
-    def begin(name: str, place: str | None = None) -> BaseProcess:
-        words = [*jobs[name], "-o", str(place_of(name) / name), "--overwrite"]
-        return bench.start(command_here, words, bench.log, place)
+    def words(name: str) -> list[str]:
+        return [*(inputs.get(word, word) for word in COMMANDS[name]), "-o", str(outputs[name] / name), "--overwrite"]
 
     fresh: dict[str, dict[str, bytes]] = {}
     seconds: dict[str, float] = {}
-    for name in jobs:
-        place_of(name).mkdir(parents=True)
-        began = time.monotonic()
-        bench.finish(begin(name))
-        seconds[name] = time.monotonic() - began
-        fresh[name] = contents(place_of(name))
+    for name, output in outputs.items():
+        output.mkdir(parents=True)
+        seconds[name] = bench.finish(command_here, words(name))
+        fresh[name] = contents(output)
 
     tally: Counter[str] = Counter()
     lost = 0
     every = [ANY, *killing.COMMANDS]
     numbers = range(options.seed * kills, (options.seed + 1) * kills)
     for number in track(numbers, description="Killing: commands", transient=True):
-        name, place = list(jobs)[number % len(jobs)], every[(number // len(jobs)) % len(every)]
-        older = dict.fromkeys(fresh[name], b"older")
-        age = partial(write_all, place_of(name), older)
+        name, place = list(COMMANDS)[number % len(COMMANDS)], every[(number // len(COMMANDS)) % len(every)]
+        output, older = outputs[name], dict.fromkeys(fresh[name], b"older")
+        age: partial[None] = partial(write_all, output, older)
         age()
+        start: partial[BaseProcess] = partial(bench.start, command_here, words(name))
         if place == ANY:
-            killed = bench.killed_at_any_time(partial(begin, name), age, seconds[name], rng)
+            killed = bench.killed_at_any_time(start, age, seconds[name], rng)
         else:
-            killed = bench.ended(begin(name, place)) == -signal.SIGKILL
-        found = contents(place_of(name))
+            killed = bench.ended(start(place)) == -signal.SIGKILL
+        left = contents(output)
         kept = all(
-            found.get(path) in (older[path], fresh[name][path]) or (not exact and is_whole(place_of(name) / path))
+            left.get(path) in (older[path], fresh[name][path]) or (not exact and is_whole(output / path))
             for path in older
         )
-        bench.finish(begin(name))
-        last = contents(place_of(name))
-        again = last == fresh[name] if exact else all(is_whole(place_of(name) / path) for path in last)
+        bench.finish(command_here, words(name))
+        last = contents(output)
+        again = last == fresh[name] if exact else all(is_whole(output / path) for path in last)
         again = again and last.keys() == older.keys()
         tally["killed"] += killed
         tally[f"at {place}"] += killed
         tally["older or new, and whole"] += kept
         tally["then the same command succeeds, and nothing is left lying"] += again
         lost += not (killed and kept and again)
-    return {"commands": {name: words[0] for name, words in jobs.items()}, **tally, "lost": lost}
+    return {"commands": {name: words[0] for name, words in COMMANDS.items()}, **tally, "lost": lost}
 
 
 def main() -> None:
@@ -322,8 +276,7 @@ def main() -> None:
     lost = 0
     for kind in options.kinds:
         kills = options.kills or KILLS[kind]
-        work = (options, bench, root, kills)
-        result = kill_commands(*work) if kind == "commands" else kill_trainings(kind, *work)
+        result = (kill_commands if kind == "commands" else kill_trainings)(kind, options, bench, root, kills)
         lost += result["lost"]
         device = torch.cuda.get_device_name(0) if options.device == "cuda" else "cpu"
         print(json.dumps({"kind": kind, "device": device, "ranks": options.gpus, "kills": kills, **result}), flush=True)

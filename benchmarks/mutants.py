@@ -27,9 +27,9 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from copy import deepcopy
+from copy import copy, deepcopy
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 # Imported here, and so once for all processes: all but the package and its tests.
 import hypothesis  # noqa: F401
@@ -48,28 +48,17 @@ SECONDS = 120
 """A changed module counts as noticed if its tests take longer than this: they hang."""
 
 
-class Room(NamedTuple):
-    """Modules, and the tests that should notice a change in them."""
-
-    modules: tuple[str, ...]
-    """Globs below the package."""
-    tests: tuple[str, ...]
-    """Globs below ``tests``; the test named like the changed module runs first."""
-    functions: tuple[str, ...] = ()
-    """Only these functions change; empty for whole modules."""
-
-
-ROOMS = {
-    "pruning": Room(("pruning/[!_]*.py",), ("pruning/test_*.py", "train/test_schedules.py")),
-    "schedules": Room(
+# Modules below the package, and tests that should notice a change in them; that named like the module runs first.
+ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "pruning": (("pruning/[!_]*.py",), ("pruning/test_*.py", "train/test_schedules.py")),
+    "schedules": (
         ("train/pruning.py", "train/choice.py"),
         ("train/test_schedules.py", "train/test_choice.py", "train/test_golden_trials.py"),
     ),
-    "surgery": Room(("core/surgery.py", "core/merging.py"), ("core/test_*.py",)),
-    "packing": Room(("io/pack/[!_]*.py",), ("io/pack/test_*.py", "fuzz/test_readers.py")),
+    "surgery": (("core/surgery.py", "core/merging.py"), ("core/test_*.py",)),
+    "packing": (("io/pack/[!_]*.py",), ("io/pack/test_*.py", "fuzz/test_readers.py")),
 }
-
-_COMPARE: dict[type[ast.cmpop], type[ast.cmpop]] = {
+OTHERS: dict[type[ast.AST], Any] = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
     ast.Gt: ast.GtE,
@@ -80,8 +69,6 @@ _COMPARE: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.IsNot: ast.Is,
     ast.In: ast.NotIn,
     ast.NotIn: ast.In,
-}
-_ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
     ast.Add: ast.Sub,
     ast.Sub: ast.Add,
     ast.Mult: ast.Div,
@@ -90,72 +77,63 @@ _ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
     ast.Mod: ast.Mult,
     ast.BitAnd: ast.BitOr,
     ast.BitOr: ast.BitAnd,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
 }
-_NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "floor": "ceil", "ceil": "floor"}
-_LEFT_ALONE = (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)
-
-
-def sites(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Every place that can change: its number in :func:`walk`, and the kind of change."""
-    for index, node in enumerate(walk(tree)):
-        if isinstance(node, ast.Compare):
-            yield index, "compare"
-        elif isinstance(node, (ast.BinOp, ast.AugAssign)) and type(node.op) in _ARITHMETIC:
-            yield index, "arithmetic"
-        elif isinstance(node, ast.BoolOp):
-            yield index, "and or"
-        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.Not, ast.Invert)):
-            yield index, "not"
-        elif isinstance(node, ast.Constant) and isinstance(node.value, (bool, int, float)):
-            yield index, "constant"
-        elif (isinstance(node, ast.Name) and node.id in _NAMES) or (
-            isinstance(node, ast.Attribute) and node.attr in _NAMES
-        ):
-            yield index, "name"
-        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
-            yield index, "left out"
+"""The operator in place of another."""
+NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "floor": "ceil", "ceil": "floor"}
 
 
 def walk(node: ast.AST) -> Iterator[ast.AST]:
     """Nodes that may change, in a fixed order."""
     yield node
     for name, value in ast.iter_fields(node):
-        if name in ("annotation", "returns", "decorator_list"):
-            continue
-        if (
-            isinstance(node, ast.AnnAssign)
-            and name == "value"
-            and isinstance(getattr(node, "parent", None), ast.ClassDef)
-        ):
+        default = isinstance(node, ast.AnnAssign) and isinstance(getattr(node, "parent", None), ast.ClassDef)
+        if name in ("annotation", "returns", "decorator_list") or (default and name == "value"):
             continue
         for child in value if isinstance(value, list) else [value]:
-            if isinstance(child, ast.AST) and not isinstance(child, _LEFT_ALONE):
+            if isinstance(child, ast.AST) and not isinstance(
+                child, (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)
+            ):
                 child.parent = node  # type: ignore[attr-defined]
                 yield from walk(child)
 
 
-def change(tree: ast.AST, index: int, kind: str) -> str:
-    """Change one place in ``tree``, and describe it."""
-    node: Any = next(node for i, node in enumerate(walk(tree)) if i == index)
-    before = ast.unparse(node)
-    if kind == "compare":
-        node.ops[0] = _COMPARE[type(node.ops[0])]()
-    elif kind == "arithmetic":
-        node.op = _ARITHMETIC[type(node.op)]()
-    elif kind == "and or":
-        node.op = ast.Or() if isinstance(node.op, ast.And) else ast.And()
-    elif kind == "not":
+def changed(node: Any) -> bool:
+    """Change a node, if it is of a kind that changes; whether it is."""
+    if isinstance(node, ast.Compare):
+        node.ops = [OTHERS[type(node.ops[0])](), *node.ops[1:]]
+    elif isinstance(node, (ast.BinOp, ast.AugAssign, ast.BoolOp)) and type(node.op) in OTHERS:
+        node.op = OTHERS[type(node.op)]()
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.Not, ast.Invert)):
         node.operand = ast.UnaryOp(node.op, node.operand)  # twice cancels
-    elif kind == "constant":
-        value = node.value
-        node.value = (
-            (not value) if isinstance(value, bool) else value + 1 if isinstance(value, int) else value * 2 + 1e-3
-        )
-    elif kind == "name":
-        gaussians = "id" if isinstance(node, ast.Name) else "attr"
-        setattr(node, gaussians, _NAMES[getattr(node, gaussians)])
-    else:
+    elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
+        node.value = not node.value
+    elif isinstance(node, ast.Constant) and isinstance(node.value, int):
+        node.value += 1
+    elif isinstance(node, ast.Constant) and isinstance(node.value, float):
+        node.value = node.value * 2 + 1e-3
+    elif isinstance(node, ast.Name) and node.id in NAMES:
+        node.id = NAMES[node.id]
+    elif isinstance(node, ast.Attribute) and node.attr in NAMES:
+        node.attr = NAMES[node.attr]
+    elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
         node.value = ast.Constant(None)
+    else:
+        return False
+    return True
+
+
+def places(tree: ast.AST) -> list[int]:
+    """Numbers in :func:`walk` of the nodes that can change."""
+    return [number for number, node in enumerate(list(walk(tree))) if changed(copy(node))]
+
+
+def change(tree: ast.AST, number: int) -> str:
+    """Change a node of a tree, and describe the change."""
+    node: Any = list(walk(tree))[number]
+    before = ast.unparse(node)
+    changed(node)
     return f"line {node.lineno}: {before}  ->  {ast.unparse(node)}"
 
 
@@ -176,32 +154,9 @@ class Changed(importlib.abc.SourceLoader, importlib.abc.MetaPathFinder):  # type
         return self.source.encode()
 
 
-def parse(room: Room) -> dict[Path, ast.Module]:
-    """Syntax trees of the room's modules."""
-    return {path: ast.parse(path.read_text()) for glob in room.modules for path in sorted(PACKAGE.glob(glob))}
-
-
-def places(room: Room, trees: dict[Path, ast.Module]) -> list[tuple[Path, int, str]]:
-    """Every place of a room that can change: module, number in :func:`walk`, kind of change."""
-    found = []
-    for path, tree in trees.items():
-        lines = {
-            line
-            for node in tree.body
-            if isinstance(node, ast.FunctionDef) and node.name in room.functions
-            for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
-        }
-        nodes = list(walk(tree))
-        for index, kind in sites(tree):
-            node: Any = nodes[index]
-            if not room.functions or node.lineno in lines:
-                found.append((path, index, kind))
-    return found
-
-
-def tests_of(room: Room, path: Path) -> list[str]:
+def tests_of(name: str, path: Path) -> list[str]:
     """The room's test files, those of the module first."""
-    files = [str(file) for glob in room.tests for file in sorted((ROOT / "tests").glob(glob))]
+    files = [str(file) for glob in ROOMS[name][1] for file in sorted((ROOT / "tests").glob(glob))]
     return sorted(files, key=lambda file: Path(file).stem != f"test_{path.stem}")
 
 
@@ -240,38 +195,30 @@ def main() -> None:
     began = time.monotonic()
     result: dict[str, Any] = {"seed": options.seed, "rooms": {}, "survivors": []}
     for name in options.rooms:
-        room = ROOMS[name]
-        trees = parse(room)
-        every = places(room, trees)
+        paths = [path for glob in ROOMS[name][0] for path in sorted(PACKAGE.glob(glob))]
+        trees = {path: ast.parse(path.read_text()) for path in paths}
+        every = [(path, number) for path, tree in trees.items() for number in places(tree)]
         if not every:
-            raise SystemExit(f"{name}: no place to change; ROOMS names modules or functions that do not exist")
+            raise SystemExit(f"{name}: no place to change; ROOMS names modules that do not exist")
         sample = sorted(random.Random(options.seed).sample(range(len(every)), min(each, len(every))))
-        if noticed(tests_of(room, ROOT), None):
+        if noticed(tests_of(name, ROOT), None):
             raise SystemExit(f"{name}: the tests fail on the unchanged code; mend them first")
         survivors = []
         console = Console(stderr=True)
         # No thread that refreshes it: a forked child would wait for the locks of that thread.
         doing = f"Changing and testing {name}"
         for number in track(sample, doing, transient=True, auto_refresh=False, console=console):
-            path, index, kind = every[number]
+            path, place = every[number]
             tree = deepcopy(trees[path])
-            what = change(tree, index, kind)
-            if not noticed(tests_of(room, path), Changed(path, tree)):
+            what = change(tree, place)
+            if not noticed(tests_of(name, path), Changed(path, tree)):
                 survivors.append(f"{path.relative_to(ROOT)}, {what}")
-        result["rooms"][name] = {
-            "places": len(every),
-            "mutants": len(sample),
-            "killed": len(sample) - len(survivors),
-        }
+        killed = len(sample) - len(survivors)
+        result["rooms"][name] = {"places": len(every), "mutants": len(sample), "killed": killed}
         result["survivors"] += survivors
     sums = {key: sum(room[key] for room in result["rooms"].values()) for key in ("places", "mutants", "killed")}
-    result = {
-        **sums,
-        "killed_percent": round(100 * sums["killed"] / sums["mutants"], 1),
-        **result,
-        "seconds": round(time.monotonic() - began),
-    }
-    print(json.dumps(result, indent=1))
+    percent, seconds = round(100 * sums["killed"] / sums["mutants"], 1), round(time.monotonic() - began)
+    print(json.dumps({**sums, "killed_percent": percent, **result, "seconds": seconds}, indent=1))
 
 
 if __name__ == "__main__":

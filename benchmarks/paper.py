@@ -21,8 +21,7 @@ from rich.markup import escape
 from harness.arms import choose_arms
 from harness.plan import Arm, Job, parser_of, plan_scene
 from harness.results import Result, group, mean_of, percent, quality_page, spread
-from harness.run import Options, Runner, check_out, compare
-from harness.script import run_script
+from harness.run import Options, Runner, check_out, compare, run_script
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.tables import number, table
 from sundae_ns.report.measured import METRICS
@@ -48,11 +47,7 @@ PRINTED: Mapping[str, Mapping[float, tuple[float, float]]] = {
 
 
 def find_scene(root: Path, scene: str) -> Path | None:
-    """Folder of a scene: in ``root``, or one or two folders below, as archives unpack (``360_v2/``, ``tandt_db/db/``).
-
-    Raises:
-        DataError: there are several.
-    """
+    """Folder of a scene: in ``root``, or one or two folders below, as archives unpack (``tandt_db/db/``)."""
     found = [
         path
         for pattern in (scene, f"*/{scene}", f"*/*/{scene}")
@@ -78,11 +73,7 @@ class PaperOptions(Options):
 
 
 def run_paper(options: PaperOptions, runner: Runner | None = None, console: Console | None = None) -> int:
-    """Measure the paper's scenes; the exit code. Arguments are as in ``run_quality``.
-
-    Raises:
-        ConfigError, DataError, StorageError: as in ``run_quality``.
-    """
+    """Measure the paper's scenes; as ``run_quality``."""
     console, arms = console or Console(), choose_arms(options.arms, options.method, options.steps_scale)
     plan, missing = plan_paper(options, arms)
     check_out(options.out, reads=[Path(job.data) for job in plan])
@@ -96,12 +87,7 @@ def run_paper(options: PaperOptions, runner: Runner | None = None, console: Cons
 
 
 def plan_paper(options: PaperOptions, arms: Sequence[Arm]) -> tuple[list[Job], list[str]]:
-    """Jobs on the paper's scenes, and the names of missing scenes.
-
-    Raises:
-        ConfigError: a name that is none of the eleven.
-        DataError: the folder has none of the scenes, or a scene lacks its images.
-    """
+    """Jobs on the paper's scenes, and the names of missing scenes; ``DataError`` if all are missing."""
     divisors = {scene: divisor for members in DATASETS.values() for scene, divisor in members.items()}
     odd = [scene for scene in options.scenes if scene not in divisors]
     if odd:

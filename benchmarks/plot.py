@@ -16,8 +16,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import NullFormatter
-
-from harness.stored import MB, lines_of
+from tables import MB, lines_of
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 PRUNED = ("bonsai", "fox")

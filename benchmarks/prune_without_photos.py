@@ -23,16 +23,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from bench_formats import read_rows, replace_rows
 from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import SundaeError
-from sundae_ns.core.files import replacing
 from sundae_ns.plugin.camera_models import camera_of
 from sundae_ns.plugin.finished_runs import load_model
 
@@ -44,7 +44,6 @@ PLACE = ("capture", "tool", "rule", "training", "share", "device", "seed", "step
 """Columns that name a row."""
 OURS, OTHER = "sundae_ns", "splat-transform"
 RULE = sn.PruneRule(selection="pairs")
-OTHER_RULES = ("decimate", "decimate-adaptive")
 TRAININGS = ("none", "distill", "distill-no-head")
 HELD_OUT = 32
 
@@ -82,12 +81,10 @@ def jobs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         yield {"tool": OURS, "rule": RULE.selection, "training": "none", "share": share, "steps": 0}
         for training in options.training:
             if training != "none":
-                yield {
-                    **{"tool": OURS, "rule": RULE.selection, "training": training, "share": share},
-                    "steps": options.steps,
-                }
+                job = {"tool": OURS, "rule": RULE.selection, "training": training, "share": share}
+                yield {**job, "steps": options.steps}
         if options.splat_transform:
-            for rule in OTHER_RULES:
+            for rule in ("decimate", "decimate-adaptive"):
                 yield {"tool": OTHER, "rule": rule, "training": "none", "share": share, "steps": 0}
 
 
@@ -141,29 +138,11 @@ def row_of(full: Full, job: dict[str, Any], options: argparse.Namespace, folder:
     }
 
 
-def read(path: Path | None) -> list[dict[str, Any]]:
-    """The rows of a table; none if there is none yet."""
-    if path is None or not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def place(row: dict[str, Any]) -> tuple[str, ...]:
-    """What names a row."""
     return tuple(str(row[name]) for name in PLACE)
 
 
-def write(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write a table atomically."""
-    with replacing(path) as partial, open(partial, "w", newline="") as file:
-        table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
-
-
 def main() -> int:
-    """Run the script."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path, help="runs of full fields")
     parser.add_argument("-o", "--out", type=Path, help="table of results; rows that are there are kept")
@@ -175,7 +154,7 @@ def main() -> int:
     parser.add_argument("--splat-transform", help="command of splat-transform, with options if it needs any")
     parser.add_argument("--again", action="store_true", help="measure rows that are there again")
     options = parser.parse_args()
-    rows = read(options.out)
+    rows = read_rows(options.out)
     printed = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
     printed.writeheader()
     failed = 0
@@ -202,7 +181,7 @@ def main() -> int:
                 sys.stdout.flush()
                 rows = [other for other in rows if place(other) != place(row)] + [row]
                 if options.out is not None:
-                    write(options.out, rows)
+                    replace_rows(options.out, rows, COLUMNS)
     return failed
 
 

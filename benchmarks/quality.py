@@ -23,8 +23,7 @@ from rich.console import Console
 from harness.arms import choose_arms
 from harness.plan import parser_of, plan_scene
 from harness.results import Result, quality_page
-from harness.run import Options, Runner, check_out, compare
-from harness.script import run_script
+from harness.run import Options, Runner, check_out, compare, run_script
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,8 +21,7 @@ from rich.markup import escape
 from harness.arms import choose_arms
 from harness.plan import Arm, Job, Words, jobs_of_shard, parser_of, plan_scene
 from harness.results import Result, group, mean_of, percent, quality_page, spread
-from harness.run import Options, Runner, check_out, compare, first_jobs
-from harness.script import run_script
+from harness.run import Options, Runner, check_out, compare, first_jobs, run_script
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.tables import MEGABYTE, number, table
 from sundae_ns.io.pack.config import FINETUNE_STEPS
@@ -48,14 +47,7 @@ class SuiteOptions(Options):
 
 
 def run_suite(options: SuiteOptions, runner: Runner | None = None, console: Console | None = None) -> int:
-    """Measure all methods on every capture of a folder; the exit code, 1 if a capture or a job is left out.
-
-    Arguments are as in ``run_quality``.
-
-    Raises:
-        ConfigError, StorageError: as in ``run_quality``.
-        DataError: the folder is none of captures.
-    """
+    """Measure all methods on every capture of a folder; as ``run_quality``, and 1 if a capture is left out."""
     console = console or Console()
     arms = choose_arms(options.arms, options.method, options.steps_scale, from_scratch=True)
     check_out(options.out, reads=[options.folder])
@@ -73,12 +65,7 @@ def run_suite(options: SuiteOptions, runner: Runner | None = None, console: Cons
 
 
 def plan_suite(options: SuiteOptions, arms: Sequence[Arm]) -> tuple[list[Job], dict[str, str]]:
-    """Jobs on the captures of a folder, capture by capture, and the reasons for which captures are left out, by name.
-
-    Raises:
-        ConfigError: a share or seed that cannot be.
-        DataError: the folder is missing, is a capture itself, or holds no folder.
-    """
+    """Jobs on the captures of a folder, and the reasons for which captures are left out, by name."""
     jobs: list[Job] = []
     left_out: dict[str, str] = {}
     for data in find_captures(options.folder, options.scenes):
@@ -94,11 +81,7 @@ def plan_suite(options: SuiteOptions, arms: Sequence[Arm]) -> tuple[list[Job], d
 
 
 def find_captures(folder: Path, scenes: Sequence[str] = ()) -> list[Path]:
-    """Folders of captures, whether they exist or not.
-
-    Args:
-        folder: that holds them.
-        scenes: their names; by default all folders that are not hidden.
+    """Folders of captures: all that are not hidden, or those named, whether they exist or not.
 
     Raises:
         DataError: the folder is missing, is a capture itself, or holds no folder.
@@ -114,11 +97,7 @@ def find_captures(folder: Path, scenes: Sequence[str] = ()) -> list[Path]:
 
 
 def check(data: Path, parser: Words, method: str) -> None:
-    """Check a capture as a training by a method of this package does.
-
-    Raises:
-        DataError: it cannot be used.
-    """
+    """Check a capture as a training by a method of this package does; ``DataError`` if it cannot be used."""
     # Late, since it loads the trainer.
     from harness.job import parse
 
@@ -127,14 +106,7 @@ def check(data: Path, parser: Words, method: str) -> None:
 
 
 def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping[str, str], command: str) -> str:
-    """All captures: seconds of trainings, packed bytes, then the page of ``quality_page``.
-
-    Args:
-        results: of all jobs.
-        arms: the sides of the comparison, in the order of the lines.
-        left_out: reasons by capture or by job.
-        command: the command that wrote the page.
-    """
+    """All captures: seconds of trainings, packed bytes, then the page of ``quality_page``."""
     lines = ["# All methods on every capture", ""]
     if left_out:
         lines += ["## Left out", ""]
@@ -177,7 +149,7 @@ def _training(groups: Mapping[tuple[str, str, float | None], Sequence[Result]]) 
             ]
         )
     heads = ["capture", "arm", "keep", "seeds", "steps", "training, s", "PSNR, dB", "SSIM"]
-    return table([*heads, "primitives", "MiB at most", "GPU"], rows)
+    return table([*heads, "Gaussians", "MiB at most", "GPU"], rows)
 
 
 def _packing(groups: Mapping[tuple[str, str, float | None], Sequence[Result]], name: str) -> list[str]:
@@ -192,7 +164,7 @@ def _packing(groups: Mapping[tuple[str, str, float | None], Sequence[Result]], n
         count = spread([result["measured"]["primitives"] for result in own], 0)
         size = spread([result[name]["bytes"] / MEGABYTE for result in own], 2)
         rows.append([scene, arm, percent(ratio), str(len(own)), count, size, *errors])
-    heads = ["capture", "arm", "keep", "seeds", "primitives", "packed, MB", "PSNR of the run", "packed"]
+    heads = ["capture", "arm", "keep", "seeds", "Gaussians", "packed, MB", "PSNR of the run", "packed"]
     return table([*heads, "SSIM of the run", "packed"], rows)
 
 

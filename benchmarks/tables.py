@@ -10,6 +10,8 @@ Rows of runs.csv are those of a suite's results.csv.
 from __future__ import annotations
 
 import argparse
+import csv
+import json
 import re
 from collections.abc import Callable, Sequence
 from itertools import pairwise
@@ -18,10 +20,26 @@ from statistics import fmean
 from typing import Any
 
 from harness.results import spread
-from harness.stored import MB, METHODS, lines_of
 from sundae_ns.core.tables import number, table
 
 ROOT = Path(__file__).parents[1]
+MB = 1e6
+METHODS = {
+    "splatfacto": "splatfacto, 30,000 steps",
+    "splatfacto-7k": "splatfacto, 7,000 steps",
+    "sundae-auto": "**sundae**",
+    "sundae-warm-up": "full field, not pruned",
+    "sundae-fast": "sundae-fast",
+    "sundae": "sundae, fixed share",
+    "sundae-with-head": "sundae, with a head in any case",
+    "sundae-no-head": "the same Gaussians, no head",
+    "sundae-no-head-bytes": "more Gaussians in place of a head",
+    "mcmc": "3DGS-MCMC",
+    "band": "the paper's band rule",
+    "random-no-head": "random Gaussians",
+    "contribution-no-head": "highest contribution, as LightGaussian",
+}
+"""Arms of runs.csv in the order of a table, by the names that readers see."""
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 LEFT_OUT = ("splatfacto-7k", "sundae-warm-up", "sundae-with-head", "sundae-no-head-bytes", "band")
@@ -30,6 +48,14 @@ SHARE = 0.1
 """Share that ``sundae`` keeps."""
 FORMATS = {".spz": ".spz", ".sog": ".sog", ".sog theirs": ".sog by splat-transform", ".sundae": ".sundae"}
 """Packed formats in the order of a table, by the heads that readers see."""
+
+
+def lines_of(name: str) -> list[dict[str, Any]]:
+    """Rows of a results file, ``.jsonl`` or ``.csv``; cells of a CSV are text."""
+    text = (ROOT / "benchmarks" / "results" / name).read_text(encoding="utf-8")
+    if name.endswith(".jsonl"):
+        return [json.loads(line) for line in text.splitlines()]
+    return list(csv.DictReader(text.splitlines()))
 
 
 def runs() -> list[dict[str, Any]]:
@@ -80,7 +106,7 @@ def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
 
 def quality() -> list[str]:
     """All methods on the captures: quality and size; :func:`speed` has times, because suites share their GPUs."""
-    heads = ["capture", "method", "keep", "primitives", "PSNR, dB", "SSIM", "PSNR, head off", "MB"]
+    heads = ["capture", "method", "keep", "Gaussians", "PSNR, dB", "SSIM", "PSNR, head off", "MB"]
     rows, found = [], default_runs()
     compared = {row["scene"] for row in found if row["variant"] in ("sundae", "sundae-auto")}
     headless = {row["scene"] for row in found if row["variant"] == "sundae" and not row["bytes_head"]}
@@ -107,7 +133,7 @@ def cells_of(row: dict[str, Any]) -> list[str]:
 
 def speed() -> list[str]:
     """Milliseconds of frames, each with the error of the same frames."""
-    heads = ["field", "size", "head in", "primitives", "frame, ms", "splat, ms", "head, ms", "PSNR, dB", "SSIM", "GPU"]
+    heads = ["field", "size", "head in", "Gaussians", "frame, ms", "splat, ms", "head, ms", "PSNR, dB", "SSIM", "GPU"]
     rows = [
         [
             line["config"],
@@ -123,7 +149,7 @@ def speed() -> list[str]:
 
 def training_time() -> list[str]:
     """Seconds of whole trainings, each with the error of what was trained."""
-    heads = ["capture", "method", "steps", "seconds", "ms a step", "primitives", "PSNR, dB", "SSIM", "GPU"]
+    heads = ["capture", "method", "steps", "seconds", "ms a step", "Gaussians", "PSNR, dB", "SSIM", "GPU"]
     rows = [
         [
             *(line["scene"], line["arm"]),
@@ -250,7 +276,7 @@ def _least_bytes(packs: Sequence[dict[str, float]], metric: str, aim: float) -> 
 
 def multi_gpu() -> list[str]:
     """Training on one and several GPUs."""
-    heads = ["field", "GPUs", "primitives", "images a second", "PSNR, dB", "MiB of a GPU, at most"]
+    heads = ["field", "GPUs", "Gaussians", "images a second", "PSNR, dB", "MiB of a GPU, at most"]
     rows = [
         [
             "tiled, not pruned" if "tiled" in line["variant"] else f"{line['scene']}, whole run",

@@ -39,17 +39,13 @@ class Entry:
 
 
 def choose_arms(words: Sequence[str], method: str, scale: float = 1.0, *, from_scratch: bool = False) -> list[Arm]:
-    """The arms that a command names, checked, with their lengths.
+    """The arms that a command names, with their lengths; ``ConfigError`` if one cannot work.
 
     Args:
         words: names of default arms and files of arms (``.yaml``); none for all default arms.
         method: method of this package that prunes once, for arms without a method.
         scale: factor on all lengths of training.
-        from_scratch: train arms without options whole, as their command of ``ns-train`` does, not from a shared
-            warm-up.
-
-    Raises:
-        ConfigError: a file, an arm, a method, an option or a length that cannot work.
+        from_scratch: train arms without options from scratch, not from a shared warm-up.
     """
     if not scale > 0:
         raise ConfigError(f"steps-scale is {scale}; give a positive factor, 0.01 for a trial")
@@ -66,15 +62,8 @@ def choose_arms(words: Sequence[str], method: str, scale: float = 1.0, *, from_s
     return [_checked(entry, method, scale, from_scratch) for entry in entries]
 
 
-# ---------------------------------------------------------------------------------------------------------------- files
-
-
 def read_entries(path: Path) -> list[Entry]:
-    """The arms of a file.
-
-    Raises:
-        ConfigError: the file cannot be read, or is no list of arms.
-    """
+    """The arms of a file; ``ConfigError`` if it cannot be read, or is no list of arms."""
     try:
         # Scalars stay text: YAML would read `off` as False.
         loaded = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.BaseLoader)
@@ -128,21 +117,14 @@ def _refuse_duplicates(names: Iterable[str], where: str) -> None:
         seen.add(name)
 
 
-# --------------------------------------------------------------------------------------------------------------- checks
-
-
 def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Arm:
-    """The arm of an entry, its options parsed by its method, its lengths resolved.
-
-    Raises:
-        ConfigError: its method, an option or a length cannot work.
-    """
     from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
     from sundae_ns.plugin.model import SundaeModelConfig
 
     method = entry.method or default
-    config, model = _config_of(entry, method), _methods()[method].pipeline.model
+    config, whole = _config_of(entry, method), _methods()[method]
+    model = whole.pipeline.model
     if not isinstance(model, SplatfactoModelConfig):
         raise ConfigError(f"arm {entry.name}: {method} has no Gaussians; use splatfacto or a method of this package")
     mode = model.pruning.mode if isinstance(model, SundaeModelConfig) else None
@@ -159,11 +141,9 @@ def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Ar
     own_steps = _scaled(config.max_num_iterations, scale)
     warmup, total, steps = 0, 0, own_steps
     if kind != "whole":
-        whole = _methods()[method]
         prune_at = whole.pipeline.model.pruning.prune_at
-        warmup, finetune = _scaled(prune_at, scale), _scaled(whole.max_num_iterations - prune_at, scale)
-        total = warmup + finetune
-        steps = finetune
+        warmup, steps = _scaled(prune_at, scale), _scaled(whole.max_num_iterations - prune_at, scale)
+        total = warmup + steps
         if options.pop(_KEEP_RATIO, None) is not None:
             ratio = config.pipeline.model.pruning.keep_ratio
     elif mode is not None:
@@ -188,11 +168,6 @@ def _methods() -> dict[str, Any]:
 
 
 def _config_of(entry: Entry, method: str) -> Any:
-    """The configuration of a method with the options of an arm.
-
-    Raises:
-        ConfigError: there is no such method or option, or a value cannot be.
-    """
     methods = _methods()
     if method not in methods:
         near = difflib.get_close_matches(method, methods) or ["sundae", "splatfacto"]

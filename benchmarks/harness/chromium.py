@@ -1,8 +1,6 @@
-"""A driver of a headless Chromium.
+"""A driver of a headless Chromium by its DevTools protocol, JSON over a websocket; viser brings the websocket library.
 
-It talks Chromium's own DevTools protocol, which is JSON over a websocket; viser brings the websocket library. So there
-is no further dependency whose version has to match the browser. The tests use it too. The browser needs no display and
-renders WebGL in software. It resolves no host names, and reaches only this machine's loopback.
+The browser needs no display, renders WebGL in software, resolves no host names, and reaches only the loopback.
 """
 
 from __future__ import annotations
@@ -72,14 +70,7 @@ class Camera:
 
 
 class Browser:
-    """One page of a headless Chromium; a context manager.
-
-    Args:
-        executable: from :func:`find_chromium`.
-        width: of the page, pixels.
-        height: of the page, pixels.
-        flags: more flags of Chromium.
-    """
+    """One page of a headless Chromium, a context manager; ``executable`` is that of :func:`find_chromium`."""
 
     def __init__(self, executable: str, width: int = 960, height: int = 640, flags: Sequence[str] = ()) -> None:
         size = f"--window-size={width},{height}"
@@ -94,8 +85,6 @@ class Browser:
         self.camera: Camera | None = None
         self.images: list[tuple[int, int]] = []
         """Width and height of every image that the viewer has sent."""
-
-    # ------------------------------------------------------------------------------------------- life of the browser
 
     def __enter__(self: Opened) -> Opened:
         try:
@@ -134,11 +123,8 @@ class Browser:
 
         wait_for(ready, "the browser's port", 60)
         port, path = address.read_text().split("\n")
-        self._socket = self._stack.enter_context(
-            connect(
-                f"ws://127.0.0.1:{port}{path}", max_size=None, compression=None, open_timeout=60, ping_interval=None
-            )
-        )
+        usual: dict[str, Any] = {"max_size": None, "compression": None, "open_timeout": 60, "ping_interval": None}
+        self._socket = self._stack.enter_context(connect(f"ws://127.0.0.1:{port}{path}", **usual))
         threading.Thread(target=self._listen, daemon=True).start()
         targets = self.call("Target.getTargets", browser=True)["targetInfos"]
         page = next(target["targetId"] for target in targets if target["type"] == "page")
@@ -147,11 +133,8 @@ class Browser:
             self.call(f"{domain}.enable")
         # The page talks to the viewer in a worker; it waits at its start until its messages are recorded.
         self.call("Target.setAutoAttach", {"autoAttach": True, "waitForDebuggerOnStart": True, "flatten": True})
-        width, height = self._size
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False},
-        )
+        metrics = {**dict(zip(("width", "height"), self._size)), "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", metrics)
 
     def _end(self, process: subprocess.Popen[bytes]) -> None:
         with suppress(BrowserError, ConnectionClosed, AttributeError):
@@ -163,21 +146,10 @@ class Browser:
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
 
-    # --------------------------------------------------------------------------------------------------- the protocol
-
     def call(
-        self,
-        method: str,
-        params: dict[str, Any] | None = None,
-        *,
-        browser: bool = False,
-        timeout: float = 60,
+        self, method: str, params: dict[str, Any] | None = None, *, browser: bool = False, timeout: float = 60
     ) -> dict[str, Any]:
-        """One call of the protocol, to the page or to the browser itself; its result.
-
-        Raises:
-            BrowserError: the call failed, or took too long.
-        """
+        """Result of a call to the page or to the browser itself; ``BrowserError`` if it fails or takes too long."""
         answer: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         number = self._send(method, params, None if browser else self._page, answer)
         try:
@@ -224,10 +196,9 @@ class Browser:
             session = params["sessionId"]
             for name in ("Runtime.enable", "Network.enable", "Runtime.runIfWaitingForDebugger"):
                 self._send(name, None, session)
-        elif method == "Network.webSocketFrameSent":
-            self._on_sent(_unpack(params["response"]))
-        elif method == "Network.webSocketFrameReceived":
-            self._on_received(_unpack(params["response"]))
+        elif method in ("Network.webSocketFrameSent", "Network.webSocketFrameReceived"):
+            for part in _messages(params["response"]):
+                self._on_message(part)
         elif method == "Runtime.exceptionThrown":
             details = params["exceptionDetails"]
             self.errors.append(details.get("exception", {}).get("description") or details["text"])
@@ -244,22 +215,14 @@ class Browser:
         if not text.startswith(KNOWN):
             self.errors.append(text)
 
-    # ------------------------------------------------------------------------------------------------ viser's messages
-
-    def _on_sent(self, message: Any) -> None:
-        for part in _messages(message):
-            if part.get("type") == "ViewerCameraMessage":
-                self.camera = Camera(
-                    tuple(part["wxyz"]), tuple(part["position"]), float(part["fov"]), float(part["aspect"])
-                )
-
-    def _on_received(self, message: Any) -> None:
-        for part in _messages(message):
-            if part.get("type") == "BackgroundImageMessage":
-                with Image.open(io.BytesIO(part["rgb_bytes"])) as image:
-                    self.images.append(image.size)
-
-    # ------------------------------------------------------------------------------------------------------- the page
+    def _on_message(self, part: dict[str, Any]) -> None:
+        """Note what viser's page and server tell each other."""
+        if part.get("type") == "ViewerCameraMessage":
+            place = tuple(part["wxyz"]), tuple(part["position"])
+            self.camera = Camera(*place, float(part["fov"]), float(part["aspect"]))
+        elif part.get("type") == "BackgroundImageMessage":
+            with Image.open(io.BytesIO(part["rgb_bytes"])) as image:
+                self.images.append(image.size)
 
     def open(self, address: str) -> None:
         """Go to an address."""
@@ -308,24 +271,16 @@ class Browser:
         self.call("Input.dispatchKeyEvent", {"type": "keyUp", **event})
 
 
-def _unpack(response: dict[str, Any]) -> Any:
-    """A message of viser's websocket; None unless the frame is binary."""
-    return msgspec.msgpack.decode(base64.b64decode(response["payloadData"])) if response["opcode"] == 2 else None
-
-
-def _messages(message: Any) -> list[dict[str, Any]]:
-    """viser sends one message, or a batch of them in one frame."""
-    if isinstance(message, dict):
-        return _messages(message["messages"]) if "messages" in message else [message]
-    return [part for part in message if isinstance(part, dict)] if isinstance(message, list) else []
+def _messages(response: dict[str, Any]) -> list[dict[str, Any]]:
+    """viser's messages in a frame: one, or a batch; none in a frame that is not binary."""
+    content = msgspec.msgpack.decode(base64.b64decode(response["payloadData"])) if response["opcode"] == 2 else []
+    if isinstance(content, dict):
+        content = content.get("messages", [content])
+    return [part for part in content if isinstance(part, dict)] if isinstance(content, list) else []
 
 
 def wait_for(ready: Callable[[], bool], what: str, seconds: float) -> None:
-    """Return as soon as ``ready()``.
-
-    Raises:
-        BrowserError: not in this time.
-    """
+    """Return as soon as ``ready()``; ``BrowserError`` if it is not in this time."""
     end = time.monotonic() + seconds
     while not ready():
         if time.monotonic() > end:

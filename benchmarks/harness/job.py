@@ -10,8 +10,9 @@ import gc
 import json
 import os
 import shutil
+import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
 from functools import cache
@@ -25,9 +26,8 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler, writer
 
-from harness.alone import watched_gpu
 from harness.plan import Job, Words, done_file, job_folder
-from harness.script import run_script
+from harness.run import run_script
 from sundae_ns.core.errors import BackendError, CheckpointError, PackError, SundaeError
 from sundae_ns.core.files import write_text
 from sundae_ns.core.metrics import Lpips, lpips_weights
@@ -49,11 +49,7 @@ NEVER = 10**9
 
 
 def read_result(path: Path) -> dict[str, Any] | None:
-    """Result of a finished job; None if it is not finished.
-
-    Raises:
-        CheckpointError: the file is damaged.
-    """
+    """Result of a finished job; None if it is not finished. ``CheckpointError`` if the file is damaged."""
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
@@ -63,11 +59,7 @@ def read_result(path: Path) -> dict[str, Any] | None:
 
 
 def perform(job: Job, out: Path) -> None:
-    """Do a job unless it is done; wait for another process that does the same job.
-
-    Raises:
-        SundaeError: it cannot be done here.
-    """
+    """Do a job unless it is done; wait for another process that does the same job."""
     job_folder(out, job.key).mkdir(parents=True, exist_ok=True)
     done_file(out, job.key).parent.mkdir(parents=True, exist_ok=True)
     with _locked(job_folder(out, job.key) / "lock"):
@@ -87,15 +79,38 @@ def _locked(path: Path) -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def watched_gpu() -> Iterator[Callable[[], bool]]:
+    """Tell whether no other job of a comparison has used the GPU since the block began; a CPU counts as alone.
+
+    Jobs of one user hold the file of a GPU, and add a byte to it: one that ends before this one is noticed too. Windows
+    has no such locks, and every job counts as alone.
+    """
+    if not torch.cuda.is_available() or os.name != "posix":
+        yield lambda: True
+        return
+    import fcntl
+
+    device = torch.cuda.current_device()
+    name = getattr(torch.cuda.get_device_properties(device), "uuid", device)
+    path = Path(tempfile.gettempdir()) / f"sundae-bench-{os.getuid()}-{name}"
+    with path.open("ab") as file:
+        first = True
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            first = False
+        fcntl.flock(file, fcntl.LOCK_SH)  # the system releases it when the process ends
+        file.write(b".")
+        file.flush()
+        length = path.stat().st_size
+        yield lambda: first and path.stat().st_size == length
+
+
 def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
-    """Train, save, open the saved run, measure it, and pack it.
+    """Train, save, open the saved run, measure it, and pack it; the plain values of its result.
 
-    Nothing is evaluated or saved while training is timed, whatever the method.
-
-    Returns:
-        Plain values: ``job``; ``measured``; ``packed`` and ``tuned``, see :func:`pack` and :func:`tune`; ``alone``,
-        whether no other job used the GPU.
-        A job that was not alone has no times.
+    Nothing is evaluated or saved while training is timed. A job that was not ``alone`` on its GPU has no times.
 
     Raises:
         BackendError: the method needs a CUDA device and there is none.
@@ -127,14 +142,7 @@ def without_times(measured: Measured) -> Measured:
 def pack(opened: Opened, path: Path) -> dict[str, Any] | None:
     """Pack a run by the defaults of ``sundae pack``; the file's bytes and its errors on the test views.
 
-    ``*_base`` are those without the head.
-
-    Args:
-        opened: the run.
-        path: file to write.
-
-    Returns:
-        None for a field that cannot be packed.
+    ``*_base`` are those without the head; None for Gaussians that cannot be packed.
     """
     try:
         return _written(opened, path, *fit_scene(contents_of(load_run(opened.source)), PackConfig()))
@@ -144,11 +152,7 @@ def pack(opened: Opened, path: Path) -> dict[str, Any] | None:
 
 
 def tune(opened: Opened, path: Path) -> dict[str, Any] | None:
-    """As :func:`pack`, after the fine-tune with which ``sundae run`` packs on a GPU.
-
-    Returns:
-        None for a run that cannot be fine-tuned, such as one that still densifies.
-    """
+    """As :func:`pack`, after the fine-tune with which ``sundae run`` packs on a GPU; None if it is impossible."""
     config = PackConfig(**FINETUNED)  # type: ignore[arg-type]
     try:
         scene, codecs = finetune(opened.source, contents_of(load_run(opened.source)), config, FINETUNE_STEPS)
@@ -202,11 +206,7 @@ def _measured(job: Job, config: TrainerConfig, command: str) -> tuple[Opened, Me
 
 
 def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
-    """The configuration as ``ns-train`` parses it, and that command.
-
-    Raises:
-        CheckpointError: its warm-up is not done.
-    """
+    """The configuration as ``ns-train`` parses it, and that command; ``CheckpointError`` if its warm-up is not done."""
     start: Words = ()
     if job.kind == "branch":
         start = ("--pipeline.model.warm-start", str(_run_folder(out, job.needs) / "nerfstudio_models"))
@@ -218,11 +218,6 @@ def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
     config.steps_per_save = config.steps_per_eval_batch = NEVER
     config.steps_per_eval_image = config.steps_per_eval_all_images = NEVER
     return config, "ns-train " + " ".join(job.scene if word == job.data else word for word in arguments)
-
-
-def config_of(job: Job) -> TrainerConfig:
-    """Configuration of the run that the job makes with today's methods; its warm-up need not be done."""
-    return parse(_arguments(job, ("--pipeline.model.warm-start", "DONE") if job.kind == "branch" else ()))
 
 
 def parse(arguments: Sequence[str]) -> TrainerConfig:

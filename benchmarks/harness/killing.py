@@ -1,100 +1,202 @@
-"""Places at which a process kills itself with SIGKILL: in a save, a prune, a trial, or while a command writes."""
+"""Processes that train or run a command of sundae, and kill themselves at a place in the code, or are killed."""
 
 from __future__ import annotations
 
 import io
+import multiprocessing
 import os
+import random
 import signal
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-import sundae_ns.core.files
-import sundae_ns.io.checkpoint
-import sundae_ns.pruning.decision
-import sundae_ns.train.pruning
-from sundae_ns.train import trials
+import torch
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.scripts import train
+
+from sundae_ns.cli.main import main as sundae
+from sundae_ns.core import files
+from sundae_ns.io import checkpoint
+from sundae_ns.pruning import decision
+from sundae_ns.train import pruning, trials
 
 Place = Callable[[int], None]
-"""Prepares this process to die the n-th time that it comes there."""
+"""Prepares this process to kill itself the n-th time that it comes there."""
+LONGEST = 900.0
+"""Seconds after which a process counts as hanging; it takes about ten."""
 
 
 def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def after(calls: int, module: Any, name: str, place: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
-    """Replace ``module.name`` by ``place(original)`` from its ``calls``-th call on."""
-    original, seen = getattr(module, name), [0]
+def at(owner: Any, name: str, replaced: Callable[..., Any], calls: Callable[[int], int] = lambda _: 1) -> Place:
+    """Call ``replaced(original, ...)`` in place of ``owner.name`` from its ``calls(n)``-th call on."""
 
-    def wrapper(*arguments: Any, **options: Any) -> Any:
-        seen[0] += 1
-        return (place(original) if seen[0] >= calls else original)(*arguments, **options)
+    def prepare(n: int) -> None:
+        original, left = getattr(owner, name), [calls(n)]
 
-    setattr(module, name, wrapper)
+        def call(*arguments: Any, **options: Any) -> Any:
+            left[0] -= 1
+            if left[0] > 0:
+                return original(*arguments, **options)
+            return replaced(original, *arguments, **options)
+
+        setattr(owner, name, call)
+
+    return prepare
 
 
-def at_once(original: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda *_, **__: die()
+def before(*_: Any, **__: Any) -> None:
+    die()
 
 
-def when_done(original: Callable[..., Any]) -> Callable[..., Any]:
-    def call(*arguments: Any, **options: Any) -> None:
-        original(*arguments, **options)
+def after(original: Callable[..., Any], *arguments: Any, **options: Any) -> None:
+    original(*arguments, **options)
+    die()
+
+
+def half_saved(original: Callable[..., Any], state: Any, file: Any) -> None:
+    whole = io.BytesIO()
+    original(state, whole)
+    file.write(whole.getvalue()[: len(whole.getvalue()) // 2])
+    file.flush()
+    die()
+
+
+def half_recorded(_: Callable[..., Any], path: Path, text: str) -> None:
+    with files.replacing(path) as partial:
+        partial.write_text(text[: len(text) // 2])
         die()
 
-    return call
+
+def half_written(_: Callable[..., Any], path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+    die()
 
 
-def half_saved(original: Callable[..., Any]) -> Callable[..., Any]:
-    def call(state: Any, file: Any) -> None:
-        whole = io.BytesIO()
-        original(state, whole)
-        file.write(whole.getvalue()[: len(whole.getvalue()) // 2])
-        file.flush()
-        die()
-
-    return call
-
-
-def half_recorded(original: Callable[..., Any]) -> Callable[..., Any]:
-    def call(path: Path, text: str) -> None:
-        with sundae_ns.core.files.replacing(path) as partial:
-            partial.write_text(text[: len(text) // 2])
-            die()
-
-    return call
-
-
-def half_written(original: Callable[..., Any]) -> Callable[..., Any]:
-    def call(path: Path) -> None:
-        os.truncate(path, path.stat().st_size // 2)
-        die()
-
-    return call
-
-
-_checkpoint, _atomic = sundae_ns.io.checkpoint, sundae_ns.core.files
-SAVES: dict[str, Place] = {
-    "save: half written": lambda n: after(n, _checkpoint.torch, "save", half_saved),
-    "save: not yet on the disk": lambda n: after(3 * n, _atomic, "flush", at_once),
-    "save: the older one not yet gone": lambda n: after(n, _checkpoint, "write", when_done),
+SAVES = {
+    "save: half written": at(checkpoint.torch, "save", half_saved, lambda n: n),
+    "save: not yet on the disk": at(files, "flush", before, lambda n: 3 * n),
+    "save: the older one not yet gone": at(checkpoint, "write", after, lambda n: n),
 }
-TRAINING: dict[str, Place] = {
+TRAINING = {
     **SAVES,
-    "prune: deciding": lambda n: after(1, sundae_ns.pruning.decision, "decide", at_once),
-    "prune: sliced": lambda n: after(1, sundae_ns.pruning.decision, "keep", when_done),
-    "prune: half recorded": lambda n: after(1, sundae_ns.train.pruning, "write_text", half_recorded),
+    "prune: deciding": at(decision, "decide", before),
+    "prune: sliced": at(decision, "keep", after),
+    "prune: half recorded": at(pruning, "write_text", half_recorded),
 }
-TRIALS: dict[str, Place] = {
-    "trial: started": lambda n: after(n, trials.TrialEngine, "start", when_done),
-    "trial: measuring": lambda n: after(n, trials, "measure_heldout", at_once),
-    "trial: back to the field before it": lambda n: after(1, trials.TrialEngine, "go_back", when_done),
-    "trials: ended": lambda n: after(1, trials.TrialEngine, "end", when_done),
+TRIALS = {
+    "trial: started": at(trials.TrialEngine, "start", after, lambda n: n),
+    "trial: measuring": at(trials, "measure_heldout", before, lambda n: n),
+    "trial: back to the Gaussians before it": at(trials.TrialEngine, "go_back", after),
+    "trials: ended": at(trials.TrialEngine, "end", after),
     **SAVES,
 }
-COMMANDS: dict[str, Place] = {
-    "half written": lambda n: after(1, _atomic, "flush", half_written),
-    "not yet renamed": lambda n: after(1, _atomic, "flush", at_once),
-    "just renamed": lambda n: after(2, _atomic, "flush", at_once),
+COMMANDS = {
+    "half written": at(files, "flush", half_written),
+    "not yet renamed": at(files, "flush", before),
+    "just renamed": at(files, "flush", before, lambda _: 2),
 }
+
+
+def train_here(config: TrainerConfig, log: Path, place: str | None = None, nth: int = 1) -> None:
+    """Train in this process; die the ``nth`` time that ``place`` is reached."""
+    _prepare(log, {**TRAINING, **TRIALS}, place, nth)
+    train.main(config)
+
+
+def command_here(words: Sequence[str], log: Path, place: str | None = None) -> None:
+    """Run a command of sundae in this process; die when ``place`` is reached."""
+    _prepare(log, COMMANDS, place, 1)
+    sundae(words)
+
+
+def _prepare(log: Path, places: dict[str, Place], place: str | None, nth: int) -> None:
+    torch.set_num_threads(1)
+    with open(log, "a") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    if place is not None:
+        places[place](nth)
+
+
+class Bench:
+    """Runs processes one after another, with one log. Processes on CUDA cannot be forked."""
+
+    def __init__(self, device: str, log: Path) -> None:
+        self.log = log
+        self.context: Any = multiprocessing.get_context("spawn" if device == "cuda" else "forkserver")
+        if device == "cpu":
+            # Fork from a process without threads: a child could wait for their locks for ever.
+            self.context.set_forkserver_preload(
+                ["nerfstudio.scripts.train", "sundae_ns.plugin.model", "sundae_ns.plugin.trainer"]
+            )
+
+    def start(self, work: Any, what: Any, *arguments: Any) -> BaseProcess:
+        """Start a process that calls ``work`` with the log."""
+        child: BaseProcess = self.context.Process(target=work, args=(what, self.log, *arguments))
+        child.start()
+        return child
+
+    def ended(self, child: BaseProcess) -> int:
+        """Wait for a process; its exit code, or minus the signal that ended it."""
+        child.join(LONGEST)
+        if child.exitcode is None:
+            child.kill()
+            child.join()
+            self.fail(f"a run did not end within {LONGEST} s")
+        return int(child.exitcode or 0)
+
+    def finish(self, work: Any, what: Any) -> float:
+        """Run a process that must succeed; its seconds."""
+        began = time.monotonic()
+        code = self.ended(self.start(work, what))
+        if code != 0:
+            self.fail(f"a run failed with exit code {code}")
+        return time.monotonic() - began
+
+    def fail(self, reason: str) -> None:
+        raise SystemExit(f"{reason}; the end of its log:\n{self.log.read_text(errors='replace')[-3000:]}")
+
+    def killed_at_any_time(self, start: Any, again: Any, seconds: float, rng: random.Random) -> bool:
+        """Kill what ``start`` starts within ``seconds``; try ``again`` if it ended before. Whether it was killed.
+
+        Of several processes a random one is killed; the others must end by themselves.
+        """
+        for _ in range(10):
+            child = start()
+            time.sleep(rng.uniform(0.0, seconds))
+            family = [child.pid, *descendants(child.pid)]
+            with suppress(ProcessLookupError):  # it has ended
+                victims = [pid for pid in family if b"resource_tracker" not in command_line(pid)]
+                os.kill(rng.choice(victims), signal.SIGKILL)
+            code, until = self.ended(child), time.monotonic() + LONGEST
+            while any(command_line(pid) for pid in family[1:]):
+                if time.monotonic() > until:
+                    self.fail("a process outlived the one that was killed")
+                time.sleep(0.1)
+            if code != 0:
+                return True
+            again()
+            seconds *= 0.8  # the machine has become faster
+        return False
+
+
+def command_line(pid: int) -> bytes:
+    """Words of a running process; empty if there is none."""
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    return b""
+
+
+def descendants(pid: int) -> list[int]:
+    """Processes that a process started, and theirs."""
+    with suppress(OSError):
+        children = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
+        return [each for child in children for each in (child, *descendants(child))]
+    return []

@@ -93,20 +93,13 @@ def other_value(value: Json, rng: random.Random) -> Json:
         near = [value + 1, value - 1, 2 * value, -value, value / 3, float(value), value + 0.5]
         return rng.choice(near)
     if isinstance(value, list) and kind < 3:
-        changed = list(value)
-        if not changed:
+        if not value:
             return [0]
-        i, j = rng.randrange(len(changed)), rng.randrange(len(changed))
-        act = rng.randrange(4)
-        if act == 0:
-            changed.append(changed[i])
-        elif act == 1:
-            del changed[i]
-        elif act == 2:
-            changed[i], changed[j] = changed[j], changed[i]
-        else:
-            changed = changed[:i] * 2
-        return changed
+        i, j = sorted((rng.randrange(len(value)), rng.randrange(len(value))))
+        repeated, removed, doubled = [*value, value[i]], value[:i] + value[i + 1 :], value[:i] * 2
+        swapped = list(value)
+        swapped[i], swapped[j] = value[j], value[i]
+        return rng.choice([repeated, removed, swapped, doubled])
     return rng.choice([rng.choice(NUMBERS), rng.choice(WORDS), rng.choice(OTHERS), RAW])
 
 

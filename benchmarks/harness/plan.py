@@ -67,14 +67,7 @@ class Job:
 
 
 def parser_of(data: Path, downscale: int = 1) -> Words:
-    """Data parser for the layout of a capture's folder, and its options; every eighth image for test, as in papers.
-
-    Args:
-        data: with ``sparse/0`` and ``images`` (COLMAP), or with a ``transforms.json`` (its own split).
-        downscale: divides the sides of the images, which come from ``images_2``, ``images_4`` ... (COLMAP only).
-
-    Returns:
-        Words of the command line; none for the method's own parser.
+    """Words of the data parser for a capture: none for a ``transforms.json``; for COLMAP every 8th image is for test.
 
     Raises:
         ConfigError: smaller images of a capture that is not in COLMAP layout.
@@ -107,18 +100,9 @@ def plan_scene(
     seeds: Sequence[int],
     repeat_at: Sequence[float],
 ) -> list[Job]:
-    """All jobs on one capture, warm-ups before the jobs that need them.
+    """All jobs on one capture, warm-ups before the jobs that need them; ``ConfigError`` for a wrong ratio or seed.
 
-    Args:
-        data: folder of the capture; its name is the scene's name in tables.
-        parser: from :func:`parser_of`.
-        arms: the sides of the comparison; their names differ.
-        keep_ratios: shares of the Gaussians to keep.
-        seeds: the first is for everything; the others repeat the shares of ``repeat_at``, from warm-ups of their own.
-        repeat_at: shares for which all seeds are run.
-
-    Raises:
-        ConfigError: a share or seed that cannot be.
+    The first seed runs everything; the others repeat the ratios of ``repeat_at``, from warm-ups of their own.
     """
     _check(keep_ratios, seeds, repeat_at, [arm.keep_ratio for arm in arms if arm.keep_ratio is not None])
     jobs: list[Job] = []
@@ -206,13 +190,7 @@ def _check(
 
 
 def jobs_of_shard(jobs: Sequence[Job], shard: str) -> list[Job]:
-    """The jobs of a part, with the warm-ups that they need; parts share only those.
-
-    Warm-ups are not dealt out: a part makes the ones that are missing, and finds the others finished.
-
-    Args:
-        jobs: of the whole plan.
-        shard: ``"2/5"`` for the second of five parts.
+    """The jobs of a part, ``"2/5"`` for the second of five, with the warm-ups that they need; parts share only those.
 
     Raises:
         ConfigError: the shard has another form.

@@ -37,11 +37,7 @@ def read_results(out: Path) -> list[Result]:
 
 
 def write_results(out: Path, results: Sequence[Result], page: str) -> None:
-    """Write ``results.jsonl``, ``results.csv`` with the columns of runs.csv, and ``table.md``.
-
-    Raises:
-        StorageError: the folder cannot be written to.
-    """
+    """Write ``results.jsonl``, ``results.csv`` with the columns of runs.csv, and ``table.md``."""
     write_text(out / "results.jsonl", "".join(json.dumps(result) + "\n" for result in results))
     write_text(out / "results.csv", csv_text([result["measured"] for result in results]))
     write_text(out / "table.md", page)
@@ -84,13 +80,7 @@ def mean_of(values: Sequence[float | None]) -> float | None:
 
 
 def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -> str:
-    """The comparison as a page: every way of rendering has a line, its time beside its error.
-
-    Args:
-        results: of all jobs.
-        arms: the sides of the comparison, in the order of the lines.
-        command: the command of the whole comparison.
-    """
+    """The comparison as a page: every way of rendering has a line, its time beside its error."""
     lines = ["# Comparison of quality", "", f"    {command}", ""]
     lines += [
         "Mean over the seeds, ± their standard deviation. Arms that start from the warm-up of a method and a seed",
@@ -99,7 +89,7 @@ def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -
         "",
         *_described(arms),
     ]
-    heads = ["arm", "rendered with", "keep", "seeds", "primitives", "PSNR, dB", "SSIM", "FLIP", "LPIPS", "JOD", "MB"]
+    heads = ["arm", "rendered with", "keep", "seeds", "Gaussians", "PSNR, dB", "SSIM", "FLIP", "LPIPS", "JOD", "MB"]
     heads += ["ms a frame", "training, s"]
     for scene in dict.fromkeys(result["job"]["scene"] for result in results):
         rows = []
@@ -126,14 +116,9 @@ def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -
 
 def _described(arms: Sequence[Arm]) -> list[str]:
     """A line for each arm: its method, how it starts, and its options."""
-    starts = {
-        "branch": "from the warm-up",
-        "whole": "from scratch",
-    }
     lines = []
     for arm in arms:
-        options = ", ".join(f"`{name} {' '.join(words)}`" for name, words in arm.options.items())
-        lines.append(
-            f"- `{arm.name}`: `{arm.method}` {starts[arm.kind]}, {arm.steps:,} steps" + (options and f"; {options}")
-        )
+        options = "".join(f"; `{name} {' '.join(words)}`" for name, words in arm.options.items())
+        start = "from the warm-up" if arm.kind == "branch" else "from scratch"
+        lines.append(f"- `{arm.name}`: `{arm.method}` {start}, {arm.steps:,} steps{options}")
     return lines

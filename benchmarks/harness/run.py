@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, NoReturn
 
 import tyro
 from rich.console import Console
@@ -19,6 +19,7 @@ from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeElapsedColum
 
 from harness.plan import Job, done_file, job_folder, jobs_of_shard
 from harness.results import Result, read_results, write_results
+from sundae_ns.cli.main import exit_with
 from sundae_ns.cli.options import check_folder
 from sundae_ns.cli.process import percent_of, run_logged
 from sundae_ns.core.errors import ConfigError, StorageError, SundaeError, writing
@@ -50,9 +51,7 @@ class Options:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """folder for jobs, results and tables; its finished jobs are not run again."""
     arms: tuple[str, ...] = ()
-    """files of arms (.yaml), and names of default arms: sundae, band (the paper's rule), contribution, random, each
-    also with -no-head; sundae-with-head, sundae-no-head-bytes; sundae-fast,
-    sundae-auto, splatfacto, splatfacto-7k."""
+    """files of arms (.yaml), and names of default arms: those of harness/arms.yaml."""
     keep_ratios: tuple[float, ...] = (0.1,)
     """shares of the warm-up's Gaussians to keep."""
     seeds: tuple[int, ...] = (42,)
@@ -80,15 +79,7 @@ class Options:
 
 
 def check_out(out: Path, *, reads: Iterable[Path]) -> None:
-    """Refuse a folder for a comparison that holds something else, or belongs to the captures.
-
-    Args:
-        out: the folder; a comparison that it holds continues there.
-        reads: captures, or folders of captures.
-
-    Raises:
-        StorageError: the folder may not be written.
-    """
+    """Raise ``StorageError`` for a folder that holds something else than a comparison, or belongs to the captures."""
     reads = list(reads)
     if any(out.resolve().is_relative_to(path.resolve()) for path in reads):
         raise StorageError(f"{out} belongs to what the command reads; choose another folder")
@@ -153,10 +144,7 @@ def run_jobs(
 ) -> dict[str, str]:
     """Run the jobs that are not done, one at a time; a job that fails stops only the jobs that need it.
 
-    Arguments and errors are those of :func:`compare`.
-
-    Returns:
-        The reason of each failure, by key.
+    Returns the reason of each failure, by key; arguments and errors are those of :func:`compare`.
     """
     done = _finished(out)
     for job in jobs:
@@ -237,3 +225,12 @@ def _check_same(job: Job, result: Result, out: Path) -> None:
         raise ConfigError(
             f"{out} holds {job.key} with other {name} ({theirs.get(name)}, now {ours[name]}); give another folder"
         )
+
+
+def run_script(parsed: Callable[..., Any], description: str | None, run: Callable[[Any], int] = int) -> NoReturn:
+    """Parse the command line into the arguments of a function or a class, and exit with the code that ``run`` returns.
+
+    Errors of the package are printed on one line, as by ``sundae``.
+    """
+    prog = Path(sys.argv[0]).name
+    exit_with(lambda: run(tyro.cli(parsed, prog=prog, description=description)), prog)

@@ -61,7 +61,7 @@ def forked_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[st
 def test_stopped_and_continued(
     tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forked_jobs: list[list[str]]
 ) -> None:
-    arms, out = ["sundae", "random-no-head"], tmp_path / "out"
+    arms, out = ["sundae", "band-no-head"], tmp_path / "out"
     jobs = plan_scene(
         tiny.scene.resolve(),
         parser_of(tiny.scene),
@@ -70,12 +70,12 @@ def test_stopped_and_continued(
         seeds=[42],
         repeat_at=[0.5],
     )
-    warm_up, random = (job for job in jobs if job.kind == "warm-up" or job.arm == "random-no-head")
+    warm_up, band = (job for job in jobs if job.kind == "warm-up" or job.arm == "band-no-head")
     for job in jobs:
-        if job is not random:
+        if job is not band:
             perform(job, out)
     # What a branch leaves that was cut off in its midst.
-    leftover = out / "jobs" / random.key / "random-no-head" / "sundae-tiny" / "run" / "events.out.tfevents.1.gone"
+    leftover = out / "jobs" / band.key / "band-no-head" / "sundae-tiny" / "run" / "events.out.tfevents.1.gone"
     leftover.parent.mkdir(parents=True)
     leftover.touch()
     stamps = {path: path.stat().st_mtime_ns for path in (out / "done").iterdir()}
@@ -88,7 +88,7 @@ def test_stopped_and_continued(
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(words[0]), run_name="__main__")
     assert ended.value.code == 0
-    assert [words[-1] for words in forked_jobs] == [random.key]
+    assert [words[-1] for words in forked_jobs] == [band.key]
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
     assert not leftover.exists()
     rows = {row.variant: row for row in read_rows(out / "results.csv")}
@@ -98,8 +98,8 @@ def test_stopped_and_continued(
     for row in rows.values():
         assert None not in (row.ms_frame, row.psnr, row.train_s)
     peaks = {arm: row.peak_primitives for arm, row in rows.items()}
-    assert peaks["sundae"] == peaks["random-no-head"] == rows[WARM_UP].primitives <= peaks[WARM_UP]
-    assert rows["sundae"].bytes_head > 0 == rows["random-no-head"].bytes_head
+    assert peaks["sundae"] == peaks["band-no-head"] == rows[WARM_UP].primitives <= peaks[WARM_UP]
+    assert rows["sundae"].bytes_head > 0 == rows["band-no-head"].bytes_head
     # What was measured is what lies there: the run can be opened and looked at.
     assert load_model(out / "jobs" / warm_up.key / WARM_UP / "sundae-tiny" / "run").steps == WARMUP
     results = {result["job"]["arm"]: result for result in read_results(out)}
