@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -131,17 +132,11 @@ def _report(stage: str, total: int) -> Iterator[Callable[[int], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    console, begun, done = Console(), time.monotonic(), 0
+    console, begun = Console(), time.monotonic()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(stage, total=total)
-
-        def advance(count: int) -> None:
-            nonlocal done
-            done = min(done + count, total)
-            bar.update(task, completed=done)
-
-        yield advance
+        yield partial(bar.advance, bar.add_task(stage, total=total))
+        done = min(int(bar.tasks[0].completed), total)
     print(f"{stage}: {done:,} of {total:,}, {time.monotonic() - begun:.0f} s", flush=True)
 
 

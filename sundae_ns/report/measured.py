@@ -36,8 +36,7 @@ COLUMNS = (
     *("train_s", "prune_s", "peak_primitives", "peak_vram_mib", "gpu", "resolution", "command"),
 )
 """Columns of the CSV. Metrics are means over the test views, ``*_base`` without the head; ``bytes_*`` are bytes,
-``ms_*`` milliseconds per frame, ``*_s`` seconds, and ``peak_vram_mib`` is the peak that torch allocated during
-training, MiB."""
+``ms_*`` milliseconds per frame, ``*_s`` seconds, ``peak_vram_mib`` the MiB that torch allocated at most in training."""
 
 
 @dataclass(frozen=True)

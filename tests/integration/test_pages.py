@@ -23,14 +23,14 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 ELSEWHERE = {
     "run PHOTOS": "trains 30,000 steps after COLMAP; test_run.py runs it with fewer, and poses from elsewhere",
-    "run walk.mp4": "the same of a video; cli/test_run.py reads its commands, poses/test_stages.py makes its capture",
-    "poses ": "takes minutes; poses/test_stages.py finds the poses of a still life",
+    "run walk.mp4": "the same of a video; cli/test_run.py reads its commands, data/test_reconstruct.py makes captures",
+    "poses ": "takes minutes; data/test_reconstruct.py finds the poses of a still life",
     "train CAPTURE": "becomes ns-train, in place of this process; cli/test_train.py reads its command",
     "python benchmarks/quality.py": "trains a dozen runs; test_comparisons.py runs it with two short ones",
     "python benchmarks/suite.py": "trains every method on every capture; test_comparisons.py trains one method",
     "python benchmarks/paper.py": "needs the archives of the paper's captures; test_comparisons.py makes two",
     "view scene.sundae": "serves until Ctrl-C; cli/test_view.py serves a page, and opens and ends it",
-    "ns-train sundae --machine.num-devices 2": "needs two GPUs; distributed/test_whole_runs.py trains on two",
+    "ns-train sundae --machine.num-devices 2": "needs two GPUs; plugin/test_whole_runs.py trains on two",
 }
 """Commands that do not run here, by how they start, with the reason and the test that covers them."""
 NAMES = {"$RUN": "RUN", "capture": "CAPTURE", "RUN_OR_PACK_OR_PLY": "other.ply", "FILE": "other.ply", "...": ""}
