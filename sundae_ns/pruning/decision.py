@@ -126,15 +126,9 @@ def decide(
                 "a merge needs a pass over the training views and there are none: set redistribution to none"
             )
         values = merged(usable, graph, selected, contribution, labels)
-    return Decision(
-        mask=mask,
-        kept=count,
-        dropped_nonfinite=n - n_finite,
-        tau=None if graph is None else graph.tau,
-        sigma=None if graph is None else graph.sigma,
-        isolated=None if graph is None else int(graph.isolated.sum()),
-        values=values,
-    )
+    if graph is None:
+        return Decision(mask, count, n - n_finite, values=values)
+    return Decision(mask, count, n - n_finite, graph.tau, graph.sigma, int(graph.isolated.sum()), values)
 
 
 def diverged(n: int) -> DataError:

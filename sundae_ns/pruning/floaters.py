@@ -18,15 +18,15 @@ SUPPORT, REACH = 3, 0.5
 photos may be of something near. Wrong points lie alone."""
 MOST = 0.05
 """Largest share of the Gaussians that can be floaters; with more of them the points do not say where the scene is."""
-_ROWS = 1 << 14
 
 
 def _distances(points: Tensor, others: Tensor, nth: int = 1) -> Tensor:
     """Distance of each point ``[N, 3]`` to the nth nearest of some others ``[M, 3]``, infinite without: ``[N]``."""
     if len(others) < nth or not len(points):
         return points.new_full((len(points),), torch.inf)
-    found = [torch.cdist(rows, others).topk(nth, largest=False).values[:, -1] for rows in points.split(_ROWS)]
-    return torch.cat(found)
+    return torch.cat(
+        [torch.cdist(rows, others).topk(nth, largest=False).values[:, -1] for rows in points.split(1 << 14)]
+    )
 
 
 @torch.no_grad()

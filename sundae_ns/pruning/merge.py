@@ -213,8 +213,7 @@ def voronoi_labels(graph: NeighborGraph, mask: Tensor) -> Tensor:
     """
     device = graph.weights.device
     mask = mask.to(device)
-    own = torch.arange(graph.N, device=device)
-    label = torch.where(mask, own, -1)
+    label = torch.where(mask, torch.arange(graph.N, device=device), -1)
     distance = torch.where(mask, 0.0, torch.inf).double()
     changed = mask
     for _ in range(MOST_HOPS):
@@ -288,10 +287,10 @@ def merged(
     labels = voronoi_labels(graph, mask) if labels is None else labels
     if as_gaussians(params).encoding == "harmonics":
         return merge(params, labels, weight)
-    own = params["features_dc"].detach()
-    colors = own.sigmoid()
+    logits = params["features_dc"].detach()
+    colors = logits.sigmoid()
     values = merge({**params, "features_dc": colors}, labels, weight)
-    stay, mixed = mask.to(own.device), values["features_dc"]
+    kept, mixed = mask.to(logits.device), values["features_dc"]
     # Unmerged colours keep their logits: a saturated colour does not survive the round trip.
-    values["features_dc"] = torch.where(mixed == colors[stay], own[stay], rgb_to_logit(mixed))
+    values["features_dc"] = torch.where(mixed == colors[kept], logits[kept], rgb_to_logit(mixed))
     return values

@@ -98,12 +98,6 @@ def band_rule(rule: PruneRule, gamma: float) -> PruneRule:
     return replace(rule, score="response", selection="band", gamma=gamma, edges="centres", redistribution="none")
 
 
-def check_share(share: float) -> None:
-    """Raise ``ConfigError`` for a share to keep that is not in (0, 1]."""
-    if not 0 < share <= 1:
-        raise ConfigError(f"keep_ratio is {share}: use a share in (0, 1], 0.1 to keep a tenth")
-
-
 def kept_count(share: float, n: int) -> int:
     """Number of ``n`` Gaussians that a prune to a share keeps: ``round(share * n)``, at least 1.
 
@@ -112,5 +106,6 @@ def kept_count(share: float, n: int) -> int:
     Raises:
         ConfigError: the share is not in (0, 1].
     """
-    check_share(share)
+    if not 0 < share <= 1:
+        raise ConfigError(f"keep_ratio is {share}: use a share in (0, 1], 0.1 to keep a tenth")
     return max(1, round(share * n))

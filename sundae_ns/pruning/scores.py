@@ -75,12 +75,8 @@ def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
     spread: in a flat field, the flat axis must not be scaled up to the others.
     """
     params = as_gaussians(params).as_harmonics()
-    groups = (
-        params["means"],
-        sh_to_rgb(params["features_dc"]),
-        torch.sigmoid(params["opacities"]).reshape(-1, 1),
-        params["scales"],
-    )
+    colors, opacities = sh_to_rgb(params["features_dc"]), params["opacities"].sigmoid().reshape(-1, 1)
+    groups = (params["means"], colors, opacities, params["scales"])
     return torch.cat([_standardise(group.detach()) for group in groups], dim=1)
 
 
@@ -92,9 +88,7 @@ def _standardise(values: Tensor) -> Tensor:
     """
     centred = values - values.median(dim=0).values
     norms = torch.linalg.vector_norm(centred, dim=1, dtype=torch.float64)
-    spread = norms.median()
-    if spread == 0:
-        spread = norms.mean()
+    spread = norms.median() or norms.mean()
     return centred / spread if spread > 0 else torch.zeros_like(centred)
 
 

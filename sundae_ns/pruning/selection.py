@@ -34,12 +34,11 @@ def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
         DataError: ``count`` is not in 1 to N.
     """
     values = as_scores(magnitude, count)
-    high = _ranked(values)[: round(gamma * count)]
-    rest = torch.ones_like(values, dtype=torch.bool)
-    rest[high] = False
-    remaining = rest.nonzero().squeeze(1)
-    low = remaining[_ranked(-values[remaining])][: count - len(high)]
-    return _mask(torch.cat([high, low]), magnitude)
+    mask = torch.zeros(len(values), dtype=torch.bool)
+    mask[_ranked(values)[: round(gamma * count)]] = True
+    others = (~mask).nonzero().squeeze(1)
+    mask[others[_ranked(-values[others])][: count - int(mask.sum())]] = True
+    return mask.to(magnitude.device)
 
 
 def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
@@ -100,11 +99,11 @@ def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Te
     left = count
     for tier in (infinite, positive, ~infinite & ~positive):
         members = tier.nonzero().squeeze(1)
+        if left == 0:
+            break
         if len(members) > left:
             weight = values[members] if tier is positive else torch.ones(len(members), dtype=torch.float64)
-            members = (
-                members[_systematic_sample(inclusion_probabilities(weight, left), left, start)] if left else members[:0]
-            )
+            members = members[_systematic_sample(inclusion_probabilities(weight, left), left, start)]
         chosen[order[members]] = True
         left -= len(members)
     return chosen.to(score.device)
@@ -113,18 +112,15 @@ def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Te
 def _systematic_sample(probabilities: Tensor, count: int, start: float) -> Tensor:
     """Indices ``[count]``, all different, at which the sum of the probabilities passes ``start + j``."""
     certain = probabilities >= 1
-    places = (~certain).nonzero().squeeze(1)
-    wanted = count - int(certain.sum())
-    sums = probabilities[places].cumsum(0)
-    taken = certain.nonzero().squeeze(1)
-    if wanted:
-        # Rounding must not lose the last draw, nor put two draws on one place.
-        marks = (start + torch.arange(wanted, dtype=torch.float64)) * (sums[-1] / wanted)
-        steps = torch.arange(wanted)
-        drawn = torch.searchsorted(sums, marks, right=True).minimum(steps + len(places) - wanted)
-        drawn = (drawn - steps).cummax(0).values + steps
-        taken = torch.cat([taken, places[drawn]])
-    return taken
+    uncertain, taken = (~certain).nonzero().squeeze(1), certain.nonzero().squeeze(1)
+    if not (wanted := count - len(taken)):
+        return taken
+    sums, steps = probabilities[uncertain].cumsum(0), torch.arange(wanted)
+    marks = (start + steps.double()) * (sums[-1] / wanted)
+    # Rounding must not lose the last draw, nor draw one Gaussian twice.
+    drawn = torch.searchsorted(sums, marks, right=True).minimum(steps + len(uncertain) - wanted)
+    drawn = (drawn - steps).cummax(0).values + steps
+    return torch.cat([taken, uncertain[drawn]])
 
 
 def as_scores(score: Tensor, count: int) -> Tensor:
@@ -147,9 +143,3 @@ def _ranked(values: Tensor) -> Tensor:
     # -inf and NaN tie in the sort, so a second stable pass moves NaN to the end.
     late = unknown[order]
     return torch.cat([order[~late], order[late]])
-
-
-def _mask(chosen: Tensor, like: Tensor) -> Tensor:
-    mask = torch.zeros(len(like), dtype=torch.bool)
-    mask[chosen] = True
-    return mask.to(like.device)

@@ -23,7 +23,7 @@ from sundae_ns.core.timing import now, peak_memory
 from sundae_ns.io.run_folder import prunes_before
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.floaters import MOST, near_cameras
-from sundae_ns.pruning.rule import PruneRule, ScoreName, check_share, kept_count
+from sundae_ns.pruning.rule import PruneRule, ScoreName, kept_count
 from sundae_ns.scene.render import contribution
 from sundae_ns.train.schedules import notify_pruned
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
@@ -95,7 +95,7 @@ class PruningConfig(PruneRule):
         """Check every option; raises a ConfigError with the first that is invalid and its remedy."""
         super().validate()
         if self.keep_ratio is not None:
-            check_share(self.keep_ratio)
+            kept_count(self.keep_ratio, 1)  # raises if the share is invalid
         self.check_at_least(every=1, prune_at=0, start=0, max_gaussians=1, target_gaussians=1, max_bytes=1)
         cap, target = self.max_gaussians, self.target_gaussians
         continuous = self.mode == "continuous"
