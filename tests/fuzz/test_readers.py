@@ -22,6 +22,7 @@ import torch
 from fields import random_field
 from foreign_files import FOREIGN, small_field
 from hypothesis import HealthCheck, given, settings
+from packed_scenes import header_and_body, sealed
 from plyfile import PlyData, PlyElement
 
 from sundae_ns.core.errors import PackError
@@ -74,17 +75,6 @@ def scene() -> PackedScene:
     return PackedScene(random_field(50, 2, 3), head, cameras, {"model": {"sh_degree": 2}})
 
 
-def parts(content: bytes) -> tuple[dict[str, Any], bytes]:
-    """Header and sections of a packed scene."""
-    (length,) = struct.unpack("<I", content[12:16])
-    return json.loads(content[48 : 48 + length]), content[48 + length :]
-
-
-def sealed(meta: bytes, body: bytes) -> bytes:
-    """A packed scene with this header and body, and a valid checksum of the header."""
-    return b"\x89SUNDAE\n" + struct.pack("<II", 3, len(meta)) + hashlib.sha256(meta).digest() + meta + body
-
-
 def resealed(meta: dict[str, Any], body: bytes) -> bytes:
     """The file with valid checksums of header and sections."""
     offset = 0
@@ -92,7 +82,7 @@ def resealed(meta: dict[str, Any], body: bytes) -> bytes:
         length = sum(section["parts"])
         section["sha256"] = hashlib.sha256(body[offset : offset + length]).hexdigest()
         offset += length
-    return sealed(json.dumps(meta).encode(), body)
+    return sealed(meta, body)
 
 
 def unpack(path: Path) -> None:
@@ -172,7 +162,7 @@ def test_damaged_files(good: Any, verdict: Any, tmp_path: Path, name: str, chang
 def test_damaged_packs_with_valid_checksums(
     good: Any, verdict: Any, tmp_path: Path, change: Callable[[bytes], bytes], header: bool
 ) -> None:
-    meta, body = parts(good("a.sundae"))
+    meta, body = header_and_body(good("a.sundae"))
     if header:
         content = sealed(change(json.dumps(meta).encode()), body)
     else:
@@ -251,7 +241,7 @@ def test_odd_packs_are_refused(kind: str, verdict: Any, tmp_path: Path) -> None:
 def test_bombs_are_refused_before_they_unpack(stated: int, words: str, good: Any, verdict: Any, tmp_path: Path) -> None:
     deflate = zlib.compressobj(9, wbits=-15)
     stream = deflate.compress(bytes(1 << 27)) + deflate.flush()
-    meta, body = parts(good("a.sundae"))
+    meta, body = header_and_body(good("a.sundae"))
     meta["sections"].append({"name": "a", "dtype": "|u1", "shape": [stated], "parts": [len(stream)]})
     content = resealed(meta, body + stream)
     (tmp_path / "a.sundae").write_bytes(content)
@@ -264,7 +254,7 @@ def test_a_few_constant_planes_cannot_fill_the_memory(verdict: Any, tmp_path: Pa
     """Every section is within its limit, but the field that they describe is not."""
     n, path = 200_000, tmp_path / "a.sundae"
     write_scene(path, PackedScene({k: v[:1].expand(n, *v.shape[1:]) for k, v in scene().gaussians.items()}))
-    meta, body = parts(path.read_bytes())
+    meta, body = header_and_body(path.read_bytes())
     padding = meta["sections"].pop()
     assert padding["name"] == "padding"
     content = resealed(meta, body[: len(body) - sum(padding["parts"])])

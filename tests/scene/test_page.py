@@ -9,7 +9,6 @@ import io
 import json
 import logging
 import re
-import struct
 import subprocess
 from collections.abc import Callable
 from functools import partial
@@ -21,7 +20,7 @@ import numpy as np
 import pytest
 import torch
 from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_node
-from packed_scenes import KINDS, write_bomb, write_kind
+from packed_scenes import KINDS, header_and_body, sealed, write_bomb, write_kind
 from PIL import Image
 
 import sundae_ns as sn
@@ -153,11 +152,8 @@ def test_the_decoder_agrees_with_python(decode: Callable[..., list[Json]], tmp_p
     for file, found, kind in zip(files, decode(*files), KINDS.values(), strict=True):
         truth = read_scene(file)
         assert found["count"] == len(truth.gaussians["means"])
-        assert (found["degree"], found["logits"], found["antialiased"]) == (
-            kind.degree,
-            kind.degree == 0,
-            kind.antialiased,
-        )
+        stated = (found["degree"], found["logits"], found["antialiased"])
+        assert stated == (kind.degree, kind.degree == 0, kind.antialiased)
         for name, value in {**truth.gaussians, **truth.head}.items():
             array = np.fromfile(f"{file}.{name}", np.float32)
             # Sums of the transform and lengths of quaternions round in another order.
@@ -168,17 +164,6 @@ def test_the_decoder_agrees_with_python(decode: Callable[..., list[Json]], tmp_p
         assert truth.cameras is not None
         poses = [camera["pose"] for camera in found["cameras"]]
         assert torch.equal(torch.tensor(poses).reshape(-1, 3, 4), truth.cameras["poses"])
-
-
-def parts(content: bytes) -> tuple[Json, bytes]:
-    (length,) = struct.unpack("<I", content[12:16])
-    return json.loads(content[48 : 48 + length]), content[48 + length :]
-
-
-def sealed(meta: Json, body: bytes) -> bytes:
-    """A file with this header and body, and a valid checksum of the header."""
-    text = json.dumps(meta).encode()
-    return b"\x89SUNDAE\n" + struct.pack("<II", 3, len(text)) + hashlib.sha256(text).digest() + text + body
 
 
 def compressed(sections: list[Json]) -> tuple[int, int, Json]:
@@ -259,7 +244,7 @@ def test_the_decoder_refuses_what_python_refuses(
     files = {"truncated": good[:-1], "longer": good + b"x", "empty": b"", "another file": b"ply\n" + good[4:]}
     files |= {"cut in its header": good[:100], "another version": good[:8] + b"\x02" + good[9:]}
     files |= {"an altered header": good[:60] + b"~" + good[61:], "an altered section": good[:-1] + b"~"}
-    meta, body = parts(good)
+    meta, body = header_and_body(good)
     for name, lie in LIES.items():
         changed = json.loads(json.dumps(meta))
         lie(changed)
@@ -283,7 +268,7 @@ def test_the_decoder_refuses_what_python_refuses(
 
 @needs_node
 def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]], packed: Path, tmp_path: Path) -> None:
-    meta, body = parts(packed.read_bytes())
+    meta, body = header_and_body(packed.read_bytes())
     lies = {
         "model": None,
         "model.sh_degree": 1,

@@ -57,9 +57,8 @@ def test_a_refit_matches_views_that_it_was_not_given(encoding: Encoding) -> None
 
 def test_a_field_that_matches_already_is_unchanged() -> None:
     full = scene()
-    assert (
-        refit(full.gaussians, full.gaussians, sn.virtual_cameras(full, 4, size=24), full.settings()) is full.gaussians
-    )
+    cameras = sn.virtual_cameras(full, 4, size=24)
+    assert refit(full.gaussians, full.gaussians, cameras, full.settings()) is full.gaussians
 
 
 def test_a_refit_that_diverges_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,12 +83,8 @@ def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None
         return images(gaussians, cameras, settings)  # type: ignore[arg-type]
 
     monkeypatch.setattr(module, "_blended", spy)
-    refit(
-        pruned(full),
-        full.gaussians,
-        [*sn.virtual_cameras(full, 2, size=96), *sn.virtual_cameras(full, 1, size=12)],
-        full.settings(),
-    )
+    cameras = [*sn.virtual_cameras(full, 2, size=96), *sn.virtual_cameras(full, 1, size=12)]
+    refit(pruned(full), full.gaussians, cameras, full.settings())
     assert sizes == {(24, 24), (12, 12)}
 
 

@@ -41,10 +41,7 @@ def started() -> sn.Scene:
 def same(one: sn.Scene, other: sn.Scene) -> bool:
     assert one.start is not None
     assert other.start is not None
-    alike = all(
-        torch.allclose(a, b, atol=1e-6)
-        for a, b in ((one.start.viewmat, other.start.viewmat), (one.start.K, other.start.K))
-    )
+    alike = all(torch.allclose(a, b, atol=1e-6) for a, b in zip(one.start[:2], other.start[:2], strict=True))
     return alike and one.start[2:] == pytest.approx(other.start[2:]) and one.up == pytest.approx(other.up)
 
 

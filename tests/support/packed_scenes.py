@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -146,3 +150,15 @@ def _cameras() -> dict[str, Tensor]:
     poses[1, :, 3] = torch.tensor([0.1, 0.0, 0.55])
     lens = torch.tensor([FOCAL, FOCAL + 1, 24.0, 19.5]).double()
     return {"poses": poses, "intrinsics": lens.repeat(2, 1), "sizes": torch.tensor([[WIDTH, HEIGHT]]).repeat(2, 1)}
+
+
+def header_and_body(content: bytes) -> tuple[dict[str, Any], bytes]:
+    """Header and sections of a packed scene."""
+    (length,) = struct.unpack("<I", content[12:16])
+    return json.loads(content[48 : 48 + length]), content[48 + length :]
+
+
+def sealed(meta: dict[str, Any] | bytes, body: bytes) -> bytes:
+    """A packed scene with this header and body, and a valid checksum of the header."""
+    text = meta if isinstance(meta, bytes) else json.dumps(meta).encode()
+    return b"\x89SUNDAE\n" + struct.pack("<II", 3, len(text)) + hashlib.sha256(text).digest() + text + body
