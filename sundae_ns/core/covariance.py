@@ -109,22 +109,18 @@ def mean_projected_area(scales: Tensor) -> Tensor:
 
 
 def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: float) -> Tensor:
-    """Bhattacharyya coefficient of each Gaussian with its neighbours, in [0, 1]; 1 for equal Gaussians.
+    """Bhattacharyya coefficient of each Gaussian with its neighbours ``[N, K]``, in [0, 1]; 1 for equal Gaussians.
 
     ``exp(-(d^T S^-1 d) / 8) (|A| |B|)^(1/4) / |S|^(1/2)`` with ``S = (A + B) / 2`` (Bhattacharyya, 1943).
 
     Args:
-        means: world units ``[N, 3]``.
+        means: world units ``[N, 3]``; the result has their dtype.
         covariance: squared world units ``[N, 3, 3]``.
         indices: neighbours ``[N, K]``.
         least_width: standard deviation added to all axes, world units; without it, parallel flat Gaussians would not
             overlap however close they are.
-
-    Returns:
-        ``[N, K]``, dtype of ``means``.
     """
-    indices = indices.to(means.device)
-    least_variance = least_width**2
+    indices, least_variance = indices.to(means.device), least_width**2
     added = least_variance * torch.tensor([1, 1, 1, 0, 0, 0], dtype=torch.float64, device=means.device)
     points = means.double()
     entries, log_det = points.new_empty(len(means), 6), points.new_empty(len(means))

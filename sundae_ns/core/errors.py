@@ -101,8 +101,8 @@ def reading(
 ) -> Iterator[None]:
     """Turn every error of reading an untrusted file into a ``failure``; decoders raise errors of many kinds.
 
-    ``kind`` names what the file should be: ``"a complete .spz"``. ``remedy`` is the remedy for a damaged file,
-    ``missing`` that for one that cannot be opened.
+    ``kind`` names what the file should be: ``"a complete .spz"``. ``remedy`` is for a damaged file, ``missing`` for one
+    that cannot be opened.
     """
     try:
         yield

@@ -155,12 +155,9 @@ class Sanitised(NamedTuple):
     """The valid Gaussians ``[M, ...]``; the tensors of the source if nothing changed."""
     mask: Tensor
     """True for these Gaussians of the source, bool ``[N]``."""
-    limits: int
-    """Number of them with an opacity of exactly 0 or 1, which was clamped."""
-    flat: int
-    """Number of them with a width of 0, which was clamped."""
-    unrotated: int
-    """Number of them with an all-zero quaternion, which became the identity."""
+    limits: int  # number of them with an opacity of exactly 0 or 1, which was clamped
+    flat: int  # with a width of 0, which was clamped
+    unrotated: int  # with an all-zero quaternion, which became the identity
 
     @property
     def dropped(self) -> int:

@@ -106,11 +106,9 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     changed = (torch.bincount(group, minlength=count) > 1) & (largest > 0) & bounded
     for value in merged.values():
         changed &= value.reshape(count, -1).isfinite().all(dim=1)
-    result = {}
-    for name, value in kept.items():
-        value = value.clone()
+    result = {name: value.clone() for name, value in kept.items()}
+    for name, value in result.items():
         value[changed] = merged[name][changed].to(value.dtype)
-        result[name] = value
     return result
 
 

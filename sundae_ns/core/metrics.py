@@ -116,13 +116,10 @@ def lpips_weights(net: Net = "alex") -> tuple[str, Path]:
 
 
 class Lpips:
-    """Learned perceptual image patch similarity (Zhang et al. 2018), built at its first use.
+    """Learned perceptual image patch similarity (Zhang et al. 2018), built at its first use, which downloads weights.
 
     torchmetrics' variant with ``normalize=True``, for images in [0, 1]. Values of different nets do not compare: most
     papers report VGG, splatfacto and gsplat report AlexNet. No ``nn.Module``, so that checkpoints do not hold the net.
-
-    Args:
-        net: the backbone, ``alex``, ``vgg`` or ``squeeze``. Missing weights are downloaded.
     """
 
     def __init__(self, net: Net = "alex") -> None:

@@ -25,7 +25,7 @@ def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimize
     """
     n = num_gaussians(params)
     for name, value in params.items():
-        if value.ndim == 0 or value.shape[0] != n:
+        if not per_gaussian(value, n):
             raise DataError(f"parameter {name!r} has shape {list(value.shape)} for {n} Gaussians: resize it")
         if name not in optimizers:
             continue

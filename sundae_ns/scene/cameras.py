@@ -203,7 +203,7 @@ def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None)
     return dataclasses.replace(scene, start=scene.cameras[int(start_view)])
 
 
-MOST_FRAMES = 36_000  # 25 minutes
+MOST_FRAMES = 36_000  # of a film: 25 minutes
 _STEEP = 0.95  # largest sine of a camera's pitch; steeper ones have no upright image
 Array = NDArray[np.float64]
 

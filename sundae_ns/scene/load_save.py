@@ -139,8 +139,7 @@ def _of_run(path: Path) -> Scene:
 def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -> Scene:
     """The scene of a checkpoint ``source`` with the contents ``loaded``, in a run with a ``config.yml``; on the CPU.
 
-    Raises:
-        CheckpointError: the run is of another method, or its parts do not fit together.
+    ``CheckpointError`` if the run is of another method, or its parts do not fit together.
     """
     options = model_options(config)
     gaussians, state = checkpoint.gaussians_of(loaded, source), checkpoint.model_state(loaded)

@@ -28,11 +28,7 @@ _PROPERTIES: dict[str, Any] = FORMAT["header"]["properties"]
 
 
 def scene_of(packed: PackedScene) -> Scene:
-    """The scene of a packed file's contents, on the CPU.
-
-    Raises:
-        PackError: the contents state an impossible model, or another head than they have.
-    """
+    """The scene of a packed file's contents, on the CPU; ``PackError`` for an impossible model, or another head."""
     stated: dict[str, Any] = packed.meta.get("model")  # type: ignore[assignment]
     wrong = fault(stated, _MODEL, "model")
     if wrong is not None:
@@ -92,11 +88,7 @@ def packed_bytes(scene: Scene) -> bytes:
 
 
 def stated_start(scene: Scene) -> dict[str, Any]:
-    """Entries ``up`` and ``start`` of a packed file's header, as far as the scene has them.
-
-    Raises:
-        ConfigError: readers would refuse them.
-    """
+    """Entries ``up`` and ``start`` of a packed file's header; ``ConfigError`` for values that readers would refuse."""
     stated: dict[str, Any] = {}
     if scene.up is not None:
         stated["up"] = [float(value) for value in scene.up]

@@ -37,13 +37,8 @@ def page_of(scene: Scene, packed: bytes, *, title: str) -> str:
 def write_page(path: Path, scene: Scene, packed: bytes, *, title: str) -> int:
     """Write the page of a scene as one file, or as a folder with ``index.html`` and ``scene.sundae`` for a web server.
 
-    Args:
-        path: file with a suffix, or folder without one.
-        scene: for the first image; rendered on its device.
-        packed: the scene as a packed file.
-
-    Returns:
-        Bytes of the file or of both files.
+    ``path`` with a suffix is a file, without one a folder. ``scene`` gives the first image, ``packed`` is its packed
+    file. Returns the bytes of all files.
     """
     if path.suffix:
         write_text(path, page_of(scene, packed, title=title))
@@ -78,11 +73,7 @@ def _poster(scene: Scene) -> str:
 
 
 def render_first(scene: Scene) -> Image.Image:
-    """The image of the start view, else of the first camera, head included, at most 640 pixels wide and high.
-
-    Raises:
-        MemoryExhaustedError: the view has more Gaussians than any real scene, or needs more memory than there is.
-    """
+    """The image of the start view, else of the first camera, head included, at most 640 pixels wide and high."""
     camera = scene.start or (scene.cameras[0] if scene.cameras else camera_in_front(scene))
     return image_of(render(scene, camera.zoomed(min(640 / max(camera.width, camera.height), 1.0))).rgb)
 

@@ -126,8 +126,7 @@ def prune_with_mask(
         fitted = refit(gaussians, full.gaussians, scaled, scene.settings(head=False), seed=rule.seed, console=console)
         fitted = resized(dataclasses.replace(scene, gaussians=fitted), size).gaussians
         small = dataclasses.replace(scene, gaussians=fitted)
-    mask = sanitised.mask.clone()
-    mask[sanitised.mask] = pruned.decision.mask
+    mask = within(sanitised.mask, pruned.decision.mask)
     return PrunedScene(small, mask, None if weights is None else float((weights > 0).float().mean()))
 
 

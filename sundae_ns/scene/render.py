@@ -55,12 +55,9 @@ class ColorSettings:
 
 
 def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tensor, settings: ColorSettings) -> Tensor:
-    """Colours of Gaussians as seen from a place, at least 0 ``[M, 3]``.
+    """Colours of Gaussians as seen from a camera centre ``[3]``, or one for each ``[M, 3]``; at least 0 ``[M, 3]``.
 
-    Args:
-        params: ``means`` ``[M, 3]``, ``features_dc`` and ``features_rest``.
-        gaussians: those that the parameters belong to, for their encoding.
-        center: camera centre ``[3]``, or one for each Gaussian ``[M, 3]``; world units.
+    ``params`` has ``means``, ``features_dc`` and ``features_rest`` of M of the ``gaussians``, which give the encoding.
     """
     if gaussians.encoding == "logits":
         return params["features_dc"].sigmoid()
@@ -171,10 +168,8 @@ def draw(
 def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, background: Tensor) -> Tensor:
     """The corrected image of one splatting pass ``[H, W, 3]``, not clamped. Only this function runs the head.
 
-    ``base`` is the image without the head, ``splatted`` holds colours and features without background.
-
-    Raises:
-        MemoryExhaustedError: on a CPU, the layers of the head need more memory than there is.
+    ``base`` is the image without the head, ``splatted`` holds colours and features without background. On a CPU,
+    ``MemoryExhaustedError`` if the layers of the head need more memory than there is.
     """
     height, width = base.shape[:2]
     if base.device.type == "cpu":
@@ -229,14 +224,9 @@ def contribution(
 ) -> Tensor:
     """Blending weight of each Gaussian, summed over the pixels of all views ``[N]``.
 
-    Args:
-        background: colour ``[3]``; fixed, so that the result does not depend on a random one.
-        count: number of Gaussians that a prune will keep. If given, pixels are weighted by the detail that these
-            cannot show (:func:`sundae_ns.pruning.scores.pixel_detail`).
-        console: shows a progress bar; None for none.
-
-    Raises:
-        DataError: a mask has another size than its view.
+    The background is fixed, so that the result does not depend on a random one. With ``count``, the number of Gaussians
+    that a prune will keep, pixels are weighted by the detail that these cannot show
+    (:func:`sundae_ns.pruning.scores.pixel_detail`). ``DataError`` if a mask has another size than its view.
     """
     total = torch.zeros(source.gaussians.num_gaussians, device=source.gaussians["means"].device)
     tracked: Iterable[TrainingCamera] = cameras
