@@ -47,7 +47,7 @@ def test_a_run_opens_while_its_training_replaces_the_checkpoint(
 ) -> None:
     run = Path(shutil.copytree(tiny.folder, tmp_path / "run"))
     newest = checkpoint.newest_whole(run)[0]
-    monkeypatch.setattr(opening, "_device", lambda: (newest.unlink(missing_ok=True), torch.device("cpu"))[1])
+    monkeypatch.setattr(opening, "fastest_device", lambda: (newest.unlink(missing_ok=True), torch.device("cpu"))[1])
     assert load_model(run).steps == tiny.steps  # it reads the capture for seconds after it has found the checkpoint
 
 
@@ -114,7 +114,7 @@ def test_a_head_that_is_not_enabled_yet_counts_no_bytes(tiny: Any) -> None:
 
 
 def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path) -> None:
-    assert load_model(tiny.config).kept == tiny.keep_ratio
+    assert load_model(tiny.config).kept == pytest.approx(tiny.keep_ratio, abs=0.01)  # a whole number of Gaussians
     run = Path(shutil.copytree(tiny.folder, tmp_path / "run"))
     prunes = [{"before": 200, "after": 50, "seconds": 1.0}, {"before": 80, "after": 40, "seconds": 0.5}]
     (run / "prune.json").write_text(json.dumps(prunes))
