@@ -199,7 +199,7 @@ def test_targets_that_cannot_be_met(tiny: Any, tmp_path: Path, capsys: pytest.Ca
 
 def test_a_fine_tune_that_loses_says_so(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plain = packed(capsys, tiny.folder, "-o", tmp_path / "plain.sundae")
-    words = [tiny.folder, "-o", tmp_path / "a.sundae", "--finetune", 1, "--head-step", "0.02", "--color-step", "1"]
+    words = [tiny.folder, "-o", tmp_path / "a.sundae", "--finetune", 1, "--head-step", "0.021", "--color-step", "1"]
     with pytest.raises(SystemExit, match="0"):
         main(["pack", *map(str, words)])
     lost = capsys.readouterr()
