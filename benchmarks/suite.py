@@ -98,11 +98,12 @@ def find_captures(folder: Path, scenes: Sequence[str] = ()) -> list[Path]:
 
 def check(data: Path, parser: Words, method: str) -> None:
     """Check a capture as a training by a method of this package does; ``DataError`` if it cannot be used."""
-    # Late, since it loads the trainer.
+    # Late, since they load the trainer.
     from harness.job import parse
+    from sundae_ns.plugin.dataparsers import check_capture
 
-    datamanager: Any = parse((method, "--data", str(data), *parser)).pipeline.datamanager
-    datamanager.check()
+    config: Any = parse((method, "--data", str(data), *parser)).pipeline.datamanager
+    check_capture(config.dataparser, data, ("train", "val"))
 
 
 def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping[str, str], command: str) -> str:

@@ -127,12 +127,12 @@ def load_kernels(
 def kernels_where_possible(
     load: Callable[[torch.device], dict[str, Launch]], device: torch.device, instead: str
 ) -> dict[str, Launch] | None:
-    """Kernels of a CUDA device from ``load``; None, and one line in the log, where they cannot be compiled or loaded.
+    """Kernels from ``load``; None on a CPU, and with one line in the log where they cannot be compiled or loaded.
 
     ``instead`` says what happens without them.
     """
     try:
-        return load(device)
+        return load(device) if device.type == "cuda" else None
     except BackendError as error:
         _log.warning("%s, on %s: %s", instead, device, error)
         return None

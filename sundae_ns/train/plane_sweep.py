@@ -244,9 +244,8 @@ def _correlations(
     patches = _patches(photo.grey)
     # X' = R X + t with s normal . X = 1: the ray r projects to K (R r + s (normal . r) t).
     ways = [other.camera.K @ (other.camera.viewmat @ photo.pose)[:3] for other in others]
-    slower, kernels = "a plane sweep runs as hundreds of kernels a direction", None
-    if photo.grey.is_cuda:
-        kernels = kernels_where_possible(sweep_kernels, photo.grey.device, slower)
+    slower = "a plane sweep runs as hundreds of kernels a direction"
+    kernels = kernels_where_possible(sweep_kernels, photo.grey.device, slower)
     if kernels:
         maps = torch.stack([torch.cat([way[:, :3] @ photo.unproject, way[:, 3:]], dim=1) for way in ways])
         images = [other.grey[0, 0] for other in others]

@@ -117,7 +117,7 @@ def _losses(
     single = all(value.dtype == torch.float32 for value in (image, target, base) if value is not None)
     large = min(target.shape[:2]) >= SSIM_WINDOW
     if weight > 0 and large and single:
-        if image.is_cuda and kernels_where_possible(loss_kernels, image.device, "SSIM runs as slower convolutions"):
+        if kernels_where_possible(loss_kernels, image.device, "SSIM runs as slower convolutions"):
             return fused_loss(image, target, weight, base, l1_weight=l1_weight)
     of_base = None if base is None else (base - target).abs().mean()
     if weight == 0 or not large:

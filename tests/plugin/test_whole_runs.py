@@ -335,7 +335,7 @@ def test_signals_to_the_command_of_two_ranks(
         ({"mixed_precision": True}, "--mixed-precision"),
         ({"gradient_accumulation_steps": {"means": 2}}, "--gradient-accumulation-steps"),
         (
-            {"pipeline.model.pruning.mode": "continuous", "pipeline.model.pruning.max_primitives": 9},
+            {"pipeline.model.pruning.mode": "continuous", "pipeline.model.pruning.max_gaussians": 9},
             "continuous pruning to a count",
         ),
         ({"machine.device_type": "cpu"}, "needs GPUs.*device-type is cpu"),
