@@ -411,11 +411,13 @@ def test_cpu_and_gpu_select_the_same_up_to_ties(rule: PruneRule, name: str) -> N
     differing = on_gpu.mask.cpu() != on_cpu.mask
     print(f"{name}: {int(differing.sum())} of {n} Gaussians differ")
     assert on_gpu.kept == on_cpu.kept
-    if rule.score == "response" and name != "two clusters 1e6 apart":  # float32 leaves ties there, in any order
+    if on_gpu.values is not None:
+        assert all(value.isfinite().all() for value in on_gpu.values.values())
+    if rule.score == "response" and name == "two clusters 1e6 apart":
+        return  # float32 leaves ties among the distances, and each device may settle them in another order
+    if rule.score == "response":
         # Responses agree up to rounding, so only Gaussians within rounding of a threshold may differ.
         expected, found = response(params, rule), response(on_device, rule).cpu()
         largest = float(expected.nan_to_num().max())
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-6 * largest, equal_nan=True)
-    if on_gpu.values is not None:
-        assert all(value.isfinite().all() for value in on_gpu.values.values())
     assert int(differing.sum()) <= max(2, n // 500)
