@@ -38,7 +38,6 @@ import numpy  # noqa: F401
 import pytest
 import scipy.spatial  # noqa: F401
 import torch
-import zstandard  # noqa: F401
 from rich.console import Console
 from rich.progress import track
 
