@@ -9,7 +9,7 @@ from torch import Tensor
 from sundae_ns.graph.neighbors import knn
 
 CUTOFF = 3.0  # edges end at this many sigma, where the weight has fallen to exp(-4.5) = 0.011
-SAMPLED = 2**20  # most distances of which the median is taken
+SAMPLED = 2**20  # most distances in the sample for the median
 
 
 @dataclass(frozen=True, eq=False)

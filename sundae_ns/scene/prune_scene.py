@@ -135,7 +135,7 @@ def weights_in(
 ) -> Tensor:
     """Blending weight of each Gaussian of a finite scene, summed over the pixels of cameras ``[N]``.
 
-    With ``count``, pixels are weighted by the detail that so many Gaussians cannot show. Raises ``DataError`` if the
+    With ``count``, pixels are weighted by the detail that ``count`` Gaussians cannot show. Raises ``DataError`` if the
     cameras see none.
     """
     sized, scaled = of_unit_size(scene, cameras)
@@ -313,7 +313,7 @@ def kept(scene: Scene, mask: Tensor) -> Scene:
 
 
 def within(mask: Tensor | None, inner: Tensor) -> Tensor:
-    """A mask ``[N]`` of which only the entries under ``inner`` ``[M]`` stay, for its M true ones; None is all true."""
+    """Apply a mask ``inner`` ``[M]`` to the M true entries of a mask ``[N]``; None stands for all true."""
     if mask is None:
         return inner
     narrowed = mask.clone()

@@ -33,7 +33,7 @@ GAIN_PER_DOUBLING = 0.4
 twice this at the end of a run, and a trial shows a part of a gain."""
 LEAST_LOSS = 0.005  # Growth of the loss over the best measurement, as a share, from which on more training harms
 
-HELD_OUT_EVERY, MOST_HELD_OUT = 8, 16  # One of this many training views is held out, at most so many
+HELD_OUT_EVERY, MOST_HELD_OUT = 8, 16  # Every 8th training view is held out, at most 16
 FEW_VIEWS = 12  # With fewer training views, two are held out in turn, for trials of half the length
 HEAD_STEPS = 1200
 """Length of a trial of a head, if it is between the shares below: shorter ones show too little of what it gains."""
@@ -101,7 +101,7 @@ def plan_heads(indices: Sequence[int], steps: int) -> tuple[list[list[int]], int
 
 
 def least_gain(doublings: float) -> float:
-    """PSNR that a scene must gain whose stored bytes are doubled so many times, dB."""
+    """PSNR that a scene must gain for this number of doublings of its bytes, dB."""
     return max(LEAST_GAIN, GAIN_PER_DOUBLING * doublings)
 
 

@@ -747,7 +747,7 @@ class AfterPrune(Callback):
 
 
 def _steps_of(run: TrainingRun) -> int:
-    """Steps of the run, of which this training may be the first part; 0 if they are not known."""
+    """Steps of the whole schedule, at least those of this training; 0 if unknown."""
     return 0 if run.last_step is None else max(run.last_step + 1, run.schedule_length or 0)
 
 
