@@ -7,7 +7,6 @@ moved and turned a little, and the images of no camera are overfitted.
 from __future__ import annotations
 
 import dataclasses
-import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from pytorch_msssim import SSIM
 from torch.nn import Parameter
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import BackendError, CheckpointError, ConfigError, reading
+from sundae_ns.core.errors import CheckpointError, ConfigError, reading
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import FEATURES, Gaussians, sanitise
 from sundae_ns.cuda.kernels import naming_full_memory
@@ -37,9 +36,7 @@ from sundae_ns.train.choice import least_gain
 from sundae_ns.train.graphed_step import RecordedStep
 from sundae_ns.train.schedules import NETWORK_BETAS, fused_adam, network_groups, sparse_factor
 from sundae_ns.train.state import TrainingState
-from sundae_ns.train.step import StepInputs, StepLosses, TrainingStep
-
-_log = logging.getLogger(__name__)
+from sundae_ns.train.step import StepInputs, StepLosses, training_step
 
 STEPS = {"cpu": 3000, "cuda": 8000}  # Steps by the device
 SIDES = {"cpu": 128, "cuda": 512}  # Sides of the images by the device, pixels
@@ -195,17 +192,9 @@ class Distillation:
         state.step = i + 1  # a head is enabled in the steps after its start
         inputs = StepInputs(camera, target, None, self._teacher.background)
         settings = state.render_settings(self._settings.backend, antialiased=self._teacher.antialiased, training=True)
-        if self._recorded is not None:
-            try:
-                self._recorded(state, inputs, settings)
-                return
-            except BackendError as error:
-                _log.warning("the distillation runs kernel by kernel, slower: %s", error)
-                self._recorded = None
-        loss, _, _ = TrainingStep(GaussianSource(state.gaussians), state, self._losses, state.gaussians)(
-            inputs, settings
-        )
-        loss.backward()
+        if self._recorded is not None and self._recorded(state, inputs, settings) is not None:
+            return
+        training_step(GaussianSource(state.gaussians), state, self._losses, inputs, settings)[0].backward()
         for optimizer in state.optimizers.values():
             optimizer.step()
             optimizer.zero_grad()

@@ -7,7 +7,6 @@ straight-through estimator of Bengio, Leonard and Courville, 2013). So losses an
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.core.errors import BackendError, CheckpointError, ConfigError
+from sundae_ns.core.errors import CheckpointError, ConfigError
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.pack.codecs import Codecs, estimated_bits
 from sundae_ns.io.pack.config import PackConfig
@@ -28,9 +27,7 @@ from sundae_ns.scene.optimise import optimise, rate_factor
 from sundae_ns.scene.render import RenderSettings
 from sundae_ns.train.graphed_step import StepRecordings
 from sundae_ns.train.schedules import NETWORK_BETAS
-from sundae_ns.train.step import StepInputs, StepResult
-
-_log = logging.getLogger(__name__)
+from sundae_ns.train.step import StepInputs, StepResult, training_step
 
 RATES = {
     "features_dc": 5e-4,
@@ -153,19 +150,15 @@ class RoundedTraining:
 
     def step(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train on one image; ``torch.cuda.OutOfMemoryError`` if the GPU's memory is full."""
-        if self._can_record:
-            kind = (inputs.camera.width, inputs.camera.height, inputs.mask is not None)
-            try:
-                return self._recordings.run(self._run, inputs, settings, kind=kind)
-            except BackendError as error:
-                _log.warning("the fine-tune runs kernel by kernel, slower: %s", error)
-                self._can_record = False
-        return self._run(inputs, settings, None)
+        kind = (inputs.camera.width, inputs.camera.height, inputs.mask is not None)
+        result = self._recordings.run(self._run, inputs, settings, kind=kind) if self._can_record else None
+        return self._run(inputs, settings, None) if result is None else result
 
     def _run(self, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None) -> StepResult:
         """One step; all of its work is recorded."""
         self._round()
-        loss, _, result = self._model.training_step(inputs, settings)
+        model = self._model
+        loss, _, result = training_step(model.source, model.state, model.losses, inputs, settings)
         gradients = torch.autograd.grad(loss, list(self.rounded.values()), allow_unused=True)
         of_rate: tuple[Tensor | None, ...] = (None,) * len(self.exact)
         if self._rate > 0:

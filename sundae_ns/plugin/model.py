@@ -32,14 +32,21 @@ from sundae_ns.plugin.viewer import ViewerControls, in_viewer
 from sundae_ns.rasterize.interface import select_backend
 from sundae_ns.rasterize.types import Backend
 from sundae_ns.scene.frames import FrameReplay, Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs
-from sundae_ns.scene.render import SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, StepResolution, contribution
+from sundae_ns.scene.render import (
+    SHOWN_BACKGROUNDS,
+    GaussianSource,
+    RenderSettings,
+    StepResolution,
+    contribution,
+    render_view,
+)
 from sundae_ns.train.build import build
 from sundae_ns.train.curve import CurvePoint
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.initialize import Start
 from sundae_ns.train.pruning import PruningConfig
 from sundae_ns.train.state import Callback, TrainingState
-from sundae_ns.train.step import StepInputs, StepLosses, TrainingStep, training_part
+from sundae_ns.train.step import StepInputs, StepLosses, training_part
 from sundae_ns.train.trials import Trials
 
 
@@ -241,7 +248,7 @@ class SundaeModel(SplatfactoModel):
     def _training_outputs(self, ns_camera: Cameras) -> MutableMapping[str, Any]:
         background, (camera, crop) = self._get_background_color(), self._training_camera(ns_camera)
         settings, depth = self.render_settings(training=True), self.config.output_depth_during_training
-        images, splatted = self.training_step.images(camera, background, settings, depth=depth)
+        images, splatted = render_view(self.source, camera, background, settings, depth=depth)
         self.state.info = splatted.info
         for callback in self.train_callbacks:
             callback.before_backward(self.state)
@@ -276,11 +283,6 @@ class SundaeModel(SplatfactoModel):
         return [point for one in self.train_callbacks if isinstance(one, Trials) for point in one.progress.curve()]
 
     # ----------------------------------------------------------------------------------------------------- training
-
-    @property
-    def training_step(self) -> TrainingStep:
-        """The training step, which nerfstudio's loop runs in two halves."""
-        return TrainingStep(self.source, self.state, self.losses, self.state.gaussians)
 
     def _training_camera(self, ns_camera: Cameras) -> tuple[Camera, Crop | None]:
         """The part of a training camera that a step shows. Views are kept: copying one to a GPU waits for it."""

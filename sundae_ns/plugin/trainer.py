@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -21,9 +20,8 @@ from nerfstudio.utils import profiler, writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
-from torch import Tensor
 
-from sundae_ns.core.errors import NOTHING_SAVED, BackendError, CheckpointError, StorageError, SundaeError, one_line
+from sundae_ns.core.errors import NOTHING_SAVED, CheckpointError, StorageError, SundaeError, one_line
 from sundae_ns.core.files import write_text, writing
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io import checkpoint, run_folder
@@ -109,13 +107,6 @@ class SundaeTrainerConfig(TrainerConfig):
         write_text(path, yaml.dump(self))
 
 
-def _detached(result: tuple[Tensor, Mapping[str, Any], Mapping[str, Any]]) -> tuple[Any, ...]:
-    """Loss, its terms, and metrics without their graph; nerfstudio holds them until the next step."""
-    loss, *parts = result
-    values = [{k: v.detach() if isinstance(v, Tensor) else v for k, v in part.items()} for part in parts]
-    return loss.detach(), *values
-
-
 class SundaeTrainer(Trainer):
     """Saves atomically, resumes from the newest whole checkpoint, and restores the random generators."""
 
@@ -193,11 +184,13 @@ class SundaeTrainer(Trainer):
         else:
             self._batch_ends = step + self.ranks.count
             if all(callback.trains(model.state) for callback in model.train_callbacks):
-                self._result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
+                self._result = self._recorded_iteration(step) or self._iteration(step)
                 if self.ranks.count > 1:
                     self.ranks.sharded.count_views(model.state, absgrad=model.config.use_absgrad)
-            elif self._result is None:  # the run was resumed while training is paused
-                self._result = self._untrained(step)
+            elif self._result is None:  # the run was resumed while training is paused: measure one image
+                with torch.no_grad(), torch.random.fork_rng([model.device] if model.device.type == "cuda" else []):
+                    _, terms, metrics = self.pipeline.get_train_loss_dict(step)
+                self._result = torch.stack([*terms.values()]).sum(), terms, metrics
         self._trained = step
         self._warn_if_long(step - self._start_step)
         if step + 1 == self._batch_ends:
@@ -205,16 +198,10 @@ class SundaeTrainer(Trainer):
             self.stop_training = self.stop_training or bool(self._stopped_by)
         return self._result
 
-    @torch.no_grad()
-    def _untrained(self, step: int) -> Any:
-        """Loss, its terms and metrics of the image of a step, without training on it."""
-        state = self.model.state
-        focal = state.trained_focal
-        # The random state of the checkpoint is that of a run that was never stopped.
-        with torch.random.fork_rng([state.device] if state.device.type == "cuda" else []):
-            _, terms, metrics = self.pipeline.get_train_loss_dict(step)
-        state.trained_focal = focal
-        return _detached((torch.stack(list(terms.values())).sum(), terms, metrics))
+    def _iteration(self, step: int) -> Any:
+        """Train one step kernel by kernel; the result has no graph, because nerfstudio holds it for a step."""
+        loss, terms, metrics = super().train_iteration(step)
+        return loss.detach(), {name: term.detach() for name, term in terms.items()}, metrics
 
     def _recordable(self) -> bool:
         """Whether a CUDA graph can hold a training step under these options."""
@@ -238,13 +225,10 @@ class SundaeTrainer(Trainer):
             return None
         model = self.model
         camera, batch = self._datamanager.next_train(step)
-        try:
-            inputs = model.step_inputs(camera, batch)
-            result = self._recorded(model.state, inputs, model.render_settings(training=True))
-        except (BackendError, torch.cuda.OutOfMemoryError) as error:
-            warn(f"training continues without recordings, slower: {str(error).splitlines()[0]}")
+        inputs = model.step_inputs(camera, batch)
+        result = self._recorded(model.state, inputs, model.render_settings(training=True))
+        if result is None:
             self._recorded = None
-            torch.cuda.empty_cache()
             return None
         model.exposure_compensation.observe(result.images["rgb"], inputs.target, inputs.mask, batch)
         self._step_schedulers()

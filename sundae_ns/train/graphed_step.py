@@ -7,6 +7,7 @@ field lies in buffers with memory for more.
 
 from __future__ import annotations
 
+import logging
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from sundae_ns.core.errors import BackendError, one_line
 from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.cuda.adam import Update, adam_step
 from sundae_ns.cuda.cuda_graphs import record, warm_up
@@ -24,7 +26,9 @@ from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.scene.render import GaussianSource, RenderSettings, degree_in_use
 from sundae_ns.train.densification import COUNTED, STATISTICS, count_view, start_counting
 from sundae_ns.train.state import TrainingState
-from sundae_ns.train.step import StepInputs, StepLosses, StepResult, TrainingStep
+from sundae_ns.train.step import StepInputs, StepLosses, StepResult, training_step
+
+_log = logging.getLogger(__name__)
 
 SPARE = 1.1  # Capacity for a field that grows, as a multiple of its number of Gaussians
 
@@ -149,7 +153,7 @@ class StepRecordings:
     """
 
     def __init__(self, *, record: bool = True) -> None:
-        self._record = record
+        self._record, self._failed = record, False
         self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()
         self._used: dict[Hashable, int] = {}  # Step at which a recording was last replayed
         self._steps = 0
@@ -166,27 +170,32 @@ class StepRecordings:
 
     def run(
         self, work: StepWork, inputs: StepInputs, settings: RenderSettings, kind: Hashable, addresses: Hashable = None
-    ) -> StepResult:
-        """Run a step, by a recording where there is one.
+    ) -> StepResult | None:
+        """Run a step, by a recording where there is one; None if steps cannot be recorded, and nothing has changed.
 
         Args:
             work, inputs: of this step.
             settings: of training images, with the backend gsplat for recording.
             kind: decides on the kernels of the step.
             addresses: of what a recording reads beside its inputs, where they may change.
-
-        Raises:
-            BackendError: the step cannot be recorded. Nothing has changed.
-            torch.cuda.OutOfMemoryError: the same.
         """
-        recording = self._recording(work, inputs, settings, kind, addresses) if kind in self._warm else None
-        if recording is None:
-            result = self._kernel_by_kernel(work, inputs, settings)
-            self._warm.add(kind)
-        else:
-            inputs.copy_to(recording.inputs)
-            recording.graph.replay()
-            result = recording.result
+        if self._failed:
+            return None
+        try:
+            recording = self._recording(work, inputs, settings, kind, addresses) if kind in self._warm else None
+            if recording is None:
+                result = self._kernel_by_kernel(work, inputs, settings)
+                self._warm.add(kind)
+            else:
+                inputs.copy_to(recording.inputs)
+                recording.graph.replay()
+                result = recording.result
+        except (BackendError, torch.cuda.OutOfMemoryError) as error:
+            _log.warning("training continues without recordings, slower: %s", one_line(error))
+            self._failed = True
+            self.forget()
+            torch.cuda.empty_cache()
+            return None
         self._steps += 1
         return result
 
@@ -289,18 +298,14 @@ class RecordedStep:
         self._held: _Held | None = None
         self._recordings = StepRecordings(record=record)
 
-    def __call__(self, state: TrainingState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
-        """Train one step.
+    def __call__(self, state: TrainingState, inputs: StepInputs, settings: RenderSettings) -> StepResult | None:
+        """Train one step; None if steps cannot be recorded, and nothing has changed.
 
         Args:
             state: the field. Afterwards its tensors are rows of this object's buffers, and ``info`` says that the
                 statistics of densification are counted.
             inputs: of this step; learning rates are those of the optimizers.
             settings: of training images, with the backend gsplat for recording.
-
-        Raises:
-            BackendError: the step cannot be recorded. Nothing has changed.
-            torch.cuda.OutOfMemoryError: the same.
         """
         held = self._held
         if held is None or not held.unchanged(state, settings):
@@ -319,7 +324,8 @@ class RecordedStep:
             kind=_kind(state, inputs, settings),
             addresses=held.addresses,
         )
-        state.info = {COUNTED: True}
+        if result is not None:
+            state.info = {COUNTED: True}
         return result
 
     def _hold(self, state: TrainingState, settings: RenderSettings) -> _Held:
@@ -352,8 +358,7 @@ class RecordedStep:
         empty = {name: value for name, value in state.gaussians.items() if name not in trained and value.numel() == 0}
         gaussians = Gaussians(trained, state.gaussians.encoding)
         source = GaussianSource(Gaussians({**empty, **trained}, state.gaussians.encoding))
-        step = TrainingStep(source, state, self._losses, gaussians)
-        loss, splatted, result = step(inputs, settings)
+        loss, splatted, result = training_step(source, state, self._losses, inputs, settings)
         network = [] if head is None else list(head.parameters())
         counting, centers = state.densifying and "grad2d" in tensors, splatted.info["means2d"]
         wanted = [*gaussians.values(), *network, *([centers] if counting else [])]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -242,26 +242,14 @@ def training_part(state: TrainingState, camera: Camera, at: StepResolution) -> t
     return camera if crop is None else camera.cut(crop), crop
 
 
-class TrainingStep(NamedTuple):
-    """The step of a field, from a view to its loss."""
-
-    source: GaussianSource  # Where the view gets its Gaussians from
-    state: TrainingState  # Says what is enabled at this step
-    losses: StepLosses  # Terms of the loss
-    params: Mapping[str, Tensor]  # Trained parameters, for the terms that see them
-
-    def images(
-        self, camera: Camera, background: Tensor, settings: RenderSettings, *, depth: bool = False
-    ) -> tuple[dict[str, Any], Rasterization]:
-        """The first half: Gaussians, one splatting pass, and the head; see :func:`render_view`."""
-        return render_view(self.source, camera, background, settings, depth=depth)
-
-    def __call__(self, inputs: StepInputs, settings: RenderSettings) -> tuple[Tensor, Rasterization, StepResult]:
-        """Both halves: the loss ``[]`` with its graph, the rasteriser's result, and the detached result of the step."""
-        with torch.enable_grad():
-            images, splatted = self.images(inputs.camera, inputs.background, settings)
-            rgb, base = images["rgb"], images["base_rgb"]
-            terms = self.losses(self.state, self.params, rgb, base, inputs.target, inputs.mask, inputs.count)
-            loss = functools.reduce(torch.add, terms.values())
-        kept = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
-        return loss, splatted, StepResult(kept, {name: value.detach() for name, value in terms.items()}, loss.detach())
+def training_step(
+    source: GaussianSource, state: TrainingState, losses: StepLosses, inputs: StepInputs, settings: RenderSettings
+) -> tuple[Tensor, Rasterization, StepResult]:
+    """The loss ``[]`` of Gaussians with its graph, the rasteriser's result, and the detached result of the step."""
+    with torch.enable_grad():
+        images, splatted = render_view(source, inputs.camera, inputs.background, settings, depth=False)
+        rgb, base = images["rgb"], images["base_rgb"]
+        terms = losses(state, source.gaussians, rgb, base, inputs.target, inputs.mask, inputs.count)
+        loss = functools.reduce(torch.add, terms.values())
+    kept = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
+    return loss, splatted, StepResult(kept, {name: value.detach() for name, value in terms.items()}, loss.detach())

@@ -23,11 +23,11 @@ class Failing(RecordedStep):
 
     steps = 0
 
-    def __call__(self, *arguments: Any) -> StepResult:
+    def _step(self, *arguments: Any) -> StepResult:
         self.steps += 1
         if self.steps == 10:
             raise BackendError("no memory for a recording\nand a long story")
-        return super().__call__(*arguments)
+        return super()._step(*arguments)
 
 
 def trained(trainer_of: MakeTrainer, steps: type[RecordedStep] | None, seed: int) -> Any:

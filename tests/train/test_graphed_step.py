@@ -34,6 +34,7 @@ class Recorded:
         inputs = self.model.step_inputs(self.camera, self.batch)
         result = self.recorded(self.model.state, inputs, self.model.render_settings(training=True))
         self.training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step)
+        assert result is not None
         return result.losses
 
 

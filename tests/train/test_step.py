@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.plugin.model import SundaeModel
-from sundae_ns.train.step import StepInputs, StepLosses, convolved_loss, image_losses, ssim_loss
+from sundae_ns.train.step import StepInputs, StepLosses, convolved_loss, image_losses, ssim_loss, training_step
 
 Build = Callable[..., SundaeModel]
 OPTIONS: tuple[dict[str, Any], ...] = ({}, {"head": {"mode": "off"}}, {"head": {"max_train_pixels": 20 * 24}})
@@ -30,7 +30,8 @@ def test_both_halves_are_the_whole_step(
     for whole in (False, True):
         if whole:
             inputs = model.step_inputs(camera(), batch())
-            loss, _, result = model.training_step(inputs, model.render_settings(training=True))
+            settings = model.render_settings(training=True)
+            loss, _, result = training_step(model.source, model.state, model.losses, inputs, settings)
             terms, images = result.losses, result.images
         else:
             outputs = model.get_outputs(camera())
