@@ -12,51 +12,49 @@ from torch import Tensor
 from sundae_ns.core.camera import Camera, world_to_camera, world_to_camera_floats
 from sundae_ns.core.errors import DataError
 from sundae_ns.data.capture import read_json
-from sundae_ns.plugin.placing import STRAY, TYPES, stray_cameras
+from sundae_ns.plugin.dataparsers import STRAY, TYPES, stray_cameras
 from sundae_ns.scene.load_save import FRAME_FILE
 from sundae_ns.train.progress import warn
 
 
-def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None = None) -> str | None:
-    """Check the poses and focal lengths of cameras ``[N]`` of training images with these names, in any units.
+def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None = None) -> None:
+    """Refuse or warn of poses and lenses of the cameras ``[N]`` of training images ``names``, in any units.
 
-    Args:
-        cameras: of the images.
-        names: of the images.
-        points: of the scene ``[M, 3]``, in the same coordinates, if any.
-
-    Returns:
-        A warning on poses that are possible, but make no good scene; None without one.
+    ``points`` of the scene ``[M, 3]`` have the same coordinates.
 
     Raises:
         DataError: a projection is none of a lens, an axis is mirrored, or a focal length belongs to no lens.
     """
     kinds = cameras.camera_type.flatten()
-    other = ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype))
+    ratios = (cameras.fx / cameras.width.clamp_min(1)).flatten()
     mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
-    ratios = cameras.fx / cameras.width.clamp_min(1)
-    no_lens = ((ratios < 0.01) | (ratios > 1000)).flatten()  # views of 178 and of 0.06 degrees
-    if other.any():
-        raise DataError(
-            f"the camera of {names[_first(other)].name} is of type {CameraType(int(kinds[_first(other)])).name}, which "
-            "no perspective image can be made of; cut its images into perspective ones, such as cube faces"
-        )
-    if mirrored.any():
-        raise DataError(
-            f"the pose of {names[_first(mirrored)].name} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses "
-            "do); negate one column of its rotation"
-        )
-    if no_lens.any():
-        i = _first(no_lens)
-        raise DataError(
-            f"the focal length of {names[i].name} is {float(cameras.fx[i]):.3g} px and the image is "
-            f"{int(cameras.width[i])} px wide, which no lens has; give the focal length in pixels"
-        )
+    for flags, cause in (
+        (
+            ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype)),
+            "the camera of {name} is of type {kind}, which no perspective image can be made of; cut its images into "
+            "perspective ones, such as cube faces",
+        ),
+        (
+            mirrored,
+            "the pose of {name} mirrors an axis ({mirrored} of {count} poses do); negate one column of its rotation",
+        ),
+        (
+            (ratios < 0.01) | (ratios > 1000),  # views of 178 and of 0.06 degrees
+            "the focal length of {name} is {focal:.3g} px and the image is {width} px wide, which no lens has; give "
+            "the focal length in pixels",
+        ),
+    ):
+        if flags.any():
+            i = _first(flags)
+            kind, focal, width = CameraType(int(kinds[i])).name, float(cameras.fx[i]), int(cameras.width[i])
+            numbers = {"mirrored": int(mirrored.sum()), "count": len(names), "focal": focal, "width": width}
+            raise DataError(cause.format(name=names[i].name, kind=kind, **numbers))
     centres = cameras.camera_to_worlds[:, :, 3]
     middle = centres.median(dim=0).values
     distances = (centres - middle).norm(dim=1)
     if len(names) > 1 and distances.max() == 0:
-        return "all cameras stand at one place, so nothing says how far things are; check the poses"
+        warn("all cameras stand at one place, so nothing says how far things are; check the poses")
+        return
     usual = distances.median()
     cloud = None if points is None or not len(points) else points
     far = torch.from_numpy(
@@ -65,25 +63,23 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     if not far.any() and usual > 0:
         reach = 0.0 if cloud is None else float((cloud - middle).norm(dim=1).median())
         far = (distances > 20 * usual) & (distances > STRAY * reach)
-    if not far.any():
-        return None
-    times = f"{float(distances[_first(far)] / usual):,.0f} times as far away as most"
-    return (
-        f"the camera of {names[_first(far)].name} is {times if usual > 0 else 'far from all others'} "
-        f"({int(far.sum())} of {len(names)} are); check its pose, or remove the view"
-    )
+    if far.any():
+        times = f"{float(distances[_first(far)] / usual):,.0f} times as far away as most"
+        warn(
+            f"the camera of {names[_first(far)].name} is {times if usual > 0 else 'far from all others'} "
+            f"({int(far.sum())} of {len(names)} are); check its pose, or remove the view"
+        )
 
 
-def stray_tests(train: Cameras, test: Cameras, names: Sequence[Path]) -> str | None:
-    """A warning on test cameras ``[M]``, of images with these names, that stand far from all others; None without."""
+def warn_of_stray_tests(train: Cameras, test: Cameras, names: Sequence[Path]) -> None:
+    """Warn of test cameras ``[M]``, of images ``names``, that stand far from all others."""
     centres = torch.cat([train.camera_to_worlds[:, :, 3], test.camera_to_worlds[:, :, 3]]).double().cpu()
     far = torch.from_numpy(stray_cameras(centres.numpy()))[len(train) :]
-    if not far.any():
-        return None
-    return (
-        f"the camera of {names[_first(far)].name}, a test view, stands far from all others ({int(far.sum())} of "
-        f"{len(names)} do); check its pose, or remove the view"
-    )
+    if far.any():
+        warn(
+            f"the camera of {names[_first(far)].name}, a test view, stands far from all others ({int(far.sum())} of "
+            f"{len(names)} do); check its pose, or remove the view"
+        )
 
 
 def _first(flags: Tensor) -> int:
@@ -124,25 +120,19 @@ def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
         )
 
 
-def other_frame(run: Path, transform: Tensor, scale: float) -> str | None:
-    """A warning if a run was trained in other coordinates than its capture is parsed to now; None if it was not.
-
-    Args:
-        run: the run's folder; None without its ``dataparser_transforms.json``.
-        transform: from the capture's coordinates ``[3, 4]``.
-        scale: after the transform.
-    """
+def warn_of_other_frame(run: Path, transform: Tensor, scale: float) -> None:
+    """Warn if a run, by its folder, was trained in other coordinates than those of a transform ``[3, 4]`` and scale."""
     try:
         stated = read_json(run / FRAME_FILE)
         before, size = torch.tensor(stated["transform"], dtype=torch.float64), float(stated["scale"])
-        if torch.allclose(before * size, transform.double() * scale, rtol=1e-3, atol=1e-3):
-            return None
+        same = torch.allclose(before * size, transform.double() * scale, rtol=1e-3, atol=1e-3)
     except (DataError, KeyError, TypeError, ValueError, RuntimeError):
-        return None
-    return (
-        f"{run} was trained in other coordinates: its capture has changed, or another version scaled it; if cameras "
-        "stand far apart, resume it with --pipeline.datamanager.robust-frame False"
-    )
+        return
+    if not same:
+        warn(
+            f"{run} was trained in other coordinates: its capture has changed, or another version scaled it; if "
+            "cameras stand far apart, resume it with --pipeline.datamanager.robust-frame False"
+        )
 
 
 def camera_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None = None, downscale: int = 1) -> Camera:

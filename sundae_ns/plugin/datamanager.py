@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import random
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
 
+import cv2
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.datamanagers import full_images_datamanager
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from nerfstudio.utils.rich_utils import CONSOLE
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,11 +25,11 @@ from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
 from sundae_ns.data.capture import check_image, undecodable
 from sundae_ns.data.layouts import larger_model, unused_masks
 from sundae_ns.data.photos import TURNED, exif_orientation, turn, wrong_size
-from sundae_ns.plugin.camera_models import check_cameras, stray_tests, warn_of_cloud
-from sundae_ns.plugin.dataparsers import check_capture, set_parser
-from sundae_ns.plugin.placing import rebound
-from sundae_ns.plugin.undistortion import undistorting
+from sundae_ns.plugin.camera_models import check_cameras, warn_of_cloud, warn_of_stray_tests
+from sundae_ns.plugin.dataparsers import check_capture, rebound, set_parser
 from sundae_ns.train.progress import warn
+
+_log = logging.getLogger(__name__)
 
 DATASET_FRAME = "sundae_dataset_frame"
 """Metadata key of the training set: transform ``[3, 4]`` and scale from the capture's coordinates to the model's."""
@@ -66,20 +68,21 @@ class CheckedDataset(InputDataset):
         """
         if self._checked:
             return
-        scale = self.scale_factor
         masks: Sequence[Path | None] = self._dataparser_outputs.mask_filenames or [None] * len(self)
         widths, heights = self.cameras.width.flatten().tolist(), self.cameras.height.flatten().tolist()
         for index, (path, mask, *expected) in enumerate(zip(self.image_filenames, masks, widths, heights)):
             full = check_image(path)
-            if [int(side * scale) for side in full] != expected:
+            if self._scaled(full) != expected:
                 orientation = exif_orientation(path)
-                full = full[::-1]
-                if orientation not in TURNED or [int(side * scale) for side in full] != expected:
-                    raise wrong_size(path, full[::-1], (expected[0], expected[1]), orientation)
-                self.turned[index] = orientation
+                if orientation not in TURNED or self._scaled(full[::-1]) != expected:
+                    raise wrong_size(path, full, (expected[0], expected[1]), orientation)
+                self.turned[index], full = orientation, full[::-1]
             if mask is not None and check_image(mask, mask=True) != full:
                 raise DataError(f"{mask} differs in size from its image {path.name}; make it {full[0]} x {full[1]} px")
         self._checked = True
+
+    def _scaled(self, size: tuple[int, int]) -> list[int]:
+        return [int(side * self.scale_factor) for side in size]
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
         """Pixels ``[H, W, 3 or 4]``, turned as the camera sees them."""
@@ -134,9 +137,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
                 "differ; use random"
             )
         set_parser(config.dataparser, config.robust_frame)
-        data = config.capture
         splits = ("train", "val" if test_mode == "val" else "test")
-        check_capture(config.dataparser, data, splits, images=test_mode != "inference")
+        check_capture(config.dataparser, config.capture, splits, images=test_mode != "inference")
         try:
             super().__init__(config, device, test_mode, **kwargs)
         except SundaeError:
@@ -148,7 +150,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
                 "size with --downscale-factor 1"
             ) from error
         except Exception as error:  # parsers raise many kinds, assertions too, with one meaning for the user
-            raise DataError(f"{data} cannot be parsed ({one_line(error)}); check the capture") from error
+            raise DataError(f"{config.capture} cannot be parsed ({one_line(error)}); check the capture") from error
         self.hold_back(())
         self._cameras: dict[int, Cameras] = {}
         self.rank = 0  # Rank of this process: at a step, rank r trains on the view that one process takes r steps later
@@ -159,8 +161,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         if len(outputs.image_filenames) == 0:
             raise DataError(f"no training images in {parser.data}; check the path and the split")
         points = outputs.metadata.get("points3D_xyz")
-        if (warning := check_cameras(outputs.cameras, outputs.image_filenames, points)) is not None:
-            warn(warning)
+        check_cameras(outputs.cameras, outputs.image_filenames, points)
         if points is not None:
             warn_of_cloud(points, outputs.cameras)
         folder, is_colmap = self.config.capture, isinstance(parser, ColmapDataParserConfig)
@@ -180,15 +181,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         """Test set."""
         dataset = super().create_eval_dataset()
         if names := dataset.image_filenames:
-            warning = stray_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names)
-            if warning is not None:
-                warn(warning)
+            warn_of_stray_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names)
         return dataset
-
-    @property
-    def holdout_indices(self) -> list[int]:
-        """Indices of the training views that are held out now."""
-        return sorted(set(self.train_indices).difference(self._served))
 
     @property
     def train_indices(self) -> list[int]:
@@ -197,24 +191,20 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     def hold_back(self, indices: Iterable[int]) -> None:
         """Hold these training views out, from the next step on, until the next call."""
-        held_back = frozenset(indices)
-        self._served = [index for index in self.train_indices if index not in held_back]
+        self.holdout_indices = sorted(set(indices))
+        self._served = [index for index in self.train_indices if index not in self.holdout_indices]
         self._order: tuple[int, list[int]] = (-1, [])  # pass over the views, and its order
 
     def view_of_step(self, step: int) -> int:
         """Index of the training view of ``step``: each pass over the views is a new permutation."""
         epoch, position = divmod(step, len(self._served))
         if self._order[0] != epoch:
-            indices = list(self._served)
-            random.Random(f"{self.config.train_cameras_sampling_seed}-{epoch}").shuffle(indices)
-            self._order = (epoch, indices)
+            self._order = (epoch, list(self._served))
+            random.Random(f"{self.config.train_cameras_sampling_seed}-{epoch}").shuffle(self._order[1])
         return self._order[1][position]
 
-    def training_views(self) -> Iterator[tuple[Cameras, torch.Tensor | None]]:
-        """All training views: camera of shape ``(1,)`` on the CPU, and mask.
-
-        The mask is bool ``[H, W, 1]``, True for pixels to train on; None for all pixels.
-        """
+    def training_views(self) -> Iterator[tuple[Cameras, Tensor | None]]:
+        """All training views: camera of shape ``(1,)`` on the CPU, and the mask, if any, bool ``[H, W, 1]``."""
         outputs = self.train_dataparser_outputs
         # Undistortion masks what a fisheye lens has not seen.
         round_lens = (outputs.cameras.camera_type != CameraType.PERSPECTIVE.value).any()
@@ -224,11 +214,11 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             mask = self.cached_train[index].get("mask") if masked else None
             yield self.train_dataset.cameras[index : index + 1], mask
 
-    def cameras(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, torch.Tensor]]]:
+    def cameras(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, Tensor]]]:
         """Training views as camera and batch, as nerfstudio's evaluation takes them; loaded one at a time."""
         return map(self._camera, indices)
 
-    def _camera(self, index: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
+    def _camera(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
         batch = dict(self.cached_train[index])  # first: undistortion, which comes with it, changes the camera
         batch["image"] = batch["image"].to(self.device, non_blocking=True)  # pinned in host memory
         if index not in self._cameras:  # nerfstudio's slicing is slow
@@ -237,13 +227,13 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             self._cameras[index] = camera
         return self._cameras[index], batch
 
-    def next_train(self, step: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
+    def next_train(self, step: int) -> tuple[Cameras, dict[str, Tensor]]:
         """Camera (on the CPU) and batch of ``step``."""
         return self._camera(self.view_of_step(step + self.rank))
 
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
-    ) -> list[dict[str, torch.Tensor]]:
+    ) -> list[dict[str, Tensor]]:
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         dataset.check_images()
         if split == "train" and self.eval_dataset:
@@ -255,16 +245,15 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             # The stock "cpu" cache pins memory, which needs a driver; "gpu" means the model's device.
             cache_images_device = "gpu"
         elif cache_images_device == "gpu" and full:
-            CONSOLE.print(
+            _log.info(
                 f"the {split} images need more than half of the free GPU memory: they stay in main memory, and each "
-                "step copies one",
-                soft_wrap=True,
+                "step copies one"
             )
             cache_images_device = "cpu"
         load = rebound(FullImageDatamanager._load_images, _undistort_image=undistorting(dataset.image_filenames))
         perspective, cameras.camera_type = cameras.camera_type, dataset.lenses  # undistort by the types of the files
         try:
-            loaded: list[dict[str, torch.Tensor]] = load(self, split, cache_images_device)
+            loaded: list[dict[str, Tensor]] = load(self, split, cache_images_device)
         finally:
             cameras.camera_type = perspective
         if split == "train" and loaded and not any(map(_shows_something, loaded)):
@@ -272,11 +261,110 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
                 f"all {len(loaded)} training images are fully transparent or masked, so there is nothing to train on; "
                 "check their alpha channel and their masks"
             )
-        transparent = sum(batch["image"].shape[-1] == 4 for batch in loaded)
-        if split == "train" and transparent:
-            CONSOLE.print(
+        if split == "train" and (transparent := sum(batch["image"].shape[-1] == 4 for batch in loaded)):
+            _log.info(
                 f"{transparent} of {len(loaded)} training images have an alpha channel: what is transparent is trained "
-                "to be empty space. To leave pixels out instead, give masks (mask_path in transforms.json)",
-                soft_wrap=True,
+                "to be empty space. To leave pixels out instead, give masks (mask_path in transforms.json)"
             )
         return loaded
+
+
+# ---------------------------------------------------------------------------------------------------- undistortion
+
+Result = tuple[NDArray[Any], NDArray[Any], Any]  # Intrinsics [3, 3], image [H, W, C] and mask
+
+
+def undistorting(paths: Sequence[Path]) -> Callable[..., Result]:
+    """nerfstudio's function that undistorts an image, with lenses that see the half space, and wrong distortions.
+
+    OpenCV chooses the focal length of a fisheye photo's perspective image by the rays at the middles of its edges. Rays
+    at 90 degrees and more have no place in one, and the focal length becomes nothing. A distortion that no image of the
+    ``paths`` can have raises ``DataError``.
+    """
+
+    def undistort(camera: Any, distortion_params: Any, data: Any, image: Any, K: Any) -> Result:
+        intrinsics, mask, kind = K.copy(), data.get("mask"), int(camera.camera_type)
+        result, cause = None, "has a distortion that leaves no image"
+        if kind == CameraType.PERSPECTIVE.value and distortion_params[3]:
+            result = _of_brown(intrinsics, distortion_params, image, mask)
+        else:
+            try:
+                stock = full_images_datamanager._undistort_image(camera, distortion_params, data, image, K)
+                ratio = float(stock[0][0, 0]) / max(stock[1].shape[1], 1)
+                # A view of more than 157 degrees (a ratio of 0.1) shows a smear.
+                if np.isfinite(stock[0]).all() and 0.1 <= ratio <= 1000 and (stock[1].any() or not image.any()):
+                    result = stock
+                elif kind == CameraType.FISHEYE.value and _is_lens(distortion_params, intrinsics, image):
+                    result = _middle(intrinsics, distortion_params, image, mask)
+            except (AssertionError, LookupError, TypeError, ValueError, cv2.error) as error:
+                cause = f"cannot be undistorted ({one_line(error)})"
+        if result is None:
+            values = ", ".join(f"{float(value):.3g}" for value in distortion_params)
+            raise DataError(
+                f"{paths[int(data['image_idx'])].name} {cause}; check its k1 ... p2 ({values}), which are of "
+                "coordinates in focal lengths, not in pixels"
+            )
+        return result
+
+    return undistort
+
+
+def _of_brown(K: NDArray[Any], distortion: Any, image: NDArray[Any], mask: Any) -> Result | None:
+    """The largest perspective image that a photo fills, by all four radial coefficients; OpenCV has three of them.
+
+    None if no image of a quarter of the focal length to three times it is filled.
+    """
+    height, width = image.shape[:2]
+    fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    k1, k2, k3, k4, p1, p2 = map(float, distortion)
+    # OpenCV's pixels have whole numbers at their middles.
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    for zoom in np.geomspace(0.25, 3, 85):  # steps of 3%
+        x, y = (u - cx) / (zoom * fx), (v - cy) / (zoom * fy)
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+        across = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) * fx + cx - 0.5
+        down = (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) * fy + cy - 0.5
+        maps = across.astype(np.float32), down.astype(np.float32)
+        inside = (maps[0] >= 0) & (maps[0] <= width - 1) & (maps[1] >= 0) & (maps[1] <= height - 1)
+        # Where the lens turns rays back, coordinates fall again.
+        if inside.all() and (np.diff(maps[0], axis=1) > 0).all() and (np.diff(maps[1], axis=0) > 0).all():
+            new = np.array([[zoom * fx, 0, cx], [0, zoom * fy, cy], [0, 0, 1]], dtype=np.float32)
+            image = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR)
+            mask = None if mask is None else torch.from_numpy(_remapped(mask, image.shape, maps)).bool()[..., None]
+            return new, image, mask
+    return None
+
+
+def _remapped(mask: Any, shape: tuple[int, ...], maps: tuple[NDArray[Any], NDArray[Any]]) -> NDArray[np.uint8]:
+    """A mask ``[H, W, 1]`` at other pixels, from 0 to 255."""
+    stored = mask.numpy().astype(np.uint8).reshape(shape[:2]) * 255
+    return np.asarray(cv2.remap(stored, *maps, interpolation=cv2.INTER_LINEAR))
+
+
+def _is_lens(distortion: Any, K: NDArray[Any], image: NDArray[Any]) -> bool:
+    """Whether rays at larger angles lie farther out, up to the edges of a fisheye photo or to 90 degrees."""
+    theta = np.linspace(0, np.pi / 2, 500)
+    radius = theta * (1 + sum(float(k) * theta ** (2 * i + 2) for i, k in enumerate(distortion[:4])))
+    outside = radius >= min(image.shape[1] / 2 / K[0, 0], image.shape[0] / 2 / K[1, 1])
+    last = int(np.argmax(outside)) if outside.any() else len(theta) - 1
+    return bool((np.diff(radius[: last + 1]) > 0).all())
+
+
+def _middle(K: NDArray[Any], distortion: Any, image: NDArray[Any], mask: Any) -> Result:
+    """The perspective image of the middle of a fisheye photo, to 60 degrees at the middles of its edges."""
+    height, width = image.shape[:2]
+    # OpenCV's pixels have whole numbers at their middles.
+    old = K.astype(np.float64)
+    old[:2, 2] -= 0.5
+    k = np.array(distortion[:4], dtype=np.float64)
+    focal = max(width, height) / 2 / np.tan(np.radians(60))
+    new = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]])
+    maps = cv2.fisheye.initUndistortRectifyMap(old, k, np.eye(3), new, (width, height), cv2.CV_32FC1)
+    valid = (maps[0] > -0.5) & (maps[0] < width - 0.5) & (maps[1] > -0.5) & (maps[1] < height - 0.5)
+    if mask is not None:
+        valid &= _remapped(mask, image.shape, maps) > 127
+    image = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR)
+    new[:2, 2] += 0.5
+    mask = None if mask is None and valid.all() else torch.from_numpy(valid)[..., None]
+    return new.astype(np.float32), image, mask

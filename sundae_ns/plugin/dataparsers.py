@@ -2,32 +2,56 @@
 
 They honour the lens of each camera, more of COLMAP's lenses and survey coordinates, leave clouds in the scale of the
 cameras, ask no questions and need no open3d, which needs system libraries of a desktop.
+
+nerfstudio's parsers are one long method each. :func:`rebound` runs a copy of such a method in which single functions
+are others; everything else, to the bit, is nerfstudio's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
-from types import SimpleNamespace
+from types import FunctionType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.cameras import camera_utils
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.data.utils import colmap_parsing_utils
 from nerfstudio.utils.io import load_from_json
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.data.capture import beside, check_transforms
+from sundae_ns.data.capture import beside, check_transforms, rigid
 from sundae_ns.data.colmap import ColmapImage, check_colmap, read_images, read_points
 from sundae_ns.data.layouts import no_model, no_transforms
-from sundae_ns.data.lenses import DISTORTION, INTRINSICS, PERSPECTIVE, Lens, lens_of, with_focal_lengths
+from sundae_ns.data.lenses import (
+    DISTORTION,
+    FISHEYE,
+    FISHEYE624,
+    INTRINSICS,
+    PERSPECTIVE,
+    Lens,
+    lens_of,
+    with_focal_lengths,
+)
 from sundae_ns.io.ply import read_point_cloud
-from sundae_ns.plugin.placing import COARSE_STEP, Array, Placing, float32_step, rebound, replaced
 from sundae_ns.train.progress import warn
+
+Array = NDArray[np.float64]
+
+TYPES = {name: CAMERA_MODEL_TO_TYPE[name].value for name in (PERSPECTIVE, FISHEYE, FISHEYE624)}
+"""nerfstudio's camera type of each kind of lens."""
+STRAY = 10.0  # A camera is stray if it stands more than this many times as far from the middle as the others
+FINE_STEP, COARSE_STEP = 1e-5, 1e-3
+"""Steps of float32 at the cameras, as shares of their distances: coordinates are shifted from the first one on, and
+cannot be used from the second one on."""
 
 
 def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, images: bool = True) -> None:
@@ -69,24 +93,155 @@ def set_parser(config: DataParserConfig, robust: bool) -> None:
 
     Args:
         config: of the parser, changed in place.
-        robust: see :class:`sundae_ns.plugin.placing.Placing`.
+        robust: centre and scale the scene by the cameras that stand near each other, and shift survey coordinates in
+            float64. Otherwise all cameras count, in float32, as in nerfstudio.
     """
     target: Any = config._target
     config._target = {Nerfstudio: LightNerfstudioParser, ColmapDataParser: CarefulColmapParser}.get(target, target)
     config.robust = robust  # type: ignore[attr-defined]
 
 
-class LightNerfstudioParser(Nerfstudio):
+def rebound(method: Any, **names: Any) -> Any:
+    """A copy of a function in which global ``names`` have these values; the function itself stays as it is."""
+    copy = FunctionType(
+        method.__code__, {**method.__globals__, **names}, method.__name__, method.__defaults__, method.__closure__
+    )
+    copy.__kwdefaults__ = method.__kwdefaults__
+    return copy
+
+
+def _replaced(module: Any, **names: Any) -> SimpleNamespace:
+    """The contents of a module, with some of its functions replaced."""
+    return SimpleNamespace(**{**vars(module), **names})
+
+
+# --------------------------------------------------------------------------------------- where cameras and points stand
+
+
+def _distances_of(centres: Array) -> tuple[Array, Array]:
+    """The middle ``[3]`` of camera centres ``[N, 3]`` and the distance ``[N]`` of each from it."""
+    middle = np.median(centres, axis=0)
+    return middle, np.linalg.norm(centres - middle, axis=1)
+
+
+def stray_cameras(centres: Array, points: Callable[[], Array | None] = lambda: None) -> NDArray[np.bool_]:
+    """Cameras so far from all others that they must not set the scene's centre and scale.
+
+    Few cameras far away may also be all that moves, in a panorama from one place. There the points are as far as they.
+
+    Args:
+        centres: camera centres ``[N, 3]``.
+        points: gives points of the scene ``[M, 3]``, in the same coordinates; called only if a camera is far away.
+
+    Returns:
+        Flags ``[N]``; of fewer than four cameras none.
+    """
+    if len(centres) < 4:
+        return np.zeros(len(centres), dtype=bool)
+    middle, distances = _distances_of(centres)
+    # Up to one camera in five is a stray one; where there are more, they are part of the capture.
+    usual = float(np.sort(distances)[len(centres) - 1 - max(1, len(centres) // 5)])
+    far = (distances > STRAY * usual) & (usual > 0)
+    cloud = points() if far.any() else None
+    if cloud is not None and len(cloud):
+        far &= distances > STRAY * float(np.median(np.linalg.norm(cloud - middle, axis=1)))
+    return far
+
+
+def _float32_step(centres: Array) -> float:
+    """Step between float32 numbers at the coordinates of camera centres ``[N, 3]``, as a share of their distances."""
+    middle, distances = _distances_of(centres)
+    usual = float(np.median(distances)) or float(distances.max())
+    step = float(np.spacing(np.float32(np.abs(middle).max())))
+    return step / usual if usual > 0 else 0.0
+
+
+class _FarOutputs(DataparserOutputs):
+    """A parsed capture whose transform has float64 numbers, as it leads away from survey coordinates."""
+
+    def transform_poses_to_original_space(self, poses: Tensor, *args: Any, **options: Any) -> Tensor:
+        return super().transform_poses_to_original_space(poses.double(), *args, **options)
+
+
+class _Placed:
+    """What both parsers do with poses, points and lenses, from the file's coordinates to those of the model."""
+
+    config: Any
+    offset: Array | None
+    """Subtracted from coordinates of the file in float64, before anything becomes float32; None for nothing."""
+    lenses: dict[Path, Lens]  # By the path of an image
+
+    def _generate(self, method: Any, *arguments: Any, **names: Any) -> DataparserOutputs:
+        """Run nerfstudio's method; in its result each camera has its own lens and the scale of the near cameras."""
+        self.offset, self.lenses, self._growth = None, {}, 1.0
+        utils = _replaced(camera_utils, auto_orient_and_center_poses=self._oriented)
+        outputs: DataparserOutputs = rebound(method, camera_utils=utils, **names)(self, *arguments)
+        cameras, lenses = outputs.cameras, [self.lenses[path] for path in outputs.image_filenames]
+        if lenses:
+            types = torch.tensor([[TYPES[lens.kind]] for lens in lenses], dtype=cameras.camera_type.dtype)
+            distortion = torch.tensor([lens.distortion for lens in lenses], dtype=torch.float32)
+            # nerfstudio undistorts no lens whose distortion is zero, a fisheye lens neither; this one moves nothing.
+            zero_fisheye = (types != CameraType.PERSPECTIVE.value).flatten() & (distortion == 0).all(dim=1)
+            distortion[zero_fisheye, 0] = 1e-12
+            cameras.camera_type, cameras.distortion_params = types, distortion
+        if self._growth != 1.0 and self.config.auto_scale_poses:
+            cameras.camera_to_worlds[:, :, 3] *= self._growth
+            outputs.dataparser_scale *= self._growth
+            if "points3D_xyz" in outputs.metadata:
+                outputs.metadata["points3D_xyz"] = outputs.metadata["points3D_xyz"] * self._growth
+        if self.offset is None:
+            return outputs
+        transform = outputs.dataparser_transform.double()
+        transform[:, 3] -= self._transform[:, :3].double() @ torch.from_numpy(self.offset)
+        known = {entry.name: getattr(outputs, entry.name) for entry in fields(outputs)}
+        return _FarOutputs(**{**known, "dataparser_transform": transform})
+
+    def _shift(self, frames: list[dict[str, Any]], points: Callable[[], Array | None], where: str) -> None:
+        """Make the poses of frames float64 and rigid, near the origin if float32 is too coarse where they stand.
+
+        Survey coordinates lie millions of metres from the origin, where float32 has steps of half a metre. ``points``
+        gives those of the capture ``[M, 3]`` in the coordinates of the poses.
+        """
+        matrices = [rigid(np.array(frame["transform_matrix"], dtype=np.float64), where) for frame in frames]
+        centres, robust = np.array([matrix[:3, 3] for matrix in matrices]), getattr(self.config, "robust", False)
+        step, centred = _float32_step(centres) if robust else 0.0, self.config.center_method != "none"
+        if step > COARSE_STEP and not centred:
+            farthest = np.abs(_distances_of(centres)[0]).max()
+            raise DataError(
+                f"{where}: the cameras stand {farthest:.3g} from the origin, where float32 numbers are "
+                f"{np.spacing(np.float32(farthest)):.2g} apart; leave out --center-method none"
+            )
+        self.offset = _distances_of(centres)[0] if step > FINE_STEP and centred else None
+        self._points, self._robust = points, robust
+        for frame, matrix in zip(frames, matrices, strict=True):
+            if self.offset is not None:
+                matrix[:3, 3] -= self.offset
+            frame["transform_matrix"] = matrix
+
+    def _oriented(self, poses: Tensor, **methods: Any) -> tuple[Tensor, Tensor]:
+        """In place of nerfstudio's function that centres and orients poses."""
+
+        def points() -> Array | None:
+            cloud = self._points()
+            return cloud if cloud is None or self.offset is None else cloud - self.offset
+
+        oriented, self._transform = camera_utils.auto_orient_and_center_poses(poses, **methods)
+        far = stray_cameras(poses[:, :3, 3].double().numpy(), points) if self._robust else np.zeros(len(poses), bool)
+        if far.any():
+            near, self._transform = camera_utils.auto_orient_and_center_poses(poses[torch.from_numpy(~far)], **methods)
+            oriented = self._transform @ poses
+            # nerfstudio divides by the largest coordinate of all cameras.
+            self._growth = float(oriented[:, :3, 3].abs().max() / near[:, :3, 3].abs().max())
+        return oriented, self._transform
+
+
+class LightNerfstudioParser(_Placed, Nerfstudio):
     """The ``nerfstudio-data`` parser; it takes the cloud of an old capture from COLMAP's model without a question."""
 
+    applied_scale = 1.0  # Scale from the original coordinates of a capture to those of its file
+
     def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
-        self.placing = Placing(getattr(self.config, "robust", False))
-        self.applied_scale = 1.0  # Scale from the original coordinates of a capture to those of its file
-        generate = rebound(
-            Nerfstudio._generate_dataparser_outputs, load_from_json=self._read, camera_utils=self.placing.camera_utils
-        )
-        outputs = generate(self, split)
-        return self.placing.finish(outputs, scaled=self.config.auto_scale_poses)
+        return self._generate(Nerfstudio._generate_dataparser_outputs, split, load_from_json=self._read)
 
     def _read(self, path: Path) -> dict[str, Any]:
         """The file as nerfstudio's method understands it: intrinsics in each frame, and lenses apart."""
@@ -95,14 +250,14 @@ class LightNerfstudioParser(Nerfstudio):
         frames = meta["frames"]
         for frame in frames:
             name = self._get_fname(Path(frame["file_path"]), folder)
-            self.placing.lenses[name] = lens_of(meta, frame, path.name)
+            self.lenses[name] = lens_of(meta, frame, path.name)
             frame.update({**{key: meta[key] for key in INTRINSICS if key in meta}, **frame})
         for entries in (meta, *frames):
             for key in (*DISTORTION, "distortion_params"):
                 entries.pop(key, None)
         for key in INTRINSICS:
             meta.pop(key, None)
-        kinds = {lens.kind for lens in self.placing.lenses.values()}
+        kinds = {lens.kind for lens in self.lenses.values()}
         meta["camera_model"] = kinds.pop() if len(kinds) == 1 else PERSPECTIVE
 
         def cloud() -> Array | None:
@@ -111,7 +266,7 @@ class LightNerfstudioParser(Nerfstudio):
                 return None
             return np.asarray(read_point_cloud(folder / name, precise=True)[0].numpy())
 
-        self.placing.shift(frames, self.config.center_method, cloud, path.name)
+        self._shift(frames, cloud, path.name)
         self.applied_scale = float(meta.get("applied_scale", 1.0))
         # The first versions of ns-process-data made no cloud of COLMAP's model, which they left here, and stated no
         # transform. nerfstudio would ask whether to make the cloud, and change the capture.
@@ -126,7 +281,6 @@ class LightNerfstudioParser(Nerfstudio):
     ) -> dict[str, Tensor] | None:
         if not ply_file_path.exists():
             raise DataError(f"{ply_file_path} does not exist; correct ply_file_path in transforms.json, or remove it")
-        offset = self.placing.offset
         if ply_file_path.is_dir():
             if not any(ply_file_path.glob("points3D.*")):
                 return None
@@ -134,38 +288,32 @@ class LightNerfstudioParser(Nerfstudio):
             points = torch.from_numpy(positions @ self._applied[:, :3].T + self._applied[:, 3])
             rgb = torch.from_numpy(colours)
         else:
-            points, rgb = read_point_cloud(ply_file_path, precise=offset is not None)
+            points, rgb = read_point_cloud(ply_file_path, precise=self.offset is not None)
         if len(points) == 0:
             return None
-        if offset is not None:
+        if self.offset is not None:
             finite = points[torch.isfinite(points).all(dim=1)].numpy()
             rounded = len(finite) > 0 and np.array_equal(finite, finite.astype(np.float32))
-            if rounded and float32_step(finite) > COARSE_STEP:
-                step = np.spacing(np.float32(np.abs(offset).max()))
+            if rounded and _float32_step(finite) > COARSE_STEP:
+                step = np.spacing(np.float32(np.abs(self.offset).max()))
                 warn(
                     f"{ply_file_path.name} has float32 coordinates that are {step:.2g} apart, as it lies far from the "
                     "origin; export it with double coordinates, or shifted"
                 )
+            points = points.double() - torch.from_numpy(self.offset)
+        points = points.float() @ transform_matrix[:3, :3].T + transform_matrix[:3, 3]
         # nerfstudio multiplies by applied_scale again, but the file's cloud is in the coordinates of its cameras.
-        scale = scale_factor / self.applied_scale
-        return {
-            "points3D_xyz": self.placing.points_in_model(points, transform_matrix, scale),
-            "points3D_rgb": rgb,
-        }
+        return {"points3D_xyz": points * (scale_factor / self.applied_scale), "points3D_rgb": rgb}
 
 
-class CarefulColmapParser(ColmapDataParser):
+class CarefulColmapParser(_Placed, ColmapDataParser):
     """The ``colmap`` parser."""
 
-    def _generate_dataparser_outputs(self, split: str = "train", **options: Any) -> DataparserOutputs:
-        self.placing = Placing(getattr(self.config, "robust", False))
-        generate = rebound(ColmapDataParser._generate_dataparser_outputs, camera_utils=self.placing.camera_utils)
-        outputs = generate(self, split, **options)
-        return self.placing.finish(outputs, scaled=self.config.auto_scale_poses)
+    def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
+        return self._generate(ColmapDataParser._generate_dataparser_outputs, split)
 
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
         images = read_images(recon_dir)
-
         cameras = {image.camera_id: image for image in images.values()}
         posed = {
             number: SimpleNamespace(
@@ -188,10 +336,10 @@ class CarefulColmapParser(ColmapDataParser):
         read = rebound(
             ColmapDataParser._get_all_images_and_cameras,
             parse_colmap_camera_params=stated,
-            colmap_utils=replaced(colmap_parsing_utils, **readers),
+            colmap_utils=_replaced(colmap_parsing_utils, **readers),
         )
         meta: dict[str, Any] = read(self, recon_dir)
-        self._lenses: dict[Path, Lens] = {Path(frame["file_path"]): frame.pop("lens") for frame in meta["frames"]}
+        self._stated: dict[Path, Lens] = {Path(frame["file_path"]): frame.pop("lens") for frame in meta["frames"]}
         self._applied = np.array(meta.get("applied_transform", np.eye(4)[:3]), dtype=np.float64)
 
         def cloud() -> Array | None:
@@ -199,19 +347,19 @@ class CarefulColmapParser(ColmapDataParser):
                 return None
             return read_points(recon_dir)[0] @ self._applied[:, :3].T + self._applied[:, 3]
 
-        self.placing.shift(meta["frames"], self.config.center_method, cloud, recon_dir.name)
+        self._shift(meta["frames"], cloud, recon_dir.name)
         return meta
 
     def _setup_downscale_factor(self, image_filenames: list[Path], *others: list[Path]) -> Any:
         paths = super()._setup_downscale_factor(image_filenames, *others)
-        self.placing.lenses = {new: self._lenses[old] for new, old in zip(paths[0], image_filenames, strict=True)}
+        self.lenses = {new: self._stated[old] for new, old in zip(paths[0], image_filenames, strict=True)}
         return paths
 
     def _load_3D_points(self, colmap_path: Path, transform_matrix: Tensor, scale_factor: float) -> dict[str, Any]:
         positions, colours = read_points(colmap_path)
-        if self.placing.offset is not None:
+        if self.offset is not None:
             # The points are not in the coordinates of the poses yet.
-            positions = positions - np.linalg.solve(self._applied[:, :3], self.placing.offset)
+            positions = positions - np.linalg.solve(self._applied[:, :3], self.offset)
         points = torch.from_numpy(positions).float()
         points = torch.cat([points, torch.ones_like(points[:, :1])], dim=1) @ transform_matrix.T * scale_factor
         return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(colours)}

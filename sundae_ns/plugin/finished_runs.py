@@ -36,6 +36,7 @@ from sundae_ns.io import checkpoint
 from sundae_ns.io.config_file import check_run, config_of, load_config
 from sundae_ns.io.formats import kind_of, refuse, unread
 from sundae_ns.io.run_folder import prunes_of
+from sundae_ns.plugin.camera_models import camera_of
 from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.plugin.dataparsers import check_capture
 from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
@@ -126,17 +127,9 @@ def _open_packed(path: Path, data: Path | None) -> Opened:
     manager = datamanager_of(scene, data).setup(device=model.device, test_mode="test", world_size=1, local_rank=0)
     source = scene.meta.get("source")
     source = source if isinstance(source, dict) else {}
-    step = source.get("step")
-    return Opened(
-        model,
-        manager,
-        source=path,
-        capture=data,
-        method=str(source.get("method") or "sundae"),
-        variant=path.name,
-        steps=step + 1 if isinstance(step, int) else 0,
-        packed_bytes=path.stat().st_size,
-    )
+    method, step = str(source.get("method") or "sundae"), source.get("step")
+    steps = step + 1 if isinstance(step, int) else 0
+    return Opened(model, manager, path, data, method, path.name, steps, packed_bytes=path.stat().st_size)
 
 
 def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> Opened:
@@ -148,9 +141,8 @@ def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> O
     if foreign:
         # The grid corrects training images only; test views are rendered without it.
         shared = {**_shared(stock, SplatfactoModelConfig), "use_bilateral_grid": False}
-        config.pipeline.model = SundaeModelConfig(
-            **shared, pruning=PruningConfig(mode="off"), head=HeadConfig(mode="off")
-        )
+        parts: Any = {"pruning": PruningConfig(mode="off"), "head": HeadConfig(mode="off")}
+        config.pipeline.model = SundaeModelConfig(**shared, **parts)
     # The datamanager's path first: it follows a capture that has moved together with the run.
     capture = data or Path(manager.data or config.data or manager.dataparser.data)
     if not capture.exists():
@@ -166,19 +158,9 @@ def _open_run(path: Path, data: Path | None, split: Literal["test", "val"]) -> O
     if split == "test":
         pipeline.eval()
     kept, seconds = (1.0, 0.0) if model.config.pruning.mode == "off" else kept_and_seconds(prunes_of(path.parent))
-    return Opened(
-        model,
-        pipeline.datamanager,
-        source=path.parent,
-        capture=capture,
-        method=config.method_name or "",
-        variant=config.experiment_name or "",
-        steps=step + 1,
-        kept=kept,
-        seed=config.machine.seed,
-        prune_s=seconds,
-        pipeline=pipeline,
-    )
+    names = config.method_name or "", config.experiment_name or ""
+    facts: Any = {"kept": kept, "seed": config.machine.seed, "prune_s": seconds, "pipeline": pipeline}
+    return Opened(model, pipeline.datamanager, path.parent, capture, *names, step + 1, **facts)
 
 
 def _config_of(path: Path) -> TrainerConfig:
@@ -200,8 +182,7 @@ def _datamanager_config(stock: DataManagerConfig) -> SundaeDatamanagerConfig:
 
 def kept_and_seconds(prunes: list[dict[str, Any]]) -> tuple[float | None, float | None]:
     """Ratio of Gaussians that all prunes kept, and their seconds; None where the record is not whole."""
-    kept: float | None = None
-    seconds: float | None = None
+    kept = seconds = None
     if prunes:
         with suppress(KeyError, TypeError, ZeroDivisionError):
             kept = math.prod(prune["after"] / prune["before"] for prune in prunes)
@@ -280,31 +261,23 @@ def load_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> 
 
 def _training_views(manager: SundaeDatamanagerConfig, most: int) -> tuple[Camera, ...]:
     cameras: Cameras = manager.setup(device="cpu", test_mode="test").train_dataset.cameras
-    chosen = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long()
-    intrinsics = torch.cat([cameras.fx, cameras.fy, cameras.cx, cameras.cy], dim=-1)[chosen].tolist()
-    sizes = torch.cat([cameras.width, cameras.height], dim=-1)[chosen].tolist()
-    rows = zip(cameras.camera_to_worlds[chosen], intrinsics, sizes, strict=True)
-    return tuple(Camera.from_pose(pose, lens, *size) for pose, lens, size in rows)
+    chosen = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()
+    return tuple(camera_of(cameras[i : i + 1], "cpu") for i in chosen)
 
 
 def describe_capture(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
-    """Plain values to parse, split and scale the same capture again; None for another parser."""
+    """Plain values to parse, split and scale the same capture again; None where :func:`stated_capture` refuses them."""
     parser = manager.dataparser
     kind = next((name for name, known in _PARSERS.items() if type(parser) is known), None)
     if kind is None:
         return None
-    options: dict[str, Any] = {}
-    for name, default in _parser_options(_PARSERS[kind]).items():
-        value = getattr(parser, name, default)
-        if isinstance(value, Path):
-            value = value.as_posix()
-        if isinstance(value, str) and isinstance(default, Path) and not _FOLDER.fullmatch(value):
-            return None  # outside of the capture
-        if name == "alpha_color" and value not in _ALPHA_COLORS:
-            return None
-        options[name] = value
+    options = {name: getattr(parser, name, default) for name, default in _parser_options(_PARSERS[kind]).items()}
+    options = {name: value.as_posix() if isinstance(value, Path) else value for name, value in options.items()}
     stated = {"parser": kind, "options": options, "scale": manager.camera_res_scale_factor}
-    return {**stated, "robust_frame": True} if manager.robust_frame else stated
+    with suppress(PackError):
+        stated_capture(stated)
+        return {**stated, "robust_frame": True} if manager.robust_frame else stated
+    return None
 
 
 def _parser_options(kind: type[DataParserConfig]) -> dict[str, Any]:

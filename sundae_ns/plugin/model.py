@@ -5,6 +5,7 @@ Module path and class names are written into every run's ``config.yml``, so movi
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, MutableMapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
@@ -48,6 +49,8 @@ from sundae_ns.train.pruning import PruningConfig
 from sundae_ns.train.state import Callback, TrainingState
 from sundae_ns.train.step import StepInputs, StepLosses, training_part
 from sundae_ns.train.trials import Trials
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -318,7 +321,7 @@ class SundaeModel(SplatfactoModel):
     ) -> list[TrainingCallback]:
         """Callbacks that call ours."""
         self._start.announce()
-        CONSOLE.log(f"rasteriser: {self.backend.name} on {self.device}")  # or an error, before the first step
+        _log.info(f"rasteriser: {self.backend.name} on {self.device}")  # or an error, before the first step
         self.viewer_controls.training_gaussians = True
         return NerfstudioRun(self, training_callback_attributes).start()
 

@@ -6,6 +6,7 @@ Module path and class names are written into every run's ``config.yml``, so movi
 from __future__ import annotations
 
 import contextlib
+import logging
 import sys
 import time
 from dataclasses import dataclass, field
@@ -28,7 +29,7 @@ from sundae_ns.io import checkpoint, run_folder
 from sundae_ns.io.checkpoint import random_state, set_random_state
 from sundae_ns.io.config_file import find_capture
 from sundae_ns.plugin import distributed
-from sundae_ns.plugin.camera_models import other_frame
+from sundae_ns.plugin.camera_models import warn_of_other_frame
 from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.plugin.dataparsers import check_capture
 from sundae_ns.plugin.model import SundaeModel
@@ -37,6 +38,8 @@ from sundae_ns.plugin.viewer import stop_rendering
 from sundae_ns.train.graphed_step import RecordedStep
 from sundae_ns.train.progress import Interruption, loaded_run, long_on_cpu, resume_command, warn
 from sundae_ns.train.schedules import schedule_table, set_schedule
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -310,7 +313,6 @@ class SundaeTrainer(Trainer):
     def _load_checkpoint(self) -> None:
         path = self._source()
         if path is None:
-            CONSOLE.print("No checkpoint to load: training from scratch.")
             return
         loaded = checkpoint.read(path)
         try:
@@ -329,10 +331,9 @@ class SundaeTrainer(Trainer):
             raise CheckpointError(
                 f"{path} does not fit this run ({one_line(error)}); load it with the options that it was trained with"
             ) from error
-        CONSOLE.print(f"Resuming after step {loaded['step']} from {path}")
+        _log.info(f"Resuming after step {loaded['step']} from {path}")
         outputs = self._datamanager.train_dataparser_outputs
-        if line := other_frame(path.parent.parent, outputs.dataparser_transform, outputs.dataparser_scale):
-            warn(line)
+        warn_of_other_frame(path.parent.parent, outputs.dataparser_transform, outputs.dataparser_scale)
 
     def _source(self) -> Path | None:
         """The checkpoint to resume from; None for a new run."""

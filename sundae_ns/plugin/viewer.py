@@ -7,6 +7,7 @@ because it was trained on all Gaussians.
 
 from __future__ import annotations
 
+import logging
 import threading
 import weakref
 from collections.abc import Callable, Sequence
@@ -14,7 +15,6 @@ from dataclasses import replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerControl, ViewerDropdown, ViewerSlider, ViewerText
 from torch import Tensor
@@ -29,6 +29,8 @@ from sundae_ns.scene.frames import GaussiansKey
 from sundae_ns.scene.render import GaussianSource
 from sundae_ns.train.curve import CurvePoint, expected_change
 from sundae_ns.train.state import TrainingState
+
+_log = logging.getLogger(__name__)
 
 RuleName = Literal["as configured", "band: high", "band: low", "band: both"]
 
@@ -177,7 +179,7 @@ class ViewerControls(torch.nn.Module):
                     pruned = self._prune(previewed_rule(self._configured, name), ratio)
                 except (SundaeError, torch.cuda.OutOfMemoryError) as error:
                     # An exception in the viewer's thread would end all rendering.
-                    CONSOLE.log(f"[yellow]No preview of {name}: {one_line(error)}")
+                    _log.warning(f"no preview of {name}: {one_line(error)}")
                 self._previews = {(name, ratio): pruned}
             return self._previews[name, ratio]
 

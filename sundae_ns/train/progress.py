@@ -27,7 +27,7 @@ class ConsoleHandler(logging.Handler):
         if record.levelno >= logging.WARNING:
             console.print(f"Warning: {text}", style="yellow", markup=False, soft_wrap=True)
         else:
-            console.print(f"[{time.strftime('%H:%M:%S')}] {text}", markup=False)
+            console.print(f"[{time.strftime('%H:%M:%S')}] {text}", markup=False, soft_wrap=True)
 
 
 def show_log() -> None:

@@ -65,13 +65,20 @@ def capture(still_life: Path, tmp_path: Path) -> Path:
 def load() -> Load:
     """Parses a capture as ``ns-train`` does, with nerfstudio's parser replaced by ours."""
 
-    def parse(data: Path, *, colmap: str | None = None, robust: bool = True, **options: Any) -> SundaeDatamanager:
+    def parse(
+        data: Path,
+        *,
+        colmap: str | None = None,
+        robust: bool = True,
+        manager: dict[str, Any] | None = None,
+        **options: Any,
+    ) -> SundaeDatamanager:
         if colmap is None:
             parser: Any = NerfstudioDataParserConfig(load_3D_points=True, **options)
         else:
             parser = ColmapDataParserConfig(colmap_path=Path(colmap), downscale_factor=1, **options)
-        config = SundaeDatamanagerConfig(data=data, dataparser=parser, cache_images_type="uint8", robust_frame=robust)
-        return config.setup(device="cpu", test_mode="val")
+        more: Any = {"cache_images_type": "uint8", "robust_frame": robust, **(manager or {})}
+        return SundaeDatamanagerConfig(data=data, dataparser=parser, **more).setup(device="cpu", test_mode="val")
 
     return parse
 

@@ -16,9 +16,10 @@ from colmap_models import write_model
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image, ImageOps
 from plyfile import PlyData, PlyElement
+from small_captures import meta_of
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.plugin.camera_models import other_frame
+from sundae_ns.plugin.camera_models import warn_of_other_frame
 from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanagerConfig
 from sundae_ns.plugin.finished_runs import datamanager_of, describe_capture
 from sundae_ns.scene.cameras import cameras_of
@@ -36,11 +37,6 @@ def said(capsys: Any) -> str:
 
 def names_of(data: Path) -> list[str]:
     return sorted(path.name for path in (data / "images").iterdir())
-
-
-def meta_of(data: Path) -> dict[str, Any]:
-    meta: dict[str, Any] = json.loads((data / "transforms.json").read_text())
-    return meta
 
 
 def moved(data: Path, offset: np.ndarray, edit: Edit) -> None:
@@ -124,7 +120,7 @@ def test_a_stray_test_view_is_named(capture: Path, load: Load, edit: Edit, capsy
 
 
 def test_earlier_runs_keep_the_frame_that_they_were_trained_in(
-    capture: Path, load: Load, edit: Edit, tmp_path: Path
+    capture: Path, load: Load, edit: Edit, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A run that is resumed in other coordinates is named."""
     stray(capture, 100.0, edit)
@@ -134,12 +130,12 @@ def test_earlier_runs_keep_the_frame_that_they_were_trained_in(
     assert float(everywhere.norm(dim=1).median()) < 0.2
     before, run = made.train_dataparser_outputs, tmp_path / "run"
     before.save_dataparser_transform(run / "dataparser_transforms.json")
-    assert other_frame(run, before.dataparser_transform, before.dataparser_scale) is None
     now = load(capture).train_dataparser_outputs
-    line = other_frame(run, now.dataparser_transform, now.dataparser_scale)
-    assert line is not None
-    assert "resume it with --pipeline.datamanager.robust-frame False" in line
-    assert other_frame(tmp_path / "none", now.dataparser_transform, now.dataparser_scale) is None
+    caplog.clear()
+    for outputs, folder in ((before, run), (now, tmp_path / "none"), (now, run)):
+        assert not caplog.messages
+        warn_of_other_frame(folder, outputs.dataparser_transform, outputs.dataparser_scale)
+    assert "resume it with --pipeline.datamanager.robust-frame False" in caplog.text
 
 
 @pytest.mark.parametrize("offset", [np.zeros(3), SURVEY])
@@ -415,11 +411,6 @@ def test_a_missing_image_is_named_with_the_one_beside_it(capture: Path, load: Lo
     (capture / "sparse" / "0" / "cameras.bin").rename(capture / "sparse" / "0" / "Cameras.bin")
     with pytest.raises(DataError, match=r"nor cameras.txt \(there is Cameras\.bin\)"):
         load(capture, colmap="sparse/0")
-
-
-def test_a_capture_that_has_gone(tmp_path: Path, load: Load) -> None:
-    with pytest.raises(DataError, match="correct data in the run's config.yml"):
-        load(tmp_path / "gone")
 
 
 def as_photos(data: Path, edit: Edit, orientation: int, *, size: tuple[int, int] = (24, 16)) -> None:

@@ -15,6 +15,7 @@ import torch
 from colmap_models import write_model
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
+from small_captures import meta_of
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.data.lenses import COLMAP_LENSES, lens_of
@@ -25,11 +26,6 @@ Load = Callable[..., Any]
 Edit = Callable[..., None]
 FOCAL = 15.0
 """Of a round lens that sees 92 degrees across 24 px."""
-
-
-def meta_of(data: Path) -> dict[str, Any]:
-    meta: dict[str, Any] = json.loads((data / "transforms.json").read_text())
-    return meta
 
 
 def names_of(data: Path) -> list[str]:

@@ -320,7 +320,7 @@ def test_a_rule_that_cannot_be_applied_shows_everything_and_says_so_once(capsys:
     few.viewer_controls.rule.value, few.viewer_controls.keep_ratio.value = "band: high", 0.5
     for _ in range(2):
         assert same(as_the_viewer(lambda: picture(few)), before)
-    assert capsys.readouterr().out.count("No preview of band: high") == 1
+    assert capsys.readouterr().out.count("no preview of band: high") == 1
     alone, _ = build()
     del alone.viewer_controls.control.viewer
     assert shown(alone, "as configured", 0.5) is None
