@@ -91,10 +91,10 @@ TRAINING = {
     "prune: half recorded": at(pruning, "write_text", half_recorded),
 }
 TRIALS = {
-    "trial: started": at(trials.TrialEngine, "start", after, lambda n: n),
+    "trial: started": at(trials.Trials, "start", after, lambda n: n),
     "trial: measuring": at(trials, "measure_heldout", before, lambda n: n),
-    "trial: back to the Gaussians before it": at(trials.TrialEngine, "go_back", after),
-    "trials: ended": at(trials.TrialEngine, "end", after),
+    "trial: back to the Gaussians before it": at(trials.Trials, "go_back", after),
+    "trials: ended": at(trials.Trials, "end", after),
     **SAVES,
 }
 COMMANDS = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import torch
@@ -13,7 +14,7 @@ from sundae_ns.train.averaging import Averaging
 from sundae_ns.train.densification import Densification, make_strategy
 from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.initialize import DenseStart, Frame, Points, Start, initial_gaussians
-from sundae_ns.train.pruning import FloaterRemoval, PruningSchedule, ScheduledPruning
+from sundae_ns.train.pruning import UNPRUNED, FloaterRemoval, ScheduledPruning
 from sundae_ns.train.state import Callback, TrainingState
 from sundae_ns.train.trials import AfterPrune, Trials
 
@@ -23,27 +24,19 @@ def check(options: Any) -> None:
     options.pruning.validate()
     if options.head.mode != "off":
         options.head.validate()
-    warm_while_growing = options.warm_start is not None and options.pruning.mode == "continuous"
-    refusals = [
-        (options.base_loss_weight < 0, f"base-loss-weight is {options.base_loss_weight}; give 0 or more"),
-        (options.prior_after_prune < 0, f"prior-after-prune is {options.prior_after_prune}; give 0 or more"),
-        (
-            options.dense_start_views < 0,
-            f"dense-start-views is {options.dense_start_views}; give a number of images, 0 for no sweep",
-        ),
-        (
-            not 0 <= options.average_share <= 1,
-            f"average-share is {options.average_share}; give a share of the schedule, 0.1 for the last tenth",
-        ),
-        (warm_while_growing, "a warm start is pruned at once, not while it grows: set pruning.mode to one-shot"),
-        (
-            options.use_bilateral_grid,
-            "sundae has no bilateral grid: the head would learn against it; use splatfacto for it",
-        ),
-    ]
-    for refused, message in refusals:
-        if refused:
-            raise ConfigError(message)
+    for name, most, remedy in (
+        ("base-loss-weight", math.inf, "0 or more"),
+        ("prior-after-prune", math.inf, "0 or more"),
+        ("dense-start-views", math.inf, "a number of images, 0 for no sweep"),
+        ("average-share", 1, "a share of the schedule, 0.1 for the last tenth"),
+    ):
+        value = getattr(options, name.replace("-", "_"))
+        if not 0 <= value <= most:
+            raise ConfigError(f"{name} is {value}; give {remedy}")
+    if options.warm_start is not None and options.pruning.mode == "continuous":
+        raise ConfigError("a warm start is pruned at once, not while it grows: set pruning.mode to one-shot")
+    if options.use_bilateral_grid:
+        raise ConfigError("sundae has no bilateral grid: the head would learn against it; use splatfacto for it")
 
 
 def build(
@@ -77,25 +70,20 @@ def build(
         head_starts_at=pruning.settled_at if head.start_at is None else head.start_at,
         sh_degree_interval=None if warm else options.sh_degree_interval,
     )
-    densification, schedule = Densification(strategy), PruningSchedule(pruning)
+    state.pruning, densification = dict(UNPRUNED), Densification(strategy)
     densification.initialize(state)
-    state.pruning = schedule.initialize_state()
-    begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
-    train_callbacks: list[Callback] = [
+    prunes: list[Callback] = [ScheduledPruning(pruning, evaluate=options.evaluate_prune)]
+    if pruning.decides or options.head.mode == "auto":
+        begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
+        trials = Trials(options, state, densification, begins_at)
+        prunes = [trials, *prunes, AfterPrune(trials)]
+    train_callbacks = [
         DenseStart(options, points, num_images, num_features=num_features, cap=strategy.cap),
         densification,
         FloaterRemoval(None if points is None else points[0]),
+        *prunes,
+        ExposureCompensation(num_images, options.exposure_compensation),
     ]
-    scheduled, decides_head = ScheduledPruning(schedule, evaluate=options.evaluate_prune), options.head.mode == "auto"
-    if pruning.decides or decides_head:
-        weight = options.ssim_lambda
-        trials = Trials(
-            pruning, state, densification, begins_at=begins_at, decides_head=decides_head, ssim_weight=weight
-        )
-        train_callbacks += [trials, scheduled, AfterPrune(trials)]
-    else:
-        train_callbacks.append(scheduled)
-    train_callbacks.append(ExposureCompensation(num_images, options.exposure_compensation))
     if options.average_share > 0:
         train_callbacks.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
     return state, train_callbacks, start

@@ -130,13 +130,10 @@ class Densification(Callback):
 
 def make_strategy(options: Any, num_images: int) -> CappedStrategy:
     """Strategy of the densification, which ends before the prune that would undo it, by the options of the model."""
-    stop, cap, pruning = options.stop_split_at, None, options.pruning
-    if pruning.mode == "continuous":
-        stop, cap = min(stop, pruning.stop), pruning.max_gaussians
-    elif pruning.ends_growth_at is not None:
-        stop = min(stop, pruning.ends_growth_at)
+    pruning = options.pruning
+    ends = (options.stop_split_at, pruning.ends_growth_at)
     strategy = CappedStrategy(
-        cap=cap,
+        cap=pruning.max_gaussians if pruning.mode == "continuous" else None,
         prune_opa=options.cull_alpha_thresh,
         grow_grad2d=options.densify_grad_thresh,
         grow_scale3d=options.densify_size_thresh,
@@ -145,7 +142,7 @@ def make_strategy(options: Any, num_images: int) -> CappedStrategy:
         prune_scale2d=options.cull_screen_size,
         refine_scale2d_stop_iter=options.stop_screen_size_at,
         refine_start_iter=options.warmup_length,
-        refine_stop_iter=stop,
+        refine_stop_iter=min(step for step in ends if step is not None),
         reset_every=options.reset_alpha_every * options.refine_every,
         refine_every=options.refine_every,
         absgrad=options.use_absgrad,

@@ -1,7 +1,7 @@
-"""Pruning in training: its options, its schedule, the callbacks that prune and remove floaters, and their records.
+"""Pruning in training: its options, the callbacks that prune and remove floaters, and their records.
 
-A schedule decides, a :class:`sundae_ns.pruning.decision.Pruner` prunes. The running state is a dict of integers,
-which checkpoints carry: a resumed run neither prunes twice nor forgets its peak.
+The running state is a dict of integers, which checkpoints carry: a resumed run neither prunes twice nor forgets its
+peak.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.files import write_text
 from sundae_ns.core.tables import without_nan
 from sundae_ns.core.timing import now, peak_memory
-from sundae_ns.io.run_folder import prunes_before
+from sundae_ns.io.run_folder import PRUNES, prunes_before
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.floaters import MOST, near_cameras
 from sundae_ns.pruning.rule import PruneRule, ScoreName, kept_count
@@ -32,6 +32,16 @@ log = logging.getLogger(__name__)
 
 
 USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise; also where trials cannot decide
+NEVER = -1  # Value of state["pruned_at"] before the first prune
+UNPRUNED = {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}
+"""Running state at the start: step of the last prune, number of prunes, peak number of Gaussians."""
+COUNT = "count"  # Key of the running state with the number that trials have chosen; 0 for the usual share
+LEAST_OPACITY = 0.005
+"""Lowest opacity of Gaussians that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
+
+Contribute = Callable[[int | None], Tensor]
+"""Renders the training views and returns the contribution of the pruner's Gaussians ``[N]``; the argument is ``count``
+of :func:`sundae_ns.scene.render.contribution`."""
 
 
 @dataclass
@@ -74,8 +84,8 @@ class PruningConfig(PruneRule):
 
     @property
     def ends_growth_at(self) -> int | None:
-        """Step of the prune after densification; None if the mode has none."""
-        return self.prune_at if self.mode == "one-shot" else None
+        """Last step at which densification may act; None if the mode sets none."""
+        return {"one-shot": self.prune_at, "continuous": self.stop}.get(self.mode)
 
     @property
     def last_due(self) -> int:
@@ -90,6 +100,32 @@ class PruningConfig(PruneRule):
     def settled_at(self) -> int:
         """Step after which the number of Gaussians does not change."""
         return self.stop if self.mode == "continuous" else self.prune_at
+
+    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
+        """Whether a field of ``n`` Gaussians is to be pruned after this step.
+
+        One-shot: after ``prune_at``, or at once if training was resumed from a later step without a prune. Continuous:
+        at ``start`` and every ``every`` steps until ``stop``; with a target only if there are more Gaussians. From
+        ``stop`` on at every step with more Gaussians than the target or, without a target, the cap.
+        """
+        if self.mode == "one-shot":
+            decided = not self.decides or COUNT in state
+            return decided and state["pruned_at"] == NEVER and step >= self.prune_at
+        if self.mode != "continuous":
+            return False
+        scheduled = self.start <= step <= self.stop and (step - self.start) % self.every == 0
+        most = self.max_gaussians if self.target_gaussians is None else self.target_gaussians
+        by_count = most is not None and n > most and (scheduled or step >= self.stop)
+        return ((scheduled and self.target_gaussians is None) or by_count) and step > state["pruned_at"]
+
+    def target(self, n: int, state: Mapping[str, Any]) -> int:
+        """Number of Gaussians that a prune keeps of ``n`` finite ones; at least 1, and under the cap."""
+        if self.target_gaussians is not None:
+            return min(self.target_gaussians, n)
+        chosen = state.get(COUNT, 0) if self.decides else 0
+        share = USUAL_SHARE if self.keep_ratio is None else self.keep_ratio
+        count = min(chosen, n) if chosen else kept_count(share, n)
+        return count if self.max_gaussians is None else min(count, self.max_gaussians)
 
     def validate(self) -> None:
         """Check every option; raises a ConfigError with the first that is invalid and its remedy."""
@@ -126,91 +162,40 @@ class PruningConfig(PruneRule):
                 raise ConfigError(message)
 
 
-def write_record(run: TrainingRun, name: str, record: Mapping[str, Any]) -> None:
+def write_record(run: TrainingRun, name: str, record: Any) -> None:
     """Write a record as JSON to the run's folder, if there is one; numbers that are not finite become null."""
     if run.folder is not None:
         run.folder.mkdir(parents=True, exist_ok=True)
         write_text(run.folder / name, json.dumps(without_nan(record), indent=2, allow_nan=False) + "\n")
 
 
-NEVER = -1  # Value of state["pruned_at"] before the first prune
-COUNT = "count"  # Key of the running state with the number that trials have chosen; 0 for the usual share
-LEAST_OPACITY = 0.005
-"""Lowest opacity of Gaussians that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
+def prune_when_due(
+    config: PruningConfig,
+    pruner: Pruner,
+    state: MutableMapping[str, Any],
+    step: int,
+    contribute: Contribute | None = None,
+) -> dict[str, Any] | None:
+    """Prune if it is due; add Gaussians that lack to the target. Call it after optimizers and densification.
 
-Contribute = Callable[[int | None], Tensor]
-"""Renders the training views and returns the contribution of the pruner's Gaussians ``[N]``; the argument is ``count``
-of :func:`sundae_ns.scene.render.contribution`."""
+    Args:
+        config: valid options.
+        pruner, state, step, contribute: as for :func:`prune_to`, also for errors.
 
-
-@dataclass(frozen=True)
-class PruningSchedule:
-    """When a field is pruned, and to how many Gaussians."""
-
-    config: PruningConfig  # Valid options; not changed
-
-    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """Whether a field of ``n`` Gaussians is to be pruned after this step.
-
-        One-shot: after ``prune_at``, or at once if training was resumed from a later step without a prune. Continuous:
-        at ``start`` and every ``every`` steps until ``stop``; with a target only if there are more Gaussians. From
-        ``stop`` on at every step with more Gaussians than the target or, without a target, the cap.
-        """
-        config = self.config
-        if config.mode == "one-shot":
-            decided = not config.decides or COUNT in state
-            return decided and state["pruned_at"] == NEVER and step >= config.prune_at
-        if config.mode != "continuous":
-            return False
-        target = config.target_gaussians
-        scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
-        most = config.max_gaussians if target is None else target
-        by_count = most is not None and n > most and (scheduled or step >= config.stop)
-        return ((scheduled and target is None) or by_count) and step > state["pruned_at"]
-
-    def target(self, n: int, state: Mapping[str, Any]) -> int:
-        """Number of Gaussians that a prune keeps of ``n`` finite ones; at least 1, and under the cap."""
-        config = self.config
-        if config.target_gaussians is not None:
-            return min(config.target_gaussians, n)
-        chosen = state.get(COUNT, 0) if config.decides else 0
-        share = USUAL_SHARE if config.keep_ratio is None else config.keep_ratio
-        count = min(chosen, n) if chosen else kept_count(share, n)
-        return count if config.max_gaussians is None else min(count, config.max_gaussians)
-
-    def initialize_state(self) -> dict[str, Any]:
-        """Running state: step of the last prune (-1 for none), number of prunes, peak number of Gaussians."""
-        return {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}
-
-    def after_step(
-        self, pruner: Pruner, state: MutableMapping[str, Any], step: int, contribute: Contribute | None = None
-    ) -> dict[str, Any] | None:
-        """Prune if it is due; add Gaussians that lack to the target. Call it after optimizers and densification.
-
-        Args:
-            pruner: of the field.
-            state: from :meth:`initialize_state`, or from a checkpoint.
-            step: training step that has just ended.
-            contribute: called only if the rule needs it, after Gaussians that are not finite have been removed.
-
-        Returns:
-            The report of :func:`prune_to`, or None if no prune was due.
-
-        Raises:
-            ConfigError: the rule needs a contribution and there is none.
-            DataError: the field cannot be pruned, see :func:`sundae_ns.pruning.decision.decide`.
-        """
-        config, report = self.config, None
+    Returns:
+        The report of :func:`prune_to`, or None if no prune was due.
+    """
+    report = None
+    state["peak"] = max(state["peak"], pruner.total)
+    if config.due(state, step, pruner.total):
+        # Continuous pruning draws anew each time, and the same after a resume.
+        rule = replace(config, seed=config.seed + step) if config.mode == "continuous" else config
+        report = prune_to(lambda n: config.target(n, state), rule, pruner, state, step, contribute)
+    lacking = (config.target_gaussians or 0) - pruner.total
+    if config.mode == "continuous" and step >= config.stop and lacking > 0:
+        pruner.add(lacking, LEAST_OPACITY)
         state["peak"] = max(state["peak"], pruner.total)
-        if self.due(state, step, pruner.total):
-            # Continuous pruning draws anew each time, and the same after a resume.
-            rule = replace(config, seed=config.seed + step) if config.mode == "continuous" else config
-            report = prune_to(lambda n: self.target(n, state), rule, pruner, state, step, contribute)
-        lacking = (config.target_gaussians or 0) - pruner.total
-        if config.mode == "continuous" and step >= config.stop and lacking > 0:
-            pruner.add(lacking, LEAST_OPACITY)
-            state["peak"] = max(state["peak"], pruner.total)
-        return report
+    return report
 
 
 def prune_to(
@@ -226,12 +211,19 @@ def prune_to(
     Args:
         target: maps the number of finite Gaussians to the number to keep.
         rule: which Gaussians stay.
-        pruner, state, step, contribute: see :meth:`PruningSchedule.after_step`, also for errors.
+        pruner: of the field.
+        state: :data:`UNPRUNED`, or from a checkpoint.
+        step: training step that has just ended.
+        contribute: called only if the rule needs it, after Gaussians that are not finite have been removed.
 
     Returns:
         ``step``; numbers of Gaussians: ``before`` (with those that are not finite), ``after``, ``dropped_nonfinite``,
         and the ``peak`` of all steps; ``seconds``, synchronised; and of the graph, None without one: ``tau``, the
         threshold on squared distances, ``sigma``, the width of the edge weights, and the number of ``isolated``.
+
+    Raises:
+        ConfigError: the rule needs a contribution and there is none.
+        DataError: the field cannot be pruned, see :func:`sundae_ns.pruning.decision.decide`.
     """
     device = pruner.params["means"].device
     before, started = pruner.total, now(device)
@@ -257,22 +249,22 @@ def summary(report: Mapping[str, Any]) -> str:
 
 
 class ScheduledPruning(Callback):
-    """Prunes when the schedule says so; ``evaluate`` measures all test views on both sides of the one-shot prune."""
+    """Prunes when it is due; ``evaluate`` measures all test views on both sides of the one-shot prune."""
 
     name = "pruning"
 
-    def __init__(self, schedule: PruningSchedule, *, evaluate: bool) -> None:
-        self.schedule = schedule
-        self.evaluate = evaluate
+    def __init__(self, config: PruningConfig, *, evaluate: bool) -> None:
+        self.config = config
+        self.evaluate = evaluate and config.mode == "one-shot"
 
     def before_training(self, run: TrainingRun) -> None:
         """Warn if training ends before the prune or the head."""
         if run.last_step is not None:
-            _warn_if_too_short(run, self.schedule.config, run.last_step)
+            _warn_if_too_short(run, self.config, run.last_step)
 
     def needs_all(self, run: TrainingRun) -> bool:
         """Whether a prune is due."""
-        return self.schedule.due(run.state.pruning, run.state.schedule_step, run.source.total)
+        return self.config.due(run.state.pruning, run.state.schedule_step, run.source.total)
 
     def after_step(self, run: TrainingRun) -> None:
         """Prune if it is due, evaluate, report, and restart the learning rates.
@@ -280,29 +272,25 @@ class ScheduledPruning(Callback):
         Raises:
             SundaeError: the field cannot be pruned. A checkpoint is saved first.
         """
-        state, config = run.state, self.schedule.config
+        state, config, due = run.state, self.config, self.needs_all(run)
         # Growing peaks before culling.
         state.pruning["peak"] = max(state.pruning["peak"], state.densification.get("peak", 0))
-        total = run.source.total
-        due = self.schedule.due(state.pruning, state.schedule_step, total)
         if due:
-            log.info(f"step {state.step}: pruning {total:,} Gaussians, with passes over the training views")
-        evaluate = due and self.evaluate and config.ends_growth_at is not None
-        before = run.evaluate() if evaluate else {}
+            log.info(f"step {state.step}: pruning {run.source.total:,} Gaussians, with passes over the training views")
+        before = run.evaluate() if due and self.evaluate else {}
 
         def contribute(count: int | None) -> Tensor:
             return contribution(run.source, run.training_views(), run.background, run.settings, count)
 
         try:
             pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
-            report = self.schedule.after_step(pruner, state.pruning, state.schedule_step, contribute)
+            report = prune_when_due(config, pruner, state.pruning, state.schedule_step, contribute)
         except SundaeError:
             # Do not lose the warm-up to an option that can be corrected: a resumed run prunes at its first step.
             run.save()
             raise
         settled = state.schedule_step >= config.settled_at
-        pruned = settled or (config.ends_growth_at is not None and state.pruning["num_prunes"] > 0)
-        if pruned:
+        if settled or (config.mode == "one-shot" and state.pruning["num_prunes"] > 0):
             with_head = settled and state.schedule_step >= state.head_starts_at
             notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
@@ -310,18 +298,16 @@ class ScheduledPruning(Callback):
         log.info(summary(report))
         if report["dropped_nonfinite"]:
             log.warning(f"removed {report['dropped_nonfinite']} Gaussians that were not finite")
-        after = run.evaluate() if evaluate else {}
+        after = run.evaluate() if due and self.evaluate else {}
         for label, results in (("warm-up", before), ("pruned", after)):
             if results:
                 psnr, ssim = results["psnr"], results["ssim"]
                 log.info(f"{label}: PSNR {psnr:.2f} dB, SSIM {ssim:.4f} on all test views")
         run.log_scalars("Prune", {name: report[name] for name in ("before", "after", "seconds", "peak")})
         if run.folder is not None:
-            path = run.folder / "prune.json"
             # A run that was killed between a prune and the next save repeats that prune.
-            reports = [*prunes_before(path, report["step"]), {**report, "warm_up": before, "pruned": after}]
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_text(path, json.dumps(reports, indent=2))
+            earlier = prunes_before(run.folder / PRUNES, report["step"])
+            write_record(run, PRUNES, [*earlier, {**report, "warm_up": before, "pruned": after}])
 
     def finish(self, run: TrainingRun) -> None:
         """Report the peak, and warn if nothing was pruned."""
@@ -329,34 +315,28 @@ class ScheduledPruning(Callback):
         peak, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
         log.info(f"peak: {peak:,} Gaussians, {memory:,.0f} MB of {state.device.type} memory")
         run.log_scalars("Peak", {"gaussians": peak, "memory_mb": memory})
-        _warn_if_too_short(run, self.schedule.config, run.state.step)
+        _warn_if_too_short(run, self.config, state.step)
 
 
 def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int) -> None:
     """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""
-    state, target = run.state, pruning.target_gaussians
-    pruned = state.pruning["num_prunes"] > 0
-    begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "prune-at")
+    state, target, pruned = run.state, pruning.target_gaussians, run.state.pruning["num_prunes"] > 0
+    continuous, starts_at = pruning.mode == "continuous", state.head_starts_at
+    begins, ends = ("start", "stop") if continuous else ("prune-at", "prune-at")
+    first = pruning.start if continuous else pruning.prune_at
     prunes = pruning.mode != "off" and state.offset == 0  # a warm start is pruned at once
-    first = pruning.start if pruning.mode == "continuous" else pruning.prune_at
     # A head whose start is not known yet is decided upon elsewhere.
-    scheduled = state.head is not None and math.isfinite(state.head_starts_at)
-    idle = scheduled and last_step + state.offset <= state.head_starts_at
+    idle = state.head is not None and math.isfinite(starts_at) and last_step + state.offset <= starts_at
     reached = pruned and target is not None and run.source.total <= target
     and_head = ", and the head stays disabled" if idle else ""
     # The head is enabled in the steps after that one.
-    head_at = int(state.head_starts_at) + 1 - state.offset if idle else 0
-    head_option = "head.start-at" if state.head_starts_at != pruning.settled_at else f"pruning.{ends}"
+    head_at = int(starts_at) + 1 - state.offset if idle else 0
+    head_option = "head.start-at" if starts_at != pruning.settled_at else f"pruning.{ends}"
     few, many = f"nothing is pruned{and_head}", f"more Gaussians are left than asked for{and_head}"
+    unfinished = prunes and last_step < pruning.last_due and not reached
     rows = [
         (prunes and last_step < first and not pruned, "first prune", first, f"pruning.{begins}", few),
-        (
-            prunes and last_step < pruning.last_due and not reached,
-            "last prune",
-            pruning.last_due,
-            f"pruning.{ends}",
-            many,
-        ),
+        (unfinished, "last prune", pruning.last_due, f"pruning.{ends}", many),
         (idle, "head", head_at, head_option, "it stays disabled"),
     ]
     for missed, event, step, option, result in rows:

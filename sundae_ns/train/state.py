@@ -19,7 +19,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.gaussians import FEATURES, Gaussians
 from sundae_ns.core.surgery import Snapshot, module_snapshot, restore, restore_module, snapshot
-from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.head.head import CompensationHead
 from sundae_ns.rasterize.types import Backend
 from sundae_ns.scene.render import RenderSettings
 
@@ -102,12 +102,13 @@ class TrainingState:
             if name in self.optimizers:
                 self.optimizers[name].state.clear()
 
-    def reshape_head(self, config: HeadConfig) -> None:
-        """Give head and features the shapes of a configuration; values are loaded later."""
+    def widen_head(self, num_features: int) -> bool:
+        """Give the head this width of features, with fresh weights; returns whether it had another."""
         assert self.head is not None
-        self.head.resize(config)
-        features = self.gaussians[FEATURES]
-        features.data = features.data.new_zeros(len(features), config.num_features)
+        changes = self.head.config.num_features != num_features
+        if changes:
+            self.head.resize(dataclasses.replace(self.head.config, num_features=num_features))
+        return changes
 
     def render_settings(
         self, backend: Backend, *, antialiased: bool, training: bool = False, absgrad: bool = False
@@ -137,9 +138,7 @@ class TrainingState:
         restore(self.gaussians, self.optimizers, saved["field"])
         if "head" in saved:
             assert self.head is not None
-            width = self.gaussians[FEATURES].shape[1]
-            if self.head.config.num_features != width:
-                self.head.resize(dataclasses.replace(self.head.config, num_features=width))
+            self.widen_head(self.gaussians[FEATURES].shape[1])
             restore_module(self.head.parameters(), self.optimizers["compensation"], saved["head"])
 
     def running_states(self) -> dict[str, dict[str, Any]]:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
@@ -34,7 +34,6 @@ from sundae_ns.core.errors import CheckpointError, PackError
 from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.core.metrics import MOST_PSNR, SSIM_WINDOW, fitted_psnr, psnr, ssim
 from sundae_ns.core.surgery import replace_parameter
-from sundae_ns.head.head import HeadConfig
 from sundae_ns.io.accounting import stored_bytes
 from sundae_ns.io.coordinates import scene_order
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
@@ -47,7 +46,7 @@ from sundae_ns.train.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.train.choice import HEADS, HeadGain, HeldOutQuality, Tolerance, Tried, mean_quality
 from sundae_ns.train.curve import RECORD, CurvePoint, curve_table
 from sundae_ns.train.densification import Densification
-from sundae_ns.train.pruning import COUNT, USUAL_SHARE, PruningConfig, prune_to, write_record
+from sundae_ns.train.pruning import COUNT, USUAL_SHARE, prune_to, write_record
 from sundae_ns.train.schedules import limit_rise, notify_pruned, put_restarts, restarts
 from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
@@ -68,6 +67,7 @@ WATCHED_SHARE = 0.5  # Longest watch of the length, as a share of the steps afte
 MORE_FEATURES = 29  # Of the last candidate: as many as are splatted without padding after the default 13
 NAMES = {"plain": "no head", "head": "head", "features": f"head with {MORE_FEATURES} features"}
 SAMPLE = 1 << 13  # Neighbouring Gaussians that are packed to estimate the bytes of all
+_MASKED = "masks leave no pixel of the held-out training views"
 _DISABLED = "so it stays disabled; train longer, or force it with --pipeline.model.head.mode residual"
 
 
@@ -123,7 +123,7 @@ def packed_size(gaussians: Mapping[str, Tensor], head: torch.nn.Module | None = 
     return [round((len(data) - fixed) * n / min(n, SAMPLE)), fixed]
 
 
-# ------------------------------------------------------------------------------------------------------------ engine
+# ------------------------------------------------------------------------------------------------------------ trials
 
 
 @dataclass(frozen=True)
@@ -136,127 +136,7 @@ class Trial:
     num_features: int | None = None
     """Width of the features: 0 disables the head, another width begins with a fresh one. None changes nothing."""
     counts: bool = True  # Whether its Gaussians are kept in any case; those of others are TrainingState.provisional
-    began: int = 0  # Step of the schedule at which it began; the engine sets it
-
-
-class TrialEngine:
-    """Runs trials on the Gaussians of a run, one after another, and keeps copies to go back to.
-
-    An enabled head corrects images after the step ``head_starts_at`` of the schedule.
-    """
-
-    def __init__(self, head_starts_at: float = -math.inf) -> None:
-        self.trial: Trial | None = None  # The current trial
-        self.kept: dict[str, dict[str, Any]] = {}
-        """Copies of the Gaussians by name: a :meth:`TrainingState.snapshot`, and the ``counted`` steps before it."""
-        self.taken_back = 0  # Steps of trials whose Gaussians were dropped
-        self.coming: dict[str, list[int]] = {}
-        """Views that are held out for the trials to come of a stage. In a trial its own views are, and no others."""
-        self._head_starts_at = head_starts_at
-        self._mean = RunningMean()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Plain values and tensors for a checkpoint."""
-        numbers = {"taken_back": self.taken_back, "coming": self.coming}
-        trial = None if self.trial is None else asdict(self.trial)
-        return {"trial": trial, "kept": self.kept, **numbers, **self._mean.state_dict()}
-
-    def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
-        """Counterpart of :meth:`state_dict`; the head is enabled as the trial has it."""
-        self.trial = None if saved["trial"] is None else Trial(**saved["trial"])
-        self.kept, self.taken_back, self.coming = dict(saved["kept"]), saved["taken_back"], dict(saved["coming"])
-        self._mean = RunningMean.of(saved, state.device)
-        self._apply(state)
-
-    def start(self, run: TrainingRun, trial: Trial) -> None:
-        """Start a trial from the present Gaussians."""
-        state = run.state
-        self.trial, self._mean = replace(trial, began=state.schedule_step), RunningMean()
-        self.hold_out(run)
-        self._apply(state)
-        if trial.num_features:
-            _widen(state, trial.num_features)
-            # Now: the callback that prunes acts before, so it would be a step later.
-            notify_pruned(state.schedulers, state.step, run.source.total)
-
-    def _apply(self, state: TrainingState) -> None:
-        """Enable the head as the trial has it, and say whether the Gaussians may be dropped."""
-        if self.trial is not None and self.trial.num_features is not None:
-            self.enable_head(state, self.trial.num_features > 0)
-        state.provisional = self.trial is not None and not self.trial.counts
-
-    def hold_out(self, run: TrainingRun) -> None:
-        """Hold out the views of the current trial, or else those of the trials to come."""
-        coming = {view for views in self.coming.values() for view in views}
-        run.hold_out(sorted(coming) if self.trial is None else self.trial.held_out)
-
-    def after_step(self, run: TrainingRun) -> bool:
-        """Average the weights if it is due; returns whether the current trial has ended."""
-        trial, state = self.trial, run.state
-        assert trial is not None
-        left = trial.began + trial.length - state.schedule_step
-        if left < trial.averaged and state.step % AVERAGED_EVERY == 0:
-            self._mean.count_in(weights_of(state))
-        return bool(left <= 0)
-
-    def measure(self, run: TrainingRun, *, with_fitted: bool = False) -> list[HeldOutQuality]:
-        """Quality of the held-out views with the mean of the weights, if there is one; the next mean begins anew."""
-        with self._mean.shown(weights_of(run.state)):
-            qualities = measure_heldout(run, with_fitted=with_fitted)
-        self._mean = RunningMean()
-        return qualities
-
-    def take_mean(self, state: TrainingState) -> None:
-        """Continue with the mean of the weights, if there is one."""
-        self._mean.replace(weights_of(state))
-        self._mean = RunningMean()
-        state.restored += 1  # another mean must not contain the weights before it
-
-    def keep(self, name: str, state: TrainingState, *, head: bool) -> None:
-        """Keep a copy of the Gaussians, and of the head if asked for, until the stage ends."""
-        self.kept[name] = {
-            "counted": state.schedule_step - self.taken_back,
-            "taken_back": self.taken_back,
-            "pruning": dict(state.pruning),
-            "restarts": restarts(state.schedulers),
-            **state.snapshot(head=head),
-        }
-
-    def go_back(self, name: str, state: TrainingState) -> None:
-        """Continue with a kept copy, its learning rates and its counted steps."""
-        kept = self.kept[name]
-        state.restore(kept)
-        peak = {name: value for name, value in state.pruning.items() if name == "peak"}  # of all trials
-        state.pruning.update({**kept["pruning"], **peak})
-        self.taken_back = state.schedule_step - kept["counted"]
-        put_restarts(state.schedulers, kept["restarts"], self.taken_back - kept["taken_back"])
-
-    def end(self, run: TrainingRun, stage: str) -> None:
-        """End the trials of a stage: forget the kept copies, and serve its views from the next step on."""
-        self.trial, self.kept, self._mean = None, {}, RunningMean()
-        self.coming.pop(stage, None)
-        self.hold_out(run)
-        self._apply(run.state)
-
-    def enable_head(self, state: TrainingState, enabled: bool) -> None:
-        """Enable or disable the head."""
-        # Not from this step on: a run that is resumed on several GPUs counts other steps.
-        state.head_starts_at = self._head_starts_at if enabled else math.inf
-
-
-def _widen(state: TrainingState, num_features: int) -> None:
-    """Start with fresh features and a fresh head if their width is another."""
-    assert state.head is not None
-    if state.head.config.num_features == num_features:
-        return
-    state.head.resize(replace(state.head.config, num_features=num_features))
-    state.optimizers["compensation"].state.clear()
-    colors, generator = state.gaussians["features_dc"].detach(), torch.Generator().manual_seed(0)
-    features = initial_features(colors, num_features, generator)
-    replace_parameter(state.gaussians, state.optimizers, FEATURES, features, {})
-
-
-# ------------------------------------------------------------------------------------------------------------ trials
+    began: int = 0  # Step of the schedule at which it began
 
 
 @dataclass
@@ -292,39 +172,38 @@ class Trials(Callback):
     It acts before the schedule prunes. :class:`AfterPrune` calls it again afterwards, for the stages that follow.
 
     Args:
-        config: options of pruning; trials decide about the count if its options leave it to them.
+        options: of the model. Trials decide about the count if those of pruning leave it to them, about the head in
+            mode auto.
         state: of the training. A head that is to be decided about stays disabled until its trial.
         densification: its running state starts anew when the trials of counts begin.
         begins_at: step of the schedule after which a head is tried: the number of Gaussians is settled.
-        decides_head: whether trials decide about the head.
-        ssim_weight: weight of SSIM in the loss.
     """
 
     name = "trials"
 
-    def __init__(
-        self,
-        config: PruningConfig,
-        state: TrainingState,
-        densification: Densification,
-        *,
-        begins_at: int,
-        decides_head: bool,
-        ssim_weight: float,
-    ) -> None:
-        self.config, self.begins_at, self.ssim_weight = config, begins_at, ssim_weight
-        self.progress, self.engine = Progress(), TrialEngine(begins_at)
-        self.decides_head = decides_head
+    def __init__(self, options: Any, state: TrainingState, densification: Densification, begins_at: float) -> None:
+        self.config, self.ssim_weight, self.begins_at = options.pruning, options.ssim_lambda, begins_at
+        self.decides_head = options.head.mode == "auto"
+        self.progress = Progress()
+        self.trial: Trial | None = None  # The current trial
+        self.kept: dict[str, dict[str, Any]] = {}
+        """Copies of the Gaussians by name: a :meth:`TrainingState.snapshot`, and the ``counted`` steps before it."""
+        self.taken_back = 0  # Steps of trials whose Gaussians were dropped
+        self.coming: dict[str, list[int]] = {}
+        """Views that are held out for the trials to come of a stage. In a trial its own views are, and no others."""
+        self._mean = RunningMean()
         self._densification = densification
-        self._head = HeadConfig(mode="off") if state.head is None else state.head.config
-        self._heads = HEADS if self._head.num_features < MORE_FEATURES else HEADS[:2]
-        self._widths = dict(zip(HEADS, (0, self._head.num_features, MORE_FEATURES), strict=True))
-        if decides_head:
-            self.engine.enable_head(state, False)
+        width = 0 if state.head is None else state.head.config.num_features
+        self._heads = HEADS if width < MORE_FEATURES else HEADS[:2]
+        self._widths = dict(zip(HEADS, (0, width, MORE_FEATURES), strict=True))
+        if self.decides_head:
+            self.enable_head(state, False)
 
     def state_dict(self) -> dict[str, Any]:
-        """What was tried and chosen, and the state of the engine."""
-        return {"progress": asdict(self.progress), "engine": self.engine.state_dict(), "head": self.decides_head}
+        """What was tried and chosen, the current trial, and the copies to go back to; plain values and tensors."""
+        engine = {"trial": self.trial and asdict(self.trial), "kept": self.kept, "taken_back": self.taken_back}
+        engine |= {"coming": self.coming, **self._mean.state_dict()}
+        return {"progress": asdict(self.progress), "engine": engine, "head": self.decides_head}
 
     def prepare_loading(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Give head and features the width that they have in the checkpoint, or remove them.
@@ -341,27 +220,32 @@ class Trials(Callback):
             )
         head, trial = saved["progress"]["chosen"].get("head"), saved["engine"]["trial"]
         if head == "features" or (trial and trial["num_features"] == MORE_FEATURES):
-            state.reshape_head(replace(self._head, num_features=MORE_FEATURES))
+            state.widen_head(MORE_FEATURES)
+            features = state.gaussians[FEATURES]
+            features.data = features.data.new_zeros(len(features), MORE_FEATURES)
         elif head == "plain":
             state.remove_head()
 
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
-        """Counterpart of :meth:`state_dict`.
+        """Counterpart of :meth:`state_dict`; the head is enabled as the trial has it.
 
         Raises:
             CheckpointError: the checkpoint lacks Gaussians to which its trials may return.
         """
         if not saved:
             return
-        tried = [Tried(**row) for row in saved["progress"]["tried"]]
+        engine, tried = saved["engine"], [Tried(**row) for row in saved["progress"]["tried"]]
         self.progress = progress = Progress(**{**saved["progress"], "tried": tried})
         if self.decides_head:
-            self.engine.enable_head(state, progress.chosen.get("head", "plain") != "plain")
-        self.engine.load_state_dict(state, saved["engine"])
+            self.enable_head(state, progress.chosen.get("head", "plain") != "plain")
+        self.trial = None if engine["trial"] is None else Trial(**engine["trial"])
+        self.kept, self.taken_back, self.coming = dict(engine["kept"]), engine["taken_back"], dict(engine["coming"])
+        self._mean = RunningMean.of(engine, state.device)
+        self._apply(state)
         needed = ["start"] if progress.stage in ("count", "tenth", "head", "length") else []
         if progress.stage == "head":
             needed += [row.head for row in progress.of("head")]
-        if not all(isinstance(self.engine.kept.get(name), Mapping) for name in needed):
+        if not all(isinstance(self.kept.get(name), Mapping) for name in needed):
             raise CheckpointError("the checkpoint lacks a field that its trials would return to; give another")
 
     def trains(self, state: TrainingState) -> bool:
@@ -387,43 +271,41 @@ class Trials(Callback):
             elif reason is not None:
                 self._keep_usual(run, reason)
             else:
-                self.engine.coming["count"] = self._count_views(run)
+                self.coming["count"] = self._count_views(run)
         if self.decides_head and "head" not in progress.chosen:
             if several:  # also if one GPU has begun them: its copies are of all Gaussians
                 wide = state.head is not None and state.head.config.num_features == MORE_FEATURES
                 self._finish_with(run, "features" if wide else "head", "trials need a single GPU")
             elif num_views < FEWEST_VIEWS:
                 self._finish_with(run, "plain", f"{num_views} training views are too few to tell whether a head helps")
-            elif progress.stage != "head" and "head" not in self.engine.coming and not self._heads_fit(run):
+            elif progress.stage != "head" and "head" not in self.coming and not self._heads_fit(run):
                 if run.last_step is not None:
                     log.warning("training ends before the head can be tried, %s", _DISABLED)
         elif several and progress.stage in ("length", "repeat", "paused"):  # a length counts steps of one image
             self._end_length(run, "", None)
-        self.engine.hold_out(run)
-        self._write(run)
+        self.hold_out(run)
+        self._record(run)
 
     def after_step(self, run: TrainingRun) -> None:
         """Try counts, before the schedule prunes."""
         progress = self.progress
         if progress.stage in ("count", "tenth"):
-            if self.engine.after_step(run):
-                self._end_trial(run)
+            self._go_on(run)
         elif self.config.decides and "count" not in progress.chosen and run.state.schedule_step >= self.config.prune_at:
             self._begin_counts(run)
 
     def after_prune(self, run: TrainingRun) -> None:
         """Try heads and lengths, once the schedule has pruned."""
-        progress, state, coming = self.progress, run.state, self.engine.coming
+        progress, state, coming = self.progress, run.state, self.coming
         if not self.decides_head or progress.stage in ("count", "tenth", "paused"):
             return
         if progress.stage:
-            if self.engine.after_step(run):
-                self._end_trial(run)
+            self._go_on(run)
         elif "head" not in progress.chosen:
             holds = state.schedule_step >= self.begins_at - HOLD_SHARE * progress.steps
             if "head" not in coming and holds and self._heads_fit(run):
                 coming["head"] = self._head_views(run)
-                self.engine.hold_out(run)
+                self.hold_out(run)
             pruned = not self.config.decides or state.pruning["num_prunes"] > 0
             if "head" in coming and pruned and state.schedule_step >= self.begins_at:
                 self._begin_heads(run)
@@ -436,35 +318,101 @@ class Trials(Callback):
         if undecided and run.last_step is not None and run.last_step + 1 >= (run.schedule_length or 0):
             log.warning("training ended before the head could be tried, %s", _DISABLED)
 
-    # ---------------------------------------------------------------------------------------------------- the one loop
-
-    def _start(self, run: TrainingRun, stage: str, length: int, views: list[int], width: int | None = None) -> None:
-        """Start the trial of a candidate; with a width of the features, its Gaussians may be dropped."""
-        self.progress.stage = stage
+    def start(self, run: TrainingRun, stage: str, length: int, views: list[int], width: int | None = None) -> None:
+        """Start a trial from the present Gaussians, which may be dropped if a width of the features is given."""
+        state, self.progress.stage, self._mean = run.state, stage, RunningMean()
         averaged = self._window if width is None else MEAN_SHARE * length
-        self.engine.start(run, Trial(length, views, averaged, width, counts=width is None))
+        self.trial = Trial(length, views, averaged, width, width is None, state.schedule_step)
+        self.hold_out(run)
+        self._apply(state)
+        if not width:
+            return
+        if state.widen_head(width):
+            state.optimizers["compensation"].state.clear()
+            colors, generator = state.gaussians["features_dc"].detach(), torch.Generator().manual_seed(0)
+            features = initial_features(colors, width, generator)
+            replace_parameter(state.gaussians, state.optimizers, FEATURES, features, {})
+        # Now: the callback that prunes acts before, so it would be a step later.
+        notify_pruned(state.schedulers, state.step, run.source.total)
 
-    def _end_trial(self, run: TrainingRun) -> None:
-        """Measure the current trial; try the next candidate of the stage, or choose."""
+    def _apply(self, state: TrainingState) -> None:
+        """Enable the head as the trial has it, and say whether the Gaussians may be dropped."""
+        if self.trial is not None and self.trial.num_features is not None:
+            self.enable_head(state, self.trial.num_features > 0)
+        state.provisional = self.trial is not None and not self.trial.counts
+
+    def enable_head(self, state: TrainingState, enabled: bool) -> None:
+        """Enable or disable the head."""
+        # Not from this step on: a run that is resumed on several GPUs counts other steps.
+        state.head_starts_at = self.begins_at if enabled else math.inf
+
+    def hold_out(self, run: TrainingRun) -> None:
+        """Hold out the views of the current trial, or else those of the trials to come."""
+        coming = {view for views in self.coming.values() for view in views}
+        run.hold_out(sorted(coming) if self.trial is None else self.trial.held_out)
+
+    def ended(self, run: TrainingRun) -> bool:
+        """Average the weights if it is due; returns whether the current trial has ended."""
+        trial, state = self.trial, run.state
+        assert trial is not None
+        left = trial.began + trial.length - state.schedule_step
+        if left < trial.averaged and state.step % AVERAGED_EVERY == 0:
+            self._mean.count_in(weights_of(state))
+        return bool(left <= 0)
+
+    def keep(self, name: str, state: TrainingState, *, head: bool) -> None:
+        """Keep a copy of the Gaussians, and of the head if asked for, until the stage ends."""
+        self.kept[name] = {
+            "counted": state.schedule_step - self.taken_back,
+            "taken_back": self.taken_back,
+            "pruning": dict(state.pruning),
+            "restarts": restarts(state.schedulers),
+            **state.snapshot(head=head),
+        }
+
+    def go_back(self, name: str, state: TrainingState) -> None:
+        """Continue with a kept copy, its learning rates and its counted steps."""
+        kept, peak = self.kept[name], state.pruning["peak"]  # of all trials
+        state.restore(kept)
+        state.pruning.update({**kept["pruning"], "peak": peak})
+        self.taken_back = state.schedule_step - kept["counted"]
+        put_restarts(state.schedulers, kept["restarts"], self.taken_back - kept["taken_back"])
+
+    def end(self, run: TrainingRun, stage: str) -> None:
+        """End the trials of a stage: forget the kept copies, and serve its views from the next step on."""
+        self.trial, self.kept, self._mean = None, {}, RunningMean()
+        self.coming.pop(stage, None)
+        self.hold_out(run)
+        self._apply(run.state)
+
+    def measure(self, run: TrainingRun) -> list[HeldOutQuality]:
+        """Quality of the held-out views with the mean of the weights, if there is one."""
+        with self._mean.shown(weights_of(run.state)):
+            return measure_heldout(run, with_fitted=self.progress.stage == "count")
+
+    def _go_on(self, run: TrainingRun) -> None:
+        """Once the current trial has ended, measure it; try the next candidate of the stage, or choose."""
         progress, state, stage = self.progress, run.state, self.progress.stage
+        if not self.ended(run):
+            return
         if stage == "repeat":
             # The mean of the last window stays to the end of the schedule.
-            self.engine.take_mean(state)
+            self._mean.replace(weights_of(state))
+            state.restored += 1  # another mean must not contain the weights before it
             self._end_length(run, "paused", progress.chosen["length"])
             log.info(f"step {state.step}: more training would harm other views; the remaining steps change nothing")
             return
-        assert self.engine.trial is not None
+        assert self.trial is not None
         enabled, wide = state.head if state.head_enabled else None, len(self._heads) == 3
         name = "plain" if enabled is None else "head"
         if enabled is not None and wide and enabled.config.num_features == MORE_FEATURES:
             name = "features"
-        views = [list(view) for view in self.engine.measure(run, with_fitted=stage == "count")]
-        row = Tried(stage, run.source.total, name, self.engine.trial.length, views)
+        row = Tried(stage, run.source.total, name, self.trial.length, [list(view) for view in self.measure(run)])
         progress.tried.append(row)
         if stage in ("count", "tenth"):
             row.bytes = packed_size(state.gaussians, enabled)
-            self.engine.go_back("start", state)
-            self.engine.enable_head(state, False)
+            self.go_back("start", state)
+            self.enable_head(state, False)
             self._try_count(run)
         elif stage == "head":
             params = {name: value for name, value in state.gaussians.items() if enabled is not None or name != FEATURES}
@@ -479,8 +427,6 @@ class Trials(Callback):
             f"step {run.state.step}: {question} Up to {trials} trials of {length:,} steps; {len(views)} of "
             f"{len(run.view_indices())} training views are held out"
         )
-
-    # ---------------------------------------------------------------------------------------------------------- counts
 
     @property
     def _tolerance(self) -> Tolerance:
@@ -513,8 +459,8 @@ class Trials(Callback):
         self.progress.full = run.source.total
         views = self._count_views(run)
         self._announce(run, "how many Gaussians does the scene need?", len(SHARES), self._window, views)
-        self.engine.enable_head(state, False)
-        self.engine.keep("start", state, head=self.decides_head)
+        self.enable_head(state, False)
+        self.keep("start", state, head=self.decides_head)
         self._try_count(run)
 
     def _try_count(self, run: TrainingRun) -> None:
@@ -530,14 +476,14 @@ class Trials(Callback):
             count, length = kept_count(SHARES[number], progress.full), self._window
             self._prune(run, count)
             notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + length)
-            self._start(run, "count", length, self._count_views(run), width=0)
+            self.start(run, "count", length, self._count_views(run), width=0)
         elif self.decides_head and curve and len(tenth) < 2 and self._count_of(curve)[0] > usual:
             length = self._plan(run)[1]
             self._prune(run, usual)
             limit_rise(state.schedulers, round(RISE_SHARE * length))
             notify_pruned(state.schedulers, state.step, usual, last=False)
             # On the views that it would hold out for trials of its own.
-            self._start(run, "tenth", length, self._head_views(run), self._widths["head" if tenth else "plain"])
+            self.start(run, "tenth", length, self._head_views(run), self._widths["head" if tenth else "plain"])
         else:
             self._choose_count(run, curve)
 
@@ -561,7 +507,7 @@ class Trials(Callback):
         """Choose a count, and let the schedule prune to it."""
         progress = self.progress
         if not curve:
-            self._keep_usual(run, "masks leave no pixel of the held-out training views")
+            self._keep_usual(run, _MASKED)
             return
         count, reason = self._count_of(curve)
         self._set_count(run, count)
@@ -590,7 +536,7 @@ class Trials(Callback):
             length, figures = self._plan(run)[1], _figures(progress.of("tenth"))
             log.info(f"a tenth of the Gaussians after {length:,} steps: {_in_words(figures)}")
             record["head"] = {"pays": progress.chosen["tenth"], "steps_per_trial": length, **figures}
-        self._record(run, "count", record)
+        self._record(run, count=record)
 
     def _keep_usual(self, run: TrainingRun, reason: str) -> None:
         log.warning(
@@ -602,11 +548,9 @@ class Trials(Callback):
         """End the trials of counts; with 0 the schedule keeps the usual share."""
         self.progress.stage, self.progress.chosen["count"] = "", count
         run.state.pruning[COUNT] = count
-        self.engine.end(run, "count")
+        self.end(run, "count")
         if not self.decides_head:
-            self.engine.enable_head(run.state, True)
-
-    # ----------------------------------------------------------------------------------------------------------- heads
+            self.enable_head(run.state, True)
 
     def _heads_fit(self, run: TrainingRun) -> bool:
         """Whether the chosen candidate can train on for the length of a trial."""
@@ -623,13 +567,13 @@ class Trials(Callback):
         trials = len(self._heads) * len(folds)
         self._announce(run, "is the head worth it?", trials, length, self._head_views(run))
         limit_rise(state.schedulers, round(RISE_SHARE * length))
-        self.engine.keep("start", state, head=True)
+        self.keep("start", state, head=True)
         self._start_head(run)
 
     def _start_head(self, run: TrainingRun) -> None:
         (folds, length), number = self._plan(run), len(self.progress.of("head"))
         head = self._heads[number // len(folds)]
-        self._start(run, "head", length, folds[number % len(folds)], self._widths[head])
+        self.start(run, "head", length, folds[number % len(folds)], self._widths[head])
 
     def _try_head(self, run: TrainingRun, head: str) -> None:
         """Try the next head from the same Gaussians, unless the last one does not pay; or choose."""
@@ -638,22 +582,22 @@ class Trials(Callback):
         if complete and (head == self._heads[-1] or choice.best_head(tried, folds) != head):
             self._choose_head(run, head)
             return
-        self.engine.keep(head, run.state, head=head != "plain")
-        self.engine.go_back("start", run.state)
+        self.keep(head, run.state, head=head != "plain")
+        self.go_back("start", run.state)
         self._start_head(run)
 
     def _choose_head(self, run: TrainingRun, trained: str) -> None:
         """Continue with the best candidate; ``trained`` is the last one."""
         tried, (folds, length) = self.progress.of("head"), self._plan(run)
         head, figures = choice.best_head(tried, len(folds)), _figures(tried)
-        reason = "" if all(row.views for row in tried) else "masks leave no pixel of the held-out training views"
+        reason = "" if all(row.views for row in tried) else _MASKED
         record: dict[str, Any] = {}
         if not reason:
             log.info(f"step {run.state.step}: held-out training views: {_in_words(figures)}. Continuing: {NAMES[head]}")
             run.log_scalars("Trials", {f"psnr_{name}": figure["psnr"] for name, figure in figures.items()})
             record = {"held_out_views": self._head_views(run), "steps_per_trial": length, "arms": figures}
         if head != trained:
-            self.engine.go_back(head, run.state)
+            self.go_back(head, run.state)
         self._finish_with(run, head, reason, record)
 
     def _finish_with(self, run: TrainingRun, head: str, reason: str, record: Mapping[str, Any] | None = None) -> None:
@@ -662,13 +606,11 @@ class Trials(Callback):
         if reason:
             log.info(f"the head is {'removed' if head == 'plain' else 'enabled'}: {reason}")
         progress.stage, progress.chosen["head"], progress.reason = "", head, reason
-        self.engine.end(run, "head")
-        self.engine.enable_head(state, head != "plain")
+        self.end(run, "head")
+        self.enable_head(state, head != "plain")
         if head == "plain":
             state.remove_head()
-        self._record(run, "head", {"decision": head, "reason": reason, "step": state.step, **(record or {})})
-
-    # ---------------------------------------------------------------------------------------------------------- length
+        self._record(run, head={"decision": head, "reason": reason, "step": state.step, **(record or {})})
 
     def _length_views(self, run: TrainingRun) -> list[int]:
         """Views that the chosen candidate has not seen since before its trial; none without trials."""
@@ -682,8 +624,8 @@ class Trials(Callback):
             progress.chosen["length"] = None
             return
         progress.watched_until = state.schedule_step + watched
-        self.engine.keep("start", state, head=state.head_enabled)
-        self._start(run, "length", self._window, views)
+        self.keep("start", state, head=state.head_enabled)
+        self.start(run, "length", self._window, views)
         log.info(
             f"step {state.step}: {num_views} training views are few; {len(views)} stay held out, to see when training "
             "stops helping"
@@ -705,30 +647,25 @@ class Trials(Callback):
                 f"step {state.step}: the held-out views were best after {length:,} steps, {then}; now {now}. "
                 "Going back, to train as long on all views"
             )
-            self.engine.go_back("start", state)
+            self.go_back("start", state)
             self._end_length(run, "repeat", length)
-            self._start(run, "repeat", length, [])
+            self.start(run, "repeat", length, [])
         elif state.schedule_step + self._window > progress.watched_until:
             log.info(f"step {state.step}: the held-out views lose nothing; training goes on, on all views")
             self._end_length(run, "", None)
         else:
-            self._start(run, "length", self._window, views)
+            self.start(run, "length", self._window, views)
             return
         record = {"held_out_views": views, "steps_per_measurement": self._window, "measured": measured}
-        self._record(run, "length", {**record, "steps_on_all_views": length, "step": state.step})
+        self._record(run, length={**record, "steps_on_all_views": length, "step": state.step})
 
     def _end_length(self, run: TrainingRun, stage: str, length: int | None) -> None:
         self.progress.stage, self.progress.chosen["length"] = stage, length
-        self.engine.end(run, "length")
+        self.end(run, "length")
 
-    # --------------------------------------------------------------------------------------------------------- records
-
-    def _record(self, run: TrainingRun, stage: str, record: Mapping[str, Any]) -> None:
-        """Add the record of a decision to ``trials.json``."""
-        self.progress.records[stage] = dict(record)
-        self._write(run)
-
-    def _write(self, run: TrainingRun) -> None:
+    def _record(self, run: TrainingRun, **decided: Mapping[str, Any]) -> None:
+        """Write ``trials.json`` with the records of all decisions."""
+        self.progress.records |= decided
         if self.progress.records:
             write_record(run, RECORD, self.progress.records)
 

@@ -81,7 +81,7 @@ def record_of(trainer: Trainer) -> dict[str, Any]:
 
 def head_steps(model: Any) -> float:
     """Steps in which the head was trained, without those that were taken back."""
-    return float(model.state.schedule_step - model.state.head_starts_at - trials_of(model).engine.taken_back)
+    return float(model.state.schedule_step - model.state.head_starts_at - trials_of(model).taken_back)
 
 
 def watch(trainer: Trainer) -> tuple[list[int], dict[str, torch.Tensor]]:

@@ -156,7 +156,7 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     record = _record(trainer)
     assert (record["decision"], record["step"], len(record["arms"])) == (chosen, decided, tried)
     # A head that was chosen has trained for one trial.
-    assert trials_of(model).engine.taken_back == (tried - 1) * LENGTH
+    assert trials_of(model).taken_back == (tried - 1) * LENGTH
     width = {"plain": 0, "head": 5, "features": 29}[chosen]
     assert model.gauss_params["features"].shape[1] == width
     assert (model.head is None) == (chosen == "plain")
@@ -216,7 +216,7 @@ def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, tria
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=3)
     model: Any = resumed.pipeline.model
     trials_of_run = trials_of(model)
-    assert "start" in trials_of_run.engine.kept
+    assert "start" in trials_of_run.kept
     resumed.ranks.count = 2
     attributes = TrainingCallbackAttributes(resumed.optimizers, resumed.grad_scaler, resumed.pipeline, resumed)
     trials_of_run.before_training(NerfstudioRun(model, attributes))
@@ -226,4 +226,4 @@ def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, tria
     assert model.state.head_enabled
     assert model.gauss_params["features"].shape[1] == width
     assert resumed.pipeline.datamanager.holdout_indices == []
-    assert trials_of_run.engine.kept == {}
+    assert trials_of_run.kept == {}

@@ -30,7 +30,7 @@ from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import response
 from sundae_ns.scene.render import GaussianSource, render_view
 from sundae_ns.train.curve import CurvePoint, expected_change
-from sundae_ns.train.pruning import PruningConfig, PruningSchedule
+from sundae_ns.train.pruning import UNPRUNED, PruningConfig, prune_when_due
 
 N = 90
 RULES: tuple[RuleName, ...] = get_args(RuleName)
@@ -155,10 +155,10 @@ def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None
     seen = as_the_viewer(lambda: picture(model))
     model.config.pruning.keep_ratio = 0.2
     optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in model.gauss_params.items()}
-    schedule = PruningSchedule(model.config.pruning)
-    report = schedule.after_step(
+    report = prune_when_due(
+        model.config.pruning,
         Pruner(model.state.gaussians, optimizers),
-        schedule.initialize_state(),
+        dict(UNPRUNED),
         model.config.pruning.prune_at,
         lambda count: model.contribution(cameras, count),  # type: ignore[arg-type]
     )

@@ -19,7 +19,7 @@ from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.train.initialize import Start
-from sundae_ns.train.pruning import COUNT, PruningConfig, PruningSchedule, summary
+from sundae_ns.train.pruning import COUNT, UNPRUNED, PruningConfig, prune_when_due, summary
 from sundae_ns.train.schedules import Decay
 
 Gaussians = tuple[dict[str, Parameter], dict[str, Optimizer]]
@@ -50,15 +50,15 @@ def train_step(params: dict[str, Parameter], optimizers: dict[str, Optimizer]) -
 
 
 def run(
-    policy: PruningSchedule, made: Gaussians, steps: range, state: dict[str, Any] | None = None
+    policy: PruningConfig, made: Gaussians, steps: range, state: dict[str, Any] | None = None
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     params, optimizers = made
-    state = policy.initialize_state() if state is None else state
+    state = dict(UNPRUNED) if state is None else state
     reports = []
     for step in steps:
         train_step(params, optimizers)
-        report = policy.after_step(
-            Pruner(params, optimizers), state, step, lambda _: params["opacities"].detach().sigmoid().squeeze(1)
+        report = prune_when_due(
+            policy, Pruner(params, optimizers), state, step, lambda _: params["opacities"].detach().sigmoid().squeeze(1)
         )
         if report is not None:
             reports.append(report)
@@ -67,9 +67,9 @@ def run(
 
 def test_one_shot_prunes_once_and_training_goes_on() -> None:
     made = gaussians()
-    policy = PruningSchedule(PruningConfig(prune_at=3, keep_ratio=0.25))
+    policy = PruningConfig(prune_at=3, keep_ratio=0.25)
     losses = []
-    state = policy.initialize_state()
+    state = dict(UNPRUNED)
     for step in range(8):
         reports, state = run(policy, made, range(step, step + 1), state)
         assert bool(reports) == (step == 3)
@@ -86,7 +86,7 @@ def test_one_shot_prunes_once_and_training_goes_on() -> None:
 @pytest.mark.parametrize(("cap", "kept"), [(None, [70, 49, 34]), (70, [70, 49, 34]), (60, [60, 42, 29])])
 def test_continuous_keeps_a_share_on_schedule(cap: int | None, kept: list[int]) -> None:
     options: dict[str, Any] = {"start": 2, "every": 3, "stop": 9, "keep_ratio": 0.7, "num_neighbors": 4}
-    policy = PruningSchedule(PruningConfig(mode="continuous", max_gaussians=cap, **options))
+    policy = PruningConfig(mode="continuous", max_gaussians=cap, **options)
     reports, state = run(policy, gaussians(), range(13))
     assert [report["step"] for report in reports] == [2, 5, 8]
     assert [report["after"] for report in reports] == kept
@@ -99,8 +99,8 @@ def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
     config = PruningConfig(
         mode="continuous", start=0, every=2, stop=100, max_gaussians=110, keep_ratio=1.0, num_neighbors=4
     )
-    policy = PruningSchedule(config)
-    state = policy.initialize_state()
+    policy = config
+    state = dict(UNPRUNED)
     counts, peaks = [], []
     params, optimizers = gaussians(100)
     for step in range(6):
@@ -119,7 +119,7 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
     config = PruningConfig(
         mode="continuous", start=0, every=2, stop=3, target_gaussians=80, max_gaussians=120, num_neighbors=4
     )
-    policy = PruningSchedule(config)
+    policy = config
     made = gaussians()
     reports, state = run(policy, made, range(2))
     assert [report["after"] for report in reports] == [80]
@@ -127,7 +127,7 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
     densification = {"grad2d": torch.zeros(last), "count": torch.zeros(last), "scene_scale": 1.0}
     for step in (3, 4):
         pruner = Pruner(params, optimizers, [densification])
-        policy.after_step(pruner, state, step, lambda _: torch.ones(last))
+        prune_when_due(policy, pruner, state, step, lambda _: torch.ones(last))
         assert {len(value) for value in params.values()} == {80}
         assert all(optimizers[name].param_groups[0]["params"] == [params[name]] for name in optimizers)
         rows = [len(value) for value in densification.values() if isinstance(value, Tensor)]
@@ -137,11 +137,11 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
 
 def test_continuous_draws_anew_each_time() -> None:
     config = PruningConfig(mode="continuous", start=0, every=1, keep_ratio=0.5, redistribution="none")
-    policy = PruningSchedule(config)
+    policy = config
     kept = []
     for step in (3, 3, 4):
         made = gaussians()
-        policy.after_step(Pruner(*made), policy.initialize_state(), step, lambda _: torch.linspace(0.1, 1, 100))
+        prune_when_due(policy, Pruner(*made), dict(UNPRUNED), step, lambda _: torch.linspace(0.1, 1, 100))
         kept.append(made[0]["means"].detach())
     assert torch.equal(kept[0], kept[1])
     assert not torch.equal(kept[0], kept[2])
@@ -159,8 +159,8 @@ def test_broken_gaussians_are_dropped_before_the_contribution_and_counted() -> N
         asked.append((count, len(params["means"])))
         return torch.ones(len(params["means"]))
 
-    policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
-    report = policy.after_step(Pruner(params, optimizers), policy.initialize_state(), 0, contribute)
+    policy = PruningConfig(prune_at=0, keep_ratio=0.5)
+    report = prune_when_due(policy, Pruner(params, optimizers), dict(UNPRUNED), 0, contribute)
     assert report is not None
     assert asked == [(49, 98)]
     assert (report["before"], report["dropped_nonfinite"], report["after"]) == (100, 2, 49)
@@ -174,9 +174,9 @@ def test_the_state_of_densification_is_sliced_along() -> None:
     strategy_state = {"grad2d": torch.arange(100), "scene_scale": 2.0}
     config = PruningConfig(prune_at=0, redistribution="none", keep_ratio=0.1)
     means = made[0]["means"].detach().clone()
-    policy = PruningSchedule(config)
-    policy.after_step(
-        Pruner(*made, [strategy_state]), policy.initialize_state(), 0, lambda _: torch.rand(len(made[0]["means"]))
+    policy = config
+    prune_when_due(
+        policy, Pruner(*made, [strategy_state]), dict(UNPRUNED), 0, lambda _: torch.rand(len(made[0]["means"]))
     )
     assert len(strategy_state["grad2d"]) == 10
     assert torch.equal(made[0]["means"], means[strategy_state["grad2d"]])
@@ -184,19 +184,17 @@ def test_the_state_of_densification_is_sliced_along() -> None:
 
 
 def test_off_never_prunes_but_counts() -> None:
-    reports, state = run(
-        PruningSchedule(PruningConfig(mode="off", prune_at=0, start=0, every=1)), gaussians(), range(4)
-    )
+    reports, state = run(PruningConfig(mode="off", prune_at=0, start=0, every=1), gaussians(), range(4))
     assert reports == []
     assert state == {"pruned_at": -1, "num_prunes": 0, "peak": 100}
 
 
 def test_a_failed_prune_leaves_field_and_state() -> None:
     made = gaussians(10)
-    policy = PruningSchedule(PruningConfig(prune_at=0))
-    state = policy.initialize_state()
+    policy = PruningConfig(prune_at=0)
+    state = dict(UNPRUNED)
     with pytest.raises(DataError, match=r"contribution has shape \[9\] for 10 Gaussians"):
-        policy.after_step(Pruner(*made), state, 0, lambda _: torch.ones(9))
+        prune_when_due(policy, Pruner(*made), state, 0, lambda _: torch.ones(9))
     assert len(made[0]["means"]) == 10
     assert state["pruned_at"] == -1
 
@@ -210,23 +208,23 @@ def test_a_failed_prune_leaves_field_and_state() -> None:
     ],
 )
 def test_what_cannot_be_pruned_names_the_cause(n: int, opacity: float, foreign: bool, words: str) -> None:
-    policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
+    policy = PruningConfig(prune_at=0, keep_ratio=0.5)
     params, optimizers = gaussians(n)
     params["opacities"].data[:] = opacity
     if foreign:
         params = {**params, "means": Parameter(torch.zeros(n, 3))}
     with pytest.raises(DataError, match=words):
-        policy.after_step(Pruner(params, optimizers), policy.initialize_state(), 0, lambda _: torch.ones(n))
+        prune_when_due(policy, Pruner(params, optimizers), dict(UNPRUNED), 0, lambda _: torch.ones(n))
     assert len(params["means"]) == n
 
 
 def test_a_report_says_in_one_line_what_happened_and_leaves_out_what_did_not() -> None:
-    (report,), _ = run(PruningSchedule(PruningConfig(prune_at=0)), gaussians(), range(1))
+    (report,), _ = run(PruningConfig(prune_at=0), gaussians(), range(1))
     assert all(type(value) in (int, float) for value in report.values())
     line = summary(report)
     assert line.startswith("step 0: kept 10 of 100 Gaussians in ")
     assert line.endswith("sigma {sigma:.3g}, tau {tau:.3g}, {isolated:,} isolated".format(**report))
-    (unscored,), _ = run(PruningSchedule(PruningConfig(prune_at=0, redistribution="none")), gaussians(), range(1))
+    (unscored,), _ = run(PruningConfig(prune_at=0, redistribution="none"), gaussians(), range(1))
     assert "sigma" not in summary(unscored)
     plain = {"step": 15000, "before": 1_234_567, "after": 123_456, "dropped_nonfinite": 0, "peak": 2_000_000}
     plain |= {"seconds": 1.26, "sigma": None}
@@ -236,11 +234,11 @@ def test_a_report_says_in_one_line_what_happened_and_leaves_out_what_did_not() -
 
 
 def test_continuous_prunes_a_step_once_and_above_the_cap_also_afterwards() -> None:
-    policy = PruningSchedule(PruningConfig(mode="continuous", start=0, stop=10, every=20, max_gaussians=100))
-    state = policy.initialize_state()
+    policy = PruningConfig(mode="continuous", start=0, stop=10, every=20, max_gaussians=100)
+    state = dict(UNPRUNED)
     assert [policy.due(state, step, 101) for step in (9, 10, 30)] == [False, True, True]
     assert not policy.due(state, 30, 100)
-    policy = PruningSchedule(PruningConfig(mode="continuous", start=0, stop=10, every=1))
+    policy = PruningConfig(mode="continuous", start=0, stop=10, every=1)
     assert [policy.due({**state, "pruned_at": 5}, step, 100) for step in (5, 6)] == [False, True]
 
 
@@ -291,13 +289,13 @@ def test_impossible_options_are_refused_in_one_line(options: dict[str, Any], wor
     ],
 )
 def test_the_schedule_decides_how_many_stay(options: dict[str, Any], of_60: int, of_10: int) -> None:
-    schedule = PruningSchedule(PruningConfig(**options))
+    schedule = PruningConfig(**options)
     assert (schedule.target(60, {}), schedule.target(10, {})) == (of_60, of_10)
 
 
 def test_trials_decide_how_many_stay_and_the_schedule_waits_for_them() -> None:
-    schedule = PruningSchedule(PruningConfig(keep_ratio=None, prune_at=3, max_gaussians=40))
-    state = schedule.initialize_state()
+    schedule = PruningConfig(keep_ratio=None, prune_at=3, max_gaussians=40)
+    state = dict(UNPRUNED)
     assert not schedule.due(state, 3, 60)
     for chosen, kept in ((7, 7), (50, 40), (0, 6)):  # 0 for the usual share
         decided = {**state, COUNT: chosen}

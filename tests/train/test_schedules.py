@@ -17,7 +17,7 @@ from sundae_ns.core.errors import ConfigError
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.method_configs import sundae
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig, NetworkAdamConfig, PruneAwareDecayConfig
-from sundae_ns.train.pruning import PruningSchedule
+from sundae_ns.train.pruning import UNPRUNED
 from sundae_ns.train.schedules import (
     LEAST_IMAGES,
     LEAST_RECOVERY,
@@ -120,9 +120,8 @@ def test_options_set_by_hand_keep_their_value() -> None:
 @pytest.mark.parametrize("length", [300, 1500, 7000, 50000])
 def test_continuous_pruning_keeps_its_number_of_prunes(length: int) -> None:
     def prunes(config: Any) -> int:
-        schedule = PruningSchedule(config.pipeline.model.pruning)
-        state = schedule.initialize_state()
-        return sum(schedule.due(state, step, 1000) for step in range(config.max_num_iterations))
+        pruning = config.pipeline.model.pruning
+        return sum(pruning.due(UNPRUNED, step, 1000) for step in range(config.max_num_iterations))
 
     assert prunes(fitted("sundae-continuous", length)) == prunes(fitted("sundae-continuous", 30000)) == 7
 

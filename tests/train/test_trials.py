@@ -1,11 +1,10 @@
-"""Trials without a trainer: the engine, states of checkpoints, and estimated sizes."""
+"""Trials without a trainer: their fields and views, states of checkpoints, and estimated sizes."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,8 +21,9 @@ from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train import trials as trials_module
 from sundae_ns.train.choice import HeldOutQuality, Tried
+from sundae_ns.train.pruning import PruningConfig
 from sundae_ns.train.schedules import Decay
-from sundae_ns.train.trials import Progress, Trial, TrialEngine, Trials, packed_size
+from sundae_ns.train.trials import Progress, Trial, Trials, packed_size
 
 Build = Callable[..., SundaeModel]
 VIEW = HeldOutQuality(10, 20.0, 0.5)
@@ -40,21 +40,26 @@ class FakeRun:
     def hold_out(self, indices: Any) -> None:
         self.held_out = list(indices)
 
-    def train(self, trials: TrialEngine, most: int = 100) -> int:
+    def train(self, trials: Trials, most: int = 100) -> int:
         """Train to the end of the trial, or ``most`` steps; returns their number."""
         for number in range(1, most + 1):
             self.state.step += 1
             self.state.gaussians["means"].data += 1
-            if trials.after_step(self):
+            if trials.ended(self):
                 return number
         return most
+
+
+def trials_for(state: Any, begins_at: float = -math.inf) -> Trials:
+    head, pruning = SimpleNamespace(mode="auto"), PruningConfig(keep_ratio=None)
+    options = SimpleNamespace(pruning=pruning, head=head, ssim_lambda=0.2)
+    return Trials(options, state, None, begins_at)  # type: ignore[arg-type]
 
 
 @pytest.fixture
 def run(build: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> FakeRun:
     monkeypatch.setattr(trials_module, "AVERAGED_EVERY", 1)
     state = build(n=20).state
-    state.head_starts_at = math.inf
     state.gaussians["means"].data.zero_()
     state.optimizers = {name: Adam([value]) for name, value in state.gaussians.items()}
     state.optimizers["compensation"] = Adam(state.head.parameters())
@@ -69,22 +74,22 @@ def test_trials_of_several_lengths_go_back_to_any_kept_field(run: FakeRun) -> No
     decay = Decay(0.1, 1000, 1.0, False, 0)
     decay.pruned_at = 0
     run.state.schedulers = {"means": LambdaLR(SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0), lr_lambda=decay)}
-    trials, state = TrialEngine(), run.state
+    trials, state = trials_for(run.state), run.state
 
     def age() -> int:
         """Steps since the rate has restarted, as far as they count."""
         return state.step - (decay.pruned_at or 0)
 
     trials.keep("first", state, head=False)
-    trials.start(run, Trial(5, held_out=[2]))
+    trials.start(run, "length", 5, [2])
     assert run.held_out == [2]
     assert run.train(trials) == 5
     trials.keep("second", state, head=False)
-    trials.start(run, Trial(3, held_out=[4]))
+    trials.start(run, "length", 3, [4])
     assert (run.train(trials), run.held_out, height(run)) == (3, [4], 8.0)
     trials.go_back("second", state)
     assert (height(run), trials.taken_back, age()) == (5.0, 3, 5)
-    trials.start(run, Trial(4))
+    trials.start(run, "length", 4, [])
     run.train(trials, most=2)
     trials.go_back("first", state)
     assert (height(run), trials.taken_back, age()) == (0.0, 3 + 2 + 5, 0)
@@ -94,9 +99,9 @@ def test_trials_of_several_lengths_go_back_to_any_kept_field(run: FakeRun) -> No
     assert (run.held_out, trials.trial, trials.kept) == ([], None, {})
 
 
-@pytest.mark.parametrize(("averaged", "shown", "own"), [(3, 4.0, 5.0), (0, 5.0, 5.0)])
+@pytest.mark.parametrize(("averaged", "shown"), [(0.6, 4.0), (0, 5.0)])
 def test_the_mean_of_the_last_weights_is_measured(
-    run: FakeRun, monkeypatch: pytest.MonkeyPatch, averaged: int, shown: float, own: float
+    run: FakeRun, monkeypatch: pytest.MonkeyPatch, averaged: float, shown: float
 ) -> None:
     seen: list[float] = []
 
@@ -105,16 +110,17 @@ def test_the_mean_of_the_last_weights_is_measured(
         return [VIEW]
 
     monkeypatch.setattr(trials_module, "measure_heldout", measured)
-    trials = TrialEngine()
-    trials.start(run, Trial(5, averaged=averaged))
+    monkeypatch.setattr(trials_module, "MEAN_SHARE", averaged)
+    trials = trials_for(run.state)
+    trials.start(run, "head", 5, [], width=0)
     run.train(trials)
     assert trials.measure(run) == [VIEW]
-    assert (seen, height(run)) == ([shown], own)
+    assert (seen, height(run)) == ([shown], 5.0)
 
 
 def test_a_field_is_provisional_until_the_trials_end(run: FakeRun) -> None:
-    state, trials = run.state, TrialEngine(head_starts_at=2)
-    trials.start(run, Trial(5, num_features=5, counts=False))
+    state, trials = run.state, trials_for(run.state, begins_at=2)
+    trials.start(run, "tenth", 5, [], width=5)
     run.train(trials)
     assert state.head_enabled
     assert state.provisional
@@ -124,22 +130,23 @@ def test_a_field_is_provisional_until_the_trials_end(run: FakeRun) -> None:
 
 
 def test_another_width_begins_with_a_fresh_head_and_a_kept_one_comes_back(run: FakeRun) -> None:
-    state, trials = run.state, TrialEngine()
+    state, trials = run.state, trials_for(run.state)
     weights = {name: value.clone() for name, value in state.head.named_parameters()}
     trials.keep("start", state, head=True)
-    trials.start(run, Trial(2, num_features=29))
+    trials.start(run, "head", 2, [], width=29)
     assert (state.head.config.num_features, state.gaussians["features"].shape) == (29, (20, 29))
     trials.go_back("start", state)
-    trials.start(run, Trial(2, num_features=0))
+    trials.start(run, "head", 2, [], width=0)
     assert not state.head_enabled
     assert (state.head.config.num_features, state.gaussians["features"].shape) == (5, (20, 5))
     assert all(torch.equal(value, weights[name]) for name, value in state.head.named_parameters())
 
 
-def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun) -> None:
-    trials, other, state = TrialEngine(), TrialEngine(), run.state
-    trials.keep("first", state, head=False)
-    trials.start(run, Trial(6, held_out=[1, 3], averaged=5, counts=False))
+def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    trials, other, state = trials_for(run.state), trials_for(run.state), run.state
+    monkeypatch.setattr(trials_module, "MEAN_SHARE", 5 / 6)
+    trials.keep("start", state, head=False)
+    trials.start(run, "tenth", 6, [1, 3], width=0)
     run.train(trials, most=4)
     saved = copy.deepcopy(trials.state_dict())
     state.provisional = False
@@ -149,9 +156,9 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun) -> None:
     other.hold_out(run)
     assert run.held_out == [1, 3]
     assert run.train(other) == 2
-    other.take_mean(state)
-    assert height(run) == 4.0  # of the steps 2 to 6
-    other.go_back("first", state)
+    monkeypatch.setattr(trials_module, "measure_heldout", lambda run, **_: [VIEW._replace(psnr=height(run))])
+    assert other.measure(run)[0].psnr == 4.0  # of the steps 2 to 6
+    other.go_back("start", state)
     assert (height(run), other.taken_back) == (0.0, 6)
 
 
@@ -199,12 +206,12 @@ def undecided(build: Build) -> tuple[SundaeModel, Trials]:
     return model, next(one for one in model.train_callbacks if isinstance(one, Trials))
 
 
-def saved(stage: str = "", kept: tuple[str, ...] = (), **progress: Any) -> dict[str, Any]:
+def saved(state: Any, stage: str = "", kept: tuple[str, ...] = (), **progress: Any) -> dict[str, Any]:
     """A state of trials."""
-    engine = TrialEngine()
-    engine.kept = {name: {} for name in kept}
-    engine.trial = Trial(10, num_features=5, counts=False) if stage else None
-    return {"progress": asdict(Progress(stage, **progress)), "engine": engine.state_dict(), "head": True}
+    trials = trials_for(state)
+    trials.progress, trials.kept = Progress(stage, **progress), {name: {} for name in kept}
+    trials.trial = Trial(10, num_features=5, counts=False) if stage else None
+    return trials.state_dict()
 
 
 def test_a_checkpoint_without_a_decision_names_the_option(undecided: tuple[SundaeModel, Trials]) -> None:
@@ -220,15 +227,15 @@ def test_a_state_without_a_field_to_go_back_to_is_refused(
     model, trials = undecided
     tried = [Tried("head", 9, "plain", 9)]
     with pytest.raises(CheckpointError, match="lacks a field") as raised:
-        trials.load_state_dict(model.state, saved(stage, kept, tried=tried))
+        trials.load_state_dict(model.state, saved(model.state, stage, kept, tried=tried))
     assert "\n" not in str(raised.value)
 
 
 def test_only_trials_do_without_mirrored_images(undecided: tuple[SundaeModel, Trials]) -> None:
     """They are too short to see what these bring; a run that resumes in a trial goes on with it."""
     model, trials = undecided
-    for state, mirrored in ((saved("head", ("start",)), False), (saved(chosen={"head": "head"}), True)):
-        trials.load_state_dict(model.state, state)
+    for options, mirrored in (({"stage": "head", "kept": ("start",)}, False), ({"chosen": {"head": "head"}}, True)):
+        trials.load_state_dict(model.state, saved(model.state, **options))  # type: ignore[arg-type]
         model.step = 10**6
         assert model.state.head_enabled
         assert model.resolution(model.step).mirror == mirrored
