@@ -271,7 +271,7 @@ def network_backward(
     """
     levels = len(net.encoder)
     widths = [conv.out_channels for conv in convolutions(net)]
-    grad_biases = torch.zeros(sum(widths), device=gradient.device).split(widths)
+    grad_biases = torch.zeros(sum(widths), dtype=torch.float32, device=gradient.device).split(widths)
     gradients: dict[int, tuple[Tensor, Tensor]] = {}
 
     def convolved(number: int, grad_raw: Tensor) -> Tensor:

@@ -208,7 +208,7 @@ def training_crop(width: int, height: int, max_pixels: int, seed: int, *, mirror
     whole = max_pixels == 0 or width * height <= max_pixels
     if whole and not mirror:
         return None
-    u, v, side = torch.rand(3, generator=torch.Generator().manual_seed(seed)).tolist()
+    u, v, side = torch.rand(3, generator=torch.Generator().manual_seed(seed), dtype=torch.float32).tolist()
     mirrored = mirror and side < 0.5
     if whole:
         return Crop(0, 0, width, height, mirrored) if mirrored else None

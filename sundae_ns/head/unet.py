@@ -19,7 +19,7 @@ SLOPE = 0.1  # slope of the activation below zero. Without normalisation a plain
 def _double_conv(c_in: int, c_out: int) -> nn.Sequential:
     layers: list[nn.Module] = []
     for channels in (c_in, c_out):
-        conv = nn.Conv2d(channels, c_out, 3, padding=1)
+        conv = nn.Conv2d(channels, c_out, 3, padding=1, dtype=torch.float32)
         # Keep the variance of activations through the depth (He et al. 2015): there is no normalisation.
         # For a tensor without values torch would import its compiler, which takes most of a second.
         if not conv.weight.is_meta:
@@ -66,7 +66,7 @@ class UNet(nn.Module):
         self.decoder = nn.ModuleList(
             _double_conv(coarse + fine, fine) for coarse, fine in zip(widths[:0:-1], widths[-2::-1], strict=True)
         )
-        self.out = nn.Conv2d(width, out_channels * fold, 1)
+        self.out = nn.Conv2d(width, out_channels * fold, 1, dtype=torch.float32)
         if zero_init:
             nn.init.zeros_(self.out.weight)
             nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]

@@ -152,7 +152,7 @@ class _Groups:
         unlike = 1 - pair_overlap(self.mean, self.entries, first, second)
         unlike += (self.color[first] - self.color[second]).square().sum(dim=1)
         # Of equal pairs, as in a grid of equal points, a random one is the cheapest; else a round would merge few.
-        unlike += 1e-9 * ((first * 2_654_435_761 + second * 40_503) % 1_000_003) / 1_000_003
+        unlike += 1e-9 * ((first * 2_654_435_761 + second * 40_503) % 1_000_003).float() / 1_000_003
         return unlike / (1 / self.weight[first] + 1 / self.weight[second])
 
     def join(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:

@@ -23,12 +23,7 @@ NamedTensors = Mapping[str, Tensor]
 
 
 class RunningMean:
-    """The mean of weights that are counted in one after another.
-
-    Args:
-        values: the mean so far, by name; empty without one.
-        count: number of weights in it.
-    """
+    """The mean of ``count`` weights so far, by name; they are counted in one after another."""
 
     def __init__(self, values: NamedTensors | None = None, count: int = 0) -> None:
         self.values, self.count = dict(values or {}), count
@@ -56,11 +51,9 @@ class RunningMean:
     @torch.no_grad()
     def replace(self, weights: NamedTensors) -> dict[str, Tensor]:
         """Put the mean, if one fits, in the place of weights; returns their copies, which are empty without a mean."""
-        if not self.fits(weights):
-            return {}
-        copies = {name: value.clone() for name, value in weights.items()}
-        for name, value in self.values.items():
-            weights[name].copy_(value)
+        copies = {name: value.clone() for name, value in weights.items()} if self.fits(weights) else {}
+        for name in copies:
+            weights[name].copy_(self.values[name])
         return copies
 
     @contextmanager
@@ -101,8 +94,7 @@ class Averaging(Callback):
         self.settled_at = settled_at
         self._mean = RunningMean()
         self._restored = 0  # Returns to a snapshot that the field had made when the mean began
-        self._replaced: dict[str, Tensor] = {}
-        """Weights of the last step, which the mean has replaced: a longer training goes on from them."""
+        self._replaced: dict[str, Tensor] = {}  # Weights of the last step, from which a longer training goes on
         self._alone = True
 
     def state_dict(self) -> dict[str, Any]:
@@ -135,9 +127,8 @@ class Averaging(Callback):
         weights = weights_of(state)
         if state.step % AVERAGED_EVERY == 0:
             self._mean.count_in(weights)
-        if state.step == last and self._mean.fits(weights):
+        if state.step == last and (replaced := self._mean.replace(weights)):
             log.info(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
-            replaced = self._mean.replace(weights)
             self._replaced = replaced if self._alone else {}
             if last == end:  # after a part, the mean goes on with the rest of the run
                 self._mean = RunningMean()

@@ -50,7 +50,7 @@ def start_counting(state: MutableMapping[str, Any], means: Tensor) -> None:
     """Make the tensors that are missing in the running state of gsplat's strategy, for centres ``[N, 3]``."""
     for name in STATISTICS:
         if name in state and state[name] is None:
-            state[name] = torch.zeros(len(means), device=means.device)
+            state[name] = means.new_zeros(len(means))
 
 
 @torch.no_grad()
@@ -122,10 +122,16 @@ class Densification(Callback):
 
     def after_step(self, run: TrainingRun) -> None:
         """Let the strategy add, move and remove Gaussians."""
-        state, params = run.state, run.state.gaussians.data
-        if state.densifying:
-            running = state.densification
-            self.strategy.step_post_backward(params, state.optimizers, running, state.schedule_step, state.info)
+        state, default = run.state, torch.get_default_dtype()
+        if not state.densifying:
+            return
+        torch.set_default_dtype(torch.float32)  # of the tensors that gsplat makes
+        try:
+            self.strategy.step_post_backward(
+                state.gaussians.data, state.optimizers, state.densification, state.schedule_step, state.info
+            )
+        finally:
+            torch.set_default_dtype(default)
 
 
 def make_strategy(options: Any, num_images: int) -> CappedStrategy:

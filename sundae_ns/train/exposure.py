@@ -50,8 +50,8 @@ class ExposureCompensation(Callback):
         self._mode = mode
         self._divides = None if mode == "auto" else mode == "on"
         """Whether photos are divided by their gains; None before that is decided."""
-        self._gains = torch.ones(num_photos, 3)
-        self._sums = torch.zeros(num_photos, 2, 3)
+        self._gains = torch.ones(num_photos, 3, dtype=torch.float32)
+        self._sums = torch.zeros(num_photos, 2, 3, dtype=torch.float32)
         """Sums since the last update: photo times image, and squares of the image, by channel."""
         self._measured = np.zeros((num_photos, 3))  # Logarithms of the brightness of a photo over that of its image
         self._counts = np.zeros(num_photos, np.int64)  # Updates of each photo

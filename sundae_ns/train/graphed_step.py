@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,26 +31,10 @@ from sundae_ns.train.step import StepInputs, StepLosses, StepResult, training_st
 _log = logging.getLogger(__name__)
 
 SPARE = 1.1  # Capacity for a field that grows, as a multiple of its number of Gaussians
-
+HEAD = "compensation"  # Name of the head's optimizer
 MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's moments in the state of its optimizer
-
 _UNSEEN = {"means": 1e15, "scales": -30.0, "opacities": -30.0}
 """Values of the rows beyond: behind the far plane, without width, transparent. Others are zero."""
-
-
-class _Row(NamedTuple):
-    """A tensor of the state with a row for each Gaussian, and where it lies."""
-
-    name: str  # Of the parameter, NAME.exp_avg or the like for moments, and of statistics
-    mapping: MutableMapping[Any, Any]  # Holds the tensor
-    key: Any
-
-    def replace(self, value: Tensor) -> None:
-        """Put another tensor in its place; a parameter stays the same object."""
-        if isinstance(self.mapping[self.key], torch.nn.Parameter):
-            self.mapping[self.key].data = value
-        else:
-            self.mapping[self.key] = value
 
 
 class Buffers:
@@ -73,7 +57,7 @@ class Buffers:
             Whether the buffers are new, so that work on the older ones is void.
         """
         n, rows = state.gaussians.num_gaussians, list(_rows(state, trained))
-        shapes = {row.name: row.mapping[row.key].shape[1:] for row in rows}
+        shapes = {name: mapping[key].shape[1:] for name, mapping, key in rows}
         fits = n <= self.capacity <= 2 * n if growing else n == self.capacity
         # Trials widen and narrow features.
         renewed = not fits or shapes != {name: buffer.shape[1:] for name, buffer in self.tensors.items()}
@@ -81,31 +65,34 @@ class Buffers:
             self.capacity = int(SPARE * n) if growing else n
             for name in self.tensors.keys() - shapes.keys():
                 del self.tensors[name]
-        for row in rows:
-            value, buffer = row.mapping[row.key], self.tensors.get(row.name)
+        for name, mapping, key in rows:
+            value, buffer = mapping[key], self.tensors.get(name)
             if renewed or buffer is None:
                 # One at a time: each replaces the older memory before the next is made.
                 buffer = value.detach().new_empty(self.capacity, *value.shape[1:]).requires_grad_(value.requires_grad)
-                self.tensors[row.name] = buffer
+                self.tensors[name] = buffer
             elif value.data_ptr() == buffer.data_ptr() and n == self._num_rows:
                 continue
             with torch.no_grad():
                 buffer[:n].copy_(value)
-                buffer[n:].fill_(_UNSEEN.get(row.name, 0.0))
-            row.replace(buffer.detach()[:n])
+                buffer[n:].fill_(_UNSEEN.get(name, 0.0))
+            if isinstance(value, torch.nn.Parameter):  # stays the same object
+                value.data = buffer.detach()[:n]
+            else:
+                mapping[key] = buffer.detach()[:n]
         self._num_rows = n
         return renewed
 
 
 def start_moments(state: TrainingState, trained: tuple[str, ...]) -> None:
     """Make the state of Adam for parameters that have none, as its first step would."""
-    for name in trained:
-        for group in state.optimizers[name].param_groups:
-            for value in group["params"]:
-                moments = state.optimizers[name].state[value]
-                if not moments:
-                    moments["step"] = torch.zeros((), dtype=torch.float32, device=value.device)
-                    moments.update({moment: torch.zeros_like(value) for moment in MOMENTS})
+    groups = [
+        (state.optimizers[name].state, group) for name in trained for group in state.optimizers[name].param_groups
+    ]
+    for states, value in [(states, value) for states, group in groups for value in group["params"]]:
+        if not states[value]:
+            states[value]["step"] = torch.zeros((), dtype=torch.float32, device=value.device)
+            states[value].update({moment: torch.zeros_like(value) for moment in MOMENTS})
 
 
 def trained_parameters(state: TrainingState) -> tuple[str, ...]:
@@ -114,21 +101,20 @@ def trained_parameters(state: TrainingState) -> tuple[str, ...]:
     return tuple(name for name in used if state.gaussians[name].numel() > 0)
 
 
-def _rows(state: TrainingState, trained: tuple[str, ...]) -> Iterator[_Row]:
+def _rows(state: TrainingState, trained: tuple[str, ...]) -> Iterator[tuple[str, MutableMapping[Any, Any], Any]]:
+    """Name, mapping and key of each tensor with a row for each Gaussian; moments are NAME.exp_avg and the like."""
     gaussians: Any = state.gaussians
     for name in trained:
-        yield _Row(name, gaussians, name)
+        yield name, gaussians, name
         moments = state.optimizers[name].state[gaussians[name]]
-        yield from (_Row(f"{name}.{moment}", moments, moment) for moment in MOMENTS)
+        yield from ((f"{name}.{moment}", moments, moment) for moment in MOMENTS)
     if state.densifying:
         running = state.densification
-        yield from (_Row(name, running, name) for name in STATISTICS if running.get(name) is not None)
+        yield from ((name, running, name) for name in STATISTICS if running.get(name) is not None)
 
 
 SPARE_PAIRS = 2.0  # Capacity for tile/Gaussian pairs, as a multiple of the most that a view has needed
-
 MAX_RECORDINGS = 8  # Recordings kept at a time: one for each image size and SH degree in use
-
 UNUSED = 1000
 """Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by
 kernel, because recording takes longer than a step."""
@@ -263,9 +249,6 @@ class StepRecordings:
         return _Recording(graph, copied, result, pairs)
 
 
-HEAD = "compensation"  # Name of the head's optimizer
-
-
 @dataclass(frozen=True)
 class _Held:
     """The tensors of a state whose Gaussians lie in the buffers, to notice cheaply when one is replaced."""
@@ -313,6 +296,7 @@ class RecordedStep:
         # Pinned: copying from other memory would wait until the GPU has finished the last step.
         numbers = torch.tensor(
             [*(float(group["lr"]) for _, _, group in held.groups), float(state.gaussians.num_gaussians)],
+            dtype=torch.float32,
             pin_memory=state.device.type == "cuda",
         ).to(state.device, non_blocking=True)
         # The prior of a field that grows is a mean over fewer rows than the buffers have.

@@ -95,7 +95,8 @@ class Sweep:
             if not steep.any():
                 continue
             ends = 1 / (high * float(facing[steep].max())), 1 / (low * float(facing[steep].min()))
-            s = torch.linspace(*ends, _number_of_planes(photo, others, normal, ends), device=facing.device)
+            planes = _number_of_planes(photo, others, normal, ends)
+            s = torch.linspace(*ends, planes, dtype=facing.dtype, device=facing.device)
             score, place = _peaks(correlations(facing, s))
             score = torch.where(steep, score, -1.0)
             found = 1 / (facing * (s[0] + place * (s[1] - s[0]))).clamp_min(1e-12)

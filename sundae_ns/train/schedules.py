@@ -27,7 +27,6 @@ from sundae_ns.io.pack.config import FINETUNE_STEPS, tuned_steps
 
 log = logging.getLogger(__name__)
 
-
 DecayShape = Literal["exponential", "cosine"]
 
 SPARSE = 15_000  # With fewer Gaussians after the prune centres move faster: on surfaces they are farther apart
@@ -87,14 +86,9 @@ def network_groups(
 
     With :data:`NETWORK_BETAS` the mean of squares follows gradients that suddenly grow: a weight moves by up to 1.2
     times the learning rate while they grow, and by 7.3 with the usual betas
-    (``(1 - b1) / sqrt((1 - b2) (1 - b1^2 / b2))``). Weights of layers with many inputs get a smaller rate, because
-    their sum grows with the inputs (Yang et al. 2022, "Tensor Programs V"). Only weights decay.
-
-    Args:
-        params: weights and biases; a head that is resized in training keeps the rates of its first shapes.
-        lr: learning rate.
-        weight_decay: of the weights.
-        full_rate_inputs: weights with more inputs than this get a proportionally smaller rate.
+    (``(1 - b1) / sqrt((1 - b2) (1 - b1^2 / b2))``). Weights of layers with more than ``full_rate_inputs`` inputs get a
+    proportionally smaller rate, because their sum grows with the inputs (Yang et al. 2022, "Tensor Programs V"). Only
+    weights decay. A head that is resized in training keeps the rates of its first shapes.
     """
     groups: dict[tuple[float, float], list[Tensor]] = {}
     for value in params:
@@ -122,7 +116,7 @@ def notify_pruned(
     Args:
         schedulers: by name.
         step: training step of the prune.
-        num_gaussians: number that was kept. With fewer than :data:`SPARSE` the rate of the centres rises.
+        num_gaussians: number that was kept. With fewer than :data:`SPARSE` centres move faster.
         last: False while pruning goes on or the head is still disabled; rates that hold until then are left alone.
         ends_at: training step at which they reach their final value, as for a trial; None for that of the run.
     """
@@ -174,13 +168,11 @@ def _apply(scheduler: LRScheduler) -> None:
     scheduler._last_lr = rates
 
 
-SCHEDULE = {
-    "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval "
-    "refine_every",
-    "pipeline.model.pruning": "prune_at start stop every",
-    "pipeline.model.head": "start_at",
-}
-"""Options of the model that count steps, by the configuration that has them. Learning rates have more."""
+SCHEDULE = (
+    "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval refine_every "
+    "pruning.prune_at pruning.start pruning.stop pruning.every head.start_at"
+).split()
+"""Options of the model that count steps. Learning rates have more."""
 
 LEAST_IMAGES = 50
 """Images that densification sees between two rounds, at least: fewer say too little of a Gaussian's gradient."""
@@ -226,12 +218,10 @@ def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
         if run is not None and "max_num_iterations" not in given:
             _leave_finetune(config, config.schedule_length - config.max_num_iterations)
         return
-    if config.schedule_length is None:
-        config.schedule_length = config.max_num_iterations
-    if config.schedule_length < 1:
-        raise ConfigError(
-            f"the length of the run is {config.schedule_length}; give --max-num-iterations 30000, or fewer"
-        )
+    length = config.max_num_iterations if config.schedule_length is None else config.schedule_length
+    if length < 1:
+        raise ConfigError(f"the length of the run is {length}; give --max-num-iterations 30000, or fewer")
+    config.schedule_length = length
     _leave_finetune(config, done=0)
     if usual is not None:
         fit_to_length(config, usual, given)
@@ -267,7 +257,7 @@ def given_options(words: Iterable[str]) -> frozenset[str]:
 
 def step_options(config: Any) -> list[str]:
     """Dotted names of all options of a trainer's configuration that the schedule consists of."""
-    names = [f"{owner}.{name}" for owner, text in SCHEDULE.items() for name in text.split()]
+    names = [f"pipeline.model.{name}" for name in SCHEDULE]
     for group, parts in config.optimizers.items():
         if parts["scheduler"] is not None:
             names += [f"optimizers.{group}.scheduler.{name}" for name in ("max_steps", "warmup_steps")]
@@ -284,11 +274,10 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
         usual: the method's own configuration.
         given: dotted names of options that keep their value, beside those that differ from ``usual``.
     """
-    share = config.schedule_length / usual.max_num_iterations
+    share = steps_share = config.schedule_length / usual.max_num_iterations
     if share == 1:
         return
     model, usual_model = config.pipeline.model, usual.pipeline.model
-    steps_share = share
     if model.warm_start is not None:
         left = usual.max_num_iterations - usual_model.pruning.prune_at
         steps_share = min(config.schedule_length / max(left, 1), 1.0)
@@ -317,8 +306,7 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
     Args:
         config: ``SundaeTrainerConfig``; its schedule and its model change.
         run: the configuration of that run.
-        usual: the method's own configuration.
-        given: see :func:`fit_to_length`.
+        usual, given: see :func:`fit_to_length`.
 
     Returns:
         A line for each option that the run has otherwise.
@@ -345,38 +333,35 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
 
 def schedule_table(config: Any) -> list[tuple[str, str]]:
     """What happens when, for the log: pairs of a part of training and its steps."""
-    model, rows = config.pipeline.model, {}
+    model = config.pipeline.model
     warm, head, pruning = model.warm_start is not None, model.head, model.pruning
     sizes = [
-        f"1/{2 ** (model.num_downscales - i)} until {(i + 1) * model.resolution_schedule:,}"
+        f"1/{2 ** (model.num_downscales - i)} until {(i + 1) * model.resolution_schedule:,}, "
         for i in range(0 if warm else model.num_downscales)
     ]
-    rows["images"] = ", ".join([*sizes, "then full size"]) if sizes else "full size"
-    rows["densification"] = "none: warm start"
-    if not warm:
-        ends = pruning.stop if pruning.mode == "continuous" else pruning.ends_growth_at
-        last = model.stop_split_at if ends is None else min(model.stop_split_at, ends)
-        resets = model.reset_alpha_every * model.refine_every
-        reset = f"reset every {resets:,}" if resets < last else "never reset"
-        rows["densification"] = f"{model.warmup_length:,} to {last:,}, every {model.refine_every:,}; opacities {reset}"
-    rows["SH degree"] = f"{model.sh_degree}" if warm else f"+1 every {model.sh_degree_interval:,} steps"
-    rows["prune"] = {
+    ends, resets = (model.stop_split_at, pruning.ends_growth_at), model.reset_alpha_every * model.refine_every
+    last = min(step for step in ends if step is not None)
+    reset = f"reset every {resets:,}" if resets < last else "never reset"
+    growth = f"{model.warmup_length:,} to {last:,}, every {model.refine_every:,}; opacities {reset}"
+    prune = {
         "continuous": f"{pruning.start:,} to {pruning.stop:,}, every {pruning.every:,}",
         "off": "none",
         "one-shot": "at once" if warm else f"after {pruning.prune_at:,}",
     }[pruning.mode]
-    if pruning.decides and not warm:
-        rows["prune"] += ", to as many as trials choose"
-    rows["head"] = "none"
-    if head.mode != "off":
-        at = pruning.settled_at if head.start_at is None else head.start_at
-        at = max(at - (pruning.prune_at if warm else 0), 0)
-        rows["head"] = f"after {at:,}" if at else "from the start"
-        rows["head"] += ", if trials favour it" if head.mode == "auto" else ""
-    schedulers = (parts["scheduler"] for parts in config.optimizers.values())
-    if ends_at := sorted({scheduler.max_steps for scheduler in schedulers if scheduler is not None}):
-        rows["learning rates"] = f"decay until {', '.join(f'{end:,}' for end in ends_at)}"
-    return list(rows.items())
+    at = pruning.settled_at if head.start_at is None else head.start_at
+    at = max(at - (pruning.prune_at if warm else 0), 0)
+    start = (f"after {at:,}" if at else "from the start") + (", if trials favour it" if head.mode == "auto" else "")
+    rates = {parts["scheduler"].max_steps for parts in config.optimizers.values() if parts["scheduler"] is not None}
+    rows = [
+        ("images", "".join([*sizes, "then full size"]) if sizes else "full size"),
+        ("densification", "none: warm start" if warm else growth),
+        ("SH degree", f"{model.sh_degree}" if warm else f"+1 every {model.sh_degree_interval:,} steps"),
+        ("prune", prune + (", to as many as trials choose" if pruning.decides and not warm else "")),
+        ("head", "none" if head.mode == "off" else start),
+    ]
+    if rates:
+        rows.append(("learning rates", f"decay until {', '.join(f'{end:,}' for end in sorted(rates))}"))
+    return rows
 
 
 def _free(config: Any, usual: Any, given: Collection[str], names: Iterable[str]) -> list[str]:
