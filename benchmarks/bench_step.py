@@ -99,7 +99,12 @@ def loss(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     def convolved(dtype: torch.dtype) -> Callable[[Tensor, Tensor], Tensor]:
         ssim = SSIM(data_range=1.0, channel=3)
         ssim.win = ssim.win.to(options.device, dtype)  # no buffer: moving the module would leave it
-        return lambda image, target: step.convolved_loss(image, target, ssim, SSIM_WEIGHT)
+
+        def loss(image: Tensor, target: Tensor) -> Tensor:
+            difference = (image - target).abs().mean()
+            return (1 - SSIM_WEIGHT) * difference + SSIM_WEIGHT * step.convolved_ssim_loss(image, target, ssim)
+
+        return loss
 
     def graded(way: Callable[[Tensor, Tensor], Tensor], image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         leaf = image.detach().requires_grad_()

@@ -41,18 +41,13 @@ LEAST_TRIAL, MOST_TRIAL = 0.04, 0.05
 """Shortest and longest trial of a head as shares of the schedule. All but the chosen one's cost at most a tenth."""
 
 
-# ------------------------------------------------------------------------------------------------------ measurements
-
-
 class HeldOutQuality(NamedTuple):
     """Quality of the image of one held-out view. The figures are NaN or infinite if the image is not finite."""
 
     pixels: int  # Number of pixels that count: those under the mask
     psnr: float  # PSNR of these pixels, dB
     ssim: float  # SSIM of these pixels; 0 for an image that is smaller than the window of SSIM
-    fitted: float = math.nan
-    """PSNR after the affine map of colours that fits best, dB: without differences in light and exposure of the photo.
-    NaN if it was not asked for."""
+    fitted: float = math.nan  # PSNR after the affine map of colours that fits the photo best, dB; NaN if not asked for
 
 
 @dataclass
@@ -65,8 +60,7 @@ class Tried:
     length: int  # Training steps of the trial
     views: list[list[float]] = field(default_factory=list)
     """For each held-out view the values of a :class:`HeldOutQuality`; empty if masks leave no pixel."""
-    bytes: list[int] | None = None
-    """Bytes of the Gaussians, with their features, and of the head; None if the field cannot be packed."""
+    bytes: list[int] | None = None  # Of the Gaussians, with their features, and of the head; None if they do not pack
 
     @property
     def qualities(self) -> list[HeldOutQuality]:
@@ -76,12 +70,9 @@ class Tried:
 
 def mean_quality(views: Sequence[HeldOutQuality]) -> tuple[float, float]:
     """PSNR (dB) and SSIM, each the mean over views weighted by the pixels that count; NaN without any."""
-    total = sum(view.pixels for view in views)
-    if not total:
-        return math.nan, math.nan
+    total = sum(view.pixels for view in views) or math.nan
     decibels = sum(view.pixels * view.psnr for view in views) / total
-    similarity = sum(view.pixels * view.ssim for view in views) / total
-    return decibels, similarity
+    return decibels, sum(view.pixels * view.ssim for view in views) / total
 
 
 def spread_cameras(indices: Sequence[int], count: int, half: int) -> list[int]:
@@ -95,9 +86,6 @@ def plan_heads(indices: Sequence[int], steps: int) -> tuple[list[list[int]], int
     chosen = spread_cameras(indices, 2 if few else max(2, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY)), 1)
     length = LEAST_TRIAL * steps / 2 if few else max(LEAST_TRIAL * steps, min(HEAD_STEPS, MOST_TRIAL * steps))
     return [[index] for index in chosen] if few else [chosen], max(round(length), 1)
-
-
-# ----------------------------------------------------------------------------------------------------------- the head
 
 
 def least_gain(doublings: float) -> float:
@@ -170,19 +158,14 @@ def head_pays(curve: Sequence[CurvePoint], gain: HeadGain, tolerance: Tolerance)
     ours, theirs = _bytes_at(curve, kept), _bytes_at(curve, without)
     if ours and theirs and added is not None:
         doublings = math.log2((ours + added) / theirs)
-    falls = gain.falls_by(kept, HEAD_PSNR[1])
-    return all(
-        is_enough(gained * falls, gain.ssim, doublings) for gained in (gain.psnr, gain.ssim_db) if gained is not None
-    )
+    falls, gains = gain.falls_by(kept, HEAD_PSNR[1]), (gain.psnr, gain.ssim_db)
+    return all(is_enough(gained * falls, gain.ssim, doublings) for gained in gains if gained is not None)
 
 
 def _bytes_at(curve: Sequence[CurvePoint], count: int) -> float | None:
     """Estimated bytes of a packed field without a head, from the nearest count of a curve."""
     near = min(curve, key=lambda point: abs(math.log(point.count / count)))
     return near.bytes and near.bytes * count / near.count
-
-
-# ---------------------------------------------------------------------------------------------------------- the count
 
 
 class Tolerance(NamedTuple):
@@ -226,10 +209,8 @@ def _paired(differences: NDArray[np.float64], pixels: NDArray[np.float64]) -> tu
     if not np.isfinite(differences).all():
         return math.inf, 0.0
     mean, views = float(differences @ pixels), len(differences)
-    if views < 2:
-        return mean, 0.0
     squares = float((pixels**2) @ (differences - mean) ** 2)
-    return mean, math.sqrt(squares * views / (views - 1))
+    return mean, math.sqrt(squares * views / max(views - 1, 1))
 
 
 def with_head(curve: Sequence[CurvePoint], gain: HeadGain) -> list[CurvePoint]:
@@ -304,9 +285,6 @@ def affordable(curve: Sequence[CurvePoint], most: int) -> int | None:
 def still_climbs(curve: Sequence[CurvePoint], tolerance: Tolerance) -> bool:
     """Whether the largest count is the best and the next smaller one clearly worse: more Gaussians might help."""
     return len(curve) > 1 and excess(curve[0], tolerance) <= 0 and excess(curve[1], tolerance) > 1
-
-
-# --------------------------------------------------------------------------------------------------------- the length
 
 
 def loss_of(views: Sequence[HeldOutQuality], ssim_weight: float) -> float:

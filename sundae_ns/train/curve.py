@@ -83,17 +83,12 @@ def expected_change(points: Sequence[CurvePoint], count: int, other: int) -> tup
 
 def curve_table(points: Sequence[CurvePoint]) -> list[str]:
     """Lines of a table of the points: count, packed size, and the expected figures with their losses."""
-    rows = [
-        [
-            f"{point.count:,}",
-            "" if point.bytes is None else f"{point.bytes / MEGABYTE:.2f}",
-            *_figures(point.psnr, point.psnr_loss, point.psnr_error, 2),
-            *_figures(point.ssim, point.ssim_loss, point.ssim_error, 4),
-        ]
-        for point in points
-    ]
-    heads = ["Gaussians", "packed, MB", "PSNR, dB", "below the best", "SSIM", "below the best"]
-    return table(heads, rows, words=0)
+    rows = []
+    for point in points:
+        size = "" if point.bytes is None else f"{point.bytes / MEGABYTE:.2f}"
+        psnr = _figures(point.psnr, point.psnr_loss, point.psnr_error, 2)
+        rows.append([f"{point.count:,}", size, *psnr, *_figures(point.ssim, point.ssim_loss, point.ssim_error, 4)])
+    return table(["Gaussians", "packed, MB", "PSNR, dB", "below the best", "SSIM", "below the best"], rows, words=0)
 
 
 def _figures(value: float | None, loss: float | None, error: float | None, digits: int) -> list[str]:

@@ -48,11 +48,9 @@ class ExposureCompensation(Callback):
 
     def __init__(self, num_photos: int, mode: Literal["auto", "on", "off"]) -> None:
         self._mode = mode
-        self._divides = None if mode == "auto" else mode == "on"
-        """Whether photos are divided by their gains; None before that is decided."""
+        self._divides = None if mode == "auto" else mode == "on"  # photos by their gains; None if not decided
         self._gains = torch.ones(num_photos, 3, dtype=torch.float32)
-        self._sums = torch.zeros(num_photos, 2, 3, dtype=torch.float32)
-        """Sums since the last update: photo times image, and squares of the image, by channel."""
+        self._sums = torch.zeros(num_photos, 2, 3, dtype=torch.float32)  # Photo x image, squares of the image
         self._measured = np.zeros((num_photos, 3))  # Logarithms of the brightness of a photo over that of its image
         self._counts = np.zeros(num_photos, np.int64)  # Updates of each photo
         self._rows = np.zeros(0, np.int64)  # Indices of the training photos
@@ -61,9 +59,9 @@ class ExposureCompensation(Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """Decision, gains and measurements."""
-        measured, counts = torch.from_numpy(self._measured.copy()), torch.from_numpy(self._counts.copy())
-        values = {"gains": self._gains.clone(), "sums": self._sums.clone(), "measured": measured, "counts": counts}
-        return {"divides": self._divides, **values}
+        tensors = {"gains": self._gains, "sums": self._sums}
+        tensors |= {"measured": torch.from_numpy(self._measured), "counts": torch.from_numpy(self._counts)}
+        return {"divides": self._divides, **{name: value.clone() for name, value in tensors.items()}}
 
     def load_state_dict(self, state: TrainingState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`; other photos begin anew."""
@@ -82,8 +80,8 @@ class ExposureCompensation(Callback):
         if len(indices) < LEAST_PHOTOS:
             self._divides = False
             if self._mode == "on":
-                few = f"{len(indices)} training photos are too few to be compared with those beside them"
-                log.warning(f"exposure-compensation is off: {few}")
+                few = "training photos are too few to be compared with those beside them"
+                log.warning(f"exposure-compensation is off: {len(indices)} {few}")
             return
         self._state, self._rows = run.state, np.asarray(indices)
         positions = places([view.camera for view in run.training_views()]).cpu()

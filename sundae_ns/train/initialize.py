@@ -30,11 +30,14 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
-
 FEWEST_POINTS = 50  # With fewer sparse points a user hears that photos overlap too little
+SIDES = {"cuda": 640, "cpu": 160}
+"""Longest side of the swept images, pixels, by device: a CPU takes a second a view, a GPU a fraction."""
+MOST_ON_CPU = 24  # Most views that a CPU sweeps
+FILLED = {"cuda": 100_000, "cpu": 20_000}
+"""Number of points up to which a sparse cloud is filled; a larger one stays as it is."""
 
 Points = tuple[Tensor, Tensor]  # Positions [N, 3] and colours in 0 to 255 [N, 3]
-
 Frame = tuple[Tensor, float]  # Transform [3, 4] and scale from the capture's coordinates to those of the model
 
 
@@ -89,16 +92,13 @@ def _sparse_gaussians(
     if points is not None and len(points[0]) > 0 and not options.random_init:
         xyz, rgb = points[0], points[1].float() / 255 if len(points[1]) else torch.full_like(points[0], 0.5)
         if len(xyz) < FEWEST_POINTS:
-            warnings.append(
-                f"the capture has only {len(xyz)} sparse points: its photos hardly overlap and the scene will be poor; "
-                "add photos between them"
-            )
+            few = "its photos hardly overlap and the scene will be poor; add photos between them"
+            warnings.append(f"the capture has only {len(xyz)} sparse points: {few}")
     else:
         if not options.random_init:
-            warnings.append(
-                f"the capture has no sparse point cloud; starting from {options.num_random} random points. Results are "
-                "better with one (COLMAP, or ply_file_path in transforms.json)."
-            )
+            better = "Results are better with one (COLMAP, or ply_file_path in transforms.json)."
+            none = f"the capture has no sparse point cloud; starting from {options.num_random} random points"
+            warnings.append(f"{none}. {better}")
         xyz, rgb = random_points(options.num_random, options.random_scale)
     if cap is not None and len(xyz) > cap:
         warnings.append(f"{len(xyz):,} points are more than the cap; starting from {cap:,} of them")
@@ -124,20 +124,14 @@ def _warm_gaussians(options: Any, source: Path, frame: Frame | None, num_feature
                 "train with it, or give --pipeline.model.warm-start-frame model"
             )
         params = similarity(params, *frame)
-    rest = params["features_rest"][:, : (options.sh_degree + 1) ** 2 - 1]
-    missing = (options.sh_degree + 1) ** 2 - 1 - rest.shape[1]
-    params["features_rest"] = torch.cat([rest, rest.new_zeros(len(rest), missing, 3)], dim=1)
+    columns = (options.sh_degree + 1) ** 2 - 1
+    rest = params["features_rest"][:, :columns]
+    missing = rest.new_zeros(len(rest), columns - rest.shape[1], 3)
+    params["features_rest"] = torch.cat([rest, missing], dim=1)
     if num_features:
         params[FEATURES] = initial_features(params["features_dc"], num_features)
     log.info(f"warm start: {len(params['means'])} Gaussians from {source}")
     return params
-
-
-SIDES = {"cuda": 640, "cpu": 160}
-"""Longest side of the swept images, pixels, by device: a CPU takes a second a view, a GPU a fraction."""
-MOST_ON_CPU = 24  # Most views that a CPU sweeps
-FILLED = {"cuda": 100_000, "cpu": 20_000}
-"""Number of points up to which a sparse cloud is filled; a larger one stays as it is."""
 
 
 class DenseStart(Callback):

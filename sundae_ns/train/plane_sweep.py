@@ -49,7 +49,6 @@ class _Reduced:
     grey: Tensor  # [1, 1, H, W]
     usable: Tensor  # Pixels that count and have contrast, bool [H, W]
     pose: Tensor  # Camera-to-world, OpenCV axes [4, 4]
-
     unproject: Tensor  # Inverse intrinsics [3, 3]
 
     def rays(self, row: Tensor, column: Tensor) -> Tensor:
@@ -107,8 +106,7 @@ class Sweep:
     def points(self, wanted: int) -> tuple[Tensor, Tensor]:
         """Points on which two or more views agree: positions ``[N, 3]`` and colours in [0, 1] ``[N, 3]``.
 
-        Args:
-            wanted: number of points that the caller needs. If there are many more, pixels are skipped evenly.
+        If there are many more than ``wanted``, pixels are skipped evenly.
         """
         empty = self._sparse.new_zeros(0, 3)
         every = max(1, sum(int((depth > 0).sum()) for depth in self._depths) // max(1, _LOOKED_AT * wanted))
@@ -125,12 +123,7 @@ class Sweep:
         return NEARER * ends[0], FARTHER * ends[1]
 
     def _agreeing(self, index: int, every: int) -> tuple[Tensor, Tensor]:
-        """Points of a view that others confirm: means with those of the others, and colours.
-
-        Args:
-            index: of the view.
-            every: examine one of this many pixels.
-        """
+        """Points of one in ``every`` pixel that other views confirm: means with those of the others, and colours."""
         photo, depth = self.photos[index], self._depths[index]
         rows, columns = (depth > 0).nonzero()[::every].T
         points = _to_world(photo, photo.rays(rows, columns) * depth[rows, columns][:, None])
@@ -221,10 +214,7 @@ def _directions(camera: Camera, up: Tensor) -> list[Tensor]:
 
 def _number_of_planes(photo: _Reduced, others: Sequence[_Reduced], normal: Tensor, ends: tuple[float, float]) -> int:
     """Number of planes between two, by the way that the middle of the image takes in the other views."""
-    row, column = (
-        torch.tensor([side // 2], device=normal.device) for side in (photo.camera.height, photo.camera.width)
-    )
-    (middle,) = photo.rays(row, column)
+    middle = photo.rays(*normal.new_tensor([photo.camera.height // 2, photo.camera.width // 2]))
     points = _to_world(photo, torch.stack([middle / (torch.dot(middle, normal).clamp_min(STEEPEST) * s) for s in ends]))
     longest = 0.0
     for other in others:
@@ -237,11 +227,7 @@ def _number_of_planes(photo: _Reduced, others: Sequence[_Reduced], normal: Tenso
 def _correlations(
     photo: _Reduced, others: Sequence[_Reduced], rays: Tensor, inverses: tuple[float, float]
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """The function of :meth:`FusedCorrelations.__call__` for a view, its neighbours and the limits of inverse depths.
-
-    Args:
-        rays: of all pixels of the view ``[H, W, 3]``.
-    """
+    """The function of :meth:`FusedCorrelations.__call__` for a view, its rays ``[H, W, 3]`` and its neighbours."""
     patches = _patches(photo.grey)
     # X' = R X + t with s normal . X = 1: the ray r projects to K (R r + s (normal . r) t).
     ways = [other.camera.K @ (other.camera.viewmat @ photo.pose)[:3] for other in others]

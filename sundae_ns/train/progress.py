@@ -50,9 +50,8 @@ LONG = 1800.0  # Seconds of a training on a CPU that are worth a warning
 def duration(seconds: float) -> str:
     """A duration in two units at most: ``1 h 5 min``, ``2 min``, ``40 s``."""
     minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
+    if minutes >= 60:
+        return f"{minutes // 60} h {minutes % 60} min"
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
@@ -66,8 +65,7 @@ class TimeLeft:
     MOST = 3.0
 
     def __init__(self) -> None:
-        self.step_s: float | None = None
-        """Seconds of a step; None before the second line, as the first step also compiles."""
+        self.step_s: float | None = None  # Of a step; None before the second line, as the first step also compiles
         self._at: tuple[int, float] | None = None
         self._steps = 0.0
 
@@ -77,13 +75,11 @@ class TimeLeft:
         if before is not None and done > before[0]:
             steps = done - before[0]
             step_s = (now - before[1]) / steps
-            if self.step_s is None:
-                self.step_s, self._steps = step_s, steps
-            else:
-                step_s = min(max(step_s, self.step_s / self.MOST), self.step_s * self.MOST)
-                weight = self._steps * math.exp(-steps / max(self.SHARE * total, 1))
-                self.step_s = (weight * self.step_s + steps * step_s) / (weight + steps)
-                self._steps = weight + steps
+            usual = step_s if self.step_s is None else self.step_s
+            step_s = min(max(step_s, usual / self.MOST), usual * self.MOST)
+            weight = self._steps * math.exp(-steps / max(self.SHARE * total, 1))
+            self.step_s = (weight * usual + steps * step_s) / (weight + steps)
+            self._steps = weight + steps
         return None if self.step_s is None else (total - done) * self.step_s
 
 

@@ -30,7 +30,6 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
-
 USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise; also where trials cannot decide
 NEVER = -1  # Value of state["pruned_at"] before the first prune
 UNPRUNED = {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}
@@ -133,29 +132,18 @@ class PruningConfig(PruneRule):
         if self.keep_ratio is not None:
             kept_count(self.keep_ratio, 1)  # raises if the share is invalid
         self.check_at_least(every=1, prune_at=0, start=0, max_gaussians=1, target_gaussians=1, max_bytes=1)
-        cap, target = self.max_gaussians, self.target_gaussians
-        continuous = self.mode == "continuous"
+        cap, target, drop, off = self.max_gaussians, self.target_gaussians, self.max_drop, self.mode == "off"
+        continuous, no_count = self.mode == "continuous", self.keep_ratio is None and target is None
+        over = cap is not None and target is not None and target > cap
         tried = "is set, and trials do not decide the number of Gaussians: set keep_ratio to None and mode to one-shot"
         refusals = [
             (continuous and self.stop < self.start, f"start ({self.start}) lies after stop ({self.stop}): swap them"),
-            (
-                continuous and self.keep_ratio is None and target is None,
-                "keep_ratio is None and mode is continuous, without trials: give 0.5, or target_gaussians",
-            ),
-            (
-                self.mode == "off" and (cap is not None or target is not None),
-                "mode is off, which prunes nothing: set mode to one-shot, or drop the number",
-            ),
-            (self.max_drop is not None and not self.decides, f"max_drop {tried}, as sundae does"),
+            (continuous and no_count, "keep_ratio is None and mode is continuous: give 0.5, or target_gaussians"),
+            (off and (cap or target), "mode is off, which prunes nothing: set one-shot, or drop the number"),
+            (drop is not None and not self.decides, f"max_drop {tried}, as sundae does"),
             (self.max_bytes is not None and not self.decides, f"max_bytes {tried}, as sundae does"),
-            (
-                self.max_drop is not None and not 0 < self.max_drop < float("inf"),
-                f"max_drop is {self.max_drop}: use a positive number of dB, 0.1 for one",
-            ),
-            (
-                cap is not None and target is not None and target > cap,
-                f"target_gaussians ({target}) is more than max_gaussians ({cap}): swap them",
-            ),
+            (drop is not None and not 0 < drop < math.inf, f"max_drop is {drop}: give 0.1, or another number of dB"),
+            (over, f"target_gaussians ({target}) is more than max_gaussians ({cap}): swap them"),
         ]
         for refused, message in refusals:
             if refused:
@@ -320,10 +308,9 @@ class ScheduledPruning(Callback):
 
 def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int) -> None:
     """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""
-    state, target, pruned = run.state, pruning.target_gaussians, run.state.pruning["num_prunes"] > 0
-    continuous, starts_at = pruning.mode == "continuous", state.head_starts_at
-    begins, ends = ("start", "stop") if continuous else ("prune-at", "prune-at")
-    first = pruning.start if continuous else pruning.prune_at
+    state, target, starts_at = run.state, pruning.target_gaussians, run.state.head_starts_at
+    begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "prune-at")
+    first, pruned = getattr(pruning, begins.replace("-", "_")), state.pruning["num_prunes"] > 0
     prunes = pruning.mode != "off" and state.offset == 0  # a warm start is pruned at once
     # A head whose start is not known yet is decided upon elsewhere.
     idle = state.head is not None and math.isfinite(starts_at) and last_step + state.offset <= starts_at

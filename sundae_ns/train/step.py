@@ -101,30 +101,20 @@ def image_losses(
     Returns:
         Both losses; the second is None without base colours.
     """
-    if not squares:
-        return _losses(image, base, target, ssim, weight, 1 - weight)
-    root = ((image - target).square().mean() + LEAST_SQUARE).sqrt()
-    if weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
-        return root, None if base is None else (base - target).abs().mean()
-    rest, of_base = _losses(image, base, target, ssim, weight, 0.0)
-    return (1 - weight) * root + rest, of_base
-
-
-def _losses(
-    image: Tensor, base: Tensor | None, target: Tensor, ssim: SSIM, weight: float, l1_weight: float
-) -> tuple[Tensor, Tensor | None]:
-    """``l1_weight L1 + weight (1 - SSIM)`` of an image, and the L1 loss of its base colours."""
+    root = ((image - target).square().mean() + LEAST_SQUARE).sqrt() if squares else None
+    windows = weight > 0 and min(target.shape[:2]) >= SSIM_WINDOW
     single = all(value.dtype == torch.float32 for value in (image, target, base) if value is not None)
-    large = min(target.shape[:2]) >= SSIM_WINDOW
-    if weight > 0 and large and single:
-        if kernels_where_possible(loss_kernels, image.device, "SSIM runs as slower convolutions"):
-            return fused_loss(image, target, weight, base, l1_weight=l1_weight)
+    slower = "SSIM runs as slower convolutions"
+    if windows and single and kernels_where_possible(loss_kernels, image.device, slower):
+        loss, of_base = fused_loss(image, target, weight, base, l1_weight=0.0 if squares else 1 - weight)
+        return loss if root is None else (1 - weight) * root + loss, of_base
     of_base = None if base is None else (base - target).abs().mean()
-    if weight == 0 or not large:
-        return (image - target).abs().mean(), of_base
-    if single and image.device.type == "cpu":
-        return l1_weight * (image - target).abs().mean() + weight * ssim_loss(image, target), of_base
-    return convolved_loss(image, target, ssim, weight, l1_weight), of_base
+    difference = (image - target).abs().mean() if root is None else root
+    if not windows:
+        return difference, of_base
+    on_cpu = single and image.device.type == "cpu"
+    dissimilarity = ssim_loss(image, target) if on_cpu else convolved_ssim_loss(image, target, ssim)
+    return (1 - weight) * difference + weight * dissimilarity, of_base
 
 
 _GAUSSIAN = cv2.getGaussianKernel(SSIM_WINDOW, SIGMA, cv2.CV_32F)
@@ -178,14 +168,12 @@ class _Dissimilarity(torch.autograd.Function):
         return grad_loss * ctx.saved_tensors[0], None
 
 
-def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_weight: float | None = None) -> Tensor:
-    """``l1_weight L1 + weight (1 - SSIM)`` by convolutions, on any device; ``l1_weight`` is ``1 - weight`` if None."""
-    l1_weight = 1 - weight if l1_weight is None else l1_weight
+def convolved_ssim_loss(image: Tensor, target: Tensor, ssim: SSIM) -> Tensor:
+    """As :func:`ssim_loss`, by convolutions, on any device and of any dtype."""
     ssim.win = ssim.win.to(target.device)  # once; each call would copy it and wait
     # Contiguous planes: convolutions of a large image with interleaved colours take much longer.
-    planes, truth = (value.permute(2, 0, 1)[None].contiguous() for value in (image, target))
-    similarity: Tensor = ssim(planes, truth)
-    return l1_weight * (image - target).abs().mean() + weight * (1 - similarity)
+    similarity: Tensor = ssim(*(value.permute(2, 0, 1)[None].contiguous() for value in (image, target)))
+    return 1 - similarity
 
 
 @dataclass(frozen=True)

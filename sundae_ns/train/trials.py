@@ -192,6 +192,10 @@ class Trials(Callback):
         self.coming: dict[str, list[int]] = {}
         """Views that are held out for the trials to come of a stage. In a trial its own views are, and no others."""
         self._mean = RunningMean()
+        self._window = 1  # Steps of a trial of a count, and between two measurements of a length
+        self._judges: list[int] = []  # Views that are held out for the trials of counts
+        self._folds: list[list[int]] = []  # Views that are held out for the trials of each head, one after another
+        self._length = 1  # Steps of a trial of a head
         self._densification = densification
         width = 0 if state.head is None else state.head.config.num_features
         self._heads = HEADS if width < MORE_FEATURES else HEADS[:2]
@@ -258,6 +262,9 @@ class Trials(Callback):
         several = run.images_per_step > 1
         # A warm start skips the steps before the prune.
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
+        self._window, indices = max(round(COUNT_SHARE * progress.steps), 1), run.view_indices()
+        self._folds, self._length = choice.plan_heads(indices, progress.steps)
+        self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // choice.HELD_OUT_EVERY), 0)
         if self.config.decides and "count" not in progress.chosen:
             obstacles = {
                 "trials of counts need a single GPU": several,
@@ -271,7 +278,7 @@ class Trials(Callback):
             elif reason is not None:
                 self._keep_usual(run, reason)
             else:
-                self.coming["count"] = self._count_views(run)
+                self.coming["count"] = self._judges
         if self.decides_head and "head" not in progress.chosen:
             if several:  # also if one GPU has begun them: its copies are of all Gaussians
                 wide = state.head is not None and state.head.config.num_features == MORE_FEATURES
@@ -304,7 +311,7 @@ class Trials(Callback):
         elif "head" not in progress.chosen:
             holds = state.schedule_step >= self.begins_at - HOLD_SHARE * progress.steps
             if "head" not in coming and holds and self._heads_fit(run):
-                coming["head"] = self._head_views(run)
+                coming["head"] = sum(self._folds, [])
                 self.hold_out(run)
             pruned = not self.config.decides or state.pruning["num_prunes"] > 0
             if "head" in coming and pruned and state.schedule_step >= self.begins_at:
@@ -432,24 +439,9 @@ class Trials(Callback):
     def _tolerance(self) -> Tolerance:
         return Tolerance.of_drop(self.config.max_drop)
 
-    @property
-    def _window(self) -> int:
-        """Steps of a trial of a count, and between two measurements of a length."""
-        return max(round(COUNT_SHARE * self.progress.steps), 1)
-
-    def _count_views(self, run: TrainingRun) -> list[int]:
-        indices = run.view_indices()
-        return choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, len(indices) // choice.HELD_OUT_EVERY), 0)
-
-    def _plan(self, run: TrainingRun) -> tuple[list[list[int]], int]:
-        return choice.plan_heads(run.view_indices(), self.progress.steps)
-
-    def _head_views(self, run: TrainingRun) -> list[int]:
-        return [index for fold in self._plan(run)[0] for index in fold]
-
     def _counts_fit(self, run: TrainingRun) -> bool:
         """Whether the trials leave enough of the steps after the prune."""
-        heads = 2 * self._plan(run)[1] if self.decides_head else 0
+        heads = 2 * self._length if self.decides_head else 0
         return len(SHARES) * self._window + heads <= MOST_TRIALS * (_steps_of(run) - self.config.prune_at)
 
     def _begin_counts(self, run: TrainingRun) -> None:
@@ -457,8 +449,7 @@ class Trials(Callback):
         Pruner(state.gaussians, state.optimizers, [state.densification]).drop_nonfinite()
         self._densification.initialize(state)  # its statistics would not match the Gaussians that come back
         self.progress.full = run.source.total
-        views = self._count_views(run)
-        self._announce(run, "how many Gaussians does the scene need?", len(SHARES), self._window, views)
+        self._announce(run, "how many Gaussians does the scene need?", len(SHARES), self._window, self._judges)
         self.enable_head(state, False)
         self.keep("start", state, head=self.decides_head)
         self._try_count(run)
@@ -476,14 +467,13 @@ class Trials(Callback):
             count, length = kept_count(SHARES[number], progress.full), self._window
             self._prune(run, count)
             notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + length)
-            self.start(run, "count", length, self._count_views(run), width=0)
+            self.start(run, "count", length, self._judges, width=0)
         elif self.decides_head and curve and len(tenth) < 2 and self._count_of(curve)[0] > usual:
-            length = self._plan(run)[1]
             self._prune(run, usual)
-            limit_rise(state.schedulers, round(RISE_SHARE * length))
+            limit_rise(state.schedulers, round(RISE_SHARE * self._length))
             notify_pruned(state.schedulers, state.step, usual, last=False)
             # On the views that it would hold out for trials of its own.
-            self.start(run, "tenth", length, self._head_views(run), self._widths["head" if tenth else "plain"])
+            self.start(run, "tenth", self._length, sum(self._folds, []), self._widths["head" if tenth else "plain"])
         else:
             self._choose_count(run, curve)
 
@@ -525,7 +515,7 @@ class Trials(Callback):
             "reason": reason,
             "step": run.state.step,
             "tolerance": self._tolerance._asdict(),
-            "held_out_views": self._count_views(run),
+            "held_out_views": self._judges,
             "steps_per_trial": self._window,
             "curve": [
                 {**asdict(point), "measured": [view._asdict() for view in row.qualities]}
@@ -533,9 +523,9 @@ class Trials(Callback):
             ],
         }
         if "tenth" in progress.chosen:
-            length, figures = self._plan(run)[1], _figures(progress.of("tenth"))
-            log.info(f"a tenth of the Gaussians after {length:,} steps: {_in_words(figures)}")
-            record["head"] = {"pays": progress.chosen["tenth"], "steps_per_trial": length, **figures}
+            figures = _figures(progress.of("tenth"))
+            log.info(f"a tenth of the Gaussians after {self._length:,} steps: {_in_words(figures)}")
+            record["head"] = {"pays": progress.chosen["tenth"], "steps_per_trial": self._length, **figures}
         self._record(run, count=record)
 
     def _keep_usual(self, run: TrainingRun, reason: str) -> None:
@@ -554,30 +544,27 @@ class Trials(Callback):
 
     def _heads_fit(self, run: TrainingRun) -> bool:
         """Whether the chosen candidate can train on for the length of a trial."""
-        folds, length = self._plan(run)
-        trials = len(self._heads) * len(folds) + 1
-        return _steps_of(run) + run.state.offset > self.begins_at + trials * length
+        trials = len(self._heads) * len(self._folds) + 1
+        return _steps_of(run) + run.state.offset > self.begins_at + trials * self._length
 
     def _begin_heads(self, run: TrainingRun) -> None:
-        progress, state, (folds, length) = self.progress, run.state, self._plan(run)
-        if "tenth" in progress.chosen:
-            head = "head" if progress.chosen["tenth"] else "plain"
+        chosen, state, trials = self.progress.chosen, run.state, len(self._heads) * len(self._folds)
+        if "tenth" in chosen:
+            head = "head" if chosen["tenth"] else "plain"
             self._finish_with(run, head, "the trials of counts have shown what it gains")
             return
-        trials = len(self._heads) * len(folds)
-        self._announce(run, "is the head worth it?", trials, length, self._head_views(run))
-        limit_rise(state.schedulers, round(RISE_SHARE * length))
+        self._announce(run, "is the head worth it?", trials, self._length, sum(self._folds, []))
+        limit_rise(state.schedulers, round(RISE_SHARE * self._length))
         self.keep("start", state, head=True)
         self._start_head(run)
 
     def _start_head(self, run: TrainingRun) -> None:
-        (folds, length), number = self._plan(run), len(self.progress.of("head"))
-        head = self._heads[number // len(folds)]
-        self.start(run, "head", length, folds[number % len(folds)], self._widths[head])
+        number, fold = divmod(len(self.progress.of("head")), len(self._folds))
+        self.start(run, "head", self._length, self._folds[fold], self._widths[self._heads[number]])
 
     def _try_head(self, run: TrainingRun, head: str) -> None:
         """Try the next head from the same Gaussians, unless the last one does not pay; or choose."""
-        tried, folds = self.progress.of("head"), len(self._plan(run)[0])
+        tried, folds = self.progress.of("head"), len(self._folds)
         complete = len(tried) % folds == 0 and head != "plain"
         if complete and (head == self._heads[-1] or choice.best_head(tried, folds) != head):
             self._choose_head(run, head)
@@ -588,14 +575,14 @@ class Trials(Callback):
 
     def _choose_head(self, run: TrainingRun, trained: str) -> None:
         """Continue with the best candidate; ``trained`` is the last one."""
-        tried, (folds, length) = self.progress.of("head"), self._plan(run)
-        head, figures = choice.best_head(tried, len(folds)), _figures(tried)
+        tried = self.progress.of("head")
+        head, figures = choice.best_head(tried, len(self._folds)), _figures(tried)
         reason = "" if all(row.views for row in tried) else _MASKED
         record: dict[str, Any] = {}
         if not reason:
             log.info(f"step {run.state.step}: held-out training views: {_in_words(figures)}. Continuing: {NAMES[head]}")
             run.log_scalars("Trials", {f"psnr_{name}": figure["psnr"] for name, figure in figures.items()})
-            record = {"held_out_views": self._head_views(run), "steps_per_trial": length, "arms": figures}
+            record = {"held_out_views": sum(self._folds, []), "steps_per_trial": self._length, "arms": figures}
         if head != trained:
             self.go_back(head, run.state)
         self._finish_with(run, head, reason, record)
@@ -612,12 +599,10 @@ class Trials(Callback):
             state.remove_head()
         self._record(run, head={"decision": head, "reason": reason, "step": state.step, **(record or {})})
 
-    def _length_views(self, run: TrainingRun) -> list[int]:
-        """Views that the chosen candidate has not seen since before its trial; none without trials."""
-        return [] if self.progress.reason else self._plan(run)[0][-1]
-
     def _begin_length(self, run: TrainingRun) -> None:
-        progress, state, views = self.progress, run.state, self._length_views(run)
+        progress, state = self.progress, run.state
+        # The chosen candidate has not seen these since before its trial.
+        views = [] if progress.reason else self._folds[-1]
         watched, num_views = int(WATCHED_SHARE * (progress.steps - state.schedule_step)), len(run.view_indices())
         # A warm start has learnt all views: what it forgets of them is no overfitting.
         if state.offset > 0 or not views or num_views >= MANY_VIEWS or watched < self._window:
@@ -633,7 +618,7 @@ class Trials(Callback):
 
     def _try_length(self, run: TrainingRun) -> None:
         """Train another window; or go back, to train on all views for as many steps as were best."""
-        progress, state, views = self.progress, run.state, self._length_views(run)
+        progress, state, views = self.progress, run.state, self._folds[-1]
         measured = []
         for row in progress.of("length"):
             psnr, ssim = mean_quality(row.qualities)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.plugin.model import SundaeModel
-from sundae_ns.train.step import StepInputs, StepLosses, convolved_loss, image_losses, ssim_loss, training_step
+from sundae_ns.train.step import StepInputs, StepLosses, convolved_ssim_loss, image_losses, ssim_loss, training_step
 
 Build = Callable[..., SundaeModel]
 OPTIONS: tuple[dict[str, Any], ...] = ({}, {"head": {"mode": "off"}}, {"head": {"max_train_pixels": 20 * 24}})
@@ -226,12 +226,12 @@ def test_losses_of_a_step_and_gradients_are_those_of_convolutions(height: int, w
 
 def test_it_rounds_as_convolutions_in_single_precision() -> None:
     image, _, target = images(48, 48)
-    (wanted,) = torch.autograd.grad(convolved_loss(image.double(), target.double(), ssim(), 1.0), image)
+    (wanted,) = torch.autograd.grad(convolved_ssim_loss(image.double(), target.double(), ssim()), image)
 
     def error(value: Tensor) -> Tensor:
         return (torch.autograd.grad(value, image)[0] - wanted).norm() / wanted.norm()
 
-    assert error(ssim_loss(image, target)) < 1.5 * error(convolved_loss(image, target, ssim(), 1.0)) + 1e-7
+    assert error(ssim_loss(image, target)) < 1.5 * error(convolved_ssim_loss(image, target, ssim())) + 1e-7
 
 
 def test_equal_images_have_no_loss_and_no_gradient() -> None:
