@@ -19,16 +19,11 @@ class NeighborGraph:
     The graph is directed: ``i`` may be among the K nearest of ``j`` without ``j`` being among those of ``i``.
     """
 
-    indices: Tensor
-    """Column indices of W, int64 ``[N, K]``."""
-    weights: Tensor
-    """Values of W in [0, 1], 0 where there is no edge ``[N, K]``."""
-    dw: Tensor
-    """Weighted degrees, the row sums of W ``[N]``."""
-    tau: float
-    """Edges join points whose squared distance is below this, squared scene units."""
-    sigma: float
-    """Width of the Gaussian of the weights, scene units."""
+    indices: Tensor  # Column indices of W, int64 [N, K]
+    weights: Tensor  # Values of W in [0, 1], 0 where there is no edge [N, K]
+    dw: Tensor  # Weighted degrees, the row sums of W [N]
+    tau: float  # Edges join points whose squared distance is below this, squared scene units
+    sigma: float  # Width of the Gaussian of the weights, scene units
 
     @property
     def N(self) -> int:

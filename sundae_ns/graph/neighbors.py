@@ -35,10 +35,8 @@ _log = logging.getLogger(__name__)
 class Neighbors(NamedTuple):
     """Neighbours of every point, nearest first; a point is never its own neighbour."""
 
-    indices: Tensor
-    """Neighbour indices, int64 ``[N, K]``."""
-    distances: Tensor
-    """Euclidean distances in scene units ``[N, K]``, dtype of the points; ``inf`` if that dtype overflows."""
+    indices: Tensor  # Neighbour indices, int64 [N, K]
+    distances: Tensor  # Euclidean distances in scene units [N, K], dtype of the points; inf if that dtype overflows
 
 
 def knn(points: Tensor, k: int) -> Neighbors:
@@ -177,16 +175,11 @@ class BoxTree:
     ``floor((j + 1) N / L) - 1`` of ``points``. Sizes of leaves differ by at most one and need not be stored.
     """
 
-    points: Tensor
-    """Positions in the order of the leaves ``[N, 3]``."""
-    order: Tensor
-    """Original index of each point, int32 ``[N]``; ascending among coincident points."""
-    boxes: Tensor
-    """Lowest and highest coordinates of the points of each node ``[2 L, 6]``; row 0 is unused."""
-    lowest: Tensor
-    """Lowest original index among the points of each node, int32 ``[2 L]``; row 0 is unused."""
-    depth: int
-    """Levels below the root."""
+    points: Tensor  # Positions in the order of the leaves [N, 3]
+    order: Tensor  # Original index of each point, int32 [N]; ascending among coincident points
+    boxes: Tensor  # Lowest and highest coordinates of the points of each node [2 L, 6]; row 0 is unused
+    lowest: Tensor  # Lowest original index among the points of each node, int32 [2 L]; row 0 is unused
+    depth: int  # Levels below the root
 
 
 def build_tree(points: Tensor) -> BoxTree:

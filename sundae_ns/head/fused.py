@@ -23,14 +23,10 @@ PACK = 8  # channels that a thread moves at once, 16 bytes; images are padded to
 _FORWARD = ("fold", "activate", "pool", "upsample", "unfold")
 
 KERNELS = (*_FORWARD, *(f"{name}_backward" for name in _FORWARD), "sum_pixels")  # names of the kernels of head.cu
-_TYPES = {torch.bfloat16: "-DBF16"}
-"""Compiler option for the dtype of images between the convolutions; tests add float32, on a CPU."""
+_TYPES = {torch.bfloat16: "-DBF16"}  # Compiler option for the dtype of images between convolutions; tests add float32
+Launches = Mapping[str, Launch]  # Launch functions by kernel name
 
-Launches = Mapping[str, Launch]
-"""Launch functions by kernel name."""
-
-MOST_WORKERS = 2**17
-"""Threads that sum a gradient over the pixels; fewer leave the GPU idle, and more wait for each other to add."""
+MOST_WORKERS = 2**17  # Threads that sum a gradient over the pixels; fewer leave the GPU idle, more wait for each other
 
 
 def compensated(net: UNet, residual: bool, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
@@ -120,14 +116,10 @@ def head_kernels(device: torch.device, dtype: torch.dtype, options: tuple[str, .
 class Tape(NamedTuple):
     """Values that the backward pass needs: inputs of the convolutions, and results before their bias and activation."""
 
-    inputs: list[Tensor]
-    """Inputs of all 3 x 3 convolutions, in order; every second one holds the activations of the convolution before."""
-    coarse: list[Tensor]
-    """Inputs of the upsamplings, from the coarsest level on."""
+    inputs: list[Tensor]  # Of all 3 x 3 convolutions; every second one holds the activations of the convolution before
+    coarse: list[Tensor]  # Inputs of the upsamplings, from the coarsest level on
     last: Tensor
-    """Input of the last kernel: the result of the last 3 x 3 convolution, without bias and activation.
-
-    ``[1, width, h, w]`` channels last."""
+    """Input of the last kernel: the last 3 x 3 convolution's result, without bias, activation ``[1, width, h, w]``."""
 
 
 def cast_weights(net: UNet, dtype: torch.dtype) -> list[Tensor]:

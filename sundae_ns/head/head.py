@@ -21,12 +21,8 @@ from sundae_ns.core.errors import BackendError, ConfigError
 from sundae_ns.head import fused
 from sundae_ns.head.unet import UNet
 
-SIZES: dict[str, tuple[int, int | None]] = {
-    "tiny": (8, None),
-    "compact": (32, 64),
-    "wide": (64, 64),
-    "regular": (64, None),
-}
+SIZES: dict[str, tuple[int, int | None]]
+SIZES = {"tiny": (8, None), "compact": (32, 64), "wide": (64, 64), "regular": (64, None)}
 """Channels of the finest level, and the maximum of the coarser ones. The last is the paper's."""
 TOLERANCE = 1.01
 """Ratio of focal lengths up to which the head runs at the image's own scale: the difference between training and test
@@ -75,11 +71,7 @@ class HeadConfig:
         return replace(self, mode="residual") if self.mode == "auto" else self
 
     def validate(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: a value is invalid.
-        """
+        """Raise a ConfigError for the first value that is invalid."""
         if self.num_features < 1:
             raise ConfigError(
                 f"head.num-features is {self.num_features}; set at least 1, or disable the head with head.mode off"
@@ -221,10 +213,8 @@ def training_crop(width: int, height: int, max_pixels: int, seed: int, *, mirror
 class ScalePlan(NamedTuple):
     """Scale and weight at which an image is compensated."""
 
-    zoom: float
-    """Factor on the focal length and sides of the image at which the head runs; 1 for the image itself."""
-    weight: float
-    """Share of the correction that is added; 0 means that the head need not run."""
+    zoom: float  # Factor on the focal length and sides of the image at which the head runs; 1 for the image itself
+    weight: float  # Share of the correction that is added; 0 means that the head need not run
 
 
 def plan(focal: float, trained: tuple[float, float] | None, pixels: int) -> ScalePlan:

@@ -11,8 +11,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 LEVELS = 4  # number of resolutions of the network; the coarsest is 1 / 2 ** (LEVELS - 1) of its input
-
-
 SLOPE = 0.1  # slope of the activation below zero. Without normalisation a plain ReLU can die, and whole levels with it
 
 
@@ -72,14 +70,7 @@ class UNet(nn.Module):
             nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
 
     def forward(self, image: Tensor) -> Tensor:
-        """Run the network.
-
-        Args:
-            image: ``[B, in_channels, H, W]``, any H and W of at least 1.
-
-        Returns:
-            ``[B, out_channels, H, W]``.
-        """
+        """The output ``[B, out_channels, H, W]`` of an image ``[B, in_channels, H, W]``, any H and W of at least 1."""
         height, width = image.shape[-2:]
         stride = self.pixel_unshuffle * 2 ** (LEVELS - 1)
         bottom, right = -height % stride, -width % stride

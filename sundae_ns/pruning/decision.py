@@ -25,29 +25,20 @@ from sundae_ns.pruning.selection import neighbor_order, select_band, select_syst
 class Decision:
     """Which Gaussians to keep, and the figures behind the choice."""
 
-    mask: Tensor
-    """True for Gaussians to keep, bool ``[N]``."""
-    kept: int
-    """Number of Gaussians that the mask keeps."""
-    dropped_nonfinite: int
-    """Number of Gaussians dropped because a parameter is NaN or infinite."""
-    tau: float | None = None
-    """Threshold of the graph on squared distances, squared scene units; None if no graph was needed."""
-    sigma: float | None = None
-    """Width of the graph's weights, scene units; None if no graph was needed."""
-    isolated: int | None = None
-    """Number of Gaussians without a neighbour within the threshold; None if no graph was needed."""
-    values: Mapping[str, Tensor] | None = None
-    """New parameters of the kept Gaussians, in order ``[kept, ...]``; None if they are unchanged."""
+    mask: Tensor  # True for Gaussians to keep, bool [N]
+    kept: int  # Number of Gaussians that the mask keeps
+    dropped_nonfinite: int  # Number of Gaussians dropped because a parameter is NaN or infinite
+    tau: float | None = None  # Threshold of the graph on squared distances, squared scene units; None without a graph
+    sigma: float | None = None  # Width of the graph's weights, scene units; None if no graph was needed
+    isolated: int | None = None  # Number of Gaussians without a neighbour within the threshold; None without a graph
+    values: Mapping[str, Tensor] | None = None  # New parameters of the kept Gaussians [kept, ...]; None if unchanged
 
 
 class Pruned(NamedTuple):
     """A pruned field, and the decision behind it."""
 
-    gaussians: Gaussians
-    """The kept Gaussians, merged with the dropped ones if the rule merges; tensors of its own."""
-    decision: Decision
-    """Mask over the field before the prune, and figures."""
+    gaussians: Gaussians  # The kept Gaussians, merged with the dropped ones if the rule merges; tensors of its own
+    decision: Decision  # Mask over the field before the prune, and figures
 
 
 @torch.no_grad()
@@ -126,9 +117,8 @@ def decide(
                 "a merge needs a pass over the training views and there are none: set redistribution to none"
             )
         values = merged(usable, graph, selected, contribution, labels)
-    if graph is None:
-        return Decision(mask, count, n - n_finite, values=values)
-    return Decision(mask, count, n - n_finite, graph.tau, graph.sigma, int(graph.isolated.sum()), values)
+    figures = (None, None, None) if graph is None else (graph.tau, graph.sigma, int(graph.isolated.sum()))
+    return Decision(mask, count, n - n_finite, *figures, values)
 
 
 def diverged(n: int) -> DataError:
@@ -145,12 +135,9 @@ def diverged(n: int) -> DataError:
 class Pruner:
     """Prunes a field in place, with its optimizers and running states."""
 
-    params: MutableMapping[str, Parameter]
-    """The field, name to parameter ``[N, ...]``; its parameters are replaced."""
-    optimizers: Mapping[str, Optimizer]
-    """By parameter name, one parameter each; others are left alone."""
-    states: Sequence[MutableMapping[str, Any]] = ()
-    """Running states on the same Gaussians; their tensors of N rows are sliced along."""
+    params: MutableMapping[str, Parameter]  # The field, name to parameter [N, ...]; its parameters are replaced
+    optimizers: Mapping[str, Optimizer]  # By parameter name, one parameter each; others are left alone
+    states: Sequence[MutableMapping[str, Any]] = ()  # Running states; their tensors of N rows are sliced along
 
     @property
     def total(self) -> int:
@@ -178,11 +165,7 @@ class Pruner:
         return sanitised.dropped
 
     def drop(self, mask: Tensor, *, at_most: float) -> int:
-        """Remove the Gaussians under a mask, unless they are too many.
-
-        Args:
-            mask: bool ``[N]``.
-            at_most: largest share of the field that is removed, below 1.
+        """Remove the Gaussians under a mask, bool ``[N]``, unless they are more than a share ``at_most``, below 1.
 
         Returns:
             Number of removed Gaussians.

@@ -10,14 +10,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-NEAREST = 0.01
-"""Share of the sparse points that may be nearer to a camera than the scene is taken to be: some of them are wrong."""
+NEAREST = 0.01  # Share of the sparse points that may be nearer to a camera than the scene: some of them are wrong
 FREE = 2 / 3  # share of that distance which is taken to be empty
 SUPPORT, REACH = 3, 0.5
 """A Gaussian is no floater if this many sparse points are within this share of the empty distance from it: a few
 photos may be of something near. Wrong points lie alone."""
-MOST = 0.05
-"""Largest share of the Gaussians that can be floaters; with more of them the points do not say where the scene is."""
+MOST = 0.05  # Largest share that can be floaters; with more of them the points do not say where the scene is
 
 
 def _distances(points: Tensor, others: Tensor, nth: int = 1) -> Tensor:

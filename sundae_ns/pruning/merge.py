@@ -18,19 +18,15 @@ from sundae_ns.core.merging import merge
 from sundae_ns.graph.graph import NeighborGraph, build_graph
 from sundae_ns.pruning.rule import PruneRule
 
-LEAST_WIDTH = 0.25
-"""Width added to Gaussians when their overlap is measured, as a share of the graph's sigma: some are flat."""
-
+LEAST_WIDTH = 0.25  # width added to Gaussians whose overlap is measured, in sigmas of the graph: some are flat
 MOST_UNLIKE = 8.0
 """Largest difference of colours that counts, in typical differences. Weights fall to e^-32 and stay positive; otherwise
 a Gaussian of an extreme colour would have no neighbour and could not be merged."""
 UNSEEN = 0.001  # share of all weight that is dropped, not merged: the lightest Gaussians
 FLOOR = 1e-4  # least weight in a merge, as a share of the mean: Gaussians that nothing sees merge by their likeness
-WIDTH = 0.01
-"""Variance added to each axis, as a share of the sum of all three: two parallel flat Gaussians are alike too."""
+WIDTH = 0.01  # variance added to each axis, as a share of the sum of all: two parallel flat Gaussians are alike too
 PART = 0.5  # share of the possible merges of a round that happen; the others wait for what the better ones leave
-MOST_ROUNDS = 256
-"""Most rounds; a field needs about 60. Thousands of clones that share their neighbours would need many more."""
+MOST_ROUNDS = 256  # a field needs about 60; thousands of clones that share their neighbours would need many more
 ROWS = 1 << 17  # Gaussians whose edges are followed at once; they take about 100 MiB
 MOST_HOPS = 64  # most edges between a dropped Gaussian and its kept one; keep ratios from 0.001 on need about a dozen
 

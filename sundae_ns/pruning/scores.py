@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import pad
 
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import as_gaussians, sh_to_rgb
@@ -109,17 +109,18 @@ def pixel_detail(image: Tensor, cells: float) -> Tensor:
     """
     height, width = image.shape[:2]
     side = round((height * width / max(cells, 1.0)) ** 0.5)
-    # An odd window of at least 3 pixels; its half is the padding, and must not exceed the image.
+    # An odd window of at least 3 pixels.
     half = max(1, min(side, height, width) // 2)
-    planes = image.detach().permute(2, 0, 1).nan_to_num()[None].double()
-
-    def local_mean(values: Tensor) -> Tensor:
-        # Rows, then columns: a square window of many pixels would take long.
-        for crop, padding in (((2 * half + 1, 1), (half, 0)), ((1, 2 * half + 1), (0, half))):
-            values = avg_pool2d(values, crop, stride=1, padding=padding, count_include_pad=False)
-        return values
-
-    variance = (local_mean(planes.square()) - local_mean(planes).square()).clamp_min(0).sum(dim=1)[0]
+    values = image.detach().nan_to_num().double()
+    values = values - values[0, 0]  # a flat image has sums of exactly 0
+    values = torch.cat([values, values.square()], dim=2)
+    for _ in range(2):  # means of columns, then of rows: differences of running sums cost the same for every window
+        at = torch.arange(len(values), device=values.device)
+        low, high = (at - half).clamp_min(0), (at + half + 1).clamp_max(len(values))
+        sums = pad(values.cumsum(dim=0), (0, 0, 0, 0, 1, 0))
+        values = ((sums[high] - sums[low]) / (high - low)[:, None, None]).transpose(0, 1)
+    means, squares = values.chunk(2, dim=2)
+    variance = (squares - means.square()).clamp_min(0).sum(dim=2)
     mean = variance.mean()
     if not mean > 0:
         return torch.ones_like(variance).to(image.dtype)
