@@ -117,8 +117,9 @@ def decide(
                 "a merge needs a pass over the training views and there are none: set redistribution to none"
             )
         values = merged(usable, graph, selected, contribution, labels)
-    figures = (None, None, None) if graph is None else (graph.tau, graph.sigma, int(graph.isolated.sum()))
-    return Decision(mask, count, n - n_finite, *figures, values)
+    if graph is None:
+        return Decision(mask, count, n - n_finite, values=values)
+    return Decision(mask, count, n - n_finite, graph.tau, graph.sigma, int(graph.isolated.sum()), values)
 
 
 def diverged(n: int) -> DataError:
