@@ -196,13 +196,15 @@ def spawn(job: Job, out: Path, on_percent: OnPercent) -> None:
 
     # Another shard may wait for the same warm-up.
     log = job_folder(out, job.key) / f"log-{os.getpid()}.txt"
-    try:
-        run_logged([sys.executable, "-c", START_JOB, str(Path(__file__).parents[1]), str(out), job.key], log, on_line)
-    except SundaeError as error:
-        *_, last = str(error).splitlines()
+    words = [sys.executable, "-c", START_JOB, str(Path(__file__).parents[1]), str(out), job.key]
+    code, end = run_logged(words, log, on_line)
+    if code == 130:
+        raise KeyboardInterrupt
+    if code:
+        *_, last = end.splitlines() or [""]
         if last.startswith(ERROR):  # an error of the package, complete in one line
-            raise SundaeError(f"{last.removeprefix(ERROR)} (log: {log})") from error
-        raise
+            raise SundaeError(f"{last.removeprefix(ERROR)} (log: {log})")
+        raise SundaeError(f"the job failed with {code}; {log} ends with:\n{end}")
 
 
 def _describe(job: Job, out: Path) -> None:

@@ -10,10 +10,9 @@ from typing import Annotated
 import torch
 import tyro
 from rich.console import Console
-from rich.progress import Progress
 
 from sundae_ns.cli.options import Overwrite, check_folder, check_least
-from sundae_ns.cli.process import percent_of, quoted, run_logged, word
+from sundae_ns.cli.process import quoted, run_command, word
 from sundae_ns.core.errors import writing
 from sundae_ns.core.files import write_bytes, write_text
 from sundae_ns.core.metrics import Lpips
@@ -41,19 +40,17 @@ def demo(
     console.print(f"SUNDAE demo on {device}: train a small scene with ns-train, and evaluate it.")
     with writing(f"cannot write to {out}"):
         write_demo_capture(scene)
-    with Progress(console=console, transient=True) as progress:
-        training = progress.add_task(f"ns-train {METHOD}", total=100)
-        train = ["ns-train", METHOD, "--data", word(scene), "--output-dir", word(out / "runs")]
-        train += ["--experiment-name", "demo", "--timestamp", "run"]
-        # Where no training view looks, above all beside the sky, a dark background shows as stains.
-        train += ["--pipeline.model.background-color", "white"]
-        train += [] if steps is None else ["--max-num-iterations", str(steps)]
-        (run / "prune.json").unlink(missing_ok=True)  # of an earlier demo
-        run_logged(train, out / "train.log", lambda line: progress.update(training, completed=percent_of(line)))
-        progress.update(training, completed=100)
-        progress.add_task("Evaluating", total=None)
-        # nerfstudio prints messages while it imports and loads.
-        with open(out / "measure.log", "w", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
+    train = ["ns-train", METHOD, "--data", word(scene), "--output-dir", word(out / "runs")]
+    train += ["--experiment-name", "demo", "--timestamp", "run"]
+    # Where no training view looks, above all beside the sky, a dark background shows as stains.
+    train += ["--pipeline.model.background-color", "white"]
+    train += [] if steps is None else ["--max-num-iterations", str(steps)]
+    (run / "prune.json").unlink(missing_ok=True)  # of an earlier demo
+    if code := run_command(train, out / "train.log"):
+        return code
+    # nerfstudio prints messages while it imports and loads.
+    with console.status("Evaluating"), open(out / "measure.log", "w", encoding="utf-8") as log:
+        with redirect_stdout(log), redirect_stderr(log):
             from sundae_ns.plugin.finished_runs import load_model, load_run
             from sundae_ns.report.measure import measure_scene
             from sundae_ns.scene.packing import packed_bytes

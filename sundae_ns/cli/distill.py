@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-from sundae_ns.cli.inputs import chosen_cameras
-from sundae_ns.cli.options import Out, Overwrite, Scene, check_exclusive, check_file, check_suffix
+from sundae_ns.cli.inputs import chosen_cameras, warn_if_few
+from sundae_ns.cli.options import Out, Overwrite, Scene, Share, check_exclusive, check_file, check_suffix, progress_bar
 from sundae_ns.core.errors import ConfigError, writing
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.load_save import SUFFIXES, load, save
@@ -20,7 +16,7 @@ from sundae_ns.scene.virtual_cameras import virtual_cameras
 def distill(
     source: Scene,
     out: Out,
-    keep: float | None = None,
+    keep: Share | None = None,
     count: int | None = None,
     steps: int | None = None,
     head: bool = True,
@@ -35,7 +31,7 @@ def distill(
 
     Args:
         out: file to write, in the format of its suffix: .sundae, or without a head .ply, .spz or .sog.
-        keep: share of the Gaussians to keep, in (0, 1]; by default 0.1.
+        keep: share of the Gaussians to keep, 0.25 or 25%; by default 0.1.
         count: number of Gaussians to keep, in place of a share.
         steps: number of training steps; by default 8,000 on a GPU, 3,000 on a CPU.
         head: whether a head may be added; without one the scene is complete in other viewers.
@@ -51,39 +47,37 @@ def distill(
     from sundae_ns.plugin.distill import Distillation
     from sundae_ns.train.progress import Interruption
 
+    warn_if_few(count, scene.num_gaussians)
     partial = out.with_name(f"{out.name}.partial")
-    console = Console(stderr=True)
     given = None if cameras is None else chosen_cameras(scene, cameras, None) or virtual_cameras(scene, None, seed=seed)
     training = Distillation(
         scene, keep=keep, count=count, cameras=given, steps=steps, seed=seed, head=head, progress=True
     )
     if partial.exists():
         training.load(partial)
-        console.print(f"resuming after step {training.step:,} of {training.steps:,}, with {partial}", highlight=False)
+        print(f"resuming after step {training.step:,} of {training.steps:,}, with {partial}", file=sys.stderr)
     stopped: list[bool] = []
-    columns = (TextColumn("Training"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Interruption(lambda: stopped.append(True)), Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("", total=None)
+    with Interruption(lambda: stopped.append(True)), progress_bar() as bar:
+        task = bar.add_task("Training", total=None)
 
         def after_step(done: int, total: int) -> bool:
-            progress.update(task, completed=done, total=total)
+            bar.update(task, completed=done, total=total)
             return not stopped
 
         finished = training.train(after_step)
     if not finished:
-        if training.step == 0:
-            print("nothing is saved yet: the trial of the head had not ended", file=sys.stderr)
-            return 130
-        with writing(f"cannot write {partial}"):
-            training.save(partial)
-        said = f"saved step {training.step:,} of {training.steps:,} as {partial}; the same command resumes:"
-        print(f"{said}\n    {shlex.join(['sundae', *sys.argv[1:]])}", file=sys.stderr)
+        said = "nothing is saved yet: the trial of the head had not ended"
+        if training.step > 0:
+            with writing(f"cannot write {partial}"):
+                training.save(partial)
+            said = f"saved step {training.step:,} of {training.steps:,} as {partial}; the same command resumes"
+        print(f"sundae: interrupted; {said}", file=sys.stderr)
         return 130
     result = training.result()
     save(result, out)
     partial.unlink(missing_ok=True)
-    head_text = "with" if result.head else "without"
-    print(f"{out}: {result.num_gaussians:,} of {scene.num_gaussians:,} Gaussians, {head_text} a head")
+    counts = f"{result.num_gaussians:,} of {scene.num_gaussians:,} Gaussians"
+    print(f"{out}: {counts}, {'with' if result.head else 'without'} a head")
     if training.gain is not None:
         print(f"a head gained {training.gain:.2f} dB in its trial, on cameras that no step sees")
     held_out = f"{len(training.held_out)} cameras that no step sees"

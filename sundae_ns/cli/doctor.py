@@ -12,6 +12,7 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Callable
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +27,7 @@ from sundae_ns.core.errors import BackendError
 from sundae_ns.core.metrics import lpips_weights
 
 PACKAGES = ("sundae-ns", "nerfstudio", "gsplat", "torch", "torchvision", "numpy", "scipy", "tyro")
+"""Packages that training needs."""
 
 
 class Part(NamedTuple):
@@ -33,11 +35,8 @@ class Part(NamedTuple):
 
     name: str
     works: bool
-    text: str
-    """Version or path, or why it does not work."""
+    text: str  # Version or path, or why it does not work
     remedy: str = ""
-    needed: bool = False
-    """Whether training needs it."""
 
 
 def doctor(compile: Flag = False) -> int:  # noqa: A002
@@ -50,13 +49,13 @@ def doctor(compile: Flag = False) -> int:  # noqa: A002
     with console.status("Building gsplat's kernels, some minutes" if compile else "Checking"):
         checked = parts(compile)
     for part in checked:
-        missing = "[red]missing[/]" if part.needed else "[yellow]-[/]"
+        missing = "[red]missing[/]" if part.name in PACKAGES else "[yellow]-[/]"
         table.add_row("[green]ok[/]" if part.works else missing, part.name, escape(part.text))
     console.print(table)
     remedies = [f"  {part.name}: {part.remedy}" for part in checked if not part.works]
     if remedies:
         console.print("\n".join(["\nTo fix:", *remedies]), soft_wrap=True, highlight=False, markup=False)
-    return int(any(part.needed and not part.works for part in checked))
+    return int(any(part.name in PACKAGES and not part.works for part in checked))
 
 
 def parts(compile_kernels: bool = False) -> list[Part]:
@@ -64,9 +63,8 @@ def parts(compile_kernels: bool = False) -> list[Part]:
     cuda, (url, weights) = torch.version.cuda or "", lpips_weights()
     driver = {"12": 525, "13": 580}.get(cuda.partition(".")[0], "of its CUDA version")  # the oldest for Linux
     fix_cuda = (
-        "apt-get install nvidia-driver (Ubuntu: ubuntu-drivers install), then reboot; nvidia-smi shows whether it "
-        f"works. This torch needs driver {driver} or newer; for an older one, pip install -c constraints-cuda12.txt "
-        "-e ."
+        "apt-get install nvidia-driver (Ubuntu: ubuntu-drivers install), reboot, and look at nvidia-smi. This torch "
+        f"needs driver {driver} or newer; for an older one, pip install -c constraints-cuda12.txt -e ."
     )
     home = f"/usr/local/cuda-{cuda}"
     fix_nvcc = (
@@ -74,85 +72,77 @@ def parts(compile_kernels: bool = False) -> list[Part]:
         f"nvidia-cuda-toolkit is 12.0), then export CUDA_HOME={home} PATH={home}/bin:$PATH"
     )
     fix_weights = f"curl --location --create-dirs --output {shlex.quote(str(weights))} {url}"
-    fix_ours = "update the driver; without them the CPU and PyTorch do their work"
     fix_photos, library = 'pip install "sundae_ns[photos]"', ctypes.util.find_library
-    return [
-        Part("python", True, platform.python_version()),
-        *(Part(name, *_version(name), f"pip install {name}", True) for name in PACKAGES),
-        Part("CUDA", *_cuda(), fix_cuda if cuda else "pip install torch==2.11.0"),
-        Part("nvcc", *_nvcc(), fix_nvcc),
-        Part("gsplat kernels", *_gsplat(compile_kernels), "sundae doctor --compile, once CUDA and nvcc are there"),
-        Part("our kernels", *_loads(_load_kernels), fix_ours),
-        Part("rasteriser", *_rasterizer(), "pip install numba"),
-        Part("LPIPS weights", *_file(weights.is_file() and weights, "LPIPS among the metrics"), fix_weights),
-        Part("libusb-1.0", *_file(library("usb-1.0"), "ns-export"), "apt-get install libusb-1.0-0"),
-        Part("libGL", *_file(library("GL"), "ns-export"), "apt-get install libgl1"),
-        Part("pycolmap", *_module("pycolmap", "sundae poses"), fix_photos),
-        Part("pillow-heif", *_module("pillow_heif", "HEIC photos"), fix_photos),
-        Part("ffmpeg", *_file(shutil.which("ffmpeg"), "ns-render"), "apt-get install ffmpeg"),
+    checks: list[tuple[str, Callable[[], str | None], str, str]] = [
+        ("python", platform.python_version, "", ""),
+        *((name, partial(metadata.version, name), f"pip install {name}", "") for name in PACKAGES),
+        ("CUDA", _cuda, fix_cuda if cuda else "pip install torch==2.11.0", ""),
+        ("nvcc", _nvcc, fix_nvcc, ""),
+        ("gsplat kernels", partial(_gsplat, compile_kernels), "sundae doctor --compile, with CUDA and nvcc", ""),
+        ("our kernels", _kernels, "update the driver; without them the CPU and PyTorch do their work", ""),
+        ("rasteriser", _rasterizer, "pip install numba", ""),
+        ("LPIPS weights", lambda: str(weights) * weights.is_file(), fix_weights, "LPIPS among the metrics"),
+        ("libusb-1.0", partial(library, "usb-1.0"), "apt-get install libusb-1.0-0", "ns-export"),
+        ("libGL", partial(library, "GL"), "apt-get install libgl1", "ns-export"),
+        ("pycolmap", partial(_module, "pycolmap"), fix_photos, "sundae poses"),
+        ("pillow-heif", partial(_module, "pillow_heif"), fix_photos, "HEIC photos"),
+        ("ffmpeg", partial(shutil.which, "ffmpeg"), "apt-get install ffmpeg", "ns-render"),
     ]
+    return [_checked(*check) for check in checks]
 
 
-def _version(package: str) -> tuple[bool, str]:
+def _checked(name: str, check: Callable[[], str | None], remedy: str, purpose: str) -> Part:
+    """The part of a check, which returns nothing or raises an error if the part is missing."""
     try:
-        return True, metadata.version(package)
+        text = check()
+        works, text = bool(text), text or "not found"
     except metadata.PackageNotFoundError:
-        return False, "not installed"
+        works, text = False, "not installed"
+    except BackendError as error:
+        works, text = False, str(error)
+    return Part(name, works, f"{text}, for {purpose}" if purpose else text, remedy)
 
 
-def _file(path: object, purpose: str) -> tuple[bool, str]:
-    return bool(path), f"{path or 'not found'}, for {purpose}"
-
-
-def _module(name: str, purpose: str) -> tuple[bool, str]:
+def _module(name: str) -> str:
     try:
-        return True, f"{importlib.import_module(name).__version__}, for {purpose}"
+        return str(importlib.import_module(name).__version__)
     except ImportError as error:
         absent = isinstance(error, ModuleNotFoundError) and error.name == name
-        return False, f"{'not installed' if absent else f'cannot be loaded ({error})'}, for {purpose}"
+        raise BackendError("not installed" if absent else f"cannot be loaded ({error})") from error
 
 
-def _cuda() -> tuple[bool, str]:
+def _cuda() -> str:
     if torch.cuda.is_available():
-        return True, f"{torch.cuda.get_device_name(0)}, torch built for {torch.version.cuda}"
-    return False, "no device that torch can use" if torch.version.cuda else "this torch is built without CUDA"
+        return f"{torch.cuda.get_device_name(0)}, torch built for {torch.version.cuda}"
+    raise BackendError("no device that torch can use" if torch.version.cuda else "this torch is built without CUDA")
 
 
-def _nvcc() -> tuple[bool, str]:
-    """A CUDA compiler that builds gsplat's kernels: gsplat calls the one in PATH, torch the one in CUDA_HOME."""
-    purpose, in_path = "gsplat needs it once, to build its kernels", shutil.which("nvcc")
+def _nvcc() -> str:
+    """The compiler of gsplat's kernels: gsplat calls the one in PATH, torch the one in CUDA_HOME."""
+    purpose, in_path, built = "gsplat needs it once, to build its kernels", shutil.which("nvcc"), torch.version.cuda
     home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
     compiler = Path(home) / "bin" / "nvcc" if home else Path(in_path or "/usr/local/cuda/bin/nvcc")
     if not compiler.is_file() or not in_path:
-        return False, f"not found in {'PATH' if compiler.is_file() else compiler.parent}; {purpose}"
+        raise BackendError(f"not found in {'PATH' if compiler.is_file() else compiler.parent}; {purpose}")
     try:
         words = [str(compiler), "--version"]
         done = subprocess.run(words, capture_output=True, encoding="utf-8", errors="replace", check=True, timeout=60)
-        (release,) = re.findall(r"release (\d+\.\d+)", done.stdout)[:1] or [""]
+        release = "".join(re.findall(r"release (\d+\.\d+)", done.stdout)[:1])
     except (OSError, subprocess.SubprocessError):
         release = ""
-    built = torch.version.cuda
     if built and release.partition(".")[0] != built.partition(".")[0]:  # torch refuses one of another major version
-        return False, f"{compiler} has CUDA {release or 'of unknown version'}, this torch {built}; {purpose}"
-    return True, f"{compiler} {release}, for gsplat's kernels"
+        raise BackendError(f"{compiler} has CUDA {release or 'of unknown version'}, this torch {built}; {purpose}")
+    return f"{compiler} {release}, for gsplat's kernels"
 
 
-def _loads(load: Callable[[], object]) -> tuple[bool, str]:
-    if not torch.cuda.is_available():
-        return False, "need a CUDA device; a CPU uses equivalent code"
-    try:
-        load()
-    except BackendError as error:
-        return False, str(error)
-    return True, "working"
-
-
-def _gsplat(compile_kernels: bool) -> tuple[bool, str]:
+def _gsplat(compile_kernels: bool) -> str:
     from sundae_ns.rasterize.interface import select_backend
 
-    if torch.cuda.is_available() and not compile_kernels and not kernels_built():
-        return False, "not built yet; the first training step builds them, in minutes"
-    return _loads(lambda: select_backend("gsplat", "cuda"))
+    _cuda()
+    if not compile_kernels and not kernels_built():
+        raise BackendError("not built yet; the first training step builds them, in minutes")
+    select_backend("gsplat", "cuda")
+    return "working"
 
 
 def kernels_built() -> bool:
@@ -165,25 +155,26 @@ def kernels_built() -> bool:
     return any(Path(spec.origin).parent.glob("csrc*")) or any(root.glob("**/gsplat_cuda.so"))
 
 
-def _load_kernels() -> None:
+def _kernels() -> str:
     from sundae_ns.cuda.loss import loss_kernels
     from sundae_ns.graph.neighbors import load_kernel
     from sundae_ns.head.fused import head_kernels, head_options
     from sundae_ns.head.head import CompensationHead, HeadConfig
 
+    _cuda()
     device = torch.device("cuda", 0)
     load_kernel(device, torch.float32, 16)
     loss_kernels(device)
     head_kernels(device, torch.bfloat16, head_options(CompensationHead(HeadConfig()).net, True))
+    return "working"
 
 
-def _rasterizer() -> tuple[bool, str]:
+def _rasterizer() -> str:
     """The backend that ``auto`` selects."""
     from sundae_ns.rasterize.interface import numba_problem
 
     if torch.cuda.is_available():
-        return True, "auto selects gsplat, if its kernels work"
-    problem = numba_problem()
-    if problem is not None:
-        return False, f"auto selects reference, in plain PyTorch, several times slower than cpu: {problem}"
-    return True, "auto selects cpu, compiled by numba; it suits small scenes, a capture needs CUDA"
+        return "auto selects gsplat, if its kernels work"
+    if (problem := numba_problem()) is not None:
+        raise BackendError(f"auto selects reference, in plain PyTorch, several times slower than cpu: {problem}")
+    return "auto selects cpu, compiled by numba; it suits small scenes, a capture needs CUDA"

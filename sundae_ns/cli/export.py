@@ -83,8 +83,8 @@ def export(
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
     with Console(stderr=True).status(f"Writing {opened.num_gaussians:,} Gaussians"):  # a .sog takes minutes
         written = save_for_viewers(opened, out, upright=upright)
-    mode = ", antialiased" if opened.antialiased else ""
-    print(f"{out}: {written.primitives:,} Gaussians, degree {written.degree}{mode}, {written.bytes:,} bytes")
+    degree = f"degree {written.degree}{', antialiased' * opened.antialiased}"
+    print(f"{out}: {written.primitives:,} Gaussians, {degree}, {written.bytes:,} bytes")
     if written.clamped:
         print(f"clamped scales or colours of {written.clamped:,} Gaussians to the range of a .spz; a .sog has none")
     if written.cut:

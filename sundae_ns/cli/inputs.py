@@ -8,6 +8,7 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -37,25 +38,19 @@ class Cleaning:
     """remove small groups of Gaussians that touch no other, and what none of the cameras of the photographs sees."""
 
     @property
-    def chosen(self) -> list[str]:
-        """Names of the options that are given."""
-        given = {"--crop": self.crop is not None, "--remove-floaters": self.remove_floaters}
-        return [name for name, is_given in given.items() if is_given]
+    def chosen(self) -> str:
+        """Name of the first option that is given, or empty."""
+        return "--crop" if self.crop is not None else "--remove-floaters" * self.remove_floaters
 
-    def mask(self, scene: Scene, cameras: Sequence[Camera], *, progress: bool = True) -> Tensor:
-        """True for Gaussians that stay, bool ``[N]``; prints their numbers to stderr.
-
-        Raises:
-            ConfigError: the box is empty.
-            DataError: nothing is left.
-        """
+    def mask(self, scene: Scene, cameras: Sequence[Camera]) -> Tensor:
+        """True for Gaussians that stay, bool ``[N]``; prints their numbers to stderr."""
         mask = torch.ones(scene.num_gaussians, dtype=torch.bool, device=scene.device)
         if self.crop is not None:
             mask = crop_mask(scene, self.crop[:3], self.crop[3:])
             print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
         if self.remove_floaters:
             left = int(mask.sum())
-            floats = floater_mask(kept(scene, mask), cameras, console=Console(stderr=True) if progress else None)
+            floats = floater_mask(kept(scene, mask), cameras, console=Console(stderr=True))
             mask[mask.clone()] = ~floats
             rule = "" if cameras else ", by their neighbours alone: no camera of the photographs is known"
             print(f"removed {int(floats.sum()):,} floaters of {left:,} Gaussians{rule}", file=sys.stderr)
@@ -63,21 +58,28 @@ class Cleaning:
                 raise DataError("all Gaussians float; leave out --remove-floaters")
         return mask
 
-    def cleaned(self, scene: Scene, *, progress: bool = True) -> Scene:
+    def cleaned(self, scene: Scene) -> Scene:
         """The scene without what :meth:`mask` cuts, by the cameras stored with it."""
-        return kept(scene, self.mask(scene, scene.cameras, progress=progress)) if self.chosen else scene
+        return kept(scene, self.mask(scene, scene.cameras)) if self.chosen else scene
+
+
+def open_run(run: Path, **options: Any) -> Scene:
+    """The scene of a run with cameras of its capture; options as :func:`.finished_runs.load_run`."""
+    check_run(run)  # before nerfstudio is imported, which takes seconds
+    from sundae_ns.plugin.finished_runs import load_run
+
+    # nerfstudio prints messages while it reads a capture.
+    with Console(file=sys.stderr).status("Reading the run"), redirect_stdout(StringIO()):
+        return load_run(run, **options)
 
 
 def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     """A scene, and the packed file that holds it; a run, whose capture may have moved, is packed in memory."""
     if kind_of(path) == "packed" or kind_of_gaussians(path) is not None or path.suffix == ".sundae":
         return packed_file(path)
-    check_run(path)  # before nerfstudio is imported, which takes seconds
-    from sundae_ns.plugin.finished_runs import load_run
+    scene = open_run(path, data=data)
     from sundae_ns.scene.packing import packed_bytes
 
-    with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
-        scene = load_run(path, data=data)
     return scene, packed_bytes(scene)
 
 
@@ -87,13 +89,15 @@ def chosen_cameras(scene: Scene, cameras: Path | None, most: int | None) -> Sequ
         return scene.cameras
     if kind_of(cameras) == "packed":
         return load(cameras).cameras
-    if not ((cameras.is_dir() or cameras.name == "config.yml") and find_config(cameras) is not None):
-        return cameras_of(cameras, scene)
-    check_run(cameras)
-    from sundae_ns.plugin.finished_runs import load_run
+    if (cameras.is_dir() or cameras.name == "config.yml") and find_config(cameras) is not None:
+        return open_run(cameras, max_cameras=most or VIEWS["cpu"]).cameras
+    return cameras_of(cameras, scene)
 
-    with redirect_stdout(StringIO()):
-        return load_run(cameras, max_cameras=most or VIEWS["cpu"]).cameras
+
+def warn_if_few(count: int | None, total: int) -> None:
+    """Say on stderr that a scene has fewer Gaussians than it should keep."""
+    if count is not None and count > total:
+        print(f"warning: the scene has {total:,} Gaussians, fewer than {count:,}; all are kept", file=sys.stderr)
 
 
 def copies_rows(source: Path, out: Path) -> bool:

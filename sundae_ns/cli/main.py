@@ -5,11 +5,13 @@ from __future__ import annotations
 import atexit
 import gc
 import importlib
+import io
 import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
+from importlib import metadata
 from typing import NoReturn
 
 from sundae_ns.core.errors import ConfigError, SundaeError, writing
@@ -37,40 +39,40 @@ COMMANDS = {
     "doctor": "check this machine, and say how to repair it",
 }
 """Commands with their lines in ``sundae --help``. Each is the function of its name in the module of its name."""
+STEP = "SUNDAE_STEP"
+"""Variable of a command that another one started, which tells how to continue after an interrupt."""
 
 
 def _dispatch(words: Sequence[str]) -> int:
     """Run the command that the words name; its exit code."""
-    if words[:1] in (["-h"], ["--help"]):
-        print("usage: sundae COMMAND ...\n\nSmall 3D Gaussian scenes by pruning and a compensation head.\n")
-        for name, line in COMMANDS.items():
-            print(f"  {name:<8} {line}")
-        print("\nsundae COMMAND --help shows the options of a command.")
+    name, *options = words or ["help"]
+    if name in ("--version", "-V", "version"):
+        print(f"sundae_ns {metadata.version('sundae_ns')}")
         return 0
-    if not words:
-        raise ConfigError("no command is given; sundae --help lists them")
-    name = words[0]
+    if name in ("help", "-h", "--help") and not options:
+        print("usage: sundae COMMAND ...\n\nSmall 3D Gaussian scenes by pruning and a compensation head.\n")
+        print("\n".join(f"  {command:<8} {line}" for command, line in COMMANDS.items()))
+        print("\nsundae COMMAND --help shows the options of a command; sundae --version the version.")
+        return 0 if words else 2
+    if name == "help":
+        name, options = options[0], ["--help"]
     if name not in COMMANDS:
         near = get_close_matches(name, COMMANDS, n=1)
         raise ConfigError(f"there is no command {name}; {f'use {near[0]}' if near else 'sundae --help lists them'}")
     import tyro
 
     # Only the module of this command: some import torch, which takes a second.
-    command = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
-    return tyro.cli(command, prog=f"sundae {name}", args=words[1:])
+    run = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
+    return tyro.cli(run, prog=f"sundae {name}", args=options)
 
 
 def exit_with(command: Callable[[], int], name: str) -> NoReturn:
-    """Run a command and exit with the code that it returns; errors of the file system name the command.
-
-    A :class:`SundaeError` is printed on one line, and the code is 2. An interrupt is 130.
-    """
+    """Run a command and exit with its code; 2 after the one line of a :class:`SundaeError`, 130 for an interrupt."""
     for variable, value in ENVIRONMENT.items():
         os.environ.setdefault(variable, value)
     try:
         # Commands name the file that they cannot write; this covers others, such as a full disk behind stdout.
-        with warnings.catch_warnings(), writing(f"{name} ended early"):
-            warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
+        with writing(f"{name} ended early"):
             code = command()
             sys.stdout.flush()
     except SundaeError as error:
@@ -82,7 +84,8 @@ def exit_with(command: Callable[[], int], name: str) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except KeyboardInterrupt:
-        print("sundae: interrupted", file=sys.stderr)
+        if not os.environ.get(STEP):  # the command that started this one says so
+            print("sundae: interrupted", file=sys.stderr)
         sys.exit(130)
     sys.exit(code)
 
@@ -91,6 +94,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``sundae``."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:
+        warnings.simplefilter("ignore")  # of libraries; PYTHONWARNINGS=error would make them errors
+        for stream in (sys.stdout, sys.stderr):  # names of files may hold bytes that are no text
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
         # Looking for garbage among the million objects of imports takes a sixth of the start, and 0.6 s of the end.
         gc.set_threshold(100_000)
         atexit.register(gc.freeze)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Annotated
 
 import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from tyro.constructors import PrimitiveConstructorSpec
 
 from sundae_ns.core.errors import ConfigError, StorageError
 
@@ -29,19 +34,29 @@ Overwrite = Annotated[Flag, tyro.conf.arg(help="replace an earlier output, once 
 Direction = tuple[float, float, float]
 
 
-def check_file(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> None:
-    """Raise ``StorageError`` for an output that is no file, that the command reads, or that exists.
+def _share(words: list[str]) -> float:
+    value = float(words[0].removesuffix("%"))
+    return value / 100 if words[0].endswith("%") else value
 
-    Args:
-        out: file to write.
-        reads: files and folders that the command reads; None for an option that was not given.
-        overwrite: whether a file that the command does not read may be replaced.
-    """
-    above = out.parent
-    while not above.exists() and above != above.parent:
-        above = above.parent
-    if not above.is_dir():
-        raise StorageError(f"{above} is no folder; choose another")
+
+Share = Annotated[
+    float,
+    PrimitiveConstructorSpec(1, "SHARE", _share, lambda value: isinstance(value, float), lambda value: [f"{value:g}"]),
+]
+"""A share of the Gaussians: ``0.25`` or ``25%``."""
+
+
+def progress_bar() -> Progress:
+    """A bar on the terminal of stderr, which is gone at its end."""
+    console = Console(file=sys.stderr)  # a command may redirect it afterwards
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    shown, both = console.is_terminal, sys.stdout.isatty()  # stdout may be a file
+    return Progress(*columns, console=console, transient=True, disable=not shown, redirect_stdout=both)
+
+
+def check_file(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> None:
+    """Raise ``StorageError`` for an output that is no file, that ``reads`` hold, or that exists; None reads nothing."""
+    _check_writable(out.parent)
     if not out.exists():
         return
     if not out.is_file():
@@ -52,16 +67,34 @@ def check_file(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> N
         raise StorageError(f"{out} exists; choose another name, or replace it with --overwrite")
 
 
-def check_folder(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> None:
-    """Raise ``StorageError`` for an output that is a file, that holds an input, or, without ``overwrite``, files."""
+def check_folder(
+    out: Path, *, reads: Iterable[Path | None], overwrite: bool | None = None, outside: Path | None = None
+) -> None:
+    """As :func:`check_file`, for a folder that an input, ``outside``, must not hold; ``overwrite`` may be no option."""
+    if out.exists() and not out.is_dir():
+        raise StorageError(f"{out} is a file; choose another folder")
+    if outside is not None and _contains(outside, out):
+        raise StorageError(f"{out} lies in {outside}, which the command reads; choose another folder")
+    _check_writable(out)
     if not out.exists():
         return
-    if not out.is_dir():
-        raise StorageError(f"{out} is a file; choose another folder")
     if any(_contains(out, path) for path in reads if path is not None):
         raise StorageError(f"{out} holds what the command reads; choose another folder")
     if not overwrite and any(out.iterdir()):
-        raise StorageError(f"{out} holds files; choose another folder, or replace its files with --overwrite")
+        replaced = "" if overwrite is None else ", or replace its files with --overwrite"
+        raise StorageError(f"{out} holds files; choose another folder{replaced}")
+
+
+def _check_writable(folder: Path) -> None:
+    """Raise ``StorageError`` unless files can be made in a folder, or in the first one above that exists."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    if not folder.is_dir():
+        raise StorageError(f"{folder} is no folder; choose another")
+    try:
+        TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise StorageError(f"cannot write to {folder.absolute()} ({error.strerror}); choose another folder") from error
 
 
 def _contains(outer: Path, inner: Path) -> bool:

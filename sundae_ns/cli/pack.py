@@ -13,28 +13,23 @@ from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import torch
 import tyro
-from rich.console import Console
-from rich.progress import Progress
 
-from sundae_ns.cli.inputs import Cleaning
-from sundae_ns.cli.options import Direction, Out, Overwrite, check_exclusive, check_file, check_least
-from sundae_ns.cli.train import has_gpu
+from sundae_ns.cli.inputs import Cleaning, open_run
+from sundae_ns.cli.options import Direction, Out, Overwrite, check_exclusive, check_file, check_least, progress_bar
 from sundae_ns.core.errors import ConfigError, SundaeError
-from sundae_ns.io.config_file import check_run
 from sundae_ns.io.formats import PRIMITIVES, kind_of_gaussians
-from sundae_ns.io.pack.codecs import Codecs
 from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED, PackConfig
-from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes, write_fitted
+from sundae_ns.io.pack.packed_scene import fit_scene, pack_bytes, write_fitted
 from sundae_ns.io.run_folder import files_of
 from sundae_ns.scene.cameras import with_start
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.packing import contents_of
 
 if TYPE_CHECKING:
+    from sundae_ns.io.pack.packed_scene import Codecs, PackedScene
     from sundae_ns.plugin.targets import Judge
-
-Pack = tuple[PackedScene, Codecs]
 
 
 def pack(
@@ -75,8 +70,8 @@ def pack(
         raise ConfigError(f"target-drop is {target_drop}; give a positive number of dB")
     if cleaning.chosen and (finetune or target_drop is not None):
         raise ConfigError(
-            f"--finetune and --target-drop look at photos of the whole scene; leave out {cleaning.chosen[0]}, or cut "
-            "the scene by `sundae export` or `sundae prune` afterwards"
+            f"--finetune and --target-drop look at photos of the whole scene; leave out {cleaning.chosen}, or cut the "
+            "scene by `sundae export` or `sundae prune` afterwards"
         )
     usual = asdict(PackConfig())
     given = {name: value for name, value in asdict(precision).items() if value != usual[name]}
@@ -87,21 +82,19 @@ def pack(
     for name, value in (("--finetune", finetune), ("--target-drop", target_drop), ("--data", data)):
         if kind is not None and value:
             raise ConfigError(f"{run} is a {PRIMITIVES[kind]} without photos; leave out {name}, or give a run")
-    if kind is None:
-        check_run(run)
-    judge, notes, tuned = cache(lambda: _judge(run, data)), list[str](), finetune > 0
-    packs: list[Pack] = []
-    bar = Progress(console=Console(file=sys.stdout), transient=True, disable=json)
-    with bar, redirect_stdout(StringIO()):  # suppresses nerfstudio's messages; the bar writes to the real stdout
-        task = bar.add_task("Reading the run", total=3 + finetune)
-        if kind is None:
-            from sundae_ns.plugin.finished_runs import load_run  # takes seconds
+    tuned = finetune > 0
+    packs: list[tuple[PackedScene, Codecs]] = []
 
-            scene = load_run(run, max_cameras=max_cameras, data=data)
-        else:
-            scene = load(run)
-        source = contents_of(with_start(cleaning.cleaned(scene, progress=False), start_view, up))
-        bar.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
+    @cache
+    def judge() -> Judge:
+        from sundae_ns.plugin.targets import Judge
+
+        return Judge(run, data)
+
+    scene = open_run(run, max_cameras=max_cameras, data=data) if kind is None else load(run)
+    source = contents_of(with_start(cleaning.cleaned(scene), start_view, up))
+    with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
+        task = bar.add_task("Fine-tuning" if finetune else "Packing", total=2 + finetune)
         if finetune:
             from sundae_ns.plugin.finetune import finetune as tune
 
@@ -114,18 +107,15 @@ def pack(
             searches = [Search(source, precision, judge), *(Search(*each, judge) for each in packs)]
             best = best_pack(searches, most_bytes=target_bytes, most_drop=target_drop or 0.0)
             if packs and best.scene is not packs[0][0]:
-                notes.append("the fine-tune loses too much for the target; packed without it, try more steps")
+                print("the fine-tune loses too much for the target; packed without it, try more steps", file=sys.stderr)
                 finetune = 0
             packs = [(best.scene, best.codecs)]  # both are compared already
         else:
             packs.append(fit_scene(source, precision))
         report = write_fitted(out, *packs[0])
         bar.update(task, advance=1, description="Measuring")
-        quality, figures = "", dict[str, Any]()
-        if kind is None and cleaning.crop is None:  # photos show what a box leaves out
-            quality, figures = _measured(judge, packs, finetune, notes)
-    for note in notes:
-        print(note, file=sys.stderr)
+        # Photos show what a box leaves out.
+        figures = _measured(judge, packs, finetune) if kind is None and cleaning.crop is None else {}
     if json:
         print(dumps({"file": str(out), **report.summary(), **figures}))
         return 0
@@ -133,43 +123,37 @@ def pack(
     print(f"{'':14}{'bytes':>12}{'bits per Gaussian':>20}")
     for name, bits in {**report.bits, "all": 8 * report.bytes / report.primitives}.items():
         print(f"{name:14}{round(bits * report.primitives / 8):12,}{bits:20.2f}")
-    if quality:
-        print(quality)
-        if not tuned and not cleaning.chosen and has_gpu():
+    if figures:
+        psnr, ssim = figures["psnr"], figures.get("ssim")
+        shown = "" if ssim is None else f", SSIM {ssim[0]:.4f} -> {ssim[1]:.4f}"
+        views = f"{figures['views']} of {figures['test_views']} test views"
+        print(f"PSNR {psnr[0]:.2f} -> {psnr[1]:.2f} dB{shown}, before and after, on {views}")
+        if not tuned and not cleaning.chosen and torch.cuda.is_available():
             print(f"--finetune {FINETUNE_STEPS} makes it about 40% smaller")
     return 0
 
 
-def _judge(run: Path, data: Path | None) -> Judge:
-    from sundae_ns.plugin.targets import Judge
-
-    return Judge(run, data)
-
-
-def _measured(
-    judge: Callable[[], Judge], packs: Sequence[Pack], finetune: int, notes: list[str]
-) -> tuple[str, dict[str, Any]]:
-    """A line and figures of the quality of the first pack; a second pack is that without the fine-tune."""
+def _measured(judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Codecs]], finetune: int) -> dict[str, Any]:
+    """Figures of the run and of the first pack; a second pack is that without the fine-tune."""
     from sundae_ns.plugin.targets import is_worth
 
     try:
         views = judge()
         before, after = views.before, views.quality(*packs[0])
     except SundaeError as error:
-        notes.append(f"the quality is not measured: {error}")
-        return "", {}
-    figures: dict[str, Any] = {"psnr": [before.psnr, after.psnr], "views": views.cameras}
-    line = f"PSNR {before.psnr:.2f} -> {after.psnr:.2f} dB"
+        print(f"the quality is not measured: {error}", file=sys.stderr)
+        return {}
+    figures: dict[str, Any] = {"psnr": [before.psnr, after.psnr]}
     if math.isfinite(before.ssim + after.ssim):  # not for images smaller than its window
         figures["ssim"] = [before.ssim, after.ssim]
-        line += f", SSIM {before.ssim:.4f} -> {after.ssim:.4f}"
     for plain in packs[1:]:
         without = views.quality(*plain).psnr
         size, plain_size = (len(pack_bytes(*pack)[0]) for pack in (packs[0], plain))
         if not is_worth(after.psnr, size, without, plain_size):
-            notes.append(
+            print(
                 f"the fine-tune of {finetune:,} steps loses {before.psnr - after.psnr:.2f} dB; a pack without it has "
                 f"{plain_size:,} bytes and loses {before.psnr - without:.2f} dB, which is worth more: give more steps, "
-                "or leave out --finetune"
+                "or leave out --finetune",
+                file=sys.stderr,
             )
-    return f"{line}, before and after, on {views.cameras} of {views.all_cameras} test views", figures
+    return {**figures, "views": views.cameras, "test_views": views.all_cameras}

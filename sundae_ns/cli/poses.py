@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sundae_ns.cli.options import Out, Source, check_least
+from sundae_ns.cli.main import STEP
+from sundae_ns.cli.options import Out, Source, check_folder, check_least, progress_bar
 from sundae_ns.cli.process import quoted, word
-from sundae_ns.core.errors import ConfigError, DataError, StorageError, SundaeError, one_line
+from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
 
 if TYPE_CHECKING:
     from sundae_ns.data.capture_files import Placed
@@ -57,22 +58,17 @@ def poses(
         out: folder of the capture; it must not exist yet.
     """
     masks = check_poses(photos, options.frames, options.masks)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise StorageError(f"{out} exists; choose another folder, or remove it")
-    if photos.is_dir() and out.resolve().is_relative_to(photos.resolve()):
-        raise StorageError(f"{out} lies in {photos}, which the command reads; choose another folder")
+    check_folder(out, reads=[], outside=photos)
     from sundae_ns.data.reconstruct import Request, find_poses, pycolmap
 
     pycolmap()
     request = Request(photos, out, options.matching, options.frames, masks)
     placed = _interruptible(lambda: find_poses(request, _report), request.work)
-    models = placed.models
     cameras = "1 camera" if placed.cameras == 1 else f"{placed.cameras} cameras"
     counts = f"{len(placed.placed):,} of {placed.total:,} photos have a pose, of {cameras}"
     print(f"{out}: {counts}; mean reprojection error {placed.error:.2f} px")
-    if len(models) > 1:
-        others = ", ".join(f"{count:,}" for count in models[1:])
-        print(f"# this is the largest of {len(models)} models that do not join; others have {others} photos")
+    if others := ", ".join(f"{count:,}" for count in placed.models[1:]):
+        print(f"# this is the largest of {len(placed.models)} models that do not join; others have {others} photos")
     if placed.masks is not None:
         print(f"# masks: {placed.masks}")
     if placed.left_out:
@@ -83,14 +79,9 @@ def poses(
 
 
 def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool = True) -> Path | None:
-    """Check photos or a video, by headers, before anything starts; ``remarks`` prints what is left out.
+    """Check photos or a video by headers; the folder of masks, with ``remarks`` by default one beside the photos.
 
-    Returns:
-        The folder of masks, with ``remarks`` by default one beside the photos that fits them.
-
-    Raises:
-        ConfigError: pycolmap is not installed, a number is out of range, or masks are given for a video.
-        DataError: the photos or masks cannot be used.
+    ``remarks`` prints what is left out.
     """
     from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside, masks_of
     from sundae_ns.data.reconstruct import check_installed
@@ -129,12 +120,8 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
 @contextmanager
 def _report(stage: str, total: int) -> Iterator[Callable[[int], None]]:
     """A bar on a terminal while a stage runs, and a line at its end."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console, begun = Console(), time.monotonic()
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    begun = time.monotonic()
+    with progress_bar() as bar:
         yield partial(bar.advance, bar.add_task(stage, total=total))
         done = min(int(bar.tasks[0].completed), total)
     print(f"{stage}: {done:,} of {total:,}, {time.monotonic() - begun:.0f} s", flush=True)
@@ -149,7 +136,8 @@ def _interruptible(work: Callable[[], Placed], folder: Path) -> Placed:
                 wait([future], 0.2)
         except KeyboardInterrupt:
             cursor = "\x1b[?25h\x1b[2K\r" if sys.stderr.isatty() else ""  # a bar hides it
-            print(f"{cursor}sundae: interrupted; the same command continues here", file=sys.stderr, flush=True)
+            said = "" if os.environ.get(STEP) else "sundae: interrupted; the same command continues here\n"
+            print(f"{cursor}{said}", end="", file=sys.stderr, flush=True)
             os._exit(130)
     try:
         return future.result()

@@ -11,14 +11,21 @@ import signal
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
-from sundae_ns.core.errors import SundaeError
+from sundae_ns.cli.main import STEP
+from sundae_ns.cli.options import progress_bar
+from sundae_ns.core.errors import STOPPED, SundaeError, writing
 
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+_MESSAGES = re.compile(
+    r"Warning: |sundae: |Viewer running|Resuming |trained: |[\d,]+ Gaussians, |[\d,]+( of [\d,]+)? steps\s*$"
+    r"|\[[\d:]{8}\] (?!.*\.py:\d+\s*$)|[┏┃┡└]|│ \S"
+)
+"""Messages of ns-train by this package, and its table of the schedule. Those of nerfstudio end in a line of code."""
 
 
 def word(path: Path) -> str:
@@ -31,72 +38,82 @@ def quoted(path: Path) -> str:
     return shlex.quote(word(path))
 
 
-@contextmanager
-def _started(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[Any]]:
-    """Start a command without input in its own process group; on Linux it gets SIGTERM if this process dies."""
+def run_command(words: Sequence[str], log: Path | None = None) -> int:
+    """Print a command and run it; its exit code. ``log`` takes what ns-train prints, except a bar and messages."""
+    print(shlex.join(words), flush=True)
+    if log is None:
+        return run_logged(words)[0]
+    refusals = list[str]()
+    with progress_bar() as bar:
+        task = bar.add_task("Training", total=100)
+
+        def show(line: str) -> None:
+            percent, line = percent_of(line), line.rstrip()
+            if percent is not None:
+                bar.update(task, completed=percent, description=" ".join(["Training", *line.split("  ")[-2:]]))
+            if _MESSAGES.match(line) or (percent is not None and bar.disable):
+                print(line, flush=True)
+                refusals.extend([line] if line.startswith("sundae: ") else [])
+
+        code, end = run_logged(words, log, show)
+    if code and code not in STOPPED and not refusals:
+        print(end, file=sys.stderr)
+    return code
+
+
+def run_logged(
+    words: Sequence[str], log: Path | None = None, on_line: Callable[[str], object] = lambda line: None
+) -> tuple[int, str]:
+    """Run a command without input in its own process group; its exit code, or 128 + n if signal n arrived.
+
+    ``log`` takes stdout and stderr in place of the terminal, and is replaced. ``on_line`` is called with each of its
+    lines; the last ones are returned. Ctrl-C, SIGTERM and SIGHUP reach the whole group, once, unless they are ignored,
+    as under nohup; SIGHUP as SIGTERM, so that a training that loses its terminal saves itself. On Linux the command
+    gets SIGTERM if this process dies.
+    """
     # Programs beside this interpreter come first.
     program = shutil.which(words[0], path=str(Path(sys.executable).parent)) or words[0]
-    options |= {"stdin": subprocess.DEVNULL, "start_new_session": True}
+    environment = {**os.environ, STEP: "1", "PYTHONWARNINGS": "ignore"}
+    options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "start_new_session": True, "env": environment}
+    if log is not None:
+        environment |= {"COLUMNS": "160"}
+        options |= {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "encoding": "utf-8", "errors": "replace"}
     if sys.platform == "linux":
         prctl = ctypes.CDLL(None).prctl
         options |= {"preexec_fn": lambda: prctl(1, signal.SIGTERM)}  # PR_SET_PDEATHSIG
-    try:
-        process = subprocess.Popen([program, *words[1:]], **options)
-    except OSError as error:
-        raise SundaeError(f"{words[0]} cannot be started ({error.strerror}); sundae doctor checks the setup") from error
-    with process:
-        yield process
+    last, received = deque[str](maxlen=12), list[int]()
 
+    def pass_on(number: int, frame: object) -> None:
+        received.append(signal.SIGINT if number == signal.SIGINT else signal.SIGTERM)
+        if hasattr(os, "killpg"):  # a Ctrl-C reaches each process of a Windows console by itself
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, received[-1])
 
-def run_command(words: Sequence[str]) -> int:
-    """Print a command and run it on the terminal; returns its exit code, or 128 + n if signal n arrived.
-
-    Ctrl-C, SIGTERM and SIGHUP reach the command and all processes that it started, once; SIGHUP as SIGTERM, so that a
-    training that loses its terminal saves itself.
-    """
-    print(shlex.join(words), flush=True)
-    received: list[int] = []
-    with _started(words) as process:
-
-        def pass_on(number: int, frame: object) -> None:
-            received.append(signal.SIGINT if number == signal.SIGINT else signal.SIGTERM)
-            if hasattr(os, "killpg"):  # a Ctrl-C reaches each process of a Windows console by itself
-                with suppress(ProcessLookupError):
-                    os.killpg(process.pid, received[-1])
-
-        before = {number: signal.signal(number, pass_on) for number in _SIGNALS}
+    with writing(f"cannot write {log}"), nullcontext() if log is None else log.open("w", encoding="utf-8") as file:
         try:
+            process = subprocess.Popen([program, *words[1:]], **options)
+        except OSError as error:
+            cause = f"{words[0]} cannot be started ({error.strerror})"
+            raise SundaeError(f"{cause}; sundae doctor checks the setup") from error
+        heard = [number for number in _SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+        before = {number: signal.signal(number, pass_on) for number in heard}
+        try:
+            for line in process.stdout or ():
+                if file is not None:
+                    file.write(line)
+                last.append(line.rstrip())
+                on_line(line)
             code = process.wait()
+        except BaseException:  # an error must not leave the process running
+            process.terminate()
+            process.wait()
+            raise
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
     if received:
-        return 128 + received[0]
-    return code if code >= 0 else 128 - code
-
-
-def run_logged(words: Sequence[str], log: Path, on_line: Callable[[str], object] = lambda line: None) -> None:
-    """Run a command with stdout and stderr in ``log``, which is replaced; ``on_line`` is called with each line.
-
-    Raises:
-        SundaeError: the command failed; the message ends with the last lines of its output.
-    """
-    last: deque[str] = deque(maxlen=12)
-    output: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "encoding": "utf-8"}
-    output |= {"errors": "replace", "env": {**os.environ, "COLUMNS": "160"}}
-    with open(log, "w", encoding="utf-8") as file, _started(words, **output) as process:
-        assert process.stdout is not None
-        try:
-            for line in process.stdout:
-                file.write(line)
-                last.append(line.rstrip())
-                on_line(line)
-        except BaseException:  # an interrupt must not leave the process running
-            process.terminate()
-            raise
-    if process.returncode:
-        end = "\n".join(last)
-        raise SundaeError(f"{Path(words[0]).name} failed with {process.returncode}; {log} ends with:\n{end}")
+        code = 128 + received[0]
+    return code if code >= 0 else 128 - code, "\n".join(last)
 
 
 def percent_of(line: str) -> float | None:

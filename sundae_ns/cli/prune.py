@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.inputs import Cleaning, chosen_cameras, copies_rows
-from sundae_ns.cli.options import Out, Overwrite, Scene, check_exclusive, check_file, check_suffix
+from sundae_ns.cli.inputs import Cleaning, chosen_cameras, copies_rows, warn_if_few
+from sundae_ns.cli.options import Out, Overwrite, Scene, Share, check_exclusive, check_file, check_suffix
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.ply import keep_vertices
 from sundae_ns.pruning.rule import PruneRule, ScoreName
@@ -32,7 +32,7 @@ class RuleOptions(PruneRule):
 def prune(
     source: Scene,
     out: Out,
-    keep: float | None = None,
+    keep: Share | None = None,
     count: int | None = None,
     target_drop: float | None = None,
     num_cameras: int | None = None,
@@ -49,7 +49,7 @@ def prune(
     Args:
         out: file to write, in the format of its suffix: .ply, .spz, .sog, .glb or .sundae. A .ply of a .ply keeps all
             properties and comments.
-        keep: share of the Gaussians to keep, of those that a box and the floaters leave, in (0, 1]; by default 0.1.
+        keep: share of the Gaussians to keep, of those that a box and the floaters leave, 0.25 or 25%; by default 0.1.
         count: number of Gaussians to keep, in place of a share.
         target_drop: keep as few as lose at most this PSNR, in dB, of a full scene that shows its photos at 30 dB; by
             the images of held-out cameras.
@@ -73,6 +73,7 @@ def prune(
         if cleaning.chosen:
             clean = cleaning.mask(scene, given)
             scene = kept(scene, clean)
+        warn_if_few(count, scene.num_gaussians)
         if looks_around:
             used = given or virtual_cameras(scene, num_cameras, seed=rule.seed)
         if target_drop is not None and used is not None:

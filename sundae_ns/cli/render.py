@@ -6,9 +6,8 @@ from pathlib import Path
 
 from PIL import Image
 from rich.console import Console
-from rich.progress import track
 
-from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file
+from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file, check_least, check_suffix, progress_bar
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.files import replacing, write_image
@@ -50,12 +49,8 @@ def render(
         fps: frames a second of a video; by default those of the camera path, else 24.
         up: direction that is upwards, for example 0 -1 0; by default that of the scene, else of its cameras, else z.
     """
-    suffix = out.suffix.lower()
-    video = suffix == ".mp4"
-    if not video and suffix not in IMAGES:
-        raise ConfigError(f"{out} is neither an image nor a video; name it {', '.join(IMAGES)} or .mp4")
-    if width is not None and width < 2:
-        raise ConfigError(f"width is {width}; give 2 pixels or more")
+    video = check_suffix(out, (*IMAGES, ".mp4")) == ".mp4"
+    check_least(width=(width, 2))
     if seconds is not None and (camera is not None or not video):
         raise ConfigError("--seconds is the length of a film without --camera; leave it out")
     if fps is not None and not (video and 0 < fps <= 240):
@@ -80,10 +75,10 @@ def render(
         return image_of(render_view(opened, camera, head=head).rgb)
 
     if video:
-        frames = track(views, "Rendering", transient=True, console=Console(stderr=True))
         speed = fps or cameras.frames_per_second or 24
-        with replacing(out) as partial:
-            count = write_video(partial, map(rendered, frames), frames_per_second=speed)
+        with replacing(out) as partial, progress_bar() as bar:
+            images = map(rendered, bar.track(views, description="Rendering"))
+            count = write_video(partial, images, frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
     index, choices = view or 0, f"--view 0 to {len(views) - 1}"

@@ -16,9 +16,8 @@ import torch
 import tyro
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
-from sundae_ns.cli.options import Out, Overwrite, check_folder, check_least
+from sundae_ns.cli.options import Out, Overwrite, check_folder, check_least, progress_bar
 from sundae_ns.core.errors import ConfigError, SundaeError, writing
 from sundae_ns.core.files import write_files
 from sundae_ns.core.metrics import Lpips, Net, flip_available, lpips_weights
@@ -27,7 +26,7 @@ from sundae_ns.train.curve import read_count_curve
 
 if TYPE_CHECKING:
     from sundae_ns.plugin.finished_runs import Opened
-    from sundae_ns.report.report_page import ShownRun, ShownView
+    from sundae_ns.report.report_page import ShownView
 
 
 def report(
@@ -57,20 +56,15 @@ def report(
     from sundae_ns.report.measure import measure_scene
     from sundae_ns.report.report_page import ShownRun, cameras_for_each, report_page
 
-    words = ["sundae", "report", *map(str, runs), "-o", str(out), "--lpips-net", lpips_net]
-    words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
-    command = shlex.join(words)
-    lpips, notes = Lpips(lpips_net) if lpips_weights(lpips_net)[1].is_file() else None, list[str]()
-    if not flip_available():
-        notes.append("FLIP: the package is not installed; run pip install flip-evaluator.")
-    if lpips is None:
-        notes.append(f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them.")
+    words = [*runs, "-o", out, "--lpips-net", lpips_net, "--warmup", warmup, "--repeats", repeats]
+    command = shlex.join(map(str, ["sundae", "report", *words, *(["--data", data] if data else [])]))
+    lpips = Lpips(lpips_net) if lpips_weights(lpips_net)[1].is_file() else None
+    missing = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
+    notes = [] if flip_available() else ["FLIP: the package is not installed; run pip install flip-evaluator."]
+    notes += [missing] if lpips is None else []
     measure = partial(measure_scene, lpips=lpips, warmup=warmup, repeats=repeats, command=command)
-    done: list[ShownRun] = []
-    failures: list[SundaeError] = []
-    columns = (*Progress.get_default_columns()[:-1], MofNCompleteColumn(), TimeRemainingColumn())
-    console = Console()
-    with Progress(*columns, console=console, transient=True) as progress:
+    console, done, failures = Console(), list[ShownRun](), list[SundaeError]()
+    with progress_bar() as progress:
         for path in runs:
             task = progress.add_task(f"Opening {escape(str(path))}", total=None)
             try:
@@ -78,8 +72,7 @@ def report(
                     opened = load_model(path, data=data)
                 label = _label(opened, {run.measured.label for run in done})
                 progress.update(task, description=f"Measuring {escape(label)}", total=len(opened.cameras))
-                advance = partial(progress.advance, task)
-                measured = measure(opened, label=label, progress=advance)
+                measured = measure(opened, label=label, progress=partial(progress.advance, task))
                 with writing(f"cannot write to {out}"):
                     out.mkdir(parents=True, exist_ok=True)
                 progress.update(task, description=f"Encoding views of {escape(label)}")
@@ -102,9 +95,10 @@ def report(
     ]
     rows, page = [run.measured.as_json() for run in done], report_page(done, notes, command)
     files = {"json": json.dumps(rows, indent=1) + "\n", "csv": csv_text(rows), "md": markdown(scenes, notes)}
-    write_files({out / f"report.{kind}": content.encode() for kind, content in {**files, "html": page}.items()})
+    contents = {kind: content.encode(errors="backslashreplace") for kind, content in {**files, "html": page}.items()}
+    write_files({out / f"report.{kind}": content for kind, content in contents.items()})
     for note in notes:
-        console.print(f"[yellow]Left out: {escape(note)}", highlight=False)
+        console.print(f"Left out: {note}", style="yellow", highlight=False, markup=False, soft_wrap=True)
     shown, total = sum(len(run.views) for run in done), sum(len(run.measured.full.views) for run in done)
     size = f"{len(page) / 1e6:.1f} MB, {shown} of {total} views"
     console.print(f"wrote {out / 'report.html'}, to look at in a browser: {size}", highlight=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shlex
 import sys
@@ -29,6 +30,8 @@ from sundae_ns.io.run_folder import LOCK, reserve, steps_left
 
 SETTINGS = "run.json"
 """File with the settings of the first command; a repeated one must share them."""
+LOG = "train.log"
+"""File with all output of ns-train."""
 DRAFT_STEPS = 3000
 
 
@@ -36,11 +39,9 @@ class Step(NamedTuple):
     """A part of the work, and how to know that it is done."""
 
     name: str
-    run: Callable[[], int]
-    """Runs its commands; the exit code."""
+    run: Callable[[], int]  # Returns the exit code of its commands
     done: Callable[[], bool]
-    result: Path | None = None
-    """File that is out of date once an earlier step has run again."""
+    result: Path | None = None  # Out of date once an earlier step has run again
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,12 @@ class Project:
         return self.quality != "draft" and has_gpu()
 
     def check(self) -> None:
-        """Raise ``ConfigError`` for options that contradict each other."""
+        """Raise an error for photos that cannot be used, and for options that contradict each other."""
+        if not self.photos.exists():
+            raise DataError(f"{self.photos} does not exist; give a folder of photos, a video, or a capture")
+        if not self.posed and ((self.photos / "sparse").is_dir() or is_model(self.photos)):
+            raise no_transforms(self.photos)  # says how to use a capture in another layout
+        layout = posed_layout(self.photos) if self.posed else None
         self.train.check(self.photos)
         mb, draft, method = self.max_mb, self.quality == "draft", self.train.method
         fixed = self.train.keep is not None or method != "sundae"
@@ -100,6 +106,8 @@ class Project:
         ):
             if wrong:
                 raise ConfigError(message)
+        if layout is not None:
+            print(f"# capture in {layout.description}", flush=True)
 
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
@@ -109,9 +117,9 @@ class Project:
         export = ["sundae", "export", word(packed), "-o", word(page)]
         steps = [
             Step("train", self._train, self._trained),
-            Step("pack", lambda: self._pack(packed), lambda: _is_packed(packed), packed),
-            Step("report", lambda: run_command(measure), lambda: _is_page(report), report),
-            Step("web page", lambda: run_command(export), lambda: _is_page(page), page),
+            Step("pack", lambda: self._pack(packed), lambda: _passes(lambda: _check_pack(packed)), packed),
+            Step("report", lambda: run_command(measure), lambda: _passes(lambda: _check_report(report)), report),
+            Step("web page", lambda: run_command(export), lambda: _passes(lambda: _check_page(page)), page),
         ]
         return steps if self.posed else [Step("camera poses", self._find_poses, self.placed), *steps]
 
@@ -122,11 +130,7 @@ class Project:
 
     def placed(self) -> bool:
         """Whether the capture is whole."""
-        try:
-            placed_in(self.capture)
-        except DataError:
-            return False
-        return True
+        return _passes(lambda: placed_in(self.capture))
 
     def _train(self) -> int:
         """Train, or resume a training; ``DataError`` if too few photos have a pose."""
@@ -138,21 +142,23 @@ class Project:
         saved, options = self.run / "nerfstudio_models", self.train
         # The name may begin with a dash.
         more = [f"--experiment-name={self.run.parent.parent.name}", "--timestamp", self.run.name]
-        more += ["--vis", "viewer+tensorboard", *(FINETUNE_WORDS if self.tunes else [])]
+        more += ["--vis", "viewer+tensorboard", "--viewer.websocket-host", "127.0.0.1"]
+        more += FINETUNE_WORDS if self.tunes else []
         if steps_left(self.run) is not None:
             more += ["--load-dir", word(saved)]
-            return run_command(replace(options, steps=None).words(self.capture, self.out / "runs", more))
-        if any(saved.glob("*.ckpt")):
-            with writing(f"cannot replace {self.run}"):
-                put_aside(self.run)
-        if self.quality == "draft":
-            options = replace(options, steps=DRAFT_STEPS)
-        if self.quality == "best":
-            more += ["--pipeline.model.pruning.max-drop", "0.03"]
-        if self.max_mb is not None:  # trials count the bytes of packs without a fine-tune
-            most = round(_bytes(self.max_mb) / (FINETUNED_SIZE if self.tunes else 1))
-            more += ["--pipeline.model.pruning.max-bytes", str(most)]
-        return run_command(options.words(self.capture, self.out / "runs", more))
+            options = replace(options, steps=None)
+        else:
+            if any(saved.glob("*.ckpt")):
+                with writing(f"cannot replace {self.run}"):
+                    put_aside(self.run)
+            if self.quality == "draft":
+                options = replace(options, steps=DRAFT_STEPS)
+            if self.quality == "best":
+                more += ["--pipeline.model.pruning.max-drop", "0.03"]
+            if self.max_mb is not None:  # trials count the bytes of packs without a fine-tune
+                most = round(_bytes(self.max_mb) / (FINETUNED_SIZE if self.tunes else 1))
+                more += ["--pipeline.model.pruning.max-bytes", str(most)]
+        return run_command(options.words(self.capture, self.out / "runs", more), self.out / LOG)
 
     def _trained(self) -> bool:
         """Whether the last step is saved, of those before the pack's fine-tune."""
@@ -166,20 +172,13 @@ class Project:
         return pack_run(self.run, packed, "--data", word(self.capture), *more, finetune=self.tunes)
 
     def claim(self) -> None:
-        """Make the folder and lock it, or check that an earlier command with the same settings made it.
-
-        Raises:
-            ConfigError: its settings were others.
-            StorageError: another process works in the folder, it holds other files, or it cannot be written.
-        """
+        """Make the folder and lock it, or check that an earlier command with the same settings made it."""
         path, photos, masks = self.out / SETTINGS, self.photos.resolve(), self.poses.masks
         settings = {"photos": str(photos), "quality": self.quality, "max_mb": self.max_mb}
         settings |= {**asdict(self.train), **asdict(self.poses), "masks": str(masks.resolve()) if masks else None}
-        if self.out.resolve().is_relative_to(photos):
-            raise StorageError(f"{self.out} lies in {self.photos}, which the command reads; choose another folder")
         # An earlier command may have been killed after it made the lock.
         begun = self.out.is_dir() and all(name.startswith((LOCK, SETTINGS)) for name in os.listdir(self.out))
-        check_folder(self.out, reads=[self.photos], overwrite=begun or path.is_file())
+        check_folder(self.out, reads=[photos], outside=self.photos, overwrite=begun or path.is_file() or None)
         with writing(f"cannot make {self.out}"):
             self.out.mkdir(parents=True, exist_ok=True)
         reserve(self.out, "works in {}; wait for it, or choose another folder")
@@ -194,7 +193,10 @@ class Project:
         for name, *values in changed:
             first, now = ("left out" if value is None else value for value in values)
             again = "repeat the first command, or choose another folder"
-            raise ConfigError(f"{self.out} was made with {name} {first}, not {now}; {again}")
+            if name == "max_mb" and self.max_mb is not None and self._trained():
+                size = f"--target-bytes {_bytes(self.max_mb)}"
+                again = f"the finished run gets this size by `sundae pack {quoted(self.run)} -o FILE {size}`"
+            raise ConfigError(f"{self.out} was made with {name.replace('_', '-')} {first}, not {now}; {again}")
 
 
 def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
@@ -204,7 +206,6 @@ def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
     interrupted training.
     """
     out, poses = project.out, project.poses
-    _check_input(project.photos)
     project.check()
     if not project.posed and not project.placed():
         check_poses(project.photos, poses.frames, poses.masks, remarks=False)  # sundae poses prints them
@@ -221,9 +222,12 @@ def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
         print(f"{heading}:", flush=True)
         code = step.run()
         if code:
-            failed = f"{step.name} ended with {code}; the same command tries it again"
-            stopped = "interrupted; the same command continues here"
-            print(f"sundae: {stopped if code in STOPPED else failed}", file=sys.stderr)
+            said = f"{step.name} ended with {code}, as the lines above say; mend that, and the same command continues"
+            if code in STOPPED:
+                said = "interrupted; the same command continues here"
+            elif code > 128:  # by a signal, as where memory is full
+                said = f"{step.name} was killed by signal {code - 128}; the same command tries it again"
+            print(f"sundae: {said}", file=sys.stderr)
             return code
         if not step.done():
             raise SundaeError(f"{step.name} ended without its result; the output above says why")
@@ -233,31 +237,33 @@ def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
     return 0
 
 
-def _check_input(photos: Path) -> None:
-    """Raise ``DataError`` for a path that can be neither a capture, a folder of photos nor a video."""
-    if not photos.exists():
-        raise DataError(f"{photos} does not exist; give a folder of photos, a video, or a capture")
-    if is_posed(photos):
-        layout = posed_layout(photos)
-        if layout is not None:
-            print(f"# capture in {layout.description}", flush=True)
-    elif (photos / "sparse").is_dir() or is_model(photos):
-        raise no_transforms(photos)  # says how to use a capture in another layout
-
-
 def _bytes(megabytes: float) -> int:
     return round(megabytes * 1e6)
 
 
-def _is_packed(path: Path) -> bool:
-    """Whether a file is a packed scene whose checksums are right."""
+def _passes(check: Callable[[], object]) -> bool:
+    """Whether a check of a result raises no error, of ours or for files that are not what they should be."""
     try:
-        container.read_sections(path, container.read_header(path))
-    except SundaeError:
+        check()
+    except (SundaeError, OSError, ValueError, TypeError, KeyError, AttributeError):
         return False
     return True
 
 
-def _is_page(path: Path) -> bool:
-    """Whether a web page has its end; a full disk or a copy may have cut it off."""
-    return path.is_file() and path.read_bytes()[-16:].rstrip().endswith((b"</html>", b"-->"))
+def _check_pack(path: Path) -> None:
+    container.read_sections(path, container.read_header(path))  # checks the checksums
+
+
+def _check_report(page: Path) -> None:
+    """A report has figures and a page; figures that could not be measured are null."""
+    runs = json.loads(page.with_suffix(".json").read_bytes())
+    figures = [value for run in runs for way in run["configurations"] for value in way["mean"].values()]
+    if not figures or not all(value is None or math.isfinite(value) for value in figures):
+        raise ValueError("not measured")
+    _check_page(page)
+
+
+def _check_page(path: Path) -> None:
+    """A web page has its end; a full disk or a copy may have cut it off."""
+    if not path.read_bytes()[-16:].rstrip().endswith((b"</html>", b"-->")):
+        raise ValueError("cut off")

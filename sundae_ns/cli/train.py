@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.options import Flag, Out, Source, check_least
+from sundae_ns.cli.options import Flag, Out, Share, Source, check_folder, check_least
 from sundae_ns.cli.process import run_command, word
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError
 from sundae_ns.data.layouts import posed_layout
@@ -30,8 +30,8 @@ class TrainOptions:
 
     method: str = "sundae"
     """one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU."""
-    keep: float | None = None
-    """share of the Gaussians to keep, in (0, 1]; by default as many as the scene needs, or that of the method."""
+    keep: Share | None = None
+    """share of the Gaussians to keep, 0.25 or 25%; by default as many as the scene needs, or that of the method."""
     steps: int | None = None
     """number of training steps; by default that of the method."""
 
@@ -42,15 +42,11 @@ class TrainOptions:
         if self.method not in methods():
             raise ConfigError(f"{self.method} is no method of sundae; use one of {', '.join(methods())}")
         if self.keep is not None and not 0 < self.keep <= 1:
-            raise ConfigError(f"keep is {self.keep}; give a share in (0, 1]")
+            raise ConfigError(f"keep is {self.keep}; give a share in (0, 1], or per cent as 25%")
         check_least(steps=(self.steps, 1))
 
     def words(self, capture: Path, out: Path, more: Sequence[str] = ()) -> list[str]:
-        """The command of ``ns-train``, with ``more`` options and perhaps a parser of captures among them.
-
-        Raises:
-            DataError: the capture is in COLMAP's or Blender's layout and damaged.
-        """
+        """The command of ``ns-train``, with ``more`` options and perhaps a parser of captures among them."""
         words = ["ns-train", self.method, "--data", word(capture), "--output-dir", word(out)]
         if self.keep is not None:
             words += ["--pipeline.model.pruning.keep-ratio", f"{self.keep:g}"]
@@ -90,6 +86,7 @@ def train(
     if resume and options.steps is not None:
         raise ConfigError("a resumed run trains its remaining steps; leave out --steps or --resume")
     options.check(capture)
+    check_folder(out, reads=[], overwrite=True)
     unfinished, more = unfinished_run(out, options.method, capture), list(further)
     if resume and unfinished is None:
         raise ConfigError(f"{out} has no unfinished run of {options.method} on {capture}; leave out --resume")
@@ -97,9 +94,8 @@ def train(
     name = given or new_name()
     if resume and unfinished is not None:
         folder, name = unfinished.folder, unfinished.folder.name
-        more[:0] = [f"--experiment-name={folder.parent.parent.name}", "--timestamp", name]
-        more[:0] = ["--load-dir", word(folder / "nerfstudio_models")]
-    elif given is None:
+        more[:0] = [f"--experiment-name={folder.parent.parent.name}", "--load-dir", word(folder / "nerfstudio_models")]
+    if resume or given is None:
         more[:0] = ["--timestamp", name]
     tunes = has_gpu()
     lengths = ("--max-num-iterations", "--schedule-length", "--finetune-steps")
@@ -123,10 +119,7 @@ def train(
 
 
 def pack_run(run: Path, out: Path, *more: str, finetune: bool) -> int:
-    """Pack a finished run with ``more`` options; returns the exit code.
-
-    A fine-tune that fails, for example because the GPU's memory is full, is left out.
-    """
+    """Pack a finished run, without the fine-tune if it fails, as where the GPU's memory is full; the exit code."""
     words = ["sundae", "pack", word(run), "-o", word(out), *more]
     if finetune:
         code = run_command([*words, "--finetune", str(FINETUNE_STEPS)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import webbrowser
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -26,10 +27,10 @@ class _Server(ThreadingHTTPServer):
 def serve(page: str, port: int) -> ThreadingHTTPServer:
     """A server of one page on 127.0.0.1, not yet started; ``ConfigError`` if the port is in use or not allowed.
 
-    It answers only requests that name this machine (``127.0.0.1``, ``localhost`` or ``[::1]``) and its port: else a
-    site whose name resolves to 127.0.0.1 (DNS rebinding) could read the scene.
+    It answers only requests that name this machine and its port: else a site whose name resolves to 127.0.0.1 (DNS
+    rebinding) could read the scene.
     """
-    content = page.encode()
+    content = page.encode(errors="backslashreplace")
 
     class Handler(BaseHTTPRequestHandler):
         timeout = IDLE_SECONDS
@@ -37,14 +38,10 @@ def serve(page: str, port: int) -> ThreadingHTTPServer:
         def do_GET(self) -> None:
             port = self.connection.getsockname()[1]
             named = [name.strip().lower() for name in self.headers.get_all("Host", [])]
+            status, body = (200, content) if self.path == "/" else (404, b"")
             if len(named) != 1 or named[0] not in _hosts(port):
-                self._answer(421, f"Open http://127.0.0.1:{port}/; forward it from a port of the same number.".encode())
-            elif self.path == "/":
-                self._answer(200, content)
-            else:
-                self._answer(404, b"")
-
-        def _answer(self, status: int, body: bytes) -> None:
+                advice = f"Open http://127.0.0.1:{port}/; forward it from a port of the same number."
+                status, body = 421, advice.encode()
             self.send_response(status)
             self.send_header("Content-Type", "text/html; charset=utf-8")
             self.send_header("Content-Length", str(len(body)))
@@ -80,13 +77,10 @@ def view(scene: Scene, port: int = 0, open_browser: bool = True, data: Path | No
         data: folder of the capture of a run, if it moved.
     """
     page = page_of(*open_packed(scene, data), title=scene.resolve().stem)
-    with serve(page, port) as server:
+    with serve(page, port) as server, suppress(KeyboardInterrupt):
         address = f"http://127.0.0.1:{server.server_port}/"
         print(f"{scene} is shown at {address} until Ctrl-C", flush=True)
         if open_browser:
             webbrowser.open(address)
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            print()
+        server.serve_forever()
     return 0

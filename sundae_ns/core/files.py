@@ -87,8 +87,8 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in UTF-8 as :func:`write_bytes` does."""
-    write_files({path: text.encode()})
+    """Write a text file in UTF-8 as :func:`write_bytes` does; bytes of a name that are no text become ``\\udcff``."""
+    write_files({path: text.encode(errors="backslashreplace")})
 
 
 def write_image(path: Path, image: Image.Image) -> None:

@@ -49,19 +49,3 @@ def test_an_interrupted_distillation_goes_on(
     assert "100 of 200 Gaussians, without a head" in said.out
     assert sorted(path.name for path in source.parent.iterdir()) == ["a.ply", "b.spz"]
     assert sn.load(out).num_gaussians == 100
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["-o", "b.ply"], "b.ply cannot hold a head; name it .sundae, or leave the head out with --no-head"),
-        (["-o", "b.txt"], "b.txt has no supported suffix"),
-        (["-o", "b.sundae", "--keep", "0.1", "--count", "5"], "--keep and --count exclude each other"),
-        (["-o", "b.sundae", "--steps", "0"], "steps is 0; give 1 or more"),
-    ],
-)
-def test_refusals_are_one_line(
-    words: list[str], message: str, source: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(source.parent)
-    assert message in command_line.refusal(capsys, "distill", "a.ply", *words)

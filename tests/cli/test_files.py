@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from colmap_models import write_model
-from command_line import refusal, run
+from command_line import run
 from foreign_files import FOREIGN, KSPLAT, small_field
 from packed_scenes import KINDS, write_kind
 from plyfile import PlyData, PlyElement
@@ -151,69 +151,6 @@ def test_prune_does_not_change_kept_rows(
     assert len(kept) == 50
     assert 3 not in kept["label"]
     assert np.array_equal(kept, more[kept["label"]])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["prune", "nothing.ply", "-o", "a.ply"], "nothing.ply cannot be read"),
-        (["prune", "in.ply", "-o", "a.ply", "--keep", "0"], "keep is 0.0"),
-        (["prune", "in.ply", "-o", "a.splat"], "a.splat has no supported suffix"),
-        (["prune", "in.ply", "-o", "a.ply", "--keep", "0.1", "--count", "5"], "--keep and --count exclude each other"),
-        (["prune", "in.ply", "-o", "a.ply", "--keep", "0.1", "--target-drop", "1"], "--keep and --target-drop exclude"),
-        (["prune", "in.ply", "-o", "a.ply", "--target-drop", "0"], "target-drop is 0.0; give a positive number of dB"),
-        (["prune", "in.ply", "-o", "a.ply", "--target-drop", "1", "--num-cameras", "1"], "a target needs two"),
-        (["prune", "in.ply", "-o", "a.ply", "--count", "0"], "count is 0; give 1 or more"),
-        (["prune", "none.ply", "-o", "a.ply"], "none.ply has 5 Gaussians, and none is finite; export it again"),
-        (["prune", "empty.ply", "-o", "a.ply"], "empty.ply has 0 Gaussians, and none is finite; export it again"),
-        (["export", "none.ply", "-o", "a.spz"], "none.ply has 5 Gaussians, and none is finite; export it again"),
-        (["prune", "in.ply", "-o", "in.bin/a.ply"], "in.bin is no folder"),
-        (["export", "in.ply", "-o", "a.splat"], "name it .ply or .spz or .sog or .glb"),
-        (["export", "in.ply", "-o", "in.bin/new/a.sog"], "in.bin is no folder"),
-        (["export", "in.ply", "-o", "a.ply"], "in.ply is a .ply already; give an output name that ends in .spz or"),
-        (["export", "in.ply", "-o", "a.sog", "--upright"], "not in nerfstudio's coordinates"),
-        (["export", "in.bin", "-o", "a.ply"], "in.bin is no .spz; give a .ply"),
-        (["pack", "in.sundae", "-o", "a.sundae"], "in.sundae is a packed scene; give the run that was packed"),
-        (["pack", "in.ply", "-o", "a.sundae", "--finetune", "9"], "in.ply is a .ply file without photos; leave out"),
-        (["pack", "in.ply", "-o", "a.sundae", "--target-drop", "1"], "leave out --target-drop, or give a run"),
-        (["pack", "gone", "-o", "a.sundae"], "gone cannot be read"),
-        (["pack", "gone", "-o", "a.sundae", "--scale-step", "2"], "scale-step is 2.0; give 0.0001 to 1"),
-        (["pack", "gone", "-o", "in.bin/a.sundae"], "in.bin is no folder; choose another"),
-        (["pack", "gone", "-o", "a.sundae", "--finetune", "-1"], "finetune is -1"),
-        (["pack", "gone", "-o", "a.sundae", "--max-cameras", "-1"], "max-cameras is -1"),
-        (["pack", "gone", "-o", "a.sundae", "--target-bytes", "0"], "target-bytes is 0"),
-        (["pack", "gone", "-o", "a.sundae", "--target-drop", "nan"], "target-drop is nan"),
-        (["pack", "gone", "-o", "a.sundae", "--target-drop", "1", "--target-bytes", "9"], "exclude each other"),
-        (["report", "a.lcc", "-o", "out"], "a.lcc is a scene of XGRIDS; convert it to .ply with"),
-        (["prune", "a.ksplat", "-o", "a.ply"], "a.ksplat is not a complete .ksplat (33 bytes are"),
-        (["export", "a.glb", "-o", "a.ply"], "a.glb is not a complete .glb with Gaussians"),
-        (["render", "a.pth", "-o", "a.png"], "a.pth is a checkpoint of another trainer; give its .ply"),
-        (["prune", "trained", "-o", "a.ply"], "trained is a folder of 3DGS; give trained/point_cloud/iter"),
-        (["view", "a.splat"], "a.splat is not a complete .splat (33 bytes are no whole number of Gaussians"),
-        (["report", "in.ply", "-o", "out"], "in.ply is a .ply file; it comes without test views"),
-        (["export", "nothing.sundae", "-o", "a.ply"], "nothing.sundae cannot be read"),
-    ],
-)
-def test_refusals_are_one_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    message: str,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_ply(Path("in.ply"), gaussians())
-    write_scene(Path("in.sundae"), PackedScene(gaussians(), meta={"model": MODEL}))
-    Path("in.bin").write_bytes(b"\x1f\x8b\xff")
-    write_ply(Path("none.ply"), {name: torch.full_like(value[:5], torch.nan) for name, value in gaussians().items()})
-    write_ply(Path("empty.ply"), {name: value[:0] for name, value in gaussians().items()})
-    for name in ("a.ksplat", "a.lcc", "a.glb", "a.pth", "a.splat"):
-        Path(name).write_bytes(bytes(33))
-    Path("trained/point_cloud/iteration_7").mkdir(parents=True)
-    Path("trained/point_cloud/iteration_7/point_cloud.ply").touch()
-    before = sorted(tmp_path.iterdir())
-    assert message in refusal(capsys, *arguments)
-    assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize("name", FOREIGN)

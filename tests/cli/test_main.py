@@ -1,4 +1,4 @@
-"""The ``sundae`` command itself, and ``sundae demo``: errors as one line; integration/ trains."""
+"""The ``sundae`` command itself: help, exit codes, names that are no text, warnings of libraries."""
 
 from __future__ import annotations
 
@@ -8,26 +8,36 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import refusal, run
+import torch
+from command_line import run
 
+import sundae_ns as sn
 from sundae_ns.cli import main
-from sundae_ns.cli.demo import demo
-from sundae_ns.core.errors import SundaeError
+from sundae_ns.cli.main import COMMANDS
+
+SUNDAE = Path(sys.executable).parent / "sundae"
 
 
-@pytest.mark.parametrize("wrong", ["foreign folder", "file", "option"])
-def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: str) -> None:
-    out, more = tmp_path / "demo", []
-    if wrong == "foreign folder":
-        out.mkdir()
-        (out / "thesis.txt").write_text("years of work")
-    elif wrong == "file":
-        out.write_text("years of work")
-    else:
-        more = ["--steps", "0"]
-    refusal(capsys, "demo", out, *more)
-    if wrong == "foreign folder":
-        assert [path.name for path in out.iterdir()] == ["thesis.txt"]
+def test_the_twelve_commands() -> None:
+    names = "run poses train prune distill pack export view render report demo doctor"
+    assert list(COMMANDS) == names.split()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        ([], 2, "show a scene with its head in the browser"),
+        (["help"], 0, "show a scene with its head in the browser"),
+        (["--help"], 0, "sundae COMMAND --help shows"),
+        (["help", "view"], 0, "usage: sundae view "),
+        (["--version"], 0, f"sundae_ns {sn.__version__}\n"),
+    ],
+)
+def test_what_a_newcomer_types(words: list[str], code: int, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(*words) == code
+    printed = capsys.readouterr()
+    assert says in printed.out
+    assert not printed.err
 
 
 def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -37,23 +47,6 @@ def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sundae_ns.cli.doctor.parts", broken)
     with pytest.raises(ZeroDivisionError):
         main(["doctor"])
-
-
-@pytest.mark.parametrize(
-    ("words", "remedy"),
-    [([], "sundae --help lists them"), (["fly"], "sundae --help lists them"), (["reprot"], "use report")],
-)
-def test_unknown_commands_are_one_line(words: list[str], remedy: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert refusal(capsys, *words).endswith(remedy)
-
-
-def test_installed_command_and_its_exit_code(tmp_path: Path) -> None:
-    command = Path(sys.executable).parent / "sundae"
-    out = tmp_path / "file"
-    out.touch()
-    result = subprocess.run([command, "demo", out], capture_output=True, text=True, check=False)
-    assert result.returncode == 2
-    assert len(result.stderr.strip().splitlines()) == 1
 
 
 @pytest.mark.parametrize("chosen", [None, "ACTIVE"])
@@ -72,15 +65,18 @@ def test_torch_is_not_loaded_before_a_command_starts() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.parametrize(("steps", "message"), [(0, "steps is 0; give at least 1"), (300, "made"), (None, "made")])
-def test_a_demo_of_no_step_is_refused_before_anything_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int | None, message: str
-) -> None:
-    def make(scene: Path) -> None:
-        scene.mkdir(parents=True)
-        raise SundaeError("made")
+def test_the_installed_command_takes_any_name_and_no_warning_for_an_error(tmp_path: Path) -> None:
+    """Names of files may hold bytes that are no text."""
+    sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), tmp_path / "a.ply")
+    environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"}
 
-    monkeypatch.setattr("sundae_ns.cli.demo.write_demo_capture", make)
-    with pytest.raises(SundaeError, match=message):
-        demo(tmp_path / "demo", steps=steps)
-    assert (tmp_path / "demo").exists() == (message == "made")
+    def started(*words: str | bytes) -> tuple[int, bytes, bytes]:
+        done = subprocess.run([SUNDAE, *words], cwd=tmp_path, env=environment, capture_output=True, check=False)
+        return done.returncode, done.stdout, done.stderr
+
+    code, out, errors = started("export", "a.ply", "-o", b"\xff.html")
+    assert (code, errors) == (0, b"")
+    assert out.startswith(b"\\udcff.html: ")
+    assert (tmp_path / os.fsdecode(b"\xff.html")).stat().st_size > 1000
+    refused = b"sundae: \\udcff.ply cannot be read (No such file or directory); check the path\n"
+    assert started("pack", b"\xff.ply", "-o", "b.sundae") == (2, b"", refused)

@@ -75,19 +75,6 @@ def test_an_existing_output_needs_overwrite(here: Path, refused: Refused, words:
     assert all(path.stat().st_mtime_ns > earlier for path, earlier in first.items() if path.is_file())
 
 
-@pytest.mark.parametrize("command", ["demo", "report"])
-def test_folders_with_files_need_overwrite(here: Path, refused: Refused, command: str) -> None:
-    (here / "mine").mkdir()
-    (here / "mine" / "thesis.txt").write_text("years of work")
-    words = [command, "mine"] if command == "demo" else [command, "a.ply", "-o", "mine"]
-    assert "--overwrite" in refused(*words)
-    assert [path.name for path in (here / "mine").iterdir()] == ["thesis.txt"]
-
-
-def test_a_folder_that_holds_the_input_is_no_output(here: Path, refused: Refused) -> None:
-    assert "holds what the command reads" in refused("report", "a.ply", "-o", ".", "--overwrite")
-
-
 def test_parts_of_a_run_are_no_output(here: Path) -> None:
     (here / "run").mkdir()
     (here / "run" / "config.yml").write_text("a: 1")

@@ -88,35 +88,6 @@ def test_a_video(colmap: FakeColmap, capsys: pytest.CaptureFixture[str]) -> None
     assert "frames: 9 of 9" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "cause"),
-    [
-        (["gone", "-o", "capture"], "gone does not exist; give a folder of photos, or a video"),
-        (["empty", "-o", "capture"], "empty holds no photos"),
-        (["text.mp4", "-o", "capture"], "text.mp4 is not a video that OpenCV decodes"),
-        (["photos/0.JPG", "-o", "capture"], "photos/0.JPG is neither a folder of photos nor a video"),
-        (["photos", "-o", "used"], "used exists; choose another folder, or remove it"),
-        (["photos", "-o", "text.mp4"], "text.mp4 exists"),
-        (["photos", "-o", "photos/capture"], "photos/capture lies in photos"),
-        (["photos", "-o", "capture", "--frames", "2"], "frames is 2; give at least 3"),
-        (["photos", "-o", "capture", "--masks", "gone"], "gone is no folder of masks"),
-        (["photos", "-o", "capture", "--masks", "empty"], "photos/0.JPG has no mask 0.png in empty"),
-        (["walk.mp4", "-o", "capture", "--masks", "empty"], "a video has no masks"),
-    ],
-)
-def test_refusals_come_before_anything_is_written(
-    colmap: FakeColmap, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], cause: str
-) -> None:
-    Path("empty").mkdir()
-    Path("text.mp4").write_text("not a video")
-    write_video(Path("walk.mp4"), 9)
-    Path("used").mkdir()
-    Path("used/thesis.txt").touch()
-    before = sorted(tmp_path.rglob("*"))
-    assert cause in refusal(capsys, *words)
-    assert sorted(tmp_path.rglob("*")) == before
-
-
 def test_without_pycolmap_one_line_says_so(
     colmap: FakeColmap, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -111,15 +111,45 @@ def test_a_command_that_is_not_installed() -> None:
         run_command(["no-such-command"])
 
 
-def test_a_failing_command_shows_its_last_lines_and_keeps_its_log(tmp_path: Path) -> None:
-    log, lines = tmp_path / "train.log", list[str]()
-    script = "import sys; print('first', flush=True); print('the cause', file=sys.stderr); sys.exit(3)"
-    with pytest.raises(SundaeError, match="failed with 3.*ends with:\nfirst\nthe cause$"):
-        run_logged([sys.executable, "-c", script], log, lines.append)
-    assert log.read_text() == "".join(lines) == "first\nthe cause\n"
+TRAINING = """
+import sys
+print("[00:00:01] Caching images                    full_images_datamanager.py:230")
+print("           Dataset is overriding indices")
+print("60 steps")
+print("┏━━━┓\\n┃ part ┃\\n┡━━━┩\\n│ images │ full size │\\n└───┘")
+print("╭─ viser ─╮\\n│   HTTP  │ http://0.0.0.0:7007 │\\n╰─╯")
+print("[00:00:02] step 30: kept 1,245 of 4,980 Gaussians", flush=True)
+print("UserWarning: lr_scheduler", file=sys.stderr, flush=True)
+print("Warning: LPIPS is left out", flush=True)
+print("30 (50.00%)  9 s left at 171 ms a step  PSNR 15.35 dB  1,245 Gaussians", flush=True)
+print(*sys.argv[1:2], file=sys.stderr)
+sys.exit(len(sys.argv) > 1)
+"""
 
 
-def test_an_interrupt_leaves_no_logged_command_behind(tmp_path: Path) -> None:
+def test_a_logged_training_shows_messages_and_the_schedule(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "train.log"
+    assert run_command([sys.executable, "-c", TRAINING], log) == 0
+    _, *printed = capfd.readouterr().out.split(TRAINING)[-1].splitlines()
+    assert [line.split()[0] for line in printed] == ["60", "┏━━━┓", "┃", "┡━━━┩", "│", "└───┘", *SHOWN]
+    assert "full_images_datamanager" in log.read_text(encoding="utf-8")
+    assert "lr_scheduler" in log.read_text(encoding="utf-8")
+
+
+SHOWN = ["[00:00:02]", "Warning:", "30"]
+
+
+@pytest.mark.parametrize(("cause", "shown"), [("sundae: a is damaged; repair it", False), ("KeyError: 'a'", True)])
+def test_a_logged_training_that_fails_says_why(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], cause: str, shown: bool
+) -> None:
+    assert run_command([sys.executable, "-c", TRAINING, cause], tmp_path / "log") == 1
+    printed = capfd.readouterr()
+    assert cause in (printed.err if shown else printed.out)
+    assert bool(printed.err) == shown
+
+
+def test_an_error_leaves_no_logged_command_behind(tmp_path: Path) -> None:
     pids = []
 
     def interrupt(line: str) -> None:
@@ -131,6 +161,16 @@ def test_an_interrupt_leaves_no_logged_command_behind(tmp_path: Path) -> None:
         run_logged([sys.executable, "-c", code], tmp_path / "log.txt", interrupt)
     with pytest.raises(ProcessLookupError):
         os.kill(pids[0], 0)
+
+
+def test_a_signal_that_is_ignored_stays_ignored() -> None:
+    """As under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        code = "import os, signal; os.kill(os.getppid(), signal.SIGHUP); os.kill(os.getpid(), signal.SIGHUP)"
+        assert run_command([sys.executable, "-c", code]) == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_path_is_no_option() -> None:

@@ -26,10 +26,6 @@ def run(*arguments: object) -> int:
     return command_line.run("render", *arguments)
 
 
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    return command_line.refusal(capsys, "render", *arguments)
-
-
 def capture_file(path: Path, count: int) -> Path:
     """A ``transforms.json`` with cameras that look along y."""
     pose = torch.eye(4)
@@ -134,36 +130,3 @@ def test_an_image_is_that_of_the_start_view(folder: Path, tmp_path: Path) -> Non
     assert pixels(tmp_path / "a.png").shape == (62, 82, 3)
     assert run(tmp_path / "a.sundae", "-o", tmp_path / "b.png", "--view", 0) == 0
     assert pixels(tmp_path / "b.png").shape == (31, 41, 3)
-
-
-def test_refusals_are_one_line_and_write_nothing(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    packed, out = folder / "packed.sundae", tmp_path / "a.png"
-    damaged, few = tmp_path / "damaged.json", camera_path(tmp_path / "few.json", 0)
-    damaged.write_text("{")
-    before = sorted(tmp_path.iterdir())
-    for words, message in (
-        ((packed, "-o", out), "there are 2 cameras; choose one with --view 0 to 1, or write an .mp4"),
-        ((packed, "-o", out, "--view", 2), "there is no camera 2; give --view 0 to 1"),
-        ((packed, "-o", out, "--view", -1), "there is no camera -1"),
-        ((packed, "-o", tmp_path / "a.gif", "--view", 0), "is neither an image nor a video"),
-        ((packed, "-o", out, "--view", 0, "--width", 1), "width is 1; give 2 pixels or more"),
-        ((packed, "-o", out, "--view", 0, "--fps", 9), "--fps is of a video"),
-        ((packed, "-o", out, "--view", 0, "--seconds", 9), "--seconds is the length of a film"),
-        ((packed, "-o", out, "--up", 0, 0, 0), "the up axis has no direction"),
-        ((packed, "-o", tmp_path / "a.mp4", "--camera", few, "--seconds", 9), "--seconds is the length of a film"),
-        ((packed, "-o", tmp_path / "a.mp4", "--seconds", 0), "is impossible; give 1 to 36,000 frames"),
-        ((packed, "-o", tmp_path / "a.mp4", "--fps", "nan"), "--fps is of a video"),
-        ((packed, "-o", out, "--camera", damaged), "damaged.json is not JSON"),
-        ((packed, "-o", out, "--camera", few), "few.json has an empty camera_path"),
-        ((packed, "-o", out, "--camera", tmp_path / "none.json"), "none.json"),
-        ((tmp_path / "none.sundae", "-o", out), "none.sundae"),
-        ((tmp_path / "none", "-o", out), "none does not exist"),
-        ((packed, "-o", damaged / "new" / "a.png"), "damaged.json is no folder; choose another"),
-    ):
-        assert message in refusal(capsys, *words)
-    assert sorted(tmp_path.iterdir()) == before
-    out.write_text("a thesis")
-    assert "--overwrite" in refusal(capsys, packed, "-o", out, "--view", 0)
-    assert out.read_text() == "a thesis"

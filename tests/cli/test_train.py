@@ -101,25 +101,6 @@ def test_what_is_not_given_is_the_method_s_own(commands: Commands) -> None:
     assert re.fullmatch(r"[\d_-]+", name), "its run is found by this name"
 
 
-@pytest.mark.parametrize(
-    ("words", "cause"),
-    [
-        (["scene", "--keep", "0"], "keep is 0.0"),
-        (["scene", "--keep", "1.5"], "keep is 1.5"),
-        (["scene", "--steps", "0"], "steps is 0"),
-        (["scene", "--method", "splatfacto"], "splatfacto is no method of sundae; use one of sundae, "),
-        (["gone"], "gone does not exist"),
-        (["scene", "photos"], "photos is no option; options of ns-train follow a --"),
-        (["scene", "--resume", "--steps", "5"], "leave out --steps or --resume"),
-    ],
-)
-def test_refusals_are_one_line(
-    commands: Commands, capsys: pytest.CaptureFixture[str], words: list[str], cause: str
-) -> None:
-    assert cause in refusal(capsys, *words)
-    assert commands.ran == []
-
-
 def test_further_options_and_the_parser_of_a_capture(commands: Commands) -> None:
     Path("scene/images").mkdir()
     Image.new("RGB", (20, 16), "grey").save("scene/images/0.png")

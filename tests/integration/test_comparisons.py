@@ -44,7 +44,7 @@ def forked_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[st
     """Fork the processes of jobs off one that has imported nerfstudio; their command lines."""
     started: list[list[str]] = []
 
-    def run_logged(words: list[str], log: Path, on_line: Callable[[str], object]) -> None:
+    def run_logged(words: list[str], log: Path, on_line: Callable[[str], object]) -> tuple[int, str]:
         python, option, code, *arguments = words
         assert (python, option) == (sys.executable, "-c")
         (tmp_path / "job.py").write_text(code)
@@ -53,6 +53,7 @@ def forked_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[st
         for line in printed.splitlines():
             on_line(line)
         started.append(words)
+        return 0, printed
 
     monkeypatch.setattr("harness.run.run_logged", run_logged)
     return started

@@ -85,7 +85,7 @@ def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> No
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sundae_ns.cli.run.run_command", start)
-    monkeypatch.setattr("sundae_ns.cli.demo.run_logged", start)
+    monkeypatch.setattr("sundae_ns.cli.demo.run_command", start)
     monkeypatch.setattr("sundae_ns.plugin.distill.CAMERAS", 8)
     monkeypatch.setattr("sundae_ns.cli.train.run_command", start)
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", stop)

@@ -128,7 +128,7 @@ def poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
     asked: list[list[str]] = []
 
-    def only_poses(words: list[str]) -> int:
+    def only_poses(words: list[str], log: Path | None = None) -> int:
         asked.append(words)
         return run_command(words) if words[:2] == ["sundae", "poses"] else 3
 

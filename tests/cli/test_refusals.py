@@ -1,0 +1,177 @@
+"""What each command refuses: one line with the cause and the remedy, before anything is written or started."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from colmap_models import write_model
+from command_line import refusal
+from fake_colmap import FakeColmap
+from run_commands import PHOTOS, photo, write_video
+
+import sundae_ns as sn
+
+REFUSALS = {
+    "fly": "there is no command fly; sundae --help lists them",
+    "reprot": "use report",
+    "demo used": "--overwrite",
+    "demo text.mp4": "text.mp4 is a file; choose another folder",
+    "demo out --steps 0": "steps is 0; give at least 1",
+    "prune nothing.ply -o a.ply": "nothing.ply cannot be read",
+    "prune in.ply -o a.ply --keep 0": "keep is 0.0",
+    "prune in.ply -o a.ply --keep 250%": "keep is 2.5; give a share in (0, 1]",
+    "prune in.ply -o a.splat": "a.splat has no supported suffix",
+    "prune in.ply -o a.ply --keep 0.1 --count 5": "--keep and --count exclude each other",
+    "prune in.ply -o a.ply --keep 0.1 --target-drop 1": "--keep and --target-drop exclude",
+    "prune in.ply -o a.ply --target-drop 0": "target-drop is 0.0; give a positive number of dB",
+    "prune in.ply -o a.ply --target-drop 1 --num-cameras 1": "a target needs two",
+    "prune in.ply -o a.ply --count 0": "count is 0; give 1 or more",
+    "prune none.ply -o a.ply": "none.ply has 5 Gaussians, and none is finite; export it again",
+    "prune empty.ply -o a.ply": "empty.ply has 0 Gaussians, and none is finite; export it again",
+    "prune in.ply -o in.bin/a.ply": "in.bin is no folder",
+    "prune in.ply -o /proc/a.ply": "cannot write to /proc (",
+    "prune a.ksplat -o a.ply": "a.ksplat is not a complete .ksplat (33 bytes are",
+    "prune trained -o a.ply": "trained is a folder of 3DGS; give trained/point_cloud/iter",
+    "distill in.ply -o b.ply": "b.ply cannot hold a head; name it .sundae, or leave the head out with --no-head",
+    "distill in.ply -o b.txt": "b.txt has no supported suffix",
+    "distill in.ply -o b.sundae --keep 10% --count 5": "--keep and --count exclude each other",
+    "distill in.ply -o b.sundae --steps 0": "steps is 0; give 1 or more",
+    "export none.ply -o a.spz": "none.ply has 5 Gaussians, and none is finite; export it again",
+    "export in.ply -o a.splat": "name it .ply or .spz or .sog or .glb",
+    "export in.ply -o in.bin/new/a.sog": "in.bin is no folder",
+    "export in.ply -o a.ply": "in.ply is a .ply already; give an output name that ends in .spz or",
+    "export in.ply -o a.sog --upright": "not in nerfstudio's coordinates",
+    "export in.bin -o a.ply": "in.bin is no .spz; give a .ply",
+    "export nothing.sundae -o a.ply": "nothing.sundae cannot be read",
+    "export a.glb -o a.ply": "a.glb is not a complete .glb with Gaussians",
+    "pack in.sundae -o a.sundae": "in.sundae is a packed scene; give the run that was packed",
+    "pack in.ply -o a.sundae --finetune 9": "in.ply is a .ply file without photos; leave out",
+    "pack in.ply -o a.sundae --target-drop 1": "leave out --target-drop, or give a run",
+    "pack in.ply -o a.sundae --target-drop 1 --remove-floaters": "leave out --remove-floaters",
+    "pack in.ply -o a.sundae --finetune 5 --crop 0 0 0 1 1 1": "leave out --crop",
+    "pack in.ply -o a.sundae --crop 1 1 1 0 0 0": "the box is empty",
+    "pack in.ply -o a.sundae --crop 7 7 7 8 8 8": "no Gaussian is in the box; most of them lie between",
+    "pack gone -o a.sundae": "gone cannot be read",
+    "pack gone -o a.sundae --scale-step 2": "scale-step is 2.0; give 0.0001 to 1",
+    "pack gone -o in.bin/a.sundae": "in.bin is no folder; choose another",
+    "pack gone -o a.sundae --finetune -1": "finetune is -1",
+    "pack gone -o a.sundae --max-cameras -1": "max-cameras is -1",
+    "pack gone -o a.sundae --target-bytes 0": "target-bytes is 0",
+    "pack gone -o a.sundae --target-drop nan": "target-drop is nan",
+    "pack gone -o a.sundae --target-drop 1 --target-bytes 9": "exclude each other",
+    "report a.lcc -o out": "a.lcc is a scene of XGRIDS; convert it to .ply with",
+    "report in.ply -o out": "in.ply is a .ply file; it comes without test views",
+    "report in.ply -o used": "--overwrite",
+    "report in.ply -o . --overwrite": "holds what the command reads",
+    "view a.splat": "a.splat is not a complete .splat (33 bytes are no whole number of Gaussians",
+    "render a.pth -o a.png": "a.pth is a checkpoint of another trainer; give its .ply",
+    "render in.sundae -o a.png": "there are 2 cameras; choose one with --view 0 to 1, or write an .mp4",
+    "render in.sundae -o a.png --view 2": "there is no camera 2; give --view 0 to 1",
+    "render in.sundae -o a.png --view -1": "there is no camera -1",
+    "render in.sundae -o a.gif --view 0": "a.gif has no supported suffix; name it .png",
+    "render in.sundae -o a.png --view 0 --width 1": "width is 1; give at least 2",
+    "render in.sundae -o a.png --view 0 --fps 9": "--fps is of a video",
+    "render in.sundae -o a.png --view 0 --seconds 9": "--seconds is the length of a film",
+    "render in.sundae -o a.png --up 0 0 0": "the up axis has no direction",
+    "render in.sundae -o a.mp4 --camera few.json --seconds 9": "--seconds is the length of a film",
+    "render in.sundae -o a.mp4 --seconds 0": "is impossible; give 1 to 36,000 frames",
+    "render in.sundae -o a.mp4 --fps nan": "--fps is of a video",
+    "render in.sundae -o a.png --camera damaged.json": "damaged.json is not JSON",
+    "render in.sundae -o a.png --camera few.json": "few.json has an empty camera_path",
+    "render in.sundae -o a.png --camera none.json": "none.json",
+    "render none.sundae -o a.png": "none.sundae",
+    "render nothing -o a.png": "nothing does not exist",
+    "render in.sundae -o damaged.json/new/a.png": "damaged.json is no folder; choose another",
+    "train scene --keep 0": "keep is 0.0",
+    "train scene --keep 1.5": "keep is 1.5; give a share in (0, 1], or per cent",
+    "train scene --steps 0": "steps is 0",
+    "train scene --method splatfacto": "splatfacto is no method of sundae; use one of sundae, ",
+    "train gone": "gone does not exist",
+    "train scene -o /proc/runs": "cannot write to /proc (",
+    "train scene photos": "photos is no option; options of ns-train follow a --",
+    "train scene --resume --steps 5": "leave out --steps or --resume",
+    "train scene --resume": "outputs has no unfinished run of sundae on scene; leave out --resume",
+    "poses gone -o out": "gone does not exist; give a folder of photos, or a video",
+    "poses empty -o out": "empty holds no photos",
+    "poses text.mp4 -o out": "text.mp4 is not a video that",
+    "poses photos/0.JPG -o out": "photos/0.JPG is neither a folder of photos nor a video",
+    "poses photos -o used": "used holds files; choose another folder",
+    "poses photos -o text.mp4": "text.mp4 is a file; choose another folder",
+    "poses photos -o photos/capture": "photos/capture lies in photos",
+    "poses photos -o out --frames 2": "frames is 2; give at least 3",
+    "poses photos -o out --masks gone": "gone is no folder of masks",
+    "poses photos -o out --masks empty": "photos/0.JPG has no mask 0.png in empty",
+    "poses walk.mp4 -o out --masks empty": "a video has no masks",
+    "run gone -o out": "gone does not exist; give a folder of photos, a video, or a capture",
+    "run empty -o out": "holds no photos",
+    "run text.mp4 -o out": "text.mp4 is not a video that",
+    "run photos/0.JPG -o out": "photos/0.JPG is neither a folder of photos nor a video",
+    "run photos -o out --frames 2": "frames is 2; give at least 3",
+    "run model -o out": "cameras.bin is not a complete cameras.bin of COLMAP",
+    "run model/sparse/0 -o out": "is a COLMAP model without its images",
+    "run undistorted -o out": "undistorted has no image 0.png, which its model dense/sparse states",
+    "run blender -o out": "blender/transforms_train.json is not JSON",
+    "run photos -o photos/out": "lies in photos",
+    "run photos -o .": "holds what the command reads",
+    "run photos -o used": "used holds files; choose another folder",
+    "run photos -o /proc/a": "cannot write to /proc (",
+    "run photos -o out --keep 2": "keep is 2.0",
+    "run photos -o out --steps 0": "steps is 0",
+    "run photos -o out --max-mb 0": "max-mb is 0; give at least 0.01",
+    "run photos -o out --max-mb 2 --keep 0.1": "--max-mb needs a method that decides",
+    "run photos -o out --quality best --method sundae-fast": "--quality best needs a method that",
+    "run photos -o out --quality draft --steps 9": "a draft has 3,000 steps",
+    "run photos -o out --masks gone": "gone is no folder of masks",
+    "run photos -o out --masks empty": "photos/0.JPG has no mask 0.png in empty",
+}
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with scenes, photos and captures, right and wrong."""
+    folder = tmp_path_factory.mktemp("inputs")
+    points = torch.rand(200, 3)
+    scene = sn.Scene.from_points(points, points)
+    cameras = tuple(sn.Camera.look_at((x, -2, 0.5), (0.5, 0.5, 0.5), width=41, height=31) for x in (0.0, 1.0))
+    sn.save(scene, folder / "in.ply")
+    sn.save(dataclasses.replace(scene, cameras=cameras), folder / "in.sundae")
+    text = (folder / "in.ply").read_bytes()
+    header, values = text.split(b"end_header\n")
+    for name, count in (("none.ply", 5), ("empty.ply", 0)):
+        nan = b"\xff" * (len(values) // 200 * count)
+        (folder / name).write_bytes(header.replace(b"vertex 200", b"vertex %d" % count) + b"end_header\n" + nan)
+    (folder / "in.bin").write_bytes(b"\x1f\x8b\xff")
+    for name in ("a.ksplat", "a.lcc", "a.glb", "a.pth", "a.splat"):
+        (folder / name).write_bytes(bytes(33))
+    (folder / "damaged.json").write_text("{")
+    path = {"render_width": 41, "render_height": 31, "camera_path": []}
+    (folder / "few.json").write_text(json.dumps(path))
+    for name in ("empty", "scene", "photos"):
+        (folder / name).mkdir()
+    for index in range(PHOTOS):
+        photo(folder / f"photos/{index}.JPG")
+    write_video(folder / "walk.mp4", 9)
+    (folder / "text.mp4").write_text("not a video")
+    cloud = "trained/point_cloud/iteration_7/point_cloud.ply"
+    for name in (cloud, "model/sparse/0/cameras.bin", "blender/transforms_train.json", "used/thesis.txt"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    write_model(folder / "undistorted/dense/sparse", ["0.png"], (20, 16))
+    return folder
+
+
+@pytest.mark.parametrize("words", REFUSALS)
+def test_refusals_are_one_line(
+    words: str, inputs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(inputs)
+    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
+    before = sorted(inputs.rglob("*"))
+    assert REFUSALS[words] in refusal(capsys, *shlex.split(words))
+    assert sorted(inputs.rglob("*")) == before
