@@ -11,7 +11,6 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
-from importlib import metadata
 from typing import NoReturn
 
 from sundae_ns.core.errors import ConfigError, SundaeError, writing
@@ -47,7 +46,7 @@ def _dispatch(words: Sequence[str]) -> int:
     """Run the command that the words name; its exit code."""
     name, *options = words or ["help"]
     if name in ("--version", "-V", "version"):
-        print(f"sundae_ns {metadata.version('sundae_ns')}")
+        print(f"sundae_ns {sys.modules['sundae_ns'].__version__}")
         return 0
     if name in ("help", "-h", "--help") and not options:
         print("usage: sundae COMMAND ...\n\nSmall 3D Gaussian scenes by pruning and a compensation head.\n")

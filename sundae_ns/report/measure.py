@@ -23,12 +23,9 @@ from sundae_ns.scene.render import compensate, draw, scale_plan
 class FrameTimes(NamedTuple):
     """Synchronised milliseconds of a frame, median over repeated renders."""
 
-    frame: float
-    """The whole image as nerfstudio's commands request it: camera, colours, splatting of colours and features, head."""
-    splat: float
-    """The same without head and features."""
-    head: float
-    """The head alone; 0 if it does not run. Its second splatting pass at another scale counts in ``frame`` only."""
+    frame: float  # As nerfstudio's commands request it: camera, colours, splatting of colours and features, head
+    splat: float  # The same without head and features
+    head: float  # Alone; 0 if it does not run. Its second splatting pass at another scale counts in ``frame`` only
 
 
 @contextmanager
@@ -43,13 +40,7 @@ def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
 
 @torch.no_grad()
 def frame_times(model: SundaeModel, camera: Any, *, warmup: int = 3, repeats: int = 5) -> FrameTimes:
-    """Time the rendering of a camera of shape ``(1,)`` at its own resolution.
-
-    Args:
-        model: in evaluation mode, on the device to time.
-        warmup: number of untimed renders.
-        repeats: number of timed renders.
-    """
+    """Time ``repeats`` renders of a camera of shape ``(1,)`` by a model in evaluation mode, after ``warmup`` others."""
     milliseconds = partial(median_ms, device=model.device, warmup=warmup, repeats=repeats)
     with compensation(model, True):
         frame = milliseconds(lambda: model.get_outputs_for_camera(camera)["rgb"])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import html
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from io import StringIO
@@ -43,15 +45,10 @@ COLUMNS = (
 class Configuration:
     """One configuration of rendering a scene. ``ms`` and ``views`` come from the same calls with the same arguments."""
 
-    name: str
-    """``head on`` or ``head off``; a scene without a head has only the latter."""
-    ms: float | None
-    """Synchronised milliseconds per frame, median over the test views; None if not timed."""
-    bytes: int
-    """Bytes in fp32 that this configuration needs: without the head, neither network nor features. For a packed scene,
-    the size of the file."""
+    name: str  # HEAD_ON or HEAD_OFF; a scene without a head has only the latter
+    ms: float | None  # Synchronised milliseconds per frame, median over the test views; None if not timed
+    bytes: int  # In fp32, without head and features where they are off; of the file for a packed scene
     views: tuple[ViewQuality, ...]
-    """Metrics by test view."""
 
     def mean(self, metric: str) -> float | None:
         """Mean of a metric over the test views; None unless every view has it."""
@@ -64,35 +61,27 @@ class Configuration:
 class Measured:
     """A finished scene with its measurements."""
 
-    label: str
-    """Name in tables and plots, unique in a report."""
-    source: str
-    """The file or folder that was opened."""
+    label: str  # In tables and plots, unique in a report
+    source: str  # File or folder that was opened
     scene: str
     method: str
     variant: str
     keep_ratio: float | None
-    seed: int | None
-    """None if the file does not record it."""
+    seed: int | None  # None if the file does not record it
     steps: int
     primitives: int
     bytes_primitives: int
     bytes_head: int
-    resolution: str
-    """Width x height, pixels."""
-    configurations: tuple[Configuration, ...]
-    """With the head, if the scene has one, then without it."""
-    ms_head: float | None = None
-    """Milliseconds of the head alone; 0 without a head."""
-    precision: str = ""
-    """Arithmetic of the head; empty without one."""
+    resolution: str  # Width x height, pixels
+    configurations: tuple[Configuration, ...]  # With the head, if the scene has one, then without it
+    ms_head: float | None = None  # Milliseconds of the head alone; 0 without a head
+    precision: str = ""  # Arithmetic of the head; empty without one
     lpips_net: str = ""
     train_s: float | None = None
     prune_s: float | None = None
     peak_primitives: int | None = None
     peak_vram_mib: float | None = None
-    gpu: str = ""
-    """Name of the GPU that rendered; empty for a CPU."""
+    gpu: str = ""  # Name of the GPU that rendered; empty for a CPU
     command: str = ""
 
     @property
@@ -148,10 +137,18 @@ def rows_of(runs: Sequence[Measured]) -> list[list[str]]:
 
 
 def markdown(scenes: Mapping[str, Sequence[Measured]], notes: Sequence[str]) -> str:
-    """The table of each scene, and what was left out, as a Markdown page."""
+    """The table of each scene, and what was left out, as a Markdown page; names stay text."""
     heads = heads_of([run for runs in scenes.values() for run in runs])
-    parts = [f"# {scene}\n\n" + "\n".join(table(heads, rows_of(runs))) for scene, runs in scenes.items()]
-    return "\n\n".join([*parts, *(f"- Left out: {note}" for note in notes)]) + "\n"
+    parts = []
+    for scene, runs in scenes.items():
+        rows = [[_plain(cell) for cell in row] for row in rows_of(runs)]
+        parts.append(f"# {_plain(scene)}\n\n" + "\n".join(table(heads, rows)))
+    return "\n\n".join([*parts, *(f"- Left out: {_plain(note)}" for note in notes)]) + "\n"
+
+
+def _plain(text: str) -> str:
+    """Text of one line in which Markdown and HTML mark nothing."""
+    return re.sub(r"([\\`*\[\]|~])", r"\\\1", html.escape(" ".join(text.split()), quote=False))
 
 
 def csv_text(runs: Sequence[Mapping[str, Any]]) -> str:

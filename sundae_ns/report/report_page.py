@@ -50,20 +50,14 @@ _NAMES = {"psnr": "PSNR", "psnr_fitted": "colours fitted", "ssim": "SSIM", "flip
 class ShownView:
     """One test view in a page. Images are addresses with their data (``data:``), and all of one size."""
 
-    index: int
-    """In the order of the capture, from 0."""
-    name: str
-    """Name of the photo's file."""
-    size: tuple[int, int]
-    """Width and height of the measured photo, pixels."""
-    shown: tuple[int, int]
-    """Width and height of the images here."""
+    index: int  # In the order of the capture, from 0
+    name: str  # Of the photo's file
+    size: tuple[int, int]  # Width and height of the measured photo, pixels
+    shown: tuple[int, int]  # Width and height of the images here
     full: ViewQuality
-    base: ViewQuality | None
-    """Without the head; None if there is no head."""
+    base: ViewQuality | None  # Without the head; None if there is no head
     photo: str
-    images: Mapping[str, str]
-    """Images over the photo: ``rendering``, ``head off`` if there is a head, and ``error map``."""
+    images: Mapping[str, str]  # Over the photo: ``rendering``, ``head off`` if there is a head, ``error map``
 
 
 @dataclass(frozen=True)
@@ -71,12 +65,9 @@ class ShownRun:
     """A run in a page."""
 
     measured: Measured
-    views: Sequence[ShownView]
-    """In the order of the capture."""
-    curve: CountCurve | None = None
-    """Expected quality over the number of Gaussians; None if no trials decided about it."""
-    capture: str = ""
-    """Identifies the capture: views of one index and name compare between runs of one capture."""
+    views: Sequence[ShownView]  # In the order of the capture
+    curve: CountCurve | None = None  # Expected quality over the number of Gaussians; None if no trials decided about it
+    capture: str = ""  # Identifies the capture: views of one index and name compare between runs of one capture
 
 
 def choose_cameras(qualities: Sequence[float], most: int) -> list[int]:

@@ -85,6 +85,13 @@ def test_each_configuration_has_a_row_of_the_table(measured: Callable[..., Measu
     assert number(1234.567, 1) == "1,234.6"
 
 
+def test_names_stay_text_in_markdown(measured: Callable[..., Measured]) -> None:
+    hostile = "<script>a|b`c\n# d*[e](f)"
+    text = markdown({hostile: [measured(hostile)]}, [hostile])
+    assert text.count("&lt;script&gt;a\\|b\\`c # d\\*\\[e\\](f)") == 4
+    assert len(text.splitlines()) == len(markdown({"a": [measured()]}, ["a"]).splitlines())
+
+
 POINT: dict[str, Any] = {"count": 200, "bytes": None, "psnr": 30.0, "ssim": 0.91, "psnr_loss": 0.25, "ssim_loss": 0.0}
 POINT |= {"psnr_error": 0.02, "ssim_error": 0.0005}
 COUNT: dict[str, Any] = {"chosen": 240, "full": 1000, "reason": "the fewest that are as good", "curve": [POINT]}
