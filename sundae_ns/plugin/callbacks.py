@@ -26,9 +26,7 @@ from sundae_ns.train.state import Callback, Photo, TrainingState
 class NerfstudioRun:
     """A training by nerfstudio's trainer, as its callbacks see it.
 
-    Args:
-        model: a ``SundaeModel``, which imports this module.
-        attributes: of nerfstudio's callbacks. Trainer and pipeline may be missing, as in a test.
+    The model is a ``SundaeModel``, which imports this module. Trainer and pipeline may be missing, as in a test.
     """
 
     def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
@@ -60,11 +58,6 @@ class NerfstudioRun:
     @property
     def _datamanager(self) -> SundaeDatamanager:
         return cast(SundaeDatamanager, self._pipeline.datamanager)
-
-    @property
-    def num_heldout(self) -> int:
-        """Number of held-out training views."""
-        return len(self._datamanager.holdout_indices)
 
     def view_indices(self) -> list[int]:
         """Indices of the training views."""
@@ -119,8 +112,7 @@ class NerfstudioRun:
     def start(self) -> list[TrainingCallback]:
         """Hand the optimizers to the state, take over records, and let our callbacks check the run.
 
-        Returns:
-            nerfstudio's callbacks, which set the step, call ours after each step, and let them report at the end.
+        nerfstudio's callbacks set the step, call ours after each step, and let them report at the end.
         """
         assert self._optimizers is not None
         self.state.optimizers, self.state.schedulers = self._optimizers.optimizers, self._optimizers.schedulers
@@ -154,29 +146,22 @@ class NerfstudioRun:
             self._optimizers.parameters[name] = [value]
 
     def _finish(self, step: int) -> None:
+        """Let callbacks report, then print quality, size and the next command."""
         with self._ranks.whole() as first:
             if first:
                 for callback in self.model.train_callbacks:
                     callback.finish(self)
-                if self.folder is not None:
-                    self._summarize(self.folder)
+            if self.folder is not None:
+                head = self.state.head if self.state.head_enabled else None
+                size = bytes_of(self.state.gaussians) + (0 if head is None else bytes_of_module(head))
+                with_head = f"{'without' if head is None else 'with'} a head"
+                lines = [f"{self.source.total:,} Gaussians, {with_head}: {size / 1e6:.2f} MB before packing"]
+                lines += [f"next: {shlex.join(['sundae', 'pack', str(self.folder), '-o', 'scene.sundae'])}"]
+                if self.model.config.evaluate_prune and (results := self.evaluate()):
+                    quality = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
+                    lines.insert(0, f"trained: {quality} on {len(self._datamanager.eval_dataset)} test views")
+                CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
         writer.write_out_storage()
-
-    def _summarize(self, folder: Path) -> None:
-        """Print quality, size and the next command."""
-        results = self.evaluate() if self.model.config.evaluate_prune else {}
-        if results:
-            quality = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
-            _say(f"trained: {quality} on {len(self._datamanager.eval_dataset)} test views")
-        head = self.state.head if self.state.head_enabled else None
-        size = bytes_of(self.state.gaussians) + (0 if head is None else bytes_of_module(head))
-        with_head = f"{'without' if head is None else 'with'} a head"
-        _say(f"{self.source.total:,} Gaussians, {with_head}: {size / 1e6:.2f} MB before packing")
-        _say(f"next: {shlex.join(['sundae', 'pack', str(folder), '-o', 'scene.sundae'])}")
-
-
-def _say(line: str) -> None:
-    CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def training_views(model: Any, datamanager: SundaeDatamanager) -> list[TrainingCamera]:

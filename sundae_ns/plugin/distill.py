@@ -44,16 +44,9 @@ CAMERAS, HELD_OUT = 256, 16  # Virtual cameras that the steps begin from, and mo
 
 
 class Distillation:
-    """The training of a pruned scene on the images of a full one.
+    """The training of a pruned scene on the images of a full one; arguments and errors as :func:`distill`.
 
-    Args:
-        teacher: the full scene; its own head, if it has one, corrects its images.
-        keep, count, cameras, steps, seed, head, size: as in :func:`distill`.
-        progress: whether the prune shows a progress bar.
-
-    Raises:
-        ConfigError: an option is out of range.
-        DataError: the scene cannot be seen.
+    ``progress`` says whether the prune shows a progress bar.
     """
 
     def __init__(
@@ -74,6 +67,7 @@ class Distillation:
             raise ConfigError(f"steps is {steps}; give 1 or more")
         if keep is None and count is None:
             keep = 0.1
+        # Its own head, if it has one, corrects its images.
         teacher = dataclasses.replace(teacher, gaussians=sanitise(teacher.gaussians).gaussians)
         side = size or by_device(SIDES, teacher.device)
         if cameras:
@@ -126,16 +120,9 @@ class Distillation:
         )
 
     def train(self, after_step: Callable[[int, int], bool]) -> bool:
-        """Decide on the head, if that is due, and train the steps that are left.
+        """Decide on the head, if that is due, and train the steps that are left; whether all steps were trained.
 
-        Args:
-            after_step: called after each step with the number of steps so far and of all; False stops.
-
-        Returns:
-            Whether all steps were trained.
-
-        Raises:
-            MemoryExhaustedError: the GPU's memory is full.
+        ``after_step`` is called after each step with the number of steps so far and of all; False stops.
         """
         # Each of both trials, without and with a head, takes a tenth of the steps.
         trial = max(round(0.1 * self.steps), 1) if self.state.head is not None and self.gain is None else 0
@@ -247,11 +234,7 @@ class Distillation:
             torch.save(content, partial)
 
     def load(self, path: Path) -> None:
-        """Continue from a file of :meth:`save`.
-
-        Raises:
-            CheckpointError: it is damaged, or was written with other options or for another scene.
-        """
+        """Continue from a file of :meth:`save`; ``CheckpointError`` if it is damaged, or of other options or scene."""
         state = self.state
         try:
             with reading(path, "a checkpoint", CheckpointError):

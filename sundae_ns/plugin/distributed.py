@@ -20,7 +20,7 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from types import FrameType
 from typing import Any
@@ -306,16 +306,9 @@ class Ranks:
         state.pruning["peak"] = max(state.pruning["peak"], sum(peaks))
         if lows := [span for span in spans if span is not None]:
             state.trained_focal = min(low for low, _ in lows), max(high for _, high in lows)
-
-        def gathered(rows: Tensor) -> Tensor:
-            rows = rows.contiguous()
-            if self.rank == 0:
-                others = [_received(rows, size, rank) for rank, size in enumerate(self.sharded.sizes) if rank > 0]
-                return torch.cat([rows, *others])
-            _send(rows, 0)
-            return rows
-
-        self._change_rows(gathered)
+        nothing = [0] * self.count
+        received = self.sharded.sizes if self.rank == 0 else nothing
+        self._change_rows([own[0], *nothing[1:]], received, waits=self.rank > 0)
         self._model.source = GaussianSource(state.gaussians)
 
     def _scatter(self) -> None:
@@ -324,23 +317,25 @@ class Ranks:
         total, pruning = _announced((state.gaussians.num_gaussians, dict(state.pruning)))
         state.pruning.update(pruning)
         bounds = [total * rank // self.count for rank in range(self.count + 1)]
-        self.sharded.sizes = [end - start for start, end in pairwise(bounds)]
-
-        def scattered(rows: Tensor) -> Tensor:
-            if self.rank > 0:
-                return _received(rows, self.sharded.sizes[self.rank], 0)
-            for rank in range(1, self.count):
-                _send(rows[bounds[rank] : bounds[rank + 1]], rank)
-            return rows[: bounds[1]].clone()
-
-        self._change_rows(scattered)
+        self.sharded.sizes, nothing = [end - start for start, end in pairwise(bounds)], [0] * self.count
+        sent = self.sharded.sizes if self.rank == 0 else nothing
+        self._change_rows(sent, [self.sharded.sizes[self.rank], *nothing[1:]])
         for value in [] if state.head is None else [*state.head.parameters(), *state.head.buffers()]:
             dist.broadcast(value.data, 0)
         self._model.source = self.sharded
 
-    def _change_rows(self, change: Callable[[Tensor], Tensor]) -> None:
-        """Replace the tensors with a row a Gaussian (parameters, moments, statistics), in an order that ranks share."""
+    def _change_rows(self, sent: list[int], received: list[int], *, waits: bool = False) -> None:
+        """Send rows of the tensors with one a Gaussian (parameters, moments, statistics), in an order that ranks share.
+
+        This rank keeps the rows that it ``received`` from each rank; all of its own if it ``waits``.
+        """
         state: TrainingState = self._model.state
+
+        def change(rows: Tensor) -> Tensor:
+            arrived = rows.new_empty(sum(received), *rows.shape[1:])
+            dist.all_to_all_single(arrived, rows[: sum(sent)].contiguous(), received, sent)
+            return rows if waits else arrived
+
         n, running = state.gaussians.num_gaussians, state.densification
         for name in list(state.gaussians):
             change_parameter(state.gaussians.data, state.optimizers, name, change)
@@ -353,18 +348,6 @@ def _announced(value: Any) -> Any:
     box = [value]
     dist.broadcast_object_list(box, src=0)
     return box[0]
-
-
-def _send(rows: Tensor, rank: int) -> None:
-    if len(rows):
-        dist.send(rows.contiguous(), rank)
-
-
-def _received(like: Tensor, size: int, rank: int) -> Tensor:
-    rows = like.new_empty(size, *like.shape[1:])
-    if size:
-        dist.recv(rows, rank)
-    return rows
 
 
 def _summed(values: Tensor, how: Any = dist.ReduceOp.SUM) -> Tensor:

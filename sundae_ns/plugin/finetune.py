@@ -29,15 +29,8 @@ from sundae_ns.train.graphed_step import StepRecordings
 from sundae_ns.train.schedules import NETWORK_BETAS
 from sundae_ns.train.step import StepInputs, StepResult, training_step
 
-RATES = {
-    "features_dc": 5e-4,
-    "features_rest": 1e-4,
-    "opacities": 1e-2,
-    "scales": 1e-3,
-    "quats": 2e-4,
-    "features": 5e-4,
-    "head": 2e-4,
-}
+RATES = {"features_dc": 5e-4, "features_rest": 1e-4, "opacities": 1e-2, "scales": 1e-3}
+RATES |= {"quats": 2e-4, "features": 5e-4, "head": 2e-4}
 """Peak rates of Adam, about a fifth of the initial rates of a run. Positions are rounded once and fixed: at the end of
 training they hardly move."""
 RATE = 0.025  # Loss for each bit per stored number: about what a bit less costs in quality at the steps of FINETUNED
@@ -56,21 +49,18 @@ def finetune(
     """Train the Gaussians and head of a run with the rounding of its pack in the loop. The run is only read.
 
     Args:
-        run: folder of a run of sundae or splatfacto, or its ``config.yml``.
+        run, data: as in :func:`load_model`, with its errors.
         scene: the same run, from ``scene.packing.contents_of``.
         config: bits of the pack.
         steps: number of steps, at least 1.
         rate: added to the loss for each bit per stored number.
-        data: the capture, if it has moved.
         progress: called after each step with its loss ``[]``, which the next step overwrites.
 
     Returns:
         The trained scene, and its codecs for ``write_fitted``.
 
     Raises:
-        ConfigError: an option cannot work.
-        CheckpointError: the run still densifies, or cannot be opened.
-        DataError: its capture is missing, or cannot be used.
+        CheckpointError: the run still densifies.
         MemoryExhaustedError: the GPU's memory is full.
     """
     if steps < 1:
@@ -118,11 +108,7 @@ def finetune(
 class RoundedTraining:
     """Adam on exact values, by gradients at the rounded values that the parameters of a model hold.
 
-    Args:
-        model: with the scene of the codecs.
-        codecs: on the device of the model.
-        rate: see :func:`finetune`.
-        head: whether the pack has a head.
+    The codecs are those of the model's scene, on its device; ``head`` says whether the pack has a head.
     """
 
     def __init__(self, model: SundaeModel, codecs: Codecs, rate: float, *, head: bool) -> None:

@@ -149,11 +149,7 @@ class SundaeModel(SplatfactoModel):
 
     @cached_property
     def backend(self) -> Backend:
-        """The rasteriser, chosen once the device is known.
-
-        Raises:
-            BackendError: ``gsplat`` was asked for and cannot run here.
-        """
+        """The rasteriser, chosen once the device is known; ``BackendError`` if it was asked for and cannot run here."""
         return select_backend(self.config.rasterizer, self.device)
 
     def get_gaussian_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
@@ -220,12 +216,8 @@ class SundaeModel(SplatfactoModel):
 
     def render_settings(self, *, training: bool) -> RenderSettings:
         """Settings of images at this step."""
-        return self.state.render_settings(
-            self.backend,
-            antialiased=self.config.rasterize_mode == "antialiased",
-            training=training,
-            absgrad=self.config.use_absgrad,
-        )
+        antialiased, absgrad = self.config.rasterize_mode == "antialiased", self.config.use_absgrad
+        return self.state.render_settings(self.backend, antialiased=antialiased, training=training, absgrad=absgrad)
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]
@@ -236,14 +228,9 @@ class SundaeModel(SplatfactoModel):
         return self.get_outputs(camera)
 
     def get_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:  # type: ignore[override]
-        """Render a camera.
+        """Render a camera of shape ``(1,)``: ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``.
 
-        Args:
-            camera: of shape ``(1,)``.
-
-        Returns:
-            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``window``, the
-            crop that the images show, or None. See ``scene.frames.late_outputs`` for those outside of training.
+        In training also ``window``, the crop that the images show, or None; else see ``scene.frames.late_outputs``.
         """
         with naming_full_memory(lambda: self.num_points):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
@@ -265,14 +252,12 @@ class SundaeModel(SplatfactoModel):
         if visible is None:
             return empty_outputs(camera.width, camera.height, background)
         settings = self.render_settings(training=False)
-        splattable = settings.head is not None
-        if not visible.compensate:
-            settings = settings.without_head()
-        images = self._replay.render(visible.source, camera, background, settings)
+        compensated = settings if visible.compensate else settings.without_head()
+        images = self._replay.render(visible.source, camera, background, compensated)
         whole = self.state.gaussians.replaced({})
         drawn = whole if visible.mask is None else visible.source.gaussians
         values = partial(self._response.values, whole, self.viewer_controls.gaussians_key, self.config.pruning)
-        late = late_outputs(images, drawn, whole, visible.mask, camera, settings, values, splattable=splattable)
+        late = late_outputs(images, drawn, whole, visible.mask, camera, settings, values)
         late["background"] = background.expand(camera.height, camera.width, 3)
         return late
 
@@ -327,17 +312,13 @@ class SundaeModel(SplatfactoModel):
 
     # --------------------------------------------------------------------------------------------- losses and metrics
 
-    def get_gt_img(self, image: Tensor, downscale: int | None = None) -> Tensor:
-        """The true image as floats on the model's device; by default at the resolution of this step."""
-        image = image.float() / 255 if image.dtype == torch.uint8 else image
-        factor = self._get_downscale_factor() if downscale is None else downscale
-        smaller: Tensor = image if factor == 1 else resize_image(image, factor)
-        return smaller.to(self.device)
-
     def truth(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
         """The true image of outputs, over their background ``[H, W, 3]``; by default at the resolution of this step."""
-        truth = crop_image(self.get_gt_img(batch["image"], downscale), outputs.get("window"))
-        return self.composite_with_background(truth, outputs["background"])
+        image, factor = batch["image"], self._get_downscale_factor() if downscale is None else downscale
+        image = image.float() / 255 if image.dtype == torch.uint8 else image
+        image = image if factor == 1 else resize_image(image, factor)
+        image = crop_image(image.to(self.device), outputs.get("window"))
+        return self.composite_with_background(image, outputs["background"])
 
     def target(self, batch: dict[str, Any], outputs: Mapping[str, Any]) -> Tensor:
         """What outputs are compared with: the truth, in training divided by the gain of its photo ``[H, W, 3]``."""

@@ -75,8 +75,7 @@ class Search:
 
     Args:
         scene: exact, or fine-tuned with the rounding of codecs.
-        fit: the options at the factor 1, or the codecs of the fine-tune. It trained with their grids and bases, which
-            no factor changes: others would only add an error.
+        fit: the options at the factor 1, or the codecs of the fine-tune, whose grids and bases no factor changes.
         judge: opens the run's test views when they are first needed.
     """
 
@@ -108,8 +107,7 @@ class Search:
     def smaller_than(self, limit: int) -> Candidate:
         """The finest pack of at most ``limit`` bytes; that at the factor 1 if it fits too and, by chance, loses less.
 
-        Raises:
-            PackError: even the coarsest is larger.
+        ``PackError`` if even the coarsest is larger.
         """
         coarsest = self.at(COARSEST)
         if coarsest.bytes > limit:
@@ -128,9 +126,7 @@ class Search:
     def better_than(self, limit: float) -> Candidate:
         """The coarsest pack that loses at most ``limit`` dB, no larger than that at the factor 1 if this one fits.
 
-        Raises:
-            PackError: even the finest loses more.
-            DataError: the capture is missing, or cannot be used.
+        ``PackError`` if even the finest loses more.
         """
 
         def fits(candidate: Candidate) -> bool:
@@ -140,11 +136,11 @@ class Search:
             coarsest = self._bisected(fits, self.default, 0.0, COARSEST)
             return min(self.default, coarsest, key=lambda candidate: candidate.bytes)
         finest = self.at(FINEST)
-        if fits(finest):
-            return self._bisected(fits, finest, FINEST, 0.0)
-        raise PackError(
-            f"the finest pack loses {self.drop(finest):.3f} dB at {finest.bytes:,} bytes; give a larger --target-drop"
-        )
+        if (drop := self.drop(finest)) > limit:
+            raise PackError(
+                f"the finest pack loses {drop:.3f} dB at {finest.bytes:,} bytes; give a larger --target-drop"
+            )
+        return self._bisected(fits, finest, FINEST, 0.0)
 
     def _bisected(self, fits: Callable[[Candidate], bool], best: Candidate, first: float, last: float) -> Candidate:
         """The fitting pack nearest to ``last``, from a fitting one at ``first``."""
@@ -161,22 +157,16 @@ class Search:
 def best_pack(searches: Sequence[Search], *, most_bytes: int | None = None, most_drop: float = 0.0) -> Candidate:
     """The pack that loses least in at most ``most_bytes``, or else the smallest that loses at most ``most_drop`` dB.
 
-    Args:
-        searches: of one run, the preferred one last.
-        most_bytes: limit of the size; None for one of the quality.
-        most_drop: limit of the loss of PSNR on the test views.
-
-    Raises:
-        PackError: no search meets the limit.
+    The searches are of one run, the preferred one last; ``PackError`` if none meets the limit.
     """
-    packs, failure = list[tuple[Search, Candidate]](), None
+    packs, failure = list[tuple[Search, Candidate]](), PackError("there is no pack")
     for search in searches if most_bytes is not None else reversed(searches):
         try:
             pack = search.better_than(most_drop) if most_bytes is None else search.smaller_than(most_bytes)
             packs.append((search, pack))
         except PackError as error:
             failure = error
-    if failure is not None and not packs:
+    if not packs:
         raise failure
     if most_bytes is None:
         return min((pack for _, pack in packs), key=lambda pack: pack.bytes)

@@ -22,7 +22,7 @@ from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
-from sundae_ns.core.errors import NOTHING_SAVED, CheckpointError, StorageError, SundaeError, one_line
+from sundae_ns.core.errors import NOTHING_SAVED, CheckpointError, SundaeError, one_line
 from sundae_ns.core.files import write_text, writing
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io import checkpoint, run_folder
@@ -101,10 +101,8 @@ class SundaeTrainerConfig(TrainerConfig):
             distributed.check_machine(self.machine.num_devices, self.machine.device_type)
             distributed.check_options(self)
         path = self.get_base_dir() / "config.yml"
-        try:
+        with writing(f"cannot make {path.parent} for --output-dir"):
             path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(f"cannot make {path.parent} ({error.strerror}); choose another --output-dir") from error
         run_folder.reserve(path.parent)
         CONSOLE.log(f"Saving config to: {path}")
         write_text(path, yaml.dump(self))

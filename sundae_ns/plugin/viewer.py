@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple, get_args
@@ -73,21 +72,6 @@ class Visible(NamedTuple):
     compensate: bool  # Whether the head may correct the image
 
 
-class _GaussiansVersion:
-    """Identifies Gaussians without keeping them alive: exactly, or to within a hundred steps in training."""
-
-    def __init__(self, state: TrainingState, training: bool) -> None:
-        values = list(state.gaussians.values())
-        self._parameters = [weakref.ref(value) for value in values]  # surgery makes new parameters
-        # Each change in place raises a tensor's version, in training at every step; there, count steps instead.
-        steps = [state.step // 100] if training else [value._version for value in values]
-        self._version = [state.gaussians.num_gaussians, *steps]
-
-    def matches(self, other: _GaussiansVersion) -> bool:
-        pairs = zip(self._parameters, other._parameters)
-        return self._version == other._version and all(mine() is not None and mine() is its() for mine, its in pairs)
-
-
 class ViewerControls(torch.nn.Module):
     """The controls, and what the preview has computed of the present Gaussians.
 
@@ -97,7 +81,7 @@ class ViewerControls(torch.nn.Module):
         state: of the model.
         configured: the rule of the run's prune.
         contribute: computes contributions.
-        curve: the curve by which trials have chosen the number of Gaussians; empty without them.
+        curve: gives the curve by which trials have chosen the number of Gaussians; empty without them.
     """
 
     def __init__(
@@ -119,7 +103,7 @@ class ViewerControls(torch.nn.Module):
         self.training_gaussians = False  # Whether a trainer changes the field
         self._state, self._configured, self._contribute, self._curve = state, configured, contribute, curve
         self._lock = threading.Lock()
-        self._seen: _GaussiansVersion | None = None
+        self._previewed: tuple[int, ...] = ()  # Of the Gaussians that were previewed
         self._graphs: dict[str, NeighborGraph] = {}
         self._contributions: dict[int | None, Tensor] = {}
         self._previews: dict[tuple[str, float], Pruned | None] = {}
@@ -169,10 +153,15 @@ class ViewerControls(torch.nn.Module):
         if ratio >= 1 or not in_viewer():
             return None
         with self._lock:
-            version = _GaussiansVersion(self._state, self.training_gaussians)
-            if self._seen is None or not self._seen.matches(version):
-                self._seen = version
-                self._graphs, self._contributions, self._previews = {}, {}, {}
+            state = self._state
+            # Each change in place raises a tensor's version, in training at every step; there, count steps instead.
+            counts = (value._version for value in state.gaussians.values())
+            version = (
+                *(state.gaussians.num_gaussians, state.pruning["num_prunes"], state.restored),
+                *((state.step // 100,) if self.training_gaussians else counts),
+            )
+            if version != self._previewed:
+                self._previewed, self._graphs, self._contributions, self._previews = version, {}, {}, {}
             if (name, ratio) not in self._previews:
                 pruned: Pruned | None = None
                 try:

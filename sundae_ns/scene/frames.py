@@ -95,8 +95,6 @@ def late_outputs(
     camera: Camera,
     settings: RenderSettings,
     values: Callable[[], Tensor | None],
-    *,
-    splattable: bool,
 ) -> LazyOutputs:
     """All outputs but the background; ``depth``, ``features`` and ``response`` are computed on access.
 
@@ -106,8 +104,8 @@ def late_outputs(
         images: ``rgb``, ``base_rgb`` and ``accumulation`` of the Gaussians ``drawn``.
         gaussians: all Gaussians. Both are kept, so their mappings must not change.
         mask: the Gaussians that were drawn, bool ``[N]``; None for all.
+        settings: without a head, the image of features is black.
         values: gives the response of all Gaussians, in [0, 1] ``[N]``, or None.
-        splattable: whether there are features that this process can splat; otherwise their image is black.
     """
     alpha = images["accumulation"]
 
@@ -117,7 +115,7 @@ def late_outputs(
         return fill_depth(splatted, alpha)
 
     def features() -> Tensor:
-        if not splattable:
+        if settings.head is None:
             return alpha.new_zeros(*alpha.shape[:2], 3)
         image = splat(drawn, camera, drawn[FEATURES], settings).colors
         return feature_colors(image, *principal_components(gaussians[FEATURES]), alpha)

@@ -41,7 +41,7 @@ def curve(monkeypatch: pytest.MonkeyPatch) -> Curve:
         decibels: Callable[[int], float], similarity: Callable[[int], float] = lambda _: 0.5, held_out: int = 2
     ) -> None:
         def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
-            assert run.num_heldout == held_out
+            assert len(list(run.heldout_views())) == held_out
             return [HeldOutQuality(576, decibels(run.state.step), similarity(run.state.step))]
 
         monkeypatch.setattr(trials, "measure_heldout", measured)

@@ -181,7 +181,7 @@ def test_config_in_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
     )
     (tmp_path / "file").write_text("")
     config.output_dir = tmp_path / "file"
-    with pytest.raises(StorageError, match="cannot make .*--output-dir"):
+    with pytest.raises(StorageError, match="cannot make .*--output-dir: a file stands where a folder should be"):
         config.save_config()
 
 
