@@ -39,4 +39,4 @@ class Sizes(NamedTuple):
     @property
     def total(self) -> int:
         """Bytes of both."""
-        return self.primitives + self.head
+        return sum(self)

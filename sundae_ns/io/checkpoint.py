@@ -6,19 +6,20 @@ A checkpoint is a zip archive of ``torch.save``, as nerfstudio writes it:
     data/N     bytes of tensor N, stored, not deflated
 
 ``pipeline`` has the tensors by ``_model.gauss_params.NAME`` and ``_model.networks.head.NAME``, and
-``_model._extra_state``, see :func:`extra_state`. Files are read weights-only, so that no code of theirs runs, and only
-after their checksums were verified.
+``_model._extra_state``, see :func:`extra_state`. No code of files runs; their checksums are verified first.
 """
 
 from __future__ import annotations
 
 import os
-import pickle
+import pickletools
 import random
 import re
 import zipfile
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
+from encodings import normalize_encoding
+from encodings.aliases import aliases
 from numbers import Integral
 from pathlib import Path
 from typing import Any, BinaryIO, get_args
@@ -36,8 +37,13 @@ _NO_CLOCK = "the checkpoint does not say where training stopped; give another"
 FORMAT = 2
 _PREFIX = "gauss_params."
 _NAME = re.compile(r"step-(\d+)\.ckpt")
-_PARTIAL = "partial--1.{}.tmp"
-"""Name of an unfinished checkpoint of a process; nerfstudio, which parses a step from every name, reads -1."""
+# What pickles of tensors name; torch's own list has makers of gigabytes from a number, such as bytearray.
+_MADE = re.compile(
+    r"torch (?!\w*Tensor$)\w+|torch\._utils _rebuild_(tensor_v2|parameter)|collections OrderedDict"
+    r"|numpy dtype|numpy\._?core\.multiarray scalar|_codecs encode"
+)
+_CODECS = {"hex_codec", "base64_codec", "quopri_codec", "uu_codec", "punycode", "idna"}  # that grow, or take long
+_PARTIAL = "partial--1.{}.tmp"  # unfinished; nerfstudio, which parses a step from every name, reads -1
 
 
 def checkpoints(folder: Path) -> list[Path]:
@@ -88,22 +94,16 @@ def _compact(value: Any) -> Any:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a checkpoint of nerfstudio's trainer on the CPU, without running code from it.
-
-    Raises:
-        CheckpointError: the file is missing, damaged, cut short, or of another kind.
-    """
+    """A checkpoint of nerfstudio's trainer, on the CPU. No code in it runs; ``CheckpointError`` if it is bad."""
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist; give a .ckpt file, or the folder of them")
     with _naming(path), path.open("rb") as file:
-        if (damage := damage_of(file)) is not None:
-            raise ValueError(damage)
+        check_whole(file)
         return _loaded(file)
 
 
 def _naming(path: Path) -> AbstractContextManager[None]:
-    another = "give another file"
-    return reading(path, "a nerfstudio checkpoint", CheckpointError, remedy=another, missing=another)
+    return reading(path, "a nerfstudio checkpoint", CheckpointError, remedy="give another file")
 
 
 def _loaded(file: BinaryIO) -> dict[str, Any]:
@@ -117,10 +117,7 @@ def _loaded(file: BinaryIO) -> dict[str, Any]:
 
 
 def newest_whole(folder: Path) -> tuple[Path, list[str]]:
-    """The newest whole checkpoint of a folder or a run, and a line for each newer damaged one.
-
-    A training may replace it at any time: :func:`read_newest` reads it too. Both raise ``CheckpointError`` without one.
-    """
+    """The newest whole checkpoint of a folder or a run, and a line for each newer damaged one; ``CheckpointError``."""
     path, file, skipped = _open_newest(folder)
     file.close()
     return path, skipped
@@ -135,22 +132,21 @@ def read_newest(folder: Path) -> tuple[Path, dict[str, Any]]:
 
 def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
     """As :func:`newest_whole`, with the open file, which stays readable after a training has removed it."""
-    listed = checkpoints(folder_of(folder))
-    while True:
-        skipped: list[str] = []
+    before, listed, skipped = None, checkpoints(folder_of(folder)), list[str]()
+    while listed != before:  # else a training has replaced them since they were listed
+        skipped.clear()
         for path in reversed(listed):
-            try:
-                file = regular(path).open("rb")
-            except OSError as error:
-                damage = error.strerror or one_line(error)
-            else:
-                if (damage := damage_of(file) or "") == "":
+            with ExitStack() as stack:
+                try:
+                    file = stack.enter_context(regular(path).open("rb"))
+                    check_whole(file)
+                except (OSError, ValueError) as error:
+                    reason = getattr(error, "strerror", None) or one_line(error)
+                    skipped.append(f"{path.name} is not whole ({reason})")
+                else:
+                    stack.pop_all()
                     return path, file, skipped
-                file.close()
-            skipped.append(f"{path.name} is not whole ({damage})")
         before, listed = listed, checkpoints(folder_of(folder))
-        if listed == before:  # else a training has replaced them since they were listed
-            break
     reasons = f" ({'; '.join(skipped)})" if skipped else ""
     raise CheckpointError(f"{folder} holds no whole checkpoint{reasons}; give the folder of a run that saved one")
 
@@ -166,11 +162,7 @@ def extra_state(**entries: Any) -> dict[str, Any]:
 
 
 def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Encoding) -> Mapping[str, Any]:
-    """The state beside the tensors in a model's ``state``, checked against the model's features and encoding.
-
-    Raises:
-        CheckpointError: a checkpoint of another method, format, feature width or encoding of colours.
-    """
+    """The state beside the tensors in a model's ``state``, checked against the model's features and encoding."""
     extra = state.get(EXTRA_STATE)
     if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
         kind = "a splatfacto checkpoint" if _PREFIX + "means" in state else "the checkpoint of another method"
@@ -178,17 +170,14 @@ def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Enc
             f"this is {kind}, not one of sundae; start from it with --pipeline.model.warm-start PATH, not --load-dir"
         )
     _check_format(extra)
-    features = extra.get("num_features")
-    if features != num_features:
-        raise CheckpointError(
-            f"the checkpoint has feature vectors of length {features}, the model of length {num_features}; "
-            f"give --pipeline.model.head.num-features {features} (0 means a model without a head)"
-        )
-    if extra.get("encoding") != encoding:
-        raise CheckpointError(
-            f"the checkpoint stores colours as {extra.get('encoding')}, the model as {encoding}; load it with the "
-            "--pipeline.model.sh-degree that it was trained with (0 stores logits)"
-        )
+    for name, ours, hint in (
+        ("num_features", num_features, "head.num-features that it was trained with (0 means a model without a head)"),
+        ("encoding", encoding, "sh-degree that it was trained with (0 stores logits)"),
+    ):
+        if extra.get(name) != ours:
+            raise CheckpointError(
+                f"the checkpoint has {name} {extra.get(name)}, the model {ours}; give the --pipeline.model.{hint}"
+            )
     states = (extra.get("running"), extra.get("extensions"))
     if not all(isinstance(state, Mapping) for state in states) or "trained_focal" not in extra:
         raise CheckpointError(_NO_CLOCK)
@@ -204,11 +193,7 @@ def _check_format(extra: Mapping[str, Any]) -> None:
 
 
 def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) -> None:
-    """Check that a ``state``, whose extra state was checked, fits the ``state_dict`` of a model.
-
-    Raises:
-        CheckpointError: a tensor is missing or has another shape, or the running states do not fit.
-    """
+    """Raise ``CheckpointError`` unless a state, whose extra state was checked, fits the ``state_dict`` of a model."""
     remedy = "load it with the options that it was trained with"
     for name, value in expected.items():
         if not isinstance(value, Tensor) or name == EXTRA_STATE:
@@ -236,84 +221,87 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
 
 
 def gaussians_of(loaded: Mapping[str, Any], path: Path) -> Gaussians:
-    """Gaussians of a checkpoint from :func:`read`, without features, float32 on the CPU.
+    """Gaussians of a checkpoint from :func:`read`, without features, float32 on the CPU; ``CheckpointError`` if none.
 
-    Raises:
-        CheckpointError: it holds no Gaussians, or is a SUNDAE checkpoint of another format.
+    Splatfacto, which does not say how it stores colours, stores logits at SH degree 0.
     """
     state = model_state(loaded)
+    extra = state.get(EXTRA_STATE)
     stored = {name: state.get(_PREFIX + name) for name in SPLAT_NAMES}
     gaussians = {name: value.float() for name, value in stored.items() if isinstance(value, Tensor)}
     if len(gaussians) < len(stored):
         raise CheckpointError(f"{path} holds no Gaussians; give a checkpoint of splatfacto or sundae")
     for odd in odd_shapes(gaussians):
         raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")
-    return Gaussians(gaussians, _encoding(gaussians, state.get(EXTRA_STATE)))
+    if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
+        return Gaussians(gaussians, "harmonics" if gaussians["features_rest"].shape[1] else "logits")
+    _check_format(extra)
+    if extra.get("encoding") not in get_args(Encoding):
+        raise CheckpointError("the checkpoint does not say how it stores colours; give another")
+    return Gaussians(gaussians, extra["encoding"])
 
 
 def model_state(loaded: Mapping[str, Any]) -> dict[str, Any]:
     """State of the model in a checkpoint, by its own names."""
-    return {
-        name.removeprefix("_model.").removeprefix("module."): value
-        for name, value in loaded["pipeline"].items()
-        if name.startswith("_model.")
-    }
+    state = {name: value for name, value in loaded["pipeline"].items() if name.startswith("_model.")}
+    return {name.removeprefix("_model.").removeprefix("module."): value for name, value in state.items()}
 
 
-def _encoding(gaussians: Mapping[str, Tensor], extra: Any) -> Encoding:
-    """How a checkpoint stores colours; splatfacto, which does not say, stores logits at SH degree 0."""
-    if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
-        return "logits" if gaussians["features_rest"].shape[1] == 0 else "harmonics"
-    _check_format(extra)
-    if extra.get("encoding") not in get_args(Encoding):
-        raise CheckpointError("the checkpoint does not say how it stores colours; give another")
-    return extra["encoding"]  # type: ignore[no-any-return]
-
-
-def damage_of(file: BinaryIO) -> str | None:
-    """Why a file is no whole archive of tensors; None if its checksums, which torch does not verify, are right."""
+def check_whole(file: BinaryIO) -> None:
+    """Raise ``ValueError`` unless a file is a whole archive of tensors, by checksums, which torch does not verify."""
     try:
         with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
             packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
             if packed or sum(entry.file_size for entry in entries) > os.fstat(file.fileno()).st_size:
-                return "it would unpack to more than its size"
-            damaged = archive.testzip()
-            return None if damaged is None else f"{damaged} in it is damaged"
-    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
-        return getattr(error, "strerror", None) or one_line(error)
+                raise ValueError("it would unpack to more than its size")
+            if (damaged := archive.testzip()) is not None:
+                raise ValueError(f"{damaged} in it is damaged")
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OverflowError) as error:
+        raise ValueError(one_line(error)) from error
 
 
 def load_tensors(file: BinaryIO) -> Any:
-    """The tensors and plain values of an open archive without :func:`damage_of`, on the CPU.
-
-    Raises:
-        Exception: of many kinds, which all mean that it holds something else.
-    """
+    """The tensors and plain values of an open, whole archive, on the CPU; raises many kinds of errors for others."""
+    with zipfile.ZipFile(file) as archive:
+        for name in archive.namelist():
+            if name.endswith(".pkl"):
+                _check_pickle(archive.read(name))
     file.seek(0)
     # Stock nerfstudio leaves numpy floats in a scheduler's state.
-    scalar: Any = np.float64(0.0).__reduce__()[0]
-    names = [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    names = [(_scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
     types: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
-    with torch.serialization.safe_globals([scalar, *names, *types]):
-        try:
-            loaded = torch.load(file, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError as error:
-            raise ValueError("it holds more than tensors and plain values, or nothing that can be read") from error
+    with torch.serialization.safe_globals([*names, *types]):
+        loaded = torch.load(file, map_location="cpu", weights_only=True)
     _check_tensors(loaded)
     return loaded
 
 
-def _check_tensors(value: Any) -> None:
-    """Refuse sparse or quantized tensors, and tensors larger than their storage, whose copy would fill memory."""
-    if isinstance(value, Tensor):
-        if value.layout is not torch.strided or value.is_quantized or value.is_meta:
-            raise ValueError("it holds a tensor that is sparse, quantized or without values")
-        if value.numel() * value.element_size() > value.untyped_storage().nbytes():
+def _check_pickle(pickled: bytes) -> None:
+    for operation, argument, _ in pickletools.genops(pickled):
+        if operation.name == "GLOBAL" and not _MADE.fullmatch(str(argument)):
+            raise ValueError(f"it holds more than tensors and plain values ({argument})")
+        if isinstance(argument, str):
+            name = normalize_encoding(argument).lower()
+            if aliases.get(name, name) in _CODECS:
+                raise ValueError(f"it asks for the codec {argument}")
+
+
+def _scalar(dtype: np.dtype[Any], content: bytes) -> Any:
+    """A number of numpy, whose own function also makes one of any size from no bytes."""
+    return np.frombuffer(content, dtype, 1)[0]
+
+
+def _check_tensors(loaded: Any) -> None:
+    """Refuse tensors larger than their storage, whose copy would fill memory."""
+    seen, waiting = {0}, [loaded]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, Tensor) and value.numel() * value.element_size() > value.untyped_storage().nbytes():
             raise ValueError("it holds a tensor that claims more than it has")
-    elif isinstance(value, (Mapping, list, tuple)):
-        for inner in value.values() if isinstance(value, Mapping) else value:
-            _check_tensors(inner)
+        if isinstance(value, (Mapping, list, tuple)) and id(value) not in seen:  # lists may hold themselves
+            seen.add(id(value))
+            waiting += value.values() if isinstance(value, Mapping) else value
 
 
 def random_state() -> dict[str, Any]:

@@ -30,7 +30,7 @@ def multiply_quaternions(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product of wxyz quaternions ``[..., 4]``: rotates by ``b``, then by ``a``."""
     aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
     w = aw * bw - (av * bv).sum(dim=-1, keepdim=True)
-    return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av.expand_as(bv), bv)], dim=-1)
+    return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(*torch.broadcast_tensors(av, bv))], dim=-1)
 
 
 def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tensor:
@@ -41,33 +41,38 @@ def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tenso
 
     Args:
         features_rest: ``[N, K, 3]`` coefficients of degrees 1 and up, K = (degree + 1)^2 - 1.
-        rotation: ``[3, 3]``.
+        rotation: ``[..., 3, 3]``, or a reflection; the result is ``[..., N, K, 3]``.
     """
     max_degree = sh_degree(features_rest)
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
     before = harmonic_basis(max_degree, directions)
-    after = harmonic_basis(max_degree, directions @ rotation.double().cpu().T)
-    rotated = features_rest.clone()
+    after = harmonic_basis(max_degree, directions @ rotation.double().cpu().mT)
+    before = before.expand_as(after)
+    rotated = features_rest.repeat(*rotation.shape[:-2], 1, 1, 1)
     for degree in range(1, max_degree + 1):
         columns = slice(degree**2, (degree + 1) ** 2)
-        matrix = torch.linalg.lstsq(after[:, columns], before[:, columns]).solution
+        matrix = torch.linalg.lstsq(after[..., columns], before[..., columns]).solution
         rows = slice(degree**2 - 1, (degree + 1) ** 2 - 1)
-        rotated[:, rows] = torch.einsum("ij,njc->nic", matrix.to(features_rest), features_rest[:, rows])
+        turned = torch.einsum("...ij,njc->...nic", matrix.to(features_rest), features_rest[:, rows])
+        rotated[..., rows, :] = turned
     return rotated
 
 
 def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) -> dict[str, Tensor]:
-    """Gaussians moved by ``x -> scale * (R x + t)``; ``transform`` ``[3, 4]`` holds rotation R and translation t.
+    """Gaussians moved by ``x -> scale * (R x + t)``; ``transform`` ``[..., 3, 4]`` has rotation R and translation t.
 
-    Opacities, SH coefficients of degree 0 and features are the tensors of ``params``.
+    R may be a reflection too. Opacities, SH coefficients of degree 0 and features are the tensors of ``params``; the
+    others become ``[..., N, C]``, means in their own dtype.
     """
-    rotation, translation = transform[:, :3].to(params["means"]), transform[:, 3].to(params["means"])
+    rotation, translation = transform[..., :3].to(params["means"]), transform[..., None, :, 3].to(params["means"])
     moved = dict(params)
-    moved["means"] = scale * (params["means"] @ rotation.T + translation)
-    turn = quaternions(rotation.double()[None])[0].to(rotation)
+    moved["means"] = scale * (params["means"] @ rotation.mT + translation)
+    # An ellipsoid is the same after a point reflection.
+    proper = rotation * rotation.det().sign()[..., None, None]
+    turn = quaternions(proper.double().reshape(-1, 3, 3)).reshape(*rotation.shape[:-2], 1, 4)
     moved["scales"] = params["scales"] + math.log(scale)
-    moved["quats"] = multiply_quaternions(turn, params["quats"])
+    moved["quats"] = multiply_quaternions(turn.to(params["quats"]), params["quats"])
     moved["features_rest"] = rotate_spherical_harmonics(params["features_rest"], rotation)
     return moved
 

@@ -24,7 +24,7 @@ from sundae_ns.io.ply import (
     read_ply,
     write_ply,
 )
-from sundae_ns.io.sog import read_sog, write_sog
+from sundae_ns.io.sog import METAS, read_sog, write_sog
 from sundae_ns.io.splat import read_gsplat, read_ksplat, read_splat
 from sundae_ns.io.spz import clamped, read_spz, write_spz
 
@@ -52,7 +52,7 @@ _FIRST_BYTES: dict[bytes, Kind] = {
     b"glTF": "glb",
 }
 _HEADERLESS: dict[str, Kind] = {".splat": "splat", ".ksplat": "ksplat"}
-_ZIPS: dict[str, Kind] = {".sog": "sog", ".pt": "gsplat"}
+_ZIPS: dict[str, Kind] = {".sog": "sog", ".zip": "sog", ".pt": "gsplat"}
 _BY_SUFFIX: dict[str, Kind] = {".ply": "ply", ".spz": "spz", ".glb": "glb", **_ZIPS, **_HEADERLESS}
 _UNREAD = {
     ".lcc": "is a scene of XGRIDS; convert it to .ply with SuperSplat or splat-transform",
@@ -82,7 +82,7 @@ def kind_of_gaussians(path: Path) -> Kind | None:
 
     A .sog may be a folder of images, or the ``meta.json`` in it.
     """
-    if path.name == "meta.json" or ((path / "meta.json").is_file() and not (path / "config.yml").exists()):
+    if path.name in METAS or (any((path / name).is_file() for name in METAS) and not (path / "config.yml").exists()):
         return "sog"
     kind = kind_of(path)
     if kind is None and not path.is_dir():
@@ -142,6 +142,7 @@ def read_gaussian_file(path: Path) -> StoredGaussians:
         case _:
             params, antialiased = read_ply(path), ANTIALIASED in ply_comments(path)
             in_model_frame = is_nerfstudio_ply(path)
+    params["means"] = params["means"].float()
     return StoredGaussians(usable(params, path, DataError, "export it again"), antialiased, in_model_frame)
 
 

@@ -16,7 +16,6 @@ most .ply files, and turns them about z.
 from __future__ import annotations
 
 import json
-import math
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -31,17 +30,25 @@ from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.core.errors import reading, regular
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SH_C0, sh_degree
+from sundae_ns.io.budget import afford, afford_gaussians, parsed_json
 from sundae_ns.io.coordinates import similarity
 from sundae_ns.io.ply import LEAST_OPACITY, MAX_SH_DEGREE, check_gaussians, checked
+from sundae_ns.io.spz import decoded
 
 EXTENSION = "KHR_gaussian_splatting"
+_SPZ = EXTENSION + "_compression_spz_2"
+_INSTANCING, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
+_KNOWN = {EXTENSION, _SPZ, _INSTANCING, _VISIBILITY, "KHR_mesh_quantization"}
+_SRGB = "srgb_rec709_display"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _MOST_NODES = 10_000
+_READ, _PLACE = 1 << 18, 1 << 12  # bytes that take as long as to read a primitive, and as to place it
 _TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _FROM_MODEL = torch.tensor([[-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])  # its own inverse
 _FROM_PLY = torch.tensor([[-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])  # its own inverse
+Transforms = NDArray[np.float64]
 _OURS, _MODEL_FRAME, _ANTIALIASED = "sundae_ns", "modelFrame", "antialiased"
 
 
@@ -53,13 +60,9 @@ def semantics(degree: int) -> list[str]:
 def write_glb(
     path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False, in_model_frame: bool = False
 ) -> None:
-    """Write the base colours of finite Gaussians of SH degree at most 3 as a .glb, atomically.
+    """Write the base colours of Gaussians that ``ply.checked`` accepts as a .glb, atomically.
 
     ``in_model_frame`` says that they are in the coordinates of nerfstudio's model.
-
-    Raises:
-        DataError: there are no Gaussians, an SH degree above 3, or wrong shapes.
-        StorageError: the disk is full or not writable.
     """
     gaussians = similarity(checked(path, params), _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0)
     opacities = gaussians["opacities"].sigmoid()
@@ -76,11 +79,14 @@ def write_glb(
     attributes |= dict(zip(semantics(sh_degree(gaussians["features_rest"])), rest, strict=True))
     marks = {_MODEL_FRAME: in_model_frame, _ANTIALIASED: antialiased}
     document, binary = _document(attributes, {name: True for name, applies in marks.items() if applies})
+    chunks: list[bytes | bytearray] = [
+        _CHUNK.pack(len(document), _JSON),
+        document,
+        _CHUNK.pack(len(binary), _BINARY),
+        binary,
+    ]
     with replacing(path) as partial, partial.open("wb") as file:
-        file.write(_HEADER.pack(b"glTF", 2, _HEADER.size + 2 * _CHUNK.size + len(document) + len(binary)))
-        for kind, content in ((_JSON, document), (_BINARY, binary)):
-            file.write(_CHUNK.pack(len(content), kind))
-            file.write(content)
+        file.writelines([_HEADER.pack(b"glTF", 2, _HEADER.size + sum(map(len, chunks))), *chunks])
 
 
 def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tuple[bytes, bytearray]:
@@ -91,29 +97,18 @@ def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tu
     types = {number: name for name, number in _TYPES.items()}
     for name, value in attributes.items():
         data = value.contiguous().numpy().tobytes()  # a multiple of four bytes
-        accessor: dict[str, Any] = {
-            "bufferView": len(buffer_views),
-            "count": len(value),
-            "type": types[value.shape[1]],
-            **({"componentType": 5126} if value.is_floating_point() else {"componentType": 5121, "normalized": True}),
-        }
+        accessor = {"bufferView": len(accessors), "count": len(value), "type": types[value.shape[1]]}
+        is_float = value.is_floating_point()
+        accessor |= {"componentType": 5126 if is_float else 5121, "normalized": not is_float}
         if name == "POSITION":  # as glTF demands
             accessor |= {"min": value.amin(dim=0).tolist(), "max": value.amax(dim=0).tolist()}
         accessors.append(accessor)
         # The target is ARRAY_BUFFER.
         buffer_views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data), "target": 34962})
         buffer += data
-    extension = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "projection": "perspective",
-        "sortingMethod": "cameraDistance",
-    }
-    primitive = {
-        "attributes": {name: i for i, name in enumerate(attributes)},
-        "mode": 0,  # points
-        "extensions": {EXTENSION: extension},
-    }
+    look = {"kernel": "ellipse", "colorSpace": _SRGB, "projection": "perspective", "sortingMethod": "cameraDistance"}
+    indices = {name: i for i, name in enumerate(attributes)}
+    primitive = {"attributes": indices, "mode": 0, "extensions": {EXTENSION: look}}  # 0 stands for points
     document = {
         "asset": {"version": "2.0", "generator": "sundae_ns", **({"extras": {_OURS: marks}} if marks else {})},
         "extensionsUsed": [EXTENSION],
@@ -132,18 +127,24 @@ def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tu
 def read_glb(path: Path) -> tuple[dict[str, Tensor], bool, bool]:
     """Read the Gaussians of a .glb of any program; meshes and cameras beside them are left out. No code in it runs.
 
-    Returns:
-        Gaussians, float32 on the CPU, and the marks of :func:`write_glb`, antialiased and in the model's frame.
-
-    Raises:
-        DataError: the file is missing, damaged, no .glb, or holds no Gaussians in a form that this module reads.
+    Returns Gaussians on the CPU, float32 but for means in float64, because nodes may move them far; and the marks of
+    :func:`write_glb`, antialiased and in the model's frame. Raises ``DataError`` for any other form.
     """
     with reading(path, "a complete .glb with Gaussians", remedy="export it again, or as .ply"):
-        document, binary = _chunks(path)
         try:
-            parts = [_read_primitive(document, binary, *found) for found in _primitives(document)]
+            document, binary = _chunks(path)
+            for name in document.get("extensionsRequired", []):
+                if name not in _KNOWN:
+                    raise ValueError(f"it requires {name}, which is not known here")
             marks = document["asset"].get("extras", {}).get(_OURS, {})
             antialiased, in_model_frame = (marks.get(name) is True for name in (_ANTIALIASED, _MODEL_FRAME))
+            parts, unpacked = [], 0
+            for primitive, transforms in _primitives(document, binary):
+                gaussians, marked = _read_primitive(document, binary, primitive)
+                antialiased |= marked
+                unpacked += _READ + len(transforms) * (_PLACE + sum(value.nbytes for value in gaussians.values()))
+                afford(unpacked, path.stat().st_size)
+                parts += [_placed(gaussians, part) for part in np.split(transforms, range(1000, len(transforms), 1000))]
         except (AttributeError, IndexError, KeyError, TypeError) as error:
             raise ValueError("its JSON is not that of a glTF scene") from error
         if not parts:
@@ -156,42 +157,59 @@ def read_glb(path: Path) -> tuple[dict[str, Tensor], bool, bool]:
 
 def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
     """The document, and the bytes of the first buffer."""
-    size = regular(path).stat().st_size
-    with path.open("rb") as file:
-        magic, version, length = _HEADER.unpack(file.read(_HEADER.size))
-        if magic != b"glTF" or version != 2 or length > size:
-            raise ValueError("its header is not that of a whole glTF 2.0 file")
-        count, kind = _CHUNK.unpack(file.read(_CHUNK.size))
-        if kind != _JSON or count > min(1 << 24, size):
-            raise ValueError("its first chunk is no JSON of at most 16 MiB")
-        document = json.loads(file.read(count))
-        rest = memoryview(file.read(length - file.tell()))
-    if not isinstance(document, dict):
-        raise ValueError("its JSON is no object")
-    if not rest:
-        return document, rest
-    count, kind = _CHUNK.unpack(rest[: _CHUNK.size])
-    if kind != _BINARY or count > len(rest) - _CHUNK.size:
-        raise ValueError("its binary chunk is cut")
-    return document, rest[_CHUNK.size : _CHUNK.size + count]
+    data = memoryview(regular(path).read_bytes())
+    magic, version, length = _HEADER.unpack_from(data)
+    if magic != b"glTF" or version != 2 or length > len(data):
+        raise ValueError("its header is not that of a whole glTF 2.0 file")
+    start, chunks = _HEADER.size, {_BINARY: data[:0]}
+    while start < length:
+        count, kind = _CHUNK.unpack_from(data, start)
+        start += _CHUNK.size + count
+        if start > length:
+            raise ValueError("a chunk of it is cut")
+        chunks[kind] = data[start - count : start]
+    return parsed_json(bytes(chunks[_JSON])), chunks[_BINARY]
 
 
-def _primitives(document: Mapping[str, Any]) -> Iterator[tuple[Mapping[str, Any], NDArray[np.float64]]]:
-    """Primitives of the scene with Gaussians, and the transform ``[4, 4]`` of the nodes above them."""
-    scene = document["scenes"][document.get("scene", 0)]
-    waiting = [(index, np.eye(4)) for index in scene.get("nodes", [])]
-    for _ in range(_MOST_NODES):
-        if not waiting:
-            return
-        index, above = waiting.pop()
-        node = document["nodes"][_index(index)]
-        transform = above @ _matrix(node)
-        waiting += [(child, transform) for child in node.get("children", [])]
-        primitives = document["meshes"][_index(node["mesh"])]["primitives"] if "mesh" in node else []
-        for primitive in primitives:
+def _primitives(document: Mapping[str, Any], binary: memoryview) -> Iterator[tuple[Mapping[str, Any], Transforms]]:
+    """Primitives with Gaussians that the scene shows, each once, and the transforms of all nodes that show it."""
+    nodes = document.get("nodes", [])
+    seen: set[int] = set()
+    shown: list[tuple[Mapping[str, Any], int]] = []  # nodes after their parents, and the positions of these
+
+    def visit(indices: list[Any], parent: int) -> None:
+        for index in indices:
+            if _index(index) in seen or len(seen) == _MOST_NODES:
+                raise ValueError(f"a node has two parents or is below itself, or it has over {_MOST_NODES:,} nodes")
+            seen.add(index)
+            if nodes[index].get("extensions", {}).get(_VISIBILITY, {}).get("visible") is not False:
+                shown.append((nodes[index], parent))
+
+    if "scenes" in document:
+        visit(document["scenes"][document.get("scene", 0)].get("nodes", []), -1)
+    else:
+        below = {index for node in nodes for index in node.get("children", [])}
+        visit([index for index in range(len(nodes)) if index not in below], -1)
+    for i, (node, _) in enumerate(shown):
+        visit(node.get("children", []), i)
+    transforms = _below_parents([node for node, _ in shown])
+    by_mesh: dict[int, list[Transforms]] = {}
+    instances = 0
+    for i, (node, parent) in enumerate(shown):
+        transforms[i] = transforms[parent] @ transforms[i] if parent >= 0 else transforms[i]
+        if "mesh" in node:
+            accessors = node.get("extensions", {}).get(_INSTANCING, {}).get("attributes", {}).items()
+            parts = {name.lower(): _values(document, binary, j) for name, j in accessors if not name.startswith("_")}
+            instances += max(map(len, parts.values()), default=1)
+            if instances > _MOST_NODES:
+                raise ValueError(f"it has over {_MOST_NODES:,} instances of meshes")
+            placed = transforms[i] @ _transforms(parts) if parts else transforms[i : i + 1]
+            by_mesh.setdefault(_index(node["mesh"]), []).append(placed)
+    for mesh, each in by_mesh.items():
+        placed = np.concatenate(each)
+        for primitive in document["meshes"][mesh]["primitives"]:
             if EXTENSION in primitive.get("extensions", {}):
-                yield primitive, transform
-    raise ValueError(f"its scene has more than {_MOST_NODES:,} nodes, or a node below itself")
+                yield primitive, placed
 
 
 def _index(value: object) -> int:
@@ -201,31 +219,38 @@ def _index(value: object) -> int:
     return value
 
 
-def _matrix(node: Mapping[str, Any]) -> NDArray[np.float64]:
-    """A node's transform ``[4, 4]``."""
+def _below_parents(nodes: list[Mapping[str, Any]]) -> Transforms:
+    """The nodes' own transforms ``[N, 4, 4]``."""
+    parts = {}
+    for name, none in {"translation": [0] * 3, "rotation": [0, 0, 0, 1], "scale": [1] * 3, "matrix": [0] * 16}.items():
+        parts[name] = np.array([node.get(name, none) for node in nodes], np.float64)
+        if parts[name].shape[1:] != (len(none),) or not np.isfinite(parts[name]).all():
+            raise ValueError(f"the {name} of a node is not {len(none)} numbers")
+    matrices = parts.pop("matrix").reshape(-1, 4, 4).transpose(0, 2, 1)
+    return np.where([[["matrix" in node]] for node in nodes], matrices, _transforms(parts))
 
-    def numbers(name: str, default: tuple[int, ...]) -> NDArray[np.float64]:
-        values = node.get(name, default)
-        if len(values) != len(default) or not all(type(value) in (int, float) for value in values):
-            raise TypeError(f"{values!r} are not {len(default)} numbers")
-        return np.array(values, dtype=np.float64)
 
-    if "matrix" in node:
-        return numbers("matrix", (0,) * 16).reshape(4, 4).T
-    turn = torch.from_numpy(numbers("rotation", (0, 0, 0, 1))).roll(1)
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrices(turn[None])[0].numpy() * numbers("scale", (1, 1, 1))
-    matrix[:3, 3] = numbers("translation", (0, 0, 0))
-    return matrix
+def _transforms(parts: Mapping[str, NDArray[Any]]) -> Transforms:
+    """Transforms ``[P, 4, 4]`` of translations ``[P, 3]``, rotations xyzw ``[P, 4]`` and scales ``[P, 3]``, if any."""
+    transforms = np.tile(np.eye(4), (max(map(len, parts.values()), default=1), 1, 1))
+    turns = torch.from_numpy(parts.get("rotation", np.array([[0.0, 0.0, 0.0, 1.0]]))).double()
+    transforms[:, :3, :3] = rotation_matrices(turns.roll(1, dims=1)).numpy()
+    transforms[:, :3, :3] *= np.asarray(parts.get("scale", np.ones((1, 3))))[:, None, :]
+    transforms[:, :3, 3] = parts.get("translation", 0.0)
+    return transforms
 
 
 def _read_primitive(
-    document: Mapping[str, Any], binary: memoryview, primitive: Mapping[str, Any], transform: NDArray[np.float64]
-) -> dict[str, Tensor]:
+    document: Mapping[str, Any], binary: memoryview, primitive: Mapping[str, Any]
+) -> tuple[dict[str, Tensor], bool]:
+    """The Gaussians of a primitive in its own coordinates, and whether they are marked as antialiased."""
     extension = primitive["extensions"][EXTENSION]
-    if extension.get("extensions") or extension.get("kernel", "ellipse") != "ellipse":
-        raise ValueError("its Gaussians are compressed, or of another kernel")
-    if extension.get("colorSpace", "srgb_rec709_display") != "srgb_rec709_display":
+    compressed = extension.get("extensions", {})
+    if compressed.keys() == {_SPZ}:  # with the values of the attributes, as CesiumJS reads it
+        return decoded(bytes(_view(document, binary, compressed[_SPZ]["bufferView"])), "LUF")
+    if compressed or extension.get("kernel", "ellipse") != "ellipse":
+        raise ValueError(f"its Gaussians are compressed ({', '.join(compressed)}), or of another kernel")
+    if extension.get("colorSpace", _SRGB) != _SRGB:
         raise ValueError(f"its colours are in {extension['colorSpace']!r}")
     attributes = primitive["attributes"]
 
@@ -236,6 +261,8 @@ def _read_primitive(
 
     means = values("POSITION")
     degree = max((d for d in range(MAX_SH_DEGREE + 1) if set(semantics(d)) <= attributes.keys()), default=0)
+    # Accessors may share their bytes; else each number has one.
+    afford_gaussians(len(means), (degree + 1) ** 2 - 1, len(binary) // 8)
     rest = [values(name) for name in semantics(degree)]
     params = {
         "means": means,
@@ -245,16 +272,35 @@ def _read_primitive(
         "features_rest": torch.stack(rest, dim=1) if rest else torch.zeros(len(means), 0, 3),
         "opacities": torch.logit(values(f"{EXTENSION}:OPACITY"), eps=LEAST_OPACITY),
     }
-    check_gaussians(params)
-    if np.array_equal(transform, np.eye(4)):
-        return params
-    linear = transform[:3, :3]
-    factor = np.cbrt(np.linalg.det(linear))
-    is_similarity = np.allclose(linear @ linear.T, factor**2 * np.eye(3), rtol=1e-4)
-    if not (math.isfinite(factor) and factor > 0 and is_similarity):
-        raise ValueError("a node mirrors or stretches its Gaussians")
-    rigid = np.concatenate([linear / factor, transform[:3, 3:] / factor], axis=1)
-    return similarity(params, torch.from_numpy(rigid).float(), float(factor))
+    check_gaussians(params, ValueError)
+    return params, False
+
+
+def _placed(gaussians: Mapping[str, Tensor], transforms: Transforms) -> dict[str, Tensor]:
+    """The Gaussians under each of the transforms ``[P, 4, 4]``, one after the other; means in float64."""
+    placed = {**gaussians, "means": gaussians["means"].double()}
+    if np.array_equal(transforms, np.eye(4)[None]):
+        return placed
+    linear = transforms[:, :3, :3]
+    factor = np.cbrt(np.abs(np.linalg.det(linear)))[:, None, None]
+    rigid = transforms[:, :3] / np.where(factor > 0, factor, np.nan)
+    if not np.allclose(rigid[..., :3] @ rigid[..., :3].transpose(0, 2, 1), np.eye(3), rtol=0, atol=1e-4):
+        raise ValueError("a node stretches its Gaussians")
+    placed = similarity(placed, torch.from_numpy(rigid), 1.0)
+    placed["means"] = placed["means"] * torch.from_numpy(factor)
+    placed["scales"] = placed["scales"] + torch.from_numpy(np.log(factor)).float()
+    return {name: value.expand(len(rigid), *gaussians[name].shape).flatten(0, 1) for name, value in placed.items()}
+
+
+def _view(document: Mapping[str, Any], binary: memoryview, index: object) -> memoryview:
+    """The bytes of a buffer view."""
+    view = document["bufferViews"][_index(index)]
+    if _index(view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
+        raise ValueError("its data are compressed, or in another file")
+    start, length = _index(view.get("byteOffset", 0)), _index(view["byteLength"])
+    if start + length > len(binary):
+        raise ValueError("its accessors reach beyond its data")
+    return binary[start : start + length]
 
 
 def _values(document: Mapping[str, Any], binary: memoryview, index: object) -> NDArray[np.float32]:
@@ -262,17 +308,14 @@ def _values(document: Mapping[str, Any], binary: memoryview, index: object) -> N
     accessor = document["accessors"][_index(index)]
     if "sparse" in accessor or "bufferView" not in accessor:
         raise ValueError("it has sparse or empty accessors")
-    buffer_view = document["bufferViews"][_index(accessor["bufferView"])]
-    if _index(buffer_view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0] or buffer_view.get("extensions"):
-        raise ValueError("its data are compressed, or in another file")
+    data = _view(document, binary, accessor["bufferView"])
     kind, columns = np.dtype(_COMPONENTS[accessor["componentType"]]), _TYPES[accessor["type"]]
-    rows, start, length = map(_index, (accessor["count"], buffer_view.get("byteOffset", 0), buffer_view["byteLength"]))
-    width = kind.itemsize * columns
-    stride, inside = _index(buffer_view.get("byteStride", width)), _index(accessor.get("byteOffset", 0))
-    used = inside + (rows - 1) * stride + width if rows else 0
-    if used > length or start + length > len(binary) or stride < width:
+    rows, width = _index(accessor["count"]), kind.itemsize * columns
+    stride = _index(document["bufferViews"][accessor["bufferView"]].get("byteStride", width))
+    start = _index(accessor.get("byteOffset", 0))
+    if (start + (rows - 1) * stride + width if rows else 0) > len(data) or stride < width:
         raise ValueError("its accessors reach beyond its data")
-    table: NDArray[Any] = np.ndarray((rows, columns), kind, binary, start + inside, (stride, kind.itemsize))
+    table: NDArray[Any] = np.ndarray((rows, columns), kind, data, start, (stride, kind.itemsize))
     values = table.astype(np.float32)
     if accessor.get("normalized") is True and kind.kind in "iu":
         values = np.maximum(values / np.float32(np.iinfo(kind).max), -1)

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from sundae_ns.core.errors import DataError, SundaeError, reading, regular
+from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SPLAT_NAMES, odd_shapes, rgb_to_sh, sh_degree_of, sh_to_rgb
 
@@ -61,7 +61,7 @@ _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 
 
-def check_gaussians(params: Mapping[str, Tensor], failure: type[SundaeError] = DataError) -> None:
+def check_gaussians(params: Mapping[str, Tensor], failure: type[Exception] = DataError) -> None:
     """Raise a ``failure`` unless there are all of ``SPLAT_NAMES``, in their shapes."""
     if missing := [name for name in SPLAT_NAMES if name not in params]:
         raise failure(f"the scene has no {', '.join(missing)}; it needs all of {', '.join(SPLAT_NAMES)}")

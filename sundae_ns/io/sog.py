@@ -23,7 +23,7 @@ import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -33,10 +33,12 @@ from torch import Tensor
 
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.core.files import replacing
+from sundae_ns.io.budget import afford, afford_gaussians, parsed_json, read_exactly
 from sundae_ns.io.coordinates import scene_order
-from sundae_ns.io.ply import MAX_SH_DEGREE, checked, from_smallest_three
+from sundae_ns.io.ply import check_gaussians, checked, from_smallest_three
 
-META = "meta.json"
+META, STREAMED = METAS = ("meta.json", "lod-meta.json")
+_LEVELS_OF_DETAIL = "it is streamed SOG; give the meta.json of one of its folders, or the file that it was made of"
 MAX_PALETTE = 1 << 16  # palette rows that two bytes can index
 _ROW_ENTRIES = 64  # palette rows in a row of the palette's image
 _COARSE = 256  # coarse cells of a large palette
@@ -45,12 +47,7 @@ _FIRST_MODE = 252  # alpha of a rotation without its first component; the next v
 
 
 def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
-    """Write the base colours of finite Gaussians of SH degree at most 3 as a .sog, atomically, in another order.
-
-    Raises:
-        DataError: there are no Gaussians, an SH degree above 3, or wrong shapes.
-        StorageError: the disk is full or not writable.
-    """
+    """Write the base colours of Gaussians that ``ply.checked`` accepts as a .sog, atomically, in another order."""
     from PIL import Image
 
     gaussians = checked(path, params)
@@ -90,12 +87,9 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
         padded[: len(rows)] = codes
         images["shN_centroids"] = padded.reshape(-1, _ROW_ENTRIES * coefficients, 3)
         images["shN_labels"] = _square(np.stack([labels & 255, labels >> 8, 0 * labels], axis=1).astype(np.uint8))
-        meta["shN"] = {
-            "count": len(rows),
-            "bands": math.isqrt(coefficients + 1) - 1,
-            "codebook": values.tolist(),
-            "files": ["shN_centroids.webp", "shN_labels.webp"],
-        }
+        files = ["shN_centroids.webp", "shN_labels.webp"]
+        bands = math.isqrt(coefficients + 1) - 1
+        meta["shN"] = {"count": len(rows), "bands": bands, "codebook": values.tolist(), "files": files}
     with replacing(path) as unfinished, zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as bundle:
         # ZipInfo has a fixed date, so that equal scenes give equal bytes.
         bundle.writestr(zipfile.ZipInfo(META), json.dumps(meta))
@@ -107,24 +101,25 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
 
 
 def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
-    """Read a bundled .sog, or a folder of images or the ``meta.json`` in it.
+    """Read a bundled .sog, a .zip of one or of its folder, or a folder of images or the ``meta.json`` in it.
 
-    Returns:
-        Gaussians as of ``ply.read_ply``, and whether they are marked as trained with antialiasing.
-
-    Raises:
-        DataError: a file is missing, damaged, no .sog, or of another version than 2.
+    Returns Gaussians as of ``ply.read_ply``, and whether they are marked as antialiased. Raises ``DataError`` if a file
+    is missing, damaged, lossy, streamed, or of another version than 2.
     """
     with reading(path, "a complete .sog"), ExitStack() as stack:
-        if path.is_dir() or path.name == META:
-            entry = partial(_file_entry, path if path.is_dir() else path.parent)
+        if path.is_dir() or path.name in METAS:
+            folder = path if path.is_dir() else path.parent
+            if path.name == STREAMED or not (folder / META).exists():
+                raise ValueError(_LEVELS_OF_DETAIL)
+            size = sum(file.stat().st_size for file in folder.glob("*.webp"))
+            entry: Callable[[str], bytes] = partial(_file_entry, folder)
         else:
-            entry = partial(_zip_entry, stack.enter_context(zipfile.ZipFile(regular(path))))
-        meta = json.loads(entry(META))
+            size = regular(path).stat().st_size
+            entry = _bundled(stack.enter_context(zipfile.ZipFile(path)), size)
+        meta = parsed_json(entry(META))
         if (version := meta.get("version", 1)) != 2:
             raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
-        arrays = _decoded(entry, meta)
-    gaussians = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
+        gaussians = _decoded(entry, meta, size)
     return gaussians, bool(meta.get("antialias")) or meta.get("model") == "antialiased"
 
 
@@ -134,20 +129,37 @@ def _file_entry(folder: Path, name: str) -> bytes:
     return regular(folder / name).read_bytes()
 
 
-def _zip_entry(bundle: zipfile.ZipFile, name: str) -> bytes:
-    """An entry of a bundle, which is stored, not deflated, so that it cannot grow."""
-    info = bundle.getinfo(name)
-    if info.compress_type != zipfile.ZIP_STORED and info.file_size > 1 << 26:
-        raise ValueError(f"{name} inflates to {info.file_size:,} bytes")
-    return bundle.read(name)
+def _bundled(bundle: zipfile.ZipFile, size: int, *, inner: bool = False) -> Callable[[str], bytes]:
+    """What reads an entry beside the ``meta.json`` of a zip, which may be in a folder or in another zip."""
+    names = {name: PurePosixPath(name).name for name in bundle.namelist()}
+    found = [name for name, last in names.items() if last == META]
+    scenes = [name for name, last in names.items() if last.endswith(".sog") and not last.startswith(".")]
+    if STREAMED in names.values():
+        raise ValueError(_LEVELS_OF_DETAIL)
+    if len(scenes) == 1 and not found and not inner:
+        return _bundled(zipfile.ZipFile(io.BytesIO(_zip_entry(bundle, size, "", scenes[0]))), size, inner=True)
+    if len(found) != 1:
+        raise ValueError(f"it holds {len(found)} {META} and {len(scenes)} .sog, not one of them")
+    return partial(_zip_entry, bundle, size, found[0].removesuffix(META))
 
 
-def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """The arrays of Gaussians, from the files by their names; the inverse of :func:`write_sog`."""
-    n = int(meta["count"])
+def _zip_entry(bundle: zipfile.ZipFile, size: int, folder: str, name: str) -> bytes:
+    info = bundle.getinfo(folder + name)
+    # The other methods unpack in one go, whatever size an entry states.
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name} is compressed by method {info.compress_type}")
+    afford(info.file_size, size)
+    with bundle.open(info) as file:
+        return read_exactly(file, info.file_size)  # to inflate no more than it states
+
+
+def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any], size: int) -> dict[str, Tensor]:
+    """Gaussians from the files by their names, which have ``size`` bytes; the inverse of :func:`write_sog`."""
+    n, coefficients = int(meta["count"]), (int(meta["shN"]["bands"]) + 1) ** 2 - 1 if "shN" in meta else 0
+    afford_gaussians(n, coefficients, size)
 
     def pixels(entry: Mapping[str, Any], index: int, channels: int) -> NDArray[np.uint8]:
-        return _pixels(file(entry["files"][index])).reshape(-1, 4)[:n, :channels]
+        return _pixels(file(entry["files"][index]), n).reshape(-1, 4)[:n, :channels]
 
     low, high = (np.asarray(meta["means"][end], np.float64) for end in ("mins", "maxs"))
     levels = pixels(meta["means"], 0, 3) + 256.0 * pixels(meta["means"], 1, 3)
@@ -159,15 +171,12 @@ def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str,
     if ((largest < 0) | (largest > 3)).any():
         raise ValueError("a rotation has no valid mode")
     rest = np.zeros((n, 0, 3), np.float32)
-    if "shN" in meta:
-        entry = meta["shN"]
-        coefficients = (int(entry["bands"]) + 1) ** 2 - 1
-        if not 0 < coefficients <= (MAX_SH_DEGREE + 1) ** 2 - 1:
-            raise ValueError(f"{entry['bands']} bands of harmonics")
-        centres = _pixels(file(entry["files"][0]))[..., :3].reshape(-1, coefficients, 3)
-        label = pixels(entry, 1, 2).astype(np.int64)
-        rest = np.asarray(entry["codebook"], np.float32)[centres[label[:, 0] + 256 * label[:, 1]]]
-    gaussians = {
+    if coefficients:
+        centres = _pixels(file(meta["shN"]["files"][0]), MAX_PALETTE * coefficients)
+        label = pixels(meta["shN"], 1, 2).astype(np.int64)
+        codes = centres[..., :3].reshape(-1, coefficients, 3)[label[:, 0] + 256 * label[:, 1]]
+        rest = np.asarray(meta["shN"]["codebook"], np.float32)[codes]
+    arrays = {
         "means": np.sign(bent) * np.expm1(np.abs(bent)),
         "scales": np.asarray(meta["scales"]["codebook"], np.float32)[pixels(meta["scales"], 0, 3)],
         "quats": from_smallest_three((turns[:, :3] / 255.0 - 0.5) * math.sqrt(2.0), largest),
@@ -175,25 +184,33 @@ def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str,
         "features_rest": rest,
         "opacities": np.log(opacity / (1 - opacity)),
     }
-    short = [name for name, value in gaussians.items() if len(value) != n]
-    if n < 1 or short:
-        raise ValueError(f"{', '.join(short) or 'the gaussians'} has fewer than {n:,} Gaussians")
+    if len(bent) != n:
+        raise ValueError(f"its images have fewer than {n:,} pixels")
+    gaussians = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
+    check_gaussians(gaussians, ValueError)
     return gaussians
 
 
-def _pixels(file: bytes) -> NDArray[np.uint8]:
-    """A WebP image ``[H, W, 4]``."""
+def _pixels(file: bytes, needed: int) -> NDArray[np.uint8]:
+    """A WebP image ``[H, W, 4]`` of about as many pixels as are needed, whose kind and size are checked before."""
     from PIL import Image
 
+    start = 12
+    while (kind := file[start : start + 4]) not in (b"VP8L", b"VP8 ", b"ANMF", b""):
+        length = int.from_bytes(file[start + 4 : start + 8], "little")
+        start += 8 + length + length % 2
+    bits = int.from_bytes(file[start + 9 : start + 13], "little")
+    width, height = 1 + bits % (1 << 14), 1 + (bits >> 14) % (1 << 14)
+    if kind != b"VP8L":
+        raise ValueError("an image is no lossless WebP: its numbers are not those of the Gaussians")
+    if width * height > 4 * needed + 65536:
+        raise ValueError(f"an image has {width} x {height} pixels for {needed:,} values")
     with Image.open(io.BytesIO(file), formats=["WEBP"]) as image:
         return np.asarray(image.convert("RGBA"))
 
 
 def codebook(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Numbers in ascending order ``[256]``, by k-means (Lloyd, 1957), and the index of the nearest for each value.
-
-    ``values`` are finite, not empty, of any shape.
-    """
+    """Ascending numbers ``[256]`` for finite values, by k-means (Lloyd, 1957), and the nearest's index for each."""
     ordered = np.sort(values, axis=None).astype(np.float64)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
     # Start with half of the centres at quantiles and half spread evenly, for the few values at the ends.
@@ -215,8 +232,7 @@ def _middles(centres: NDArray[np.float64]) -> NDArray[np.float64]:
 def palette(rows: NDArray[np.float32], max_rows: int = MAX_PALETTE) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """A palette ``[P, D]`` of at most ``max_rows`` rows, fitted to rows ``[N, D]``, and the index of each row ``[N]``.
 
-    A k-means of 65,536 centres over a million rows would take hours. So it has two levels: 256 coarse cells, and in
-    each cell centres in proportion to its rows.
+    By 256 coarse cells, with centres in proportion to their rows: one k-means of 65,536 centres would take hours.
     """
     n = len(rows)
     if n <= max_rows:

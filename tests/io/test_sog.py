@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,14 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from limits import verdict
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from sundae_ns.core.errors import DataError
 from sundae_ns.io.coordinates import scene_order
+from sundae_ns.io.formats import read_gaussian_file
 from sundae_ns.io.sog import codebook, kmeans, palette, write_sog
 from sundae_ns.scene.initialization import from_points
 
@@ -141,3 +146,136 @@ def test_a_palette_of_two_levels() -> None:
     assert np.sqrt(((found[labels] - rows) ** 2).mean()) < 0.011
     same, each = palette(rows, 3000)
     assert np.array_equal(same[each], rows)
+
+
+def entries(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as bundle:
+        return {name: bundle.read(name) for name in bundle.namelist()}
+
+
+def zipped(content: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", method) as bundle:
+        for name, data in content.items():
+            bundle.writestr(name, data)
+    return out.getvalue()
+
+
+@pytest.fixture(scope="module")
+def bundled(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    path = tmp_path_factory.mktemp("sog") / "a.sog"
+    write_sog(path, gaussians())
+    return entries(path)
+
+
+FORMS: dict[str, Callable[[dict[str, bytes]], bytes]] = {
+    "in a folder": lambda files: zipped({f"garden/{name}": data for name, data in files.items()}),
+    "deflated": lambda files: zipped(files, zipfile.ZIP_DEFLATED),
+    "in a zip": lambda files: zipped({"readme.txt": b"", "__MACOSX/._a.sog": b"", "b/a.sog": zipped(files)}),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("suffix", [".sog", ".zip"])
+def test_other_forms_of_a_bundle(tmp_path: Path, bundled: dict[str, bytes], form: str, suffix: str) -> None:
+    (tmp_path / "a.sog").write_bytes(zipped(bundled))
+    (tmp_path / f"b{suffix}").write_bytes(FORMS[form](bundled))
+    truth, found = (read_gaussian_file(tmp_path / name).sanitised.gaussians for name in ("a.sog", f"b{suffix}"))
+    assert all(torch.equal(found[name], truth[name]) for name in truth)
+
+
+def webp(width: int, height: int, **options: Any) -> bytes:
+    image = io.BytesIO()
+    Image.new("RGBA", (width, height), (1, 2, 3, 252)).save(image, "WEBP", **options)
+    return image.getvalue()
+
+
+def _lie(content: bytes, name: bytes, size: int) -> bytes:
+    """A bundle that states another size of an entry."""
+    data = bytearray(content)
+    for mark, at, header in ((b"PK\x03\x04", 22, 30), (b"PK\x01\x02", 24, 46)):
+        start = -1
+        while (start := data.find(mark, start + 1)) >= 0:
+            if data[start + header : start + header + len(name)] == name:
+                data[start + at : start + at + 4] = size.to_bytes(4, "little")
+    return bytes(data)
+
+
+def _meta(**changes: Any) -> Callable[[dict[str, bytes]], bytes]:
+    return lambda files: zipped(
+        {**files, "meta.json": json.dumps({**json.loads(files["meta.json"]), **changes}).encode()}
+    )
+
+
+def _bomb(method: int) -> Callable[[dict[str, bytes]], bytes]:
+    return lambda files: _lie(zipped({**files, "means_l.webp": bytes(1 << 28)}, method), b"means_l.webp", 1000)
+
+
+def _all(image: bytes) -> dict[str, bytes]:
+    return dict.fromkeys(("means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp"), image)
+
+
+HOSTILE: dict[str, tuple[Callable[[dict[str, bytes]], bytes], str]] = {
+    "a lossy image": (lambda files: zipped({**files, "means_l.webp": webp(13, 13, quality=80)}), "no lossless WebP"),
+    "a lossy image with alpha": (
+        lambda files: zipped({**files, "sh0.webp": webp(13, 13, quality=80, alpha_quality=50)}),
+        "lossless",
+    ),
+    "no image": (lambda files: zipped({**files, "means_l.webp": b"RIFF"}), "no lossless WebP"),
+    "an image beyond its Gaussians": (
+        lambda files: zipped({**files, **_all(webp(9000, 9000, lossless=True))}),
+        "9000 x 9000 pixels for 150",
+    ),
+    "as many Gaussians as pixels": (
+        lambda files: _meta(count=81_000_000)({**files, **_all(webp(9000, 9000, lossless=True))}),
+        "would unpack to",
+    ),
+    "bz2": (_bomb(zipfile.ZIP_BZIP2), "compressed by method 12"),
+    "lzma": (_bomb(zipfile.ZIP_LZMA), "compressed by method 14"),
+    "deflate": (_bomb(zipfile.ZIP_DEFLATED), "CRC-32"),
+    "a size beyond the file": (lambda files: _lie(zipped(files), b"means_l.webp", 2**32 - 2), "would unpack to"),
+    "a bundle in a bundle in a bundle": (
+        lambda files: zipped({"a.sog": zipped({"b.sog": zipped(files)})}),
+        "0 meta.json and 1 .sog",
+    ),
+    "two scenes": (lambda files: zipped({"a.sog": zipped(files), "b.sog": zipped(files)}), "0 meta.json and 2 .sog"),
+    "streamed": (
+        lambda files: zipped({"lod-meta.json": b"{}", "0_0/meta.json": b"{}"}),
+        "streamed SOG; give the meta.json",
+    ),
+    "deep JSON": (lambda files: zipped({**files, "meta.json": b"[" * 999_999}), "recursion"),
+    "fewer than no Gaussians": (_meta(count=-5), "it states -5 Gaussians"),
+    "endless Gaussians": (_meta(count=math.inf), "infinity"),
+    "more Gaussians than pixels": (
+        lambda files: zipped({**files, **_all(webp(9, 9, lossless=True))}),
+        "fewer than 150 pixels",
+    ),
+    "an outside file": (_meta(quats={"files": ["../../etc/passwd"]}), "no item named"),
+    "a short codebook": (_meta(scales={"codebook": [0.0], "files": ["scales.webp"]}), "out of bounds"),
+    "a codebook of pairs": (
+        _meta(scales={"codebook": [[0.0, 1.0]] * 256, "files": ["scales.webp"]}),
+        "scales has shape",
+    ),
+    "NaN for a bound": (
+        _meta(means={"mins": [math.nan] * 3, "maxs": [1] * 3, "files": ["means_l.webp", "means_u.webp"]}),
+        "none is finite",
+    ),
+    "no SH degree": (_meta(shN={"bands": 9, "codebook": [0], "files": []}), "99 SH coefficients"),
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_hostile_bundles(tmp_path: Path, bundled: dict[str, bytes], kind: str) -> None:
+    make, words = HOSTILE[kind]
+    path = tmp_path / "a.sog"
+    path.write_bytes(make(bundled))
+    error = verdict(lambda: read_gaussian_file(path), path.stat().st_size)
+    assert isinstance(error, DataError)
+    assert words in str(error)
+
+
+@pytest.mark.parametrize("name", ["", "lod-meta.json"])
+def test_a_streamed_folder_is_named(tmp_path: Path, name: str) -> None:
+    (tmp_path / "lod-meta.json").write_text("{}")
+    with pytest.raises(DataError, match="it is streamed SOG; give the meta.json of one of its folders"):
+        read_gaussian_file(tmp_path / name)

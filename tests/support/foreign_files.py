@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gzip
 import math
+import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
+import zstandard
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
@@ -126,6 +129,50 @@ def write_gsplat(path: Path, gaussians: Mapping[str, Tensor], **others: object) 
         "shN": gaussians["features_rest"],
     }
     torch.save({"step": 6999, "splats": splats, **others}, path)
+
+
+def spz(
+    gaussians: Mapping[str, Tensor],
+    version: int,
+    *,
+    axes: int | None = None,
+    antialiased: bool = False,
+    bits: int = 12,
+    count: int | None = None,
+    degree: int | None = None,
+) -> bytes:
+    """A .spz by its specification; ``axes`` state a coordinate system, the last three change its header alone."""
+    values = {name: value.numpy() for name, value in gaussians.items()}
+    n, coefficients = values["features_rest"].shape[:2]
+    fixed = np.rint(values["means"] * 4096).astype("<i4").view(np.uint8).reshape(n, 3, 4)[..., :3]
+    quats = np.roll(values["quats"], -1, axis=1)  # xyzw
+    largest = np.abs(quats).argmax(axis=1) if version > 2 else np.full(n, 3)
+    quats = quats * np.where(quats[np.arange(n), largest] < 0, -1, 1)[:, None]
+    words = largest.astype("<u4")
+    for others in quats[np.arange(4) != largest[:, None]].reshape(n, 3).T if version > 2 else ():
+        words = words << 10 | (others < 0) << 9 | np.rint(np.abs(others) * math.sqrt(2) * 511).astype("<u4")
+
+    def levels(values: np.ndarray) -> np.ndarray:
+        return np.rint(values).clip(0, 255).astype(np.uint8)
+
+    parts = [
+        values["means"].astype("<f2") if version == 1 else fixed,
+        levels(255 / (1 + np.exp(-values["opacities"]))),
+        levels(values["features_dc"] * 0.15 * 255 + 127.5),
+        levels(values["scales"] * 16 + 160),
+        words.astype("<u4") if version > 2 else levels(quats[:, :3] * 127.5 + 127.5),
+        levels(values["features_rest"] * 128 + 128),
+    ]
+    stored = [part.tobytes() for part in parts if part.size]
+    about = (n if count is None else count, math.isqrt(coefficients) if degree is None else degree, bits)
+    flags = antialiased + (0 if axes is None else 2)
+    header = struct.pack("<4sIIBBBB", b"NGSP", version, *about, flags, 0 if version < 4 else len(stored))
+    extension = b"" if axes is None else struct.pack("<IIIIII", 0xADBE0002, 4, 0, 0xADBE0003, 4, axes)
+    if version < 4:
+        return gzip.compress(header + b"".join(stored) + extension)
+    frames = [zstandard.ZstdCompressor().compress(part) for part in stored]
+    table = [struct.pack("<QQ", len(frame), len(part)) for frame, part in zip(frames, stored, strict=True)]
+    return header + struct.pack("<I12x", 32 + len(extension)) + extension + b"".join([*table, *frames])
 
 
 def ksplat(level: int, degree: int) -> Path:

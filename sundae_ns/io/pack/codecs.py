@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,7 @@ from sundae_ns.io.pack.config import STEPS, PackConfig
 from sundae_ns.io.pack.container import Array, Coded, Floats
 from sundae_ns.io.pack.quantize import Blocks, Rotations, Transform, fit_transform
 
-_LOGITS = (-6.0, 8.0)
-"""Opacities outside of these logits look the same as at them: below 1/255 nothing is drawn."""
+_LOGITS = (-6.0, 8.0)  # opacities outside look the same as at these: below 1/255 nothing is drawn
 _STEPS = {
     "quats": "rotation_step",
     "scales": "scale_step",
@@ -56,11 +55,7 @@ class HeadCodec:
     columns: dict[str, Tensor]
 
     def encode(self, head: Mapping[str, Tensor]) -> Coded:
-        """Return the stored form, with the levels of all weights in one column.
-
-        Raises:
-            PackError: weights are not finite.
-        """
+        """The stored form, with the levels of all weights in one column; ``PackError`` if some are not finite."""
         names = sorted(head)
         values = {name: _on_cpu(head[name]) for name in names}
         if not all(torch.isfinite(value).all() for value in values.values()):
@@ -113,7 +108,15 @@ class Codecs:
 
     def to(self, device: torch.device) -> Codecs:
         """Return a copy on another device."""
-        return _moved(self, device)  # type: ignore[no-any-return]
+
+        def moved(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {name: moved(inner) for name, inner in value.items()}
+            if isinstance(value, (Rotations, Transform, HeadCodec)):
+                return type(value)(**moved(vars(value)))
+            return value.to(device) if isinstance(value, Tensor) else value
+
+        return replace(self, gaussians=moved(self.gaussians), head=moved(self.head))
 
     def with_steps(self, config: PackConfig, gaussians: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Codecs:
         """The same grids and bases with the steps of other valid options; bits and blocks of positions stay.
@@ -124,10 +127,10 @@ class Codecs:
         codecs: dict[str, Rotations | Transform] = {}
         for name, codec in self.gaussians.items():
             step = codec.step * ratios[_STEPS[name]]
-            if isinstance(codec, Rotations):
-                codecs[name] = Rotations(step)
-            else:
+            if isinstance(codec, Transform):
                 codecs[name] = codec.with_step(step, as_matrix(gaussians[name]))
+            else:
+                codecs[name] = Rotations(step)
         kept = {"position_bits": self.config.position_bits, "block": self.config.block}
         of_head = None if self.head is None else self.head.scaled(ratios["head_step"], head)
         return Codecs(replace(config, **kept), self.blocks, codecs, of_head)  # type: ignore[arg-type]
@@ -145,17 +148,6 @@ class Codecs:
     def rounded_head(self, head: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the head that a reader decodes."""
         return {name: value if self.head is None else self.head.rounded(name, value) for name, value in head.items()}
-
-
-def _moved(value: Any, device: torch.device) -> Any:
-    """Copy a structure of dictionaries and dataclasses, with its tensors on ``device``."""
-    if isinstance(value, Tensor):
-        return value.to(device)
-    if isinstance(value, dict):
-        return {name: _moved(inner, device) for name, inner in value.items()}
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{part.name: _moved(getattr(value, part.name), device) for part in fields(value)})
-    return value
 
 
 def fit_codecs(
@@ -188,11 +180,8 @@ def fit_codecs(
 
 
 def _fit_head(head: Mapping[str, Tensor], share: float, sensitivity: Mapping[str, Tensor]) -> HeadCodec | None:
-    """Steps of a share of each output channel's largest weight, or, with a sensitivity, steps of the same total error.
-
-    Steps in inverse proportion to the root of the sensitivity take the fewest bits for an error. The levels of a head
-    differ most: each weight of a finer level acts on four times as many pixels.
-    """
+    """Steps of a share of each output channel's largest weight, or, by a sensitivity, of the same total error."""
+    # Steps in inverse proportion to the root of the sensitivity take the fewest bits for an error.
     if not head:
         return None
     weights = {name: _on_cpu(value) for name, value in head.items() if value.ndim > 1}

@@ -31,11 +31,7 @@ class PackConfig:
     """Step of the head's weights, in units of the largest weight of their output channel."""
 
     def validate(self) -> None:
-        """Check every option.
-
-        Raises:
-            ConfigError: names the first invalid option and its valid values.
-        """
+        """Raise ``ConfigError`` for the first invalid option, with its valid values."""
         limits = {"position_bits": (4, 16), "block": (16, 1 << 20), **dict.fromkeys(STEPS, (0.0001, 1))}
         for name, (minimum, maximum) in limits.items():
             value = getattr(self, name)
@@ -56,17 +52,11 @@ FINETUNED: dict[str, int | float] = {
     "head_step": 0.14,
 }
 """Coarser options for scenes that were fine-tuned with them (``sundae_ns.plugin.finetune``)."""
-FINETUNE_STEPS = 1500
-"""Steps of a fine-tune that make up for them: packs lose at most about 0.1 dB more (``curve.csv``)."""
-LEAST_LENGTHS = 20
-"""A run whose last steps are a fine-tune has at least this many times its steps: measured with a twentieth."""
-FINETUNED_SIZE = 0.6
-"""Bytes of such a pack as a share of one without: 0.58 to 0.61 on six captures."""
+FINETUNE_STEPS = 1500  # that make up for them: packs lose at most about 0.1 dB more (``curve.csv``)
+LEAST_LENGTHS = 20  # of a run, in fine-tunes, whose last steps are one: measured with a twentieth
+FINETUNED_SIZE = 0.6  # bytes of such a pack as a share of one without: 0.58 to 0.61 on six captures
 
 
 def tuned_steps(length: int, steps: int = FINETUNE_STEPS) -> int:
-    """Number of steps at the end of a schedule of ``length`` steps that a fine-tune takes the place of.
-
-    0 for shorter schedules, whose fine-tune comes after the last step.
-    """
+    """Number of last steps of a schedule that a fine-tune takes the place of; 0 for shorter ones, which it follows."""
     return steps if length >= LEAST_LENGTHS * steps else 0

@@ -28,7 +28,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,7 +37,8 @@ import jsonschema
 import numpy as np
 from numpy.typing import NDArray
 
-from sundae_ns.core.errors import PackError, regular
+from sundae_ns.core.errors import PackError, reading, regular
+from sundae_ns.io.budget import afford
 
 FORMAT: dict[str, Any] = json.loads(resources.files(__package__).joinpath("format.json").read_text(encoding="utf-8"))
 """``limits`` of files, schemas of ``container``, ``header`` and ``model``, and ``sections`` by codec and part."""
@@ -54,12 +55,8 @@ Coded = tuple[dict[str, Any], Levels, dict[str, Array]]
 """The stored form of an attribute: its entry in the header, its levels ``[N, C]``, and its other sections by name."""
 
 
-class DamagedError(PackError):
-    """What is wrong with a packed scene, in words that do not name the file."""
-
-
 class Section(NamedTuple):
-    """An array in the file."""
+    """An array in the file, of ``size`` bytes, which is stored in parts of these lengths."""
 
     name: str
     dtype: np.dtype[Any]
@@ -67,16 +64,7 @@ class Section(NamedTuple):
     parts: tuple[int, ...]
     sha256: str
     offset: int
-
-    @property
-    def size(self) -> int:
-        """Bytes of the array."""
-        return math.prod(self.shape) * self.dtype.itemsize
-
-    @property
-    def planes(self) -> int:
-        """Number of planes of the array."""
-        return _rows(self.shape) * self.dtype.itemsize if self.size else 0
+    size: int
 
 
 class Header(NamedTuple):
@@ -87,15 +75,9 @@ class Header(NamedTuple):
     size: int
 
 
-@contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Turn a ``DamagedError`` or ``OSError`` into a ``PackError`` that names the file."""
-    try:
-        yield
-    except DamagedError as error:
-        raise PackError(f"{path} is not a whole packed scene ({error}); get it again, or pack it again") from error
-    except OSError as error:
-        raise PackError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+def naming(path: Path) -> AbstractContextManager[None]:
+    """Turn every error of reading a packed scene into a ``PackError`` that names the file."""
+    return reading(path, "a whole packed scene", PackError, remedy="get it again, or pack it again")
 
 
 def _unique_by(_: Any, key: str | int, items: list[Any], __: Any) -> Iterator[jsonschema.ValidationError]:
@@ -137,10 +119,10 @@ def fault(value: Any, schema: Mapping[str, Any], prefix: str = "") -> str | None
     return ".".join(keys)
 
 
-def check(value: Any, schema: str, prefix: str = "") -> None:
-    """Raise ``DamagedError`` if a part of the header violates a schema of ``FORMAT``."""
-    if (wrong := fault(value, FORMAT[schema], prefix)) is not None:
-        raise DamagedError(f"its header has no valid {wrong or schema}")
+def check(value: Any, schema: str) -> None:
+    """Raise ``ValueError`` if a part of the header violates a schema of ``FORMAT``."""
+    if (wrong := fault(value, FORMAT[schema])) is not None:
+        raise ValueError(f"its header has no valid {wrong or schema}")
 
 
 def parsed(content: bytes) -> Any:
@@ -154,15 +136,12 @@ def parsed(content: bytes) -> Any:
     def check_depth(value: Any, left: int) -> None:
         if isinstance(value, (list, dict)):
             if left == 0:
-                raise RecursionError
+                raise ValueError("its header is nested too deeply")
             for inner in value.values() if isinstance(value, dict) else value:
                 check_depth(inner, left - 1)
 
-    try:
-        value = json.loads(content.decode(), parse_int=finite, parse_float=finite, parse_constant=finite)
-        check_depth(value, LIMITS["depth"])
-    except RecursionError as error:
-        raise ValueError("it is nested too deeply") from error
+    value = json.loads(content.decode(), parse_int=finite, parse_float=finite, parse_constant=finite)
+    check_depth(value, LIMITS["depth"])
     return value
 
 
@@ -201,15 +180,10 @@ def _deflated(plane: bytes) -> bytes:
 
 
 def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0) -> tuple[bytes, dict[str, int]]:
-    """The bytes of a file, and the number of bytes of each of its sections.
+    """The bytes of a file, and the number of bytes of each of its sections; ``PackError`` if the header is too long.
 
-    Args:
-        meta: JSON values for the header, without the key ``sections``.
-        arrays: arrays of the dtypes that ``format.json`` lists.
-        unpacked: bytes that a reader decodes from the arrays, if more than their own size.
-
-    Raises:
-        PackError: the header is too long for a reader.
+    ``meta`` has JSON values for the header, ``arrays`` dtypes that ``format.json`` lists. A reader decodes ``unpacked``
+    bytes from them, if more than their own size.
     """
     little = {name: array.astype(array.dtype.newbyteorder("<"), copy=False) for name, array in arrays.items()}
     parts = {name: [_deflated(plane) for plane in split_planes(array)] for name, array in little.items()}
@@ -219,17 +193,17 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
     if lacking > 0:
         little[PADDING] = np.zeros(lacking, np.uint8)
         parts[PADDING] = [little[PADDING].tobytes()]
+    stored = {name: b"".join(planes) for name, planes in parts.items()}
     sections = [
         {
             "name": name,
             "dtype": array.dtype.newbyteorder("<").str,
             "shape": list(array.shape),
             "parts": [len(part) for part in parts[name]],
-            "sha256": hashlib.sha256(b"".join(parts[name])).hexdigest(),
+            "sha256": hashlib.sha256(stored[name]).hexdigest(),
         }
         for name, array in little.items()
     ]
-    stored = {name: b"".join(planes) for name, planes in parts.items()}
     content = b"".join([_front({**meta, "sections": sections}), *stored.values()])
     return content, {name: len(section) for name, section in stored.items()}
 
@@ -245,40 +219,30 @@ def _front(meta: Mapping[str, Any]) -> bytes:
 
 
 def restated(content: bytes, entries: Mapping[str, Any]) -> bytes:
-    """A checked file with other entries of its header, which must not be ``sections``; its sections stay as they are.
-
-    The file may not become so much shorter that its sections unpack to too much; an entry more is always right.
-    """
+    """A checked file with more entries in its header, or longer ones, which must not be ``sections``."""
     end = _PREAMBLE.size + _PREAMBLE.unpack_from(content)[2]
     return _front({**parsed(content[_PREAMBLE.size : end]), **entries}) + content[end:]
 
 
 def read_header(path: Path) -> Header:
-    """Read and check the header, without the sections.
-
-    Raises:
-        PackError: the file is not a packed scene, of another version, truncated, altered, or states impossible sizes.
-    """
+    """Read and check the header, without the sections; ``PackError`` if it is not that of a whole packed scene."""
     with naming(path), regular(path).open("rb") as file:
         size = path.stat().st_size
         preamble = file.read(_PREAMBLE.size)
         if preamble[: len(MAGIC)] != MAGIC:
             raise PackError(f"{path} is not a packed scene; give a file that sundae pack wrote")
         if len(preamble) < _PREAMBLE.size:
-            raise DamagedError("it ends before its header")
+            raise ValueError("it ends before its header")
         _, version, length, digest = _PREAMBLE.unpack(preamble)
         if version != VERSION:
             remedy = "pack the run again" if version < VERSION else "update this program"
             raise PackError(f"{path} has version {version} of the format, this program reads {VERSION}; {remedy}")
         if length > min(MAX_HEADER, size - _PREAMBLE.size):
-            raise DamagedError("it ends in its header")
+            raise ValueError("it ends in its header")
         text = file.read(length)
         if hashlib.sha256(text).digest() != digest:
-            raise DamagedError("the checksum of its header is wrong")
-        try:
-            meta = parsed(text)
-        except ValueError as error:
-            raise DamagedError("its header is not JSON") from error
+            raise ValueError("the checksum of its header is wrong")
+        meta = parsed(text)
         return Header(meta, _sections(meta, _PREAMBLE.size + length, size), size)
 
 
@@ -287,46 +251,41 @@ def _sections(meta: Any, offset: int, size: int) -> dict[str, Section]:
     sections: dict[str, Section] = {}
     for entry in meta["sections"]:
         shape, parts = (tuple(map(int, entry[key])) for key in ("shape", "parts"))
-        section = Section(entry["name"], np.dtype(entry["dtype"]), shape, parts, entry["sha256"], offset)
-        if len(parts) != section.planes or max(parts, default=0) > section.size // max(section.planes, 1):
-            raise DamagedError(f"its header states impossible parts of {section.name}")
-        sections[section.name] = section
+        dtype, name = np.dtype(entry["dtype"]), entry["name"]
+        length = math.prod(shape) * dtype.itemsize
+        planes = _rows(shape) * dtype.itemsize if length else 0
+        if len(parts) != planes or max(parts, default=0) > length // max(planes, 1):
+            raise ValueError(f"its header states impossible parts of {name}")
+        sections[name] = Section(name, dtype, shape, parts, entry["sha256"], offset, length)
         offset += sum(parts)
     if offset != size:
-        raise DamagedError(f"its header states {offset:,} bytes, it has {size:,}")
-    check_ratio(sum(section.size for section in sections.values()), size)
+        raise ValueError(f"its header states {offset:,} bytes, it has {size:,}")
+    afford(sum(section.size for section in sections.values()), size, SPARE, MAX_RATIO)
     return sections
-
-
-def check_ratio(unpacked: int, size: int) -> None:
-    """Raise ``DamagedError`` if a file of ``size`` bytes may not unpack to ``unpacked`` bytes."""
-    if unpacked > SPARE + MAX_RATIO * size:
-        raise DamagedError(f"{size:,} bytes would unpack to {unpacked:,}")
 
 
 def read_sections(path: Path, header: Header) -> dict[str, Array]:
     """Read all sections except padding; ``PackError`` if one is altered or truncated."""
     with naming(path):
         content = memoryview(path.read_bytes())
-        for section in header.sections.values():
-            stored = content[section.offset : section.offset + sum(section.parts)]
-            if hashlib.sha256(stored).hexdigest() != section.sha256:
-                raise DamagedError(f"the checksum of {section.name} is wrong")
 
         def decode(section: Section) -> Array:
-            if section.size == 0:
+            stored = content[section.offset : section.offset + sum(section.parts)]
+            if hashlib.sha256(stored).hexdigest() != section.sha256:
+                raise ValueError(f"the checksum of {section.name} is wrong")
+            if section.size == 0 or section.name == PADDING:
                 return np.zeros(section.shape, section.dtype)
             planes, start = [], section.offset
             for part in section.parts:
-                planes.append(_inflated(content[start : start + part], section.size // section.planes))
+                planes.append(_inflated(content[start : start + part], section.size // len(section.parts)))
                 start += part
             table = np.frombuffer(b"".join(planes), np.uint8).reshape(_rows(section.shape), section.dtype.itemsize, -1)
             numbers = np.ascontiguousarray(table.transpose(0, 2, 1))
             return numbers.reshape(-1).view(section.dtype).reshape(section.shape)
 
-        wanted = [section for section in header.sections.values() if section.name != PADDING]
         with ThreadPoolExecutor(2) as pool:
-            return dict(zip([section.name for section in wanted], pool.map(decode, wanted), strict=True))
+            arrays = dict(zip(header.sections, pool.map(decode, header.sections.values()), strict=True))
+        return {name: array for name, array in arrays.items() if name != PADDING}
 
 
 def _inflated(part: memoryview, size: int) -> bytes:
@@ -338,4 +297,4 @@ def _inflated(part: memoryview, size: int) -> bytes:
         plane = inflate.decompress(part, size + 1)
         if len(plane) == size and inflate.eof and not inflate.unused_data:
             return plane
-    raise DamagedError("a section cannot be decompressed")
+    raise ValueError("a section cannot be decompressed")

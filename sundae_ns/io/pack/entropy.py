@@ -13,16 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sundae_ns.io.pack.container import Array, DamagedError, Levels
+from sundae_ns.io.pack.container import Array, Levels
 from sundae_ns.rasterize.cpu.parallel import compiled, inlined
 
-LARGEST = (1 << 24) - 1
-"""Largest magnitude of a number."""
+LARGEST = (1 << 24) - 1  # magnitude of a number
 CONTEXTS = 4
-NEIGHBOURS = 4
-"""Earlier rows from which the contexts of a row are made."""
-WINDOW = 128
-"""Neighbours are searched among this many earlier rows."""
+NEIGHBOURS = 4  # earlier rows from which the contexts of a row are made
+WINDOW = 128  # earlier rows among which they are searched
 _MASK = 0xFFFFFFFF
 _NODES = 128
 _SIDE = 64
@@ -31,15 +28,11 @@ _CLASSES = 16
 _EVEN = 1 << 15
 
 Stream = NDArray[np.uint8]
-Near = NDArray[np.int32]
-"""Rows ``[N, NEIGHBOURS]`` before each row, the nearest first; -1 for none."""
+Near = NDArray[np.int32]  # rows ``[N, NEIGHBOURS]`` before each row, the nearest first; -1 for none
 
-
+# Probabilities of 12 bits ``[4095]`` for -2047 to 2047 in 256ths of their logits. The format fixes these numbers: other
+# machines' exponentials must round to them (a test holds their hash).
 _SQUASH = np.rint(4096 / (1 + np.exp(-np.arange(-2047, 2048) / 256))).clip(1, 4095).astype(np.int32)
-"""Probabilities of 12 bits ``[4095]`` for -2047 to 2047 in 256ths of their logits.
-
-The format fixes these numbers: other machines' exponentials must round to them (a test holds their hash).
-"""
 _STRETCH = np.searchsorted(_SQUASH, np.arange(4096), side="left").clip(0, 4094).astype(np.int32) - 2047
 _RATES = (65536 * 5 // (5 * np.arange(256) + 8)).astype(np.int32)
 
@@ -243,7 +236,7 @@ def encode_gaps(codes: NDArray[np.uint64], block: int, bits: int) -> Stream:
 
 
 def decode_gaps(stream: Stream, count: int, block: int, bits: int) -> NDArray[np.uint64]:
-    """Morton codes ``[N]`` from :func:`encode_gaps`; ``PackError`` if the stream does not end with its last number."""
+    """Morton codes ``[N]`` from :func:`encode_gaps`; ``ValueError`` if the stream does not end with its last number."""
     codes = np.zeros(count, np.int64)
     _read(_run_gaps, stream, codes, block, bits)
     return codes.astype(np.uint64)
@@ -269,7 +262,7 @@ def encode_levels(levels: Array, near: Near) -> Stream:
 
 
 def decode_levels(stream: Stream, width: int, near: Near) -> Levels:
-    """Numbers ``[N, C]`` from :func:`encode_levels`; ``PackError`` if the stream does not end with its last number."""
+    """Numbers ``[N, C]`` from :func:`encode_levels`; ``ValueError`` if the stream does not end with its last number."""
     levels = np.zeros((len(near), width), np.int32)
     _read(_run, stream, levels, near)
     return levels
@@ -291,4 +284,4 @@ def _read(run: Callable[..., None], stream: Stream, *arguments: Any) -> None:
     run(*arguments, stream.copy(), coder, True)  # the loop takes no read-only arrays
     # A decoder has read four bytes where the encoder wrote the last one.
     if int(coder[3]) - 3 != len(stream):
-        raise DamagedError("a stream does not end with its last number")
+        raise ValueError("a stream does not end with its last number")

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -20,11 +21,11 @@ from torch import Tensor
 from sundae_ns.core.errors import PackError
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import FEATURES, SPLAT_NAMES, finite_mask, num_gaussians
+from sundae_ns.io.budget import afford
 from sundae_ns.io.pack import container, entropy, quantize
 from sundae_ns.io.pack.codecs import Codecs, Sensitivity, as_matrix, fit_codecs
 from sundae_ns.io.pack.config import PackConfig
-from sundae_ns.io.pack.container import FORMAT, Array, DamagedError, Levels, fits, in_range
-from sundae_ns.io.pack.entropy import Near
+from sundae_ns.io.pack.container import FORMAT, MAX_RATIO, SPARE, Array, Levels, fault, fits, in_range
 from sundae_ns.io.pack.quantize import Blocks
 from sundae_ns.io.ply import check_gaussians
 
@@ -38,16 +39,11 @@ _MAX_WIDTH: int = FORMAT["header"]["properties"]["attributes"]["properties"][FEA
 class PackedScene:
     """All that is needed to render a scene."""
 
-    gaussians: dict[str, Tensor]
-    """See :mod:`sundae_ns.core.gaussians`; float32 on the CPU."""
-    head: dict[str, Tensor] = default(default_factory=dict)
-    """State of the head; empty without a head."""
-    cameras: dict[str, Tensor] | None = None
-    """Cameras by the names of :data:`CAMERAS`."""
-    meta: dict[str, Any] = default(default_factory=dict)
-    """JSON values: configuration of the model, coordinate frame, and other entries of the caller."""
-    sensitivity: Sensitivity | None = None
-    """What errors do to images; not stored. Without it all errors weigh the same."""
+    gaussians: dict[str, Tensor]  # see core.gaussians; float32 on the CPU
+    head: dict[str, Tensor] = default(default_factory=dict)  # its state; empty without a head
+    cameras: dict[str, Tensor] | None = None  # by the names of CAMERAS
+    meta: dict[str, Any] = default(default_factory=dict)  # JSON: the model's configuration, frame, and other entries
+    sensitivity: Sensitivity | None = None  # what errors do to images; not stored; without it all weigh the same
 
 
 class PackReport(NamedTuple):
@@ -60,11 +56,10 @@ class PackReport(NamedTuple):
     @property
     def bits(self) -> dict[str, float]:
         """Bits per Gaussian of each attribute, and of ``head``, ``cameras`` and ``header``."""
-        sums: dict[str, float] = {}
+        sums = Counter[str]()
         for name, count in self.sections.items():
-            attribute = name.partition("/")[0]
-            sums[attribute] = sums.get(attribute, 0.0) + 8 * count / self.primitives
-        return sums
+            sums[name.partition("/")[0]] += count
+        return {name: 8 * count / self.primitives for name, count in sums.items()}
 
     def summary(self) -> dict[str, Any]:
         """JSON values: Gaussians, bytes, and the bits per Gaussian of each attribute and of all."""
@@ -78,11 +73,9 @@ def _check(params: Mapping[str, Tensor]) -> None:
     n = num_gaussians(params)
     if n == 0:
         raise PackError("the scene has no Gaussians; there is nothing to pack")
-    features = params.get(FEATURES)
-    if features is not None and not (
-        features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MAX_WIDTH
-    ):
-        raise PackError(f"features has shape {list(features.shape)}; it must be [{n}, 1 to {_MAX_WIDTH}]")
+    shape = params[FEATURES].shape if FEATURES in params else (n, 1)
+    if len(shape) != 2 or shape[0] != n or not 1 <= shape[1] <= _MAX_WIDTH:
+        raise PackError(f"features has shape {list(shape)}; it must be [{n}, 1 to {_MAX_WIDTH}]")
     known = {name: params[name].float() for name in (*SPLAT_NAMES, FEATURES) if name in params}
     if broken := n - int(finite_mask(known).sum()):
         raise PackError(f"{broken} of {n} Gaussians are not finite (NaN or infinite); prune the scene first")
@@ -91,9 +84,7 @@ def _check(params: Mapping[str, Tensor]) -> None:
 def fit_scene(scene: PackedScene, config: PackConfig | None = None) -> tuple[PackedScene, Codecs]:
     """The scene with its Gaussians in the stored order and with rounded positions, and codecs fitted to it.
 
-    Raises:
-        ConfigError: an option is invalid.
-        PackError: there are no Gaussians, wrong shapes or values that are not finite.
+    Raises ``ConfigError`` for invalid options, ``PackError`` for no Gaussians, wrong shapes or values not finite.
     """
     config = config or PackConfig()
     config.validate()
@@ -110,11 +101,8 @@ def write_scene(path: Path, scene: PackedScene, config: PackConfig | None = None
 def write_fitted(path: Path, scene: PackedScene, codecs: Codecs) -> PackReport:
     """Pack a scene, atomically, with codecs that were fitted to it before or after training with rounding.
 
-    Gaussians are in the order of :func:`fit_scene`. Their positions are ignored; the codecs hold them.
-
-    Raises:
-        PackError: values are not finite, or the codecs do not fit the scene.
-        StorageError: the disk is full or not writable.
+    Gaussians are in the order of :func:`fit_scene`. Their positions are ignored; the codecs hold them. Raises
+    ``PackError`` if values are not finite, or the codecs do not fit the scene.
     """
     packed, sections = pack_bytes(scene, codecs)
     with replacing(path) as partial:
@@ -146,64 +134,61 @@ def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int
             arrays |= {f"{name}/levels": stream, **{f"{name}/{part}": array for part, array in parts.items()}}
     if scene.cameras is not None:
         for name, section in CAMERAS.items():
-            array = scene.cameras[name].detach().cpu().numpy().astype(section["dtype"])
-            if not in_range(array, section):
-                raise PackError(f"{name} of the cameras have values that readers refuse; give other cameras")
-            arrays[f"cameras/{name}"] = array
-
+            arrays[f"cameras/{name}"] = scene.cameras[name].detach().cpu().numpy().astype(section["dtype"])
     meta = {**scene.meta, "primitives": n, "attributes": about}
+    wrong = fault(meta, FORMAT["header"])
+    for name, array in arrays.items():
+        attribute, _, part = name.partition("/")
+        if not in_range(array, FORMAT["sections"][about.get(attribute, {"codec": attribute})["codec"]][part]):
+            wrong = name
+    if wrong is not None:
+        raise PackError(f"{wrong} has values that readers refuse; give other cameras, or drop the largest values")
     unpacked = 4 * sum(value.numel() for value in (*scene.gaussians.values(), *scene.head.values()))
     return container.encode(meta, arrays, unpacked=unpacked)
 
 
-class _Reader:
-    """Header and sections of a file; each section is checked before use. All methods raise ``DamagedError``."""
-
-    def __init__(self, header: container.Header, arrays: Mapping[str, Array]) -> None:
-        self.size = header.size
-        self.meta = header.meta
-        self.arrays = arrays
-
-    def about(self, attribute: str) -> dict[str, Any]:
-        """The header's entry of an attribute."""
-        if attribute not in self.meta["attributes"]:
-            raise DamagedError(f"its header has no valid attributes.{attribute}")
-        return self.meta["attributes"][attribute]  # type: ignore[no-any-return]
-
-    def array(self, attribute: str, part: str, **lengths: int) -> Array:
-        """A section in the dtype, shape and range that the format states; ``lengths`` are sides that it names."""
-        codec = attribute if attribute == "cameras" else self.about(attribute)["codec"]
-        section, name = FORMAT["sections"][codec][part], f"{attribute}/{part}"
-        array = self.arrays.get(name)
-        if array is None or not fits(array, section, lengths):
-            raise DamagedError(f"{name} is missing or has another shape")
-        if not in_range(array, section):
-            raise DamagedError(f"{name} has values that are not finite or out of range")
-        return array
-
-    def levels(self, name: str, near: Near, width: int) -> tuple[Levels, float]:
-        """Levels ``[N, C]`` of an attribute, and their step."""
-        levels = entropy.decode_levels(self.array(name, "levels"), width, near)
-        return levels, float(self.about(name)["step"])
+class _Sections(NamedTuple):
+    size: int
+    meta: dict[str, Any]
+    arrays: dict[str, Array]
 
 
-def _decode_head(reader: _Reader) -> dict[str, Tensor]:
-    if "head/levels" not in reader.arrays:
+def _about(file: _Sections, attribute: str) -> dict[str, Any]:
+    """The header's entry of an attribute."""
+    if attribute not in file.meta["attributes"]:
+        raise ValueError(f"its header has no valid attributes.{attribute}")
+    return file.meta["attributes"][attribute]  # type: ignore[no-any-return]
+
+
+def _array(file: _Sections, attribute: str, part: str, **lengths: int) -> Array:
+    """A section in the dtype, shape and range that the format states; ``lengths`` are sides that it names."""
+    codec = attribute if attribute == "cameras" else _about(file, attribute)["codec"]
+    section, name = FORMAT["sections"][codec][part], f"{attribute}/{part}"
+    array = file.arrays.get(name)
+    if array is None or not fits(array, section, lengths):
+        raise ValueError(f"{name} is missing or has another shape")
+    if not in_range(array, section):
+        raise ValueError(f"{name} has values that are not finite or out of range")
+    return array
+
+
+def _decode_head(file: _Sections) -> dict[str, Tensor]:
+    if "head/levels" not in file.arrays:
         return {}
-    about = reader.about("head")
-    sources = {part: reader.array("head", part) for part in ("plain", "steps", "columns")}
+    about = _about(file, "head")
+    sources = {part: _array(file, "head", part) for part in ("plain", "steps", "columns")}
     tensors = {name: tuple(map(int, shape)) for name, shape in about["tensors"]}
     sizes = {name: math.prod(shape) for name, shape in tensors.items()}
     count = sum(sizes[name] for name, shape in tensors.items() if len(shape) > 1)
     if about["weights"] != count:
-        raise DamagedError("the head has another number of weights than it states")
-    container.check_ratio(4 * count, reader.size)
+        raise ValueError("the head has another number of weights than it states")
+    afford(4 * count, file.size, SPARE, MAX_RATIO)
     near = entropy.predecessors(count)
-    sources["levels"] = entropy.decode_levels(reader.array("head", "levels"), 1, near).reshape(-1)
+    sources["levels"] = entropy.decode_levels(_array(file, "head", "levels"), 1, near).reshape(-1)
 
     def take(part: str, count: int) -> Tensor:
         if count > len(sources[part]):
-            raise DamagedError("the head has fewer weights than it states")
+            raise ValueError("the head has fewer weights than it states")
         taken, sources[part] = np.split(sources[part], [count])
         return torch.from_numpy(taken.astype(np.float32))
 
@@ -215,60 +200,60 @@ def _decode_head(reader: _Reader) -> dict[str, Tensor]:
             steps = take("steps", shape[0])[:, None] * take("columns", shape[1])
             head[name] = quantize.weights_at(take("levels", sizes[name]).reshape(shape), steps)
             if not torch.isfinite(head[name]).all():
-                raise DamagedError("the head has weights beyond float32")
+                raise ValueError("the head has weights beyond float32")
     return head
 
 
-def _decode_cameras(reader: _Reader) -> dict[str, Tensor] | None:
-    if "cameras/poses" not in reader.arrays:
+def _decode_cameras(file: _Sections) -> dict[str, Tensor] | None:
+    if "cameras/poses" not in file.arrays:
         return None
-    count = len(reader.arrays["cameras/poses"])
-    arrays = {name: reader.array("cameras", name, cameras=count) for name in CAMERAS}
+    count = len(file.arrays["cameras/poses"])
+    arrays = {name: _array(file, "cameras", name, cameras=count) for name in CAMERAS}
     arrays["sizes"] = arrays["sizes"].astype(np.int64)
     return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
 
 def read_scene(path: Path) -> PackedScene:
-    """Unpack a file, without executing anything in it, and with memory bounded by its size.
-
-    Raises:
-        PackError: the file is missing, of another version, truncated, altered, or not a valid scene.
-    """
+    """Unpack a file, without executing anything in it, with memory bounded by its size; ``PackError`` if it is bad."""
     header = container.read_header(path)
     with container.naming(path):
         container.check(header.meta, "header")
         n, attributes = int(header.meta["primitives"]), header.meta["attributes"]
         width, features = (int(attributes.get(name, {"width": 0})["width"]) for name in ("features_rest", FEATURES))
-        container.check_ratio(4 * n * (14 + width + features), header.size)
-        return _decoded(_Reader(header, container.read_sections(path, header)), n, width, features)
+        afford(4 * n * (14 + width + features), header.size, SPARE, MAX_RATIO)
+        file = _Sections(header.size, header.meta, container.read_sections(path, header))
+        return _decoded(file, n, width, features)
 
 
-def _decoded(reader: _Reader, n: int, width: int, features: int) -> PackedScene:
-    bits, size = (int(reader.about("means")[key]) for key in ("bits", "block"))
-    low, high = (reader.array("means", end, blocks=-(-n // size)) for end in ("low", "high"))
-    blocks = Blocks(entropy.decode_gaps(reader.array("means", "gaps"), n, size, bits), low, high)
+def _decoded(file: _Sections, n: int, width: int, features: int) -> PackedScene:
+    bits, size = (int(_about(file, "means")[key]) for key in ("bits", "block"))
+    low, high = (_array(file, "means", end, blocks=-(-n // size)) for end in ("low", "high"))
+    blocks = Blocks(entropy.decode_gaps(_array(file, "means", "gaps"), n, size, bits), low, high)
     near = entropy.neighbours_of(blocks.cells, size)
 
+    def levels(name: str, channels: int) -> tuple[Levels, float]:
+        return entropy.decode_levels(_array(file, name, "levels"), channels, near), float(_about(file, name)["step"])
+
     def quats() -> Array:
-        levels, step = reader.levels("quats", near, 3)
-        return np.asarray(quantize.rotations_at(torch.from_numpy(levels), step).numpy())
+        coded, step = levels("quats", 3)
+        return np.asarray(quantize.rotations_at(torch.from_numpy(coded), step).numpy())
 
     def rows(name: str, channels: int) -> Array:
-        levels, step = reader.levels(name, near, channels)
-        mean = reader.array(name, "mean", width=channels)
-        basis = reader.array(name, "basis", square=channels**2).reshape(channels, channels)
-        return quantize.rows_at(levels, mean, basis, step)
+        coded, step = levels(name, channels)
+        mean = _array(file, name, "mean", width=channels)
+        basis = _array(file, name, "basis", square=channels**2).reshape(channels, channels)
+        return quantize.rows_at(coded, mean, basis, step)
 
     with ThreadPoolExecutor(2) as pool:
         # The largest jobs come first, so that the threads end together.
         wide, narrow = {"features_rest": width, FEATURES: features}, {"scales": 3, "features_dc": 3, "opacities": 1}
         jobs = {name: pool.submit(rows, name, channels) for name, channels in wide.items() if channels}
-        head = pool.submit(_decode_head, reader)
+        head = pool.submit(_decode_head, file)
         jobs["quats"] = pool.submit(quats)
         jobs |= {name: pool.submit(rows, name, channels) for name, channels in narrow.items()}
         jobs["means"] = pool.submit(quantize.dequantize_positions, blocks, bits, size)
         gaussians = {name: torch.from_numpy(job.result()) for name, job in jobs.items()}
     gaussians["features_rest"] = gaussians.get("features_rest", torch.zeros(0)).reshape(n, width // 3, 3)
     ordered = {name: gaussians[name] for name in (*SPLAT_NAMES, FEATURES) if name in gaussians}
-    meta = {name: value for name, value in reader.meta.items() if name not in ("sections", "attributes", "primitives")}
-    return PackedScene(ordered, head.result(), _decode_cameras(reader), meta)
+    meta = {name: value for name, value in file.meta.items() if name not in ("sections", "attributes", "primitives")}
+    return PackedScene(ordered, head.result(), _decode_cameras(file), meta)

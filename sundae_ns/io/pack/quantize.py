@@ -1,9 +1,8 @@
 """Quantisation: positions in blocks, rotations near the identity, rows by a transform, weights of the head.
 
 A transform (Karhunen-Loeve) makes rows uncorrelated; most coefficients round to zero, which takes almost no bytes.
-
-Error bounds do not count the rounding of the result to float32 (half a unit in the last place). Rounding is implemented
-once, in torch: files store levels, and training with rounding uses the values of the same levels.
+Error bounds do not count the rounding of the result to float32. Rounding is implemented once, in torch: files store
+levels, and training with rounding uses the values of the same levels.
 """
 
 from __future__ import annotations
@@ -46,13 +45,8 @@ class Blocks(NamedTuple):
 def quantize_positions(means: Floats, bits: int, size: int) -> tuple[Blocks, NDArray[np.int64]]:
     """Round positions to a grid in each block, and sort each block by Morton code, so that differences are small.
 
-    Args:
-        means: ``[N, 3]``, finite, in the order of ``coordinates.scene_order``.
-        bits: bits of each coordinate of a cell.
-        size: Gaussians per block.
-
-    Returns:
-        The blocks, and the permutation ``[N]`` from their order to rows of ``means``.
+    ``means`` ``[N, 3]`` are finite, in the order of ``coordinates.scene_order``; a coordinate of a cell has ``bits``, a
+    block ``size`` Gaussians. Returns the blocks, and the permutation ``[N]`` from their order to rows of ``means``.
     """
     n = len(means)
     starts = np.arange(0, n, size)
@@ -78,13 +72,8 @@ def aligned(quats: Floats, scales: Floats) -> tuple[Floats, Floats]:
 
     An ellipsoid has 24 descriptions: its axes in another order, or reversed. The one with the smallest rotation has
     w of at least 0.85, so that three components tell the fourth, and takes 4.6 bits less.
-
-    Args:
-        quats: wxyz, finite, of any length ``[N, 4]``; zero ones are the identity, as in the rasterisers.
-        scales: one for each axis ``[N, 3]``.
-
-    Returns:
-        Unit quaternions ``[N, 4]`` with w positive, and the scales in their new order ``[N, 3]``.
+    ``quats`` ``[N, 4]`` are wxyz, finite, of any length, zero ones the identity; ``scales`` ``[N, 3]`` are one for each
+    axis. Returns unit quaternions with w positive, and the scales in their new order.
     """
     # The 24 rotations of a cube; of a quaternion and its negative, the one whose first nonzero component is positive.
     candidates = [q for q in itertools.product((1, 0, -1), repeat=4) if np.count_nonzero(q) in (1, 2, 4)]
@@ -109,18 +98,15 @@ class Rotations:
     def encode(self, values: Floats) -> Coded:
         """Quantise finite quaternions of any length; zero ones are the identity, as in the rasterisers."""
         about = {"codec": "xyz", "width": 3, "step": self.step, "bound": rotation_bound(self.step)}
-        return about, self._levels(torch.from_numpy(values)).numpy().astype(np.int32), {}
+        return about, self.coefficients(torch.from_numpy(values)).round().numpy().astype(np.int32), {}
 
     def rounded(self, values: Tensor) -> Tensor:
         """Return the unit quaternions that a reader decodes; bit for bit on a CPU."""
-        return rotations_at(self._levels(values), self.step)
+        return rotations_at(self.coefficients(values).round(), self.step)
 
     def coefficients(self, values: Tensor) -> Tensor:
         """Components x, y and z in steps, float64 ``[N, 3]``; gradients flow through them."""
         return _normalized(values.double())[:, 1:] / self.step
-
-    def _levels(self, values: Tensor) -> Tensor:
-        return self.coefficients(values).round()
 
 
 def rotations_at(levels: Tensor, step: float) -> Tensor:
@@ -200,12 +186,9 @@ class Transform:
 def fit_transform(rows: Floats, step: float, *, centred: bool = True, form: Tensor | None = None) -> Transform:
     """Fit a transform to finite rows ``[N, D]``, N and D at least 1.
 
-    Args:
-        rows: the values.
-        step: positive; a larger one is used where the largest coefficient would not fit.
-        centred: subtract the mean row; else rows of zeros stay exact.
-        form: weighs errors e of rows by e' form e, positive definite ``[D, D]``; coefficients are uncorrelated where
-            this is the squared length. None or zeros for the identity.
+    A larger ``step`` is used where the largest coefficient would not fit. Rows that are not ``centred`` on their mean
+    keep zeros exact. ``form`` ``[D, D]``, positive definite, weighs errors e of rows by e' form e; coefficients are
+    uncorrelated where this is the squared length. None or zeros stand for the identity.
     """
     values = rows.astype(np.float64)
     mean = (values.mean(axis=0) if centred else np.zeros(rows.shape[1])).astype(np.float32)

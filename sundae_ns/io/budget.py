@@ -1,0 +1,43 @@
+"""The one budget of all readers, of memory and so of time: what a file may unpack to follows from its own bytes."""
+
+from __future__ import annotations
+
+import json
+from io import BufferedIOBase
+from typing import IO, Any
+
+from sundae_ns.core.gaussians import sh_degree_of
+
+SPARE, RATIO = 64 << 20, 32  # bytes, and bytes for each byte of the file; a real .sog has 24, a .spz 12
+_MOST_JSON = 16 << 20
+
+
+def afford(unpacked: int, size: int, spare: int = SPARE, ratio: int = RATIO) -> None:
+    """Raise ``ValueError`` if a file of ``size`` bytes may not unpack to ``unpacked`` bytes."""
+    if unpacked > spare + ratio * size:
+        raise ValueError(f"{size:,} bytes would unpack to {unpacked:,}")
+
+
+def afford_gaussians(count: int, coefficients: int, size: int) -> None:
+    """The same for the float32 of Gaussians with so many SH coefficients of degrees 1 and up for each channel."""
+    if count < 1 or sh_degree_of(coefficients) is None:
+        raise ValueError(f"it states {count:,} Gaussians of {coefficients} SH coefficients")
+    afford(4 * count * (14 + 3 * coefficients), size)
+
+
+def read_exactly(stream: IO[bytes] | BufferedIOBase, size: int) -> bytes:
+    """The next ``size`` bytes of a stream that decompresses; ``ValueError`` if it ends before."""
+    content = stream.read(size)
+    if len(content) < size:
+        raise ValueError(f"{size - len(content):,} bytes are missing")
+    return content
+
+
+def parsed_json(content: bytes) -> Any:
+    """A JSON object of a file; ``ValueError`` for other values, and for more than 16 MiB, which take a gigabyte."""
+    if len(content) > _MOST_JSON:
+        raise ValueError(f"its JSON has {len(content):,} bytes, and may have {_MOST_JSON:,}")
+    value = json.loads(content)
+    if not isinstance(value, dict):
+        raise ValueError("its JSON is no object")
+    return value

@@ -1,0 +1,108 @@
+"""Files of .spz of every version, made by the specification: values, stated axes, and sizes that lie."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+import zstandard
+from foreign_files import colors_of, small_field, spz
+from limits import verdict
+
+import sundae_ns as sn
+from sundae_ns.core.covariance import covariances_of
+from sundae_ns.core.errors import DataError
+from sundae_ns.io.spz import read_spz
+from sundae_ns.rasterize.reference import harmonic_basis
+
+
+@pytest.mark.parametrize(("version", "degree"), [(1, 3), (2, 0), (3, 4), (4, 1), (4, 0)])
+def test_values_of_every_version(tmp_path: Path, version: int, degree: int) -> None:
+    truth = small_field(200, degree)
+    (tmp_path / "a.spz").write_bytes(spz(truth, version, antialiased=degree == 4))
+    found, antialiased = read_spz(tmp_path / "a.spz")
+    assert antialiased == (degree == 4)
+    signs = (found["quats"] * truth["quats"]).sum(dim=1, keepdim=True).sign()
+    # Half a step each; half precision near 1 has steps of 2^-11, three bytes near a rotation of pi tell w badly.
+    for ours, theirs, step in (
+        (found["means"], truth["means"], 2**-10 if version == 1 else 2**-12),
+        (found["scales"], truth["scales"], 1 / 16),
+        (colors_of(found), colors_of(truth), 0.0075),
+        (found["features_rest"], truth["features_rest"], 1 / 64),
+        (found["opacities"].sigmoid(), truth["opacities"].sigmoid(), 1 / 255),
+        ((found["quats"] * signs)[:, 1:], truth["quats"][:, 1:], 0.003 if version > 2 else 2 / 127),
+    ):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=step / 2 + 1e-6)
+
+
+AXES = {"LDB": 1, "RUB": 4, "RDF": 6, "LUF": 7, "RUF": 8, "RBD": 10, "RFU": 16}
+"""Numbers of coordinate systems in Adobe's extension."""
+
+
+@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize("version", [3, 4])
+def test_stated_axes_are_turned_to_those_of_a_ply(tmp_path: Path, version: int, axes: str) -> None:
+    """Each Gaussian is where it was to the right, down and forward, and shows the same colours from there."""
+    truth = small_field(50, 3)
+    (tmp_path / "a.spz").write_bytes(spz(truth, version))
+    plain = read_spz(tmp_path / "a.spz")[0]
+    (tmp_path / "a.spz").write_bytes(spz(truth, version, axes=AXES[axes]))
+    found = read_spz(tmp_path / "a.spz")[0]
+    rows = {"R": (0, 1), "L": (0, -1), "D": (1, 1), "U": (1, -1), "F": (2, 1), "B": (2, -1)}
+    turn = torch.zeros(3, 3)
+    for column, letter in enumerate(axes):
+        row, sign = rows[letter]
+        turn[row, column] = sign
+    torch.testing.assert_close(found["means"], plain["means"] @ turn.T)
+    expected = turn.double() @ covariances_of(plain) @ turn.T.double()
+    torch.testing.assert_close(covariances_of(found), expected, rtol=0, atol=1e-8)
+    seen = torch.nn.functional.normalize(torch.randn(9, 3, generator=torch.Generator().manual_seed(0)))
+    before, after = (harmonic_basis(3, directions)[:, 1:] for directions in (seen, seen @ turn.T))
+    colors = (
+        torch.einsum("dk,nkc->ndc", *pair)
+        for pair in ((after, found["features_rest"]), (before, plain["features_rest"]))
+    )
+    torch.testing.assert_close(*colors, rtol=0, atol=1e-5)
+
+
+def _bomb(size: int) -> bytes:
+    return zstandard.ZstdCompressor(level=1).compress(bytes(size))
+
+
+def _with_stream(content: bytes, frame: bytes) -> bytes:
+    """The positions are another frame, which the table states as the right one."""
+    stored = struct.unpack_from("<Q", content, 32)[0]
+    return content[:32] + struct.pack("<Q", len(frame)) + content[40:128] + frame + content[128 + stored :]
+
+
+FIELD = small_field(100, 1)
+HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
+    "a second member": (lambda: spz(FIELD, 3) + gzip.compress(bytes(1 << 27)), "unpacks to far more"),
+    "a long end": (lambda: gzip.compress(gzip.decompress(spz(FIELD, 3)) + bytes(1 << 27)), "unpacks to far more"),
+    "a frame of 256 MB": (lambda: _with_stream(spz(FIELD, 4), _bomb(1 << 28)), "has not the 900 bytes"),
+    "a short frame": (lambda: _with_stream(spz(FIELD, 4), _bomb(7)), "has not the 900 bytes"),
+    "four billion Gaussians": (lambda: spz(FIELD, 4, count=2**32 - 1), "would unpack to"),
+    "no Gaussians": (lambda: spz(FIELD, 3, count=0), "it states 0 Gaussians"),
+    "fewer bytes than Gaussians": (lambda: spz(FIELD, 3, count=101), "bytes are missing"),
+    "SH degree 5": (lambda: spz(FIELD, 3, degree=5), "35 SH coefficients"),
+    "a cut stream": (lambda: spz(FIELD, 3)[:-9], "ended before"),
+    "a wrong checksum": (lambda: spz(FIELD, 3)[:-8] + bytes(8), "CRC"),
+    "version 5": (lambda: spz(FIELD, 5), "version 1 to 4"),
+    "version 4 in gzip": (lambda: gzip.compress(spz(FIELD, 4)), "version 1 to 4"),
+    "another gzip file": (lambda: gzip.compress(b"ply" * 9), "not that of a .spz"),
+    "99 fractional bits": (lambda: spz(FIELD, 3, bits=99), "version 1 to 4"),
+    "unknown axes": (lambda: spz(FIELD, 4, axes=17), "out of range"),
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_hostile_files(tmp_path: Path, kind: str) -> None:
+    make, words = HOSTILE[kind]
+    (tmp_path / "a.spz").write_bytes(make())
+    error = verdict(lambda: sn.load(tmp_path / "a.spz"), (tmp_path / "a.spz").stat().st_size)
+    assert isinstance(error, DataError)
+    assert words in str(error)
