@@ -51,8 +51,8 @@ def _no_garbage_collection() -> Iterator[None]:
 
 
 def _side_stream(device: torch.device) -> torch.cuda.Stream:
-    # One stream for all graphs, because memory cached for one stream does not serve another; one per thread, because
-    # work of another thread on the same stream would be recorded too.
+    # One for all graphs, because memory cached for one stream does not serve another; one per thread, because work of
+    # another thread would be recorded too.
     streams: dict[torch.device, torch.cuda.Stream] = _thread.__dict__.setdefault("streams", {})
     if device not in streams:
         streams[device] = torch.cuda.Stream(device)
@@ -98,7 +98,11 @@ def record(
         except RuntimeError as error:
             if error not in errors:  # ending the recording failed too
                 errors.append(error)
-                _abandon(graph, pool)
+                # Else torch's allocator would ask this graph for its allocations, and never release memory. There is no
+                # public function.
+                with suppress(AttributeError, RuntimeError):
+                    torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), pool)
+                _abandoned.append(graph)
                 if before is not None:
                     # Else torch refuses random numbers: its generator waits for a recording that does not exist.
                     generator.graphsafe_set_state(before)
@@ -108,14 +112,6 @@ def record(
             cause = str(first).partition("\n")[0]
             raise BackendError(f"{device} cannot record this as a CUDA graph: {cause}") from first
     return graph, result
-
-
-def _abandon(graph: torch.cuda.CUDAGraph, pool: tuple[int, int]) -> None:
-    """Tell torch's allocator that a recording which cannot be ended is over; else it would never release memory."""
-    # Torch has no public function. Without this one, the allocator keeps asking the graph which allocations it owns.
-    with suppress(AttributeError, RuntimeError):
-        torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), pool)
-    _abandoned.append(graph)
 
 
 class GraphCache(Generic[_Result]):

@@ -17,7 +17,7 @@ from importlib import resources
 import torch
 from torch import Tensor
 
-from sundae_ns.core.errors import BackendError, out_of_memory
+from sundae_ns.core.errors import BackendError, MemoryExhaustedError, one_line, out_of_memory
 
 Argument = Tensor | int | float | None
 Launch = Callable[[int, Sequence[Argument]], None]
@@ -74,10 +74,8 @@ def compile_cubin(file: str, architecture: str, options: Sequence[str] = ()) -> 
 class Kernel:
     """The kernel ``name`` of a file of ``sundae_ns/csrc`` on one device, callable with tensors and numbers.
 
-    ``options`` are further compiler options, ``block`` is the number of threads per block.
-
-    Raises:
-        BackendError: the kernel cannot be compiled or loaded.
+    ``options`` are further compiler options, ``block`` is the number of threads per block. ``BackendError`` if it
+    cannot be compiled or loaded.
     """
 
     def __init__(self, file: str, name: str, device: torch.device, options: Sequence[str] = (), block: int = 128):
@@ -115,11 +113,7 @@ class Kernel:
 def load_kernels(
     file: str, names: tuple[str, ...], options: tuple[str, ...], device: torch.device, block: int = 128
 ) -> dict[str, Launch]:
-    """Kernels of one file by name, compiled on the first call; arguments are those of :class:`Kernel`.
-
-    Raises:
-        BackendError: the kernels cannot be compiled or loaded.
-    """
+    """Kernels of one file by name, compiled on the first call; arguments and errors are those of :class:`Kernel`."""
     return {name: Kernel(file, name, device, options, block) for name in names}
 
 
@@ -182,14 +176,13 @@ def _library(name: str) -> ctypes.CDLL:
 
 @contextmanager
 def naming_full_memory(num_gaussians: Callable[[], int]) -> Iterator[None]:
-    """Turn CUDA's error of full memory inside the block into one that names the number of Gaussians and a remedy.
-
-    ``num_gaussians`` counts the Gaussians; it is called on an error only.
-
-    Raises:
-        MemoryExhaustedError: the memory of the GPU is full.
-    """
+    """Turn errors of full memory inside the block into ``MemoryExhaustedError``, which names the Gaussians."""
     try:
         yield
     except torch.cuda.OutOfMemoryError as error:
         raise out_of_memory(error, num_gaussians()) from error
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, MemoryError) or "DefaultCPUAllocator" in str(error):
+            cause = f"the memory is full with {num_gaussians():,} Gaussians ({one_line(error)})"
+            raise MemoryExhaustedError(f"{cause}; give smaller images, or fewer Gaussians") from error
+        raise

@@ -34,11 +34,7 @@ OPTIONS = (
 
 
 def loss_kernels(device: torch.device) -> dict[str, Launch]:
-    """The kernels for a CUDA device, compiled on the first call.
-
-    Raises:
-        BackendError: the kernels cannot be compiled or loaded.
-    """
+    """The kernels for a CUDA device; see :func:`.load_kernels`."""
     return load_kernels("loss.cu", ("compare", "compare_backward"), OPTIONS, device, _THREADS)
 
 

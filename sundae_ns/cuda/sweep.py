@@ -6,7 +6,7 @@ samples another image for one tile and one plane into shared memory, and sums th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -34,16 +34,19 @@ class Patches(NamedTuple):
 
 
 def sweep_kernels(device: torch.device) -> dict[str, Launch]:
-    """The kernel for a CUDA device, compiled on the first call.
-
-    Raises:
-        BackendError: the kernel cannot be compiled or loaded.
-    """
+    """The kernel for a CUDA device; see :func:`.load_kernels`."""
     return load_kernels("sweep.cu", ("correlate",), OPTIONS, device, _THREADS)
 
 
-class FusedCorrelations:
-    """Correlations between the patches of one image and those of other images.
+def fused_correlations(
+    kernels: dict[str, Launch],
+    patches: Patches,
+    others: Sequence[Tensor],
+    maps: Tensor,
+    inverses: tuple[float, float],
+    least_variance: float,
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """A function that correlates the patches of one image with those of other images.
 
     Args:
         kernels: returned by :func:`sweep_kernels`.
@@ -53,41 +56,26 @@ class FusedCorrelations:
             to the homogeneous ``map @ (x, y, 1, d)``.
         inverses: lowest and highest inverse depth.
         least_variance: lower limit for the variance of a patch of another image.
+
+    Returns:
+        For ``facing``, dot products of a normal and the points at depth 1 behind the pixel centres ``[H, W]``, and
+        inverse distances ``s`` ``[S]``: the highest correlation over the other images, for planes
+        ``normal . X = 1 / s``, float32 ``[S, H, W]``. It is -1 where no other image contains the projected pixel, and
+        where the inverse depth is outside the limits.
     """
+    ends = list(accumulate(image.numel() for image in others))
+    starts = [(end - image.numel(), *image.shape) for end, image in zip(ends, others)]
+    shapes = torch.tensor(starts, dtype=torch.int32, device=maps.device)
+    inputs = [value.contiguous() for value in patches]
+    images = (maps.contiguous(), shapes, torch.cat([image.flatten() for image in others]))
 
-    def __init__(
-        self,
-        kernels: dict[str, Launch],
-        patches: Patches,
-        others: Sequence[Tensor],
-        maps: Tensor,
-        inverses: tuple[float, float],
-        least_variance: float,
-    ) -> None:
-        ends = list(accumulate(image.numel() for image in others))
-        shapes = [(end - image.numel(), *image.shape) for end, image in zip(ends, others)]
-        self._launch, self._limits = kernels["correlate"], (*inverses, least_variance)
-        self._patches = [value.contiguous() for value in patches]
-        self._others = [
-            maps.contiguous(),
-            torch.tensor(shapes, dtype=torch.int32, device=maps.device),
-            torch.cat([image.flatten() for image in others]),
-        ]
-        self._num_others = len(others)
-
-    def __call__(self, facing: Tensor, s: Tensor) -> Tensor:
-        """Highest correlation over the other images, for planes ``normal . X = 1 / s``: float32 ``[S, H, W]``.
-
-        It is -1 where no other image contains the projected pixel, and where the inverse depth is outside the limits.
-
-        Args:
-            facing: dot products of the normal and the points at depth 1 behind the pixel centres ``[H, W]``.
-            s: inverse distances of the planes ``[S]``.
-        """
+    def correlate(facing: Tensor, s: Tensor) -> Tensor:
         height, width = facing.shape
         tiles = -(-height // _TILE_HEIGHT) * -(-width // _TILE_WIDTH)
         scores = facing.new_empty(len(s), height, width)
-        numbers = (height, width, len(s), self._num_others, *self._limits)
-        arrays = (*self._patches, facing.contiguous(), s.contiguous(), *self._others, scores)
-        self._launch(len(s) * tiles * _THREADS, (*numbers, *arrays))
+        numbers = (height, width, len(s), len(others), *inverses, least_variance)
+        arrays = (*inputs, facing.contiguous(), s.contiguous(), *images, scores)
+        kernels["correlate"](len(s) * tiles * _THREADS, (*numbers, *arrays))
         return scores
+
+    return correlate

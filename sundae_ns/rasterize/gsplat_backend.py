@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 import torch
 from torch import Tensor
 
@@ -17,42 +15,34 @@ _CHANNELS_PER_PASS = 32
 
 
 class GsplatBackend:
-    """gsplat's kernels, for float32 tensors on a CUDA device."""
+    """gsplat's kernels, for float32 tensors on a CUDA device; every method raises ``BackendError`` for others."""
 
     name = "gsplat"
 
     def rasterize(self, inputs: Inputs) -> Rasterization:
-        """Render one view.
-
-        Raises:
-            BackendError: The tensors are not float32 on a CUDA device.
-        """
-        _check_kernels_take(inputs.means)
+        """Render one view."""
+        check_kernels_take(inputs.means)
         if inputs.means.shape[0] == 0:  # CUDA refuses to launch a grid of no blocks
             return ReferenceBackend().rasterize(inputs)
         camera = inputs.camera
-        splats = _project(inputs, camera.viewmat[None], camera.K[None])
-        lists = self._lists(splats, camera.width, camera.height)
-        channels = inputs.colors
-        if inputs.render_depth:
-            channels = torch.cat([channels, splats.depths[0, :, None]], dim=1)
-        # Each pass overwrites absgrad with that of its own channels, so absgrad allows one pass only.
-        passes = [channels] if inputs.absgrad else channels.split(_CHANNELS_PER_PASS, dim=1)
-        blended = [self._blend(splats, part[None], lists, inputs.absgrad) for part in passes]
-        image = blended[0][0][0] if len(blended) == 1 else torch.cat([part[0] for part, _ in blended], dim=-1)
-        return result_of(image, blended[0][1][0], splats.means2d, splats.radii, inputs)
+        images, alphas, splats = self._draw(inputs, camera.viewmat[None], camera.K[None], inputs.colors[None])
+        return result_of(images[0], alphas[0], splats.means2d, splats.radii, inputs)
 
     def rasterize_cameras(self, inputs: Inputs, viewmats: Tensor, Ks: Tensor) -> Tensor:
-        """Render several cameras at once, with one wait for the device; colours are ``[V, N, C]``.
+        """Render several cameras at once, with one wait for the device; colours are ``[V, N, C]``."""
+        check_kernels_take(inputs.means)
+        return GsplatBackend()._draw(inputs, viewmats, Ks, inputs.colors)[0]  # our own lists are of one view
 
-        Raises:
-            BackendError: The tensors are not float32 on a CUDA device.
-        """
-        _check_kernels_take(inputs.means)
+    def _draw(self, inputs: Inputs, viewmats: Tensor, Ks: Tensor, colors: Tensor) -> tuple[Tensor, Tensor, Splats]:
+        """Images ``[V, H, W, C]`` and alphas ``[V, H, W, 1]`` of V views, and their splats; colours ``[V, N, C]``."""
         splats = _project(inputs, viewmats, Ks)
-        lists = GsplatBackend._lists(self, splats, inputs.camera.width, inputs.camera.height)
-        parts = inputs.colors.split(_CHANNELS_PER_PASS, dim=2)
-        return torch.cat([GsplatBackend._blend(self, splats, part, lists, False)[0] for part in parts], dim=-1)
+        lists = self._lists(splats, inputs.camera.width, inputs.camera.height)
+        if inputs.render_depth:
+            colors = torch.cat([colors, splats.depths[..., None]], dim=2)
+        # Each pass overwrites absgrad with that of its own channels, so absgrad allows one pass only.
+        passes = [colors] if inputs.absgrad else colors.split(_CHANNELS_PER_PASS, dim=2)
+        images, alphas = zip(*(self._blend(splats, part, lists, inputs.absgrad) for part in passes))
+        return images[0] if len(images) == 1 else torch.cat(images, dim=-1), alphas[0], splats
 
     def _lists(self, splats: Splats, width: int, height: int) -> GsplatLists:
         """gsplat's own lists: every tile that a Gaussian's bounding square touches."""
@@ -75,14 +65,10 @@ class GsplatBackend:
         )
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-        """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``.
-
-        Raises:
-            BackendError: The tensors are not float32 on a CUDA device.
-        """
+        """See :meth:`.Backend.spherical_harmonics`."""
         from gsplat import spherical_harmonics
 
-        _check_kernels_take(directions)
+        check_kernels_take(directions)
         if directions.shape[0] == 0:
             return ReferenceBackend().spherical_harmonics(degree, directions, coeffs)
         return spherical_harmonics(degree, directions, coeffs)
@@ -92,9 +78,7 @@ class RecordableGsplat(GsplatBackend):
     """gsplat that CUDA graphs can record: nothing waits for the GPU, and all work is on torch's current stream.
 
     Tiles get our own lists, shorter than gsplat's. Colours, and blending with gradients, have kernels of our own.
-
-    Args:
-        capacity: for tile/Gaussian pairs.
+    ``capacity`` is for tile/Gaussian pairs.
     """
 
     def __init__(self, capacity: Capacity) -> None:
@@ -109,25 +93,16 @@ class RecordableGsplat(GsplatBackend):
             return gsplat_kernels.blend(*values, lists, absgrad)
         return super()._blend(splats, colors, lists, absgrad)  # frames stay gsplat's to the bit
 
-    def harmonic_colors(
-        self, degree: int, means: Tensor, center: Tensor, features_dc: Tensor, features_rest: Tensor
-    ) -> Tensor:
-        """See :func:`sundae_ns.rasterize.interface.harmonic_colors`; differentiable once, but not in ``center``.
-
-        Raises:
-            BackendError: The tensors are not float32 on a CUDA device, or the kernels cannot be compiled.
-        """
-        _check_kernels_take(means)
-        return cast("Tensor", gsplat_kernels.harmonic_colors(degree, means, center, features_dc, features_rest))
-
 
 def _project(inputs: Inputs, viewmats: Tensor, Ks: Tensor) -> Splats:
     """Project Gaussians to the screens of views, transforms ``[V, 4, 4]`` and intrinsics ``[V, 3, 3]``."""
     from gsplat import fully_fused_projection
 
-    opacities = inputs.opacities
+    opacities, quats = inputs.opacities, inputs.quats
+    identity = constant((1.0, 0.0, 0.0, 0.0), quats.dtype, quats.device)
+    quats = torch.where((quats == 0).all(dim=-1, keepdim=True), identity, quats)  # the kernels divide by the length
     radii, means2d, depths, conics, compensations = fully_fused_projection(
-        *(inputs.means, None, _without_zeros(inputs.quats), inputs.scales),
+        *(inputs.means, None, quats, inputs.scales),
         *(viewmats, Ks, inputs.camera.width, inputs.camera.height),
         near_plane=inputs.near_plane,
         far_plane=inputs.far_plane,
@@ -138,14 +113,9 @@ def _project(inputs: Inputs, viewmats: Tensor, Ks: Tensor) -> Splats:
     return Splats(radii, means2d, depths, conics, opacities)
 
 
-def _check_kernels_take(tensor: Tensor) -> None:
+def check_kernels_take(tensor: Tensor) -> None:
+    """Raise ``BackendError`` unless a tensor is float32 on a CUDA device."""
     if tensor.dtype != torch.float32 or tensor.device.type != "cuda":
         raise BackendError(
             f"gsplat takes float32 on cuda, not {tensor.dtype} on {tensor.device}; convert, or use 'reference'"
         )
-
-
-def _without_zeros(quats: Tensor) -> Tensor:
-    """Replace all-zero quaternions by the identity, because the kernels divide by the length."""
-    is_zero = (quats == 0).all(dim=-1, keepdim=True)
-    return torch.where(is_zero, constant((1.0, 0.0, 0.0, 0.0), quats.dtype, quats.device), quats)

@@ -6,9 +6,8 @@ All run on torch's current stream and wait for nothing, so CUDA graphs can recor
   hundreds of tiles where no pixel blends it, and every pixel still evaluates it. The lists here leave those pairs out;
   which Gaussians are blended, and in which order, stays the same to the bit.
 - ``csrc/blending.cu``: gsplat's backward pass sums each value of a Gaussian over the pixels of a warp by five
-  exchanges, and adds the sums one by one. Here the lanes of a warp halve the values while they exchange them: 32 values
-  take 31 exchanges in place of 160, and all are added at once. The gradient of alpha needs the sum over all later
-  Gaussians only as a product with the pixel's gradient. So a thread keeps one number for it, not one for each channel.
+  exchanges. Here the lanes of a warp halve the values while they exchange them: 32 values take 31 exchanges in place of
+  160. For the gradient of alpha a thread keeps one number, not one for each channel.
 - ``csrc/colors.cu``: gsplat 1.4 launches its harmonics on CUDA's default stream, which a CUDA graph does not record.
   These kernels also read the coefficients without a copy that joins both parameters.
 """
@@ -28,9 +27,7 @@ from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANC
 TILE = 16
 """Side of gsplat's tiles, pixels."""
 
-LANES = 32
-"""Threads of a warp."""
-
+LANES = 32  # threads of a warp
 _PIXELS = TILE * TILE  # of a tile, and threads of a block that blends one
 _PER_BLOCK = 128  # Gaussians of a block of threads, which reads and writes their coefficients as one piece
 _ROUNDING = "-DROUNDING=1e-5f"  # slack on exponents, relative to their terms: rounding never drops a blended Gaussian
@@ -74,15 +71,8 @@ class GsplatLists:
 def tile_lists(splats: Splats, width: int, height: int, *, capacity: Capacity) -> GsplatLists:
     """Lists of the Gaussians that each tile of a view blends: alpha is at least 1/255 in one of its pixels.
 
-    Args:
-        splats: the Gaussians, on a CUDA device.
-        width: image width in pixels.
-        height: image height in pixels.
-        capacity: number of pairs to allocate; the number needed is appended to it. Without a limit this waits once for
-            the device. With a limit, an extra row of tiles below the image takes the unused pairs.
-
-    Raises:
-        BackendError: the kernels cannot be compiled or loaded.
+    The number of pairs needed is appended to ``capacity``. Without a limit this waits once for the device. With a
+    limit, an extra row of tiles below the image takes the unused pairs. ``BackendError`` without the kernels.
     """
     radii, means2d, depths, conics, opacities = splats
     device = means2d.device
@@ -90,21 +80,16 @@ def tile_lists(splats: Splats, width: int, height: int, *, capacity: Capacity) -
     dtype = torch.int16 if columns * (rows + 1) <= torch.iinfo(torch.int16).max else torch.int32
     kernels = load_kernels("tiles.cu", ("count_tiles", "list_tiles"), listing_options(dtype), device)
     n = means2d.shape[1]
-    lanes = lanes_per_gaussian(n)
+    lanes = 32 if n < 2**17 else 8  # threads for the rows of tiles of a Gaussian: few ones may each be large
     order = depths[0].argsort(stable=True)
     geometry = (n, lanes, order, means2d, conics, opacities, radii, radii.ndim - 1, width, height, columns, rows)
     counts = torch.empty(n * lanes, dtype=torch.int32, device=device)
     kernels["count_tiles"](n * lanes, [*geometry, counts])
     ends = counts.cumsum(0)
     capacity.needed.append(ends[-1])
-    if capacity.pairs is None:
-        pairs, below = int(ends[-1]), 0
-        tiles = torch.empty(pairs, dtype=dtype, device=device)
-        primitives = torch.empty(pairs, dtype=torch.int32, device=device)
-    else:
-        pairs, below = capacity.pairs, 1
-        tiles = torch.full((pairs,), columns * rows, dtype=dtype, device=device)
-        primitives = torch.zeros(pairs, dtype=torch.int32, device=device)
+    pairs, below = (int(ends[-1]), 0) if capacity.pairs is None else (capacity.pairs, 1)
+    tiles = torch.full((pairs,), columns * rows, dtype=dtype, device=device)
+    primitives = torch.zeros(pairs, dtype=torch.int32, device=device)
     kernels["list_tiles"](n * lanes, [*geometry, counts, ends, pairs, tiles, primitives])
     tiles, by_tile = torch.sort(tiles, stable=True)  # stable, so each list stays in order of depth
     numbers = torch.arange(columns * (rows + below), dtype=dtype, device=device)
@@ -113,11 +98,6 @@ def tile_lists(splats: Splats, width: int, height: int, *, capacity: Capacity) -
     # Gradients would walk through the unused pairs, so their tiles are marked.
     drawn = (numbers < columns * rows).view(shape) if below else None
     return GsplatLists(width, height, starts.view(shape), primitives.index_select(0, by_tile), drawn)
-
-
-def lanes_per_gaussian(n: int) -> int:
-    """Threads that share the rows of tiles of a Gaussian: a few Gaussians may each be as large as the image."""
-    return 32 if n < 2**17 else 8
 
 
 def listing_options(dtype: torch.dtype) -> tuple[str, ...]:
@@ -131,16 +111,11 @@ def listing_options(dtype: torch.dtype) -> tuple[str, ...]:
 def blending_options(channels: int, *, absgrad: bool) -> tuple[str, ...]:
     """Compiler options of ``blending.cu``; with ``absgrad`` it also sums absolute gradients of the centres."""
     values = channels + (8 if absgrad else 6)
-    numbers = {
-        **{"TILE": TILE, "THREADS": _PIXELS, "LANES": LANES, "CHANNELS": channels, "PADDED": -(-channels // 4) * 4},
-        **{"VALUES": values, "SLOTS": 1 << (values - 1).bit_length(), "ABSOLUTE": int(absgrad)},
-    }
+    numbers = {"TILE": TILE, "THREADS": _PIXELS, "LANES": LANES, "CHANNELS": channels, "VALUES": values}
+    numbers |= {"PADDED": -(-channels // 4) * 4, "SLOTS": 1 << (values - 1).bit_length(), "ABSOLUTE": int(absgrad)}
     limits = {"MAX_ALPHA": MAX_ALPHA, "MIN_ALPHA": MIN_ALPHA, "MIN_TRANSMITTANCE": MIN_TRANSMITTANCE}
-    return (
-        *(f"-D{name}={number}" for name, number in numbers.items()),
-        *(f"-D{name}={limit:.9e}f" for name, limit in limits.items()),
-        _ROUNDING,
-    )
+    words = [f"-D{name}={number}" for name, number in numbers.items()]
+    return *words, *(f"-D{name}={limit:.9e}f" for name, limit in limits.items()), _ROUNDING
 
 
 class _Blend(torch.autograd.Function):
@@ -182,10 +157,8 @@ blend = _Blend.apply
 """Blend splats to an image ``[1, H, W, C]`` and its alpha ``[1, H, W, 1]``; once differentiable.
 
 It takes centres ``[1, N, 2]`` in pixels, conics ``[1, N, 3]``, colours ``[1, N, C]``, opacities ``[1, N]``, the tile
-lists, and ``absgrad``. Tensors are float32 on a CUDA device. Lists of tiles outside the image are ignored. With
-``absgrad`` the backward pass sets ``absgrad`` ``[1, N, 2]`` of the centres: the absolute gradients of the pixels,
-summed (AbsGS).
-It raises BackendError if the kernels cannot be compiled or loaded.
+lists, and ``absgrad``, all on a CUDA device. Lists of tiles outside the image are ignored. With ``absgrad`` the
+backward pass sets that of the centres, as :func:`sundae_ns.rasterize.reference.composite` does.
 """
 
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import BackendError, ConfigError, DataError
+from sundae_ns.core.errors import BackendError, ConfigError, DataError, one_line
 from sundae_ns.core.gaussians import MAX_SH_DEGREE
-from sundae_ns.rasterize.gsplat_backend import GsplatBackend, RecordableGsplat
+from sundae_ns.rasterize import gsplat_kernels
+from sundae_ns.rasterize.gsplat_backend import GsplatBackend, RecordableGsplat, check_kernels_take
 from sundae_ns.rasterize.reference import ReferenceBackend
 from sundae_ns.rasterize.types import Backend, Inputs, Rasterization, check_memory, constant
 
@@ -24,10 +25,6 @@ def rasterize(inputs: Inputs, *, backend: Backend) -> Rasterization:
 
     Differentiable with respect to the Gaussians, and to ``camera.viewmat`` except under gsplat; not to ``camera.K``.
 
-    Args:
-        inputs: Gaussians, camera and options.
-        backend: From :func:`select_backend`.
-
     Raises:
         DataError: A tensor has the wrong shape, dtype or device, or the image is empty.
         MemoryExhaustedError: On a CPU, the image or its lists need more memory than there is, or without gradients the
@@ -36,7 +33,8 @@ def rasterize(inputs: Inputs, *, backend: Backend) -> Rasterization:
     _check(inputs)
     if inputs.means.device.type == "cpu":
         width, height = inputs.camera.width, inputs.camera.height
-        size = (inputs.colors.shape[1] + 2) * width * height * inputs.means.element_size()
+        # Beside the blended channels: accumulation, state of the pixels, depth, and a base image with its parts.
+        size = (inputs.colors.shape[1] + 15) * width * height * inputs.means.element_size()
         check_memory(size, f"images of {width:,} x {height:,} pixels")
     return backend.rasterize(inputs)
 
@@ -47,8 +45,7 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
     Args:
         inputs: As for :func:`rasterize`, but with colours for each camera ``[V, N, C]``. Of its camera only the size is
             read; it has neither depth nor ``absgrad``.
-        viewmats: Of each camera ``[V, 4, 4]``.
-        Ks: Of each camera ``[V, 3, 3]``.
+        viewmats, Ks: Of each camera ``[V, 4, 4]`` and ``[V, 3, 3]``.
         backend: From :func:`select_backend`.
 
     Returns:
@@ -74,7 +71,7 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
 
 
 def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, backend: Backend) -> Tensor:
-    """Evaluate real spherical harmonics up to ``degree``: the raw sum, without the 0.5 that colours add.
+    """Evaluate real spherical harmonics up to ``degree``: the raw sum ``[N, 3]``, without the 0.5 that colours add.
 
     Args:
         degree: SH degree, 0 to 4; only the first ``(degree + 1) ** 2`` coefficients are read.
@@ -82,9 +79,6 @@ def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, back
             ``[N, 3]``
         coeffs: Coefficients in the order and with the signs of 3DGS. ``[N, K, 3]``
         backend: From :func:`select_backend`.
-
-    Returns:
-        ``[N, 3]``
 
     Raises:
         DataError: The degree is out of range or a shape is wrong.
@@ -106,24 +100,21 @@ def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, back
 def harmonic_colors(
     degree: int, means: Tensor, center: Tensor, features_dc: Tensor, features_rest: Tensor, *, backend: Backend
 ) -> Tensor:
-    """Colours of Gaussians as seen from a point: their harmonics plus 0.5, at least 0.
+    """Colours of Gaussians as seen from a point: their harmonics plus 0.5, at least 0 ``[N, 3]``.
 
     Args:
         degree: SH degree, 0 to 4.
         means: Centres in world units. ``[N, 3]``
         center: Camera centre ``[3]``, or one for each Gaussian ``[N, 3]``.
-        features_dc: First coefficients. ``[N, 3]``
-        features_rest: The others, at least those of the degree. ``[N, K - 1, 3]``
+        features_dc, features_rest: First coefficients ``[N, 3]``, and at least those of the degree ``[N, K - 1, 3]``.
         backend: From :func:`select_backend`.
-
-    Returns:
-        ``[N, 3]``
 
     Raises:
         DataError: The degree is out of range or a shape is wrong.
     """
     if isinstance(backend, RecordableGsplat) and len(means):
-        return backend.harmonic_colors(degree, means, center, features_dc, features_rest)
+        check_kernels_take(means)
+        return cast("Tensor", gsplat_kernels.harmonic_colors(degree, means, center, features_dc, features_rest))
     coeffs = torch.cat([features_dc[:, None], features_rest], dim=1)
     return (spherical_harmonics(degree, means - center, coeffs, backend=backend) + 0.5).clamp_min(0)
 
@@ -140,10 +131,7 @@ def blending_weights(inputs: Inputs, pixels: Tensor | None = None, *, backend: B
         backend: From :func:`select_backend`.
 
     Returns:
-        ``[N]``, in pixels, detached; 0 for Gaussians that are invisible.
-
-    Raises:
-        DataError: As :func:`rasterize`, or ``pixels`` has another size than the image.
+        ``[N]``, in pixels, detached; 0 for Gaussians that are invisible. Errors are those of :func:`rasterize`.
     """
     camera = inputs.camera
     if pixels is not None:
@@ -158,13 +146,12 @@ def blending_weights(inputs: Inputs, pixels: Tensor | None = None, *, backend: B
 
 
 def _check(inputs: Inputs) -> None:
-    camera, colors, n = inputs.camera, inputs.colors, len(inputs.means)
-    if camera.width < 1 or camera.height < 1:
-        size = f"{camera.width}x{camera.height}"
-        raise DataError(f"an image of {size} pixels is empty; width and height must be at least 1")
-    gaussians = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-    tensors = {name: getattr(inputs, name) for name in gaussians} | {"viewmat": camera.viewmat, "K": camera.K}
-    shapes = {**gaussians, "viewmat": (4, 4), "K": (3, 3)}
+    (viewmat, K, width, height, _), colors, n = inputs.camera, inputs.colors, len(inputs.means)
+    if width < 1 or height < 1:
+        raise DataError(f"an image of {width}x{height} pixels is empty; width and height must be at least 1")
+    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "viewmat": (4, 4), "K": (3, 3)}
+    tensors = {**vars(inputs), "viewmat": viewmat, "K": K}
+    tensors = {name: tensors[name] for name in shapes}
     _check_shapes(*((value, name, shapes[name]) for name, value in tensors.items()))
     if colors.dim() != 2 or colors.shape[0] != n or colors.shape[1] < 1:
         raise DataError(f"colors has shape {list(colors.shape)}; pass [{n}, C] with at least one channel")
@@ -199,19 +186,13 @@ def select_backend(name: BackendName, device: torch.device | str) -> Backend:
     device = torch.device(device)
     if name not in ("auto", "gsplat", "cpu", "reference"):
         raise ConfigError(f"unknown rasterizer {name!r}; use auto, gsplat, cpu or reference")
-    if name in ("auto", "gsplat"):
-        problem = _gsplat_problem(device)
-        if problem is None:
-            return GsplatBackend()
-        if name == "gsplat":
-            raise BackendError(f"gsplat cannot rasterize: {problem}; or use the backend 'reference'")
-    if name in ("auto", "cpu"):
-        on_cpu = device.type == "cpu"
-        problem = numba_problem() if on_cpu else f"the tensors are on the device '{device}'; move them to 'cpu'"
-        if problem is None:
-            return _cpu_backend()
-        if name == "cpu":
-            raise BackendError(f"the cpu backend cannot rasterize: {problem}; or use the backend 'reference'")
+    for backend, make, problem_on in (("gsplat", GsplatBackend, _gsplat_problem), ("cpu", _cpu_backend, _cpu_problem)):
+        if name in ("auto", backend):
+            problem = problem_on(device)
+            if problem is None:
+                return make()
+            if name == backend:
+                raise BackendError(f"{backend} cannot rasterize: {problem}; or use the backend 'reference'")
     return ReferenceBackend()
 
 
@@ -230,43 +211,40 @@ def _gsplat_problem(device: torch.device) -> str | None:
     return _kernel_problem()
 
 
+def _cpu_problem(device: torch.device) -> str | None:
+    return numba_problem() if device.type == "cpu" else f"the tensors are on the device '{device}'; move them to 'cpu'"
+
+
 @cache
 def _kernel_problem() -> str | None:
     """Run gsplat's smallest kernel; the cause and remedy if it fails, else None."""
     try:
-        ones = torch.ones(1, 1, 3, device="cuda")
+        ones = torch.ones(1, 1, 3, dtype=torch.float32, device="cuda")
         GsplatBackend().spherical_harmonics(0, ones[0], ones).sum().item()
     except ImportError as error:
-        return f"gsplat does not import ({_first_line(error)}); install gsplat"
+        return f"gsplat does not import ({one_line(error)}); install gsplat"
     except Exception as error:  # a failed build or a missing kernel image raises errors of many kinds
-        return f"its kernels do not run ({_first_line(error)}); install a gsplat wheel for this torch, or nvcc"
+        return f"its kernels do not run ({one_line(error)}); install a gsplat wheel for this torch, or nvcc"
     return None
 
 
 @cache
 def numba_problem() -> str | None:
-    """Render one pixel with the compiled loops; the cause and remedy if that fails, else None.
-
-    This takes half a second, or some seconds if the loops were never compiled before.
-    """
+    """Render one pixel with the compiled loops, which may compile them; cause and remedy if that fails, else None."""
     try:
-        ones = torch.ones(1, 4)
-        camera = Camera(torch.eye(4), torch.eye(3), 1, 1, 1.0)
+        ones = torch.ones(1, 4, dtype=torch.float32, device="cpu")
+        camera = Camera(ones[0].diag(), ones[0, :3].diag(), 1, 1, 1.0)
         inputs = Inputs(ones[:, :3], ones, ones[:, :3], ones[:, 0], ones[:, :1], camera)
         rasterize(inputs, backend=_cpu_backend())
     except ImportError as error:
-        return f"numba does not import ({_first_line(error)}); pip install numba"
+        return f"numba does not import ({one_line(error)}); pip install numba"
     except Exception as error:  # versions, processors and settings that numba refuses raise errors of many kinds
         remedy = "pip install --force-reinstall numba, and unset NUMBA_DISABLE_JIT"
-        return f"numba does not compile ({_first_line(error)}); {remedy}"
+        return f"numba does not compile ({one_line(error)}); {remedy}"
     return None
 
 
 def _cpu_backend() -> Backend:
-    from sundae_ns.rasterize.cpu.backend import CpuBackend
+    from sundae_ns.rasterize.cpu.backend import CpuBackend  # imports numba
 
     return CpuBackend()
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

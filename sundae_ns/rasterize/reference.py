@@ -18,7 +18,7 @@ from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
 from sundae_ns.core.covariance import rotation_matrices
-from sundae_ns.rasterize.types import Inputs, Rasterization, check_pairs, result_of, strategy_radii
+from sundae_ns.rasterize.types import Inputs, Rasterization, check_memory, check_pairs, result_of
 
 BLUR = 0.3
 """Variance in square pixels added to each footprint."""
@@ -54,10 +54,10 @@ class ReferenceBackend:
         means2d = projection.means2d[None]
         width, height = inputs.camera.width, inputs.camera.height
         image, alpha = composite(means2d, projection, opacities, colors, width, height, absgrad=inputs.absgrad)
-        return result_of(image, alpha, means2d, strategy_radii(projection.radii), inputs)
+        return result_of(image, alpha, means2d, projection.radii, inputs)
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-        """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""
+        """See :meth:`.Backend.spherical_harmonics`."""
         basis = harmonic_basis(degree, normalize(directions, dim=-1))
         return (basis[..., None] * coeffs[:, : basis.shape[-1]]).sum(dim=-2)
 
@@ -110,24 +110,20 @@ def project(inputs: Inputs) -> Projection:
     positive = ratio > 0
     compensations = torch.where(positive, torch.where(positive, ratio, 1.0).sqrt(), 0.0)
 
+    # Three standard deviations of the longer axis, rounded up; 0 where that square does not touch the image.
+    with torch.no_grad():
+        spread = (0.25 * (xx - yy).square() + xy * xy).clamp(min=0.01).sqrt()
+        radii = torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt()).clamp(max=MAX_RADIUS)
+        size = means2d.new_tensor([width, height])
+        inside = (means2d + radii[:, None] > 0) & (means2d - radii[:, None] < size)
+        radii = (radii * inside.all(dim=-1) * in_range).to(torch.int32)
     covars2d = torch.stack([xx, xy, yy], dim=-1)
-    radii = _screen_radii(means2d.detach(), covars2d.detach(), width, height) * in_range
-    return Projection(means2d, covars2d, conics, camera[:, 2], compensations, radii.to(torch.int32))
+    return Projection(means2d, covars2d, conics, camera[:, 2], compensations, radii)
 
 
 def _limit_slope(slope: Tensor, focal: Tensor, centre: Tensor, size: int) -> Tensor:
     margin = FOV_MARGIN * 0.5 * size / focal
     return torch.clamp(slope, min=-centre / focal - margin, max=(size - centre) / focal + margin)
-
-
-def _screen_radii(means2d: Tensor, covars2d: Tensor, width: int, height: int) -> Tensor:
-    """Three standard deviations of the longer axis, rounded up; 0 where that square does not touch the image."""
-    xx, xy, yy = covars2d.unbind(-1)
-    spread = (0.25 * (xx - yy).square() + xy * xy).clamp(min=0.01).sqrt()
-    radii = torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt()).clamp(max=MAX_RADIUS)
-    size = means2d.new_tensor([width, height])
-    inside = (means2d + radii[:, None] > 0) & (means2d - radii[:, None] < size)
-    return radii * inside.all(dim=-1)
 
 
 def blended_values(inputs: Inputs, projection: Projection) -> tuple[Tensor, Tensor]:
@@ -149,19 +145,12 @@ def composite(
     width: int,
     height: int,
     *,
-    absgrad: bool = False,
+    absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Blend front to back: the image ``[H, W, C]`` and its alpha ``[H, W, 1]``.
+    """Blend opacities ``[N]`` and channels ``[N, C]`` to an image ``[H, W, C]`` and its alpha ``[H, W, 1]``.
 
-    Args:
-        means2d: Centres in pixels ``[1, N, 2]``. With ``absgrad`` the backward pass sets its ``absgrad`` ``[1, N, 2]``:
-            absolute gradients of each pixel with respect to the centre, summed (Ye et al., "AbsGS", 2024).
-        projection: Depths, conics and radii.
-        opacities: Opacities to blend ``[N]``.
-        colors: Channels to blend ``[N, C]``.
-        width: Image width in pixels.
-        height: Image height in pixels.
-        absgrad: See ``means2d``.
+    ``means2d`` are centres in pixels ``[1, N, 2]``. With ``absgrad`` the backward pass sets their ``absgrad``
+    ``[1, N, 2]``: absolute gradients of each pixel with respect to the centre, summed (Ye et al., "AbsGS", 2024).
 
     Raises:
         MemoryExhaustedError: On a CPU, the lists of tiles are too long.
@@ -174,7 +163,11 @@ def composite(
     first, beyond = ((centres - radii) / BIN).floor(), ((centres + radii) / BIN).ceil()
     if not means2d.is_cuda:
         spans = (beyond.minimum(beyond.new_tensor([columns, rows])) - first.clamp(min=0)).clamp(min=0)
-        check_pairs(int(spans.prod(dim=1).sum()), len(ids), columns * rows, 100, training=means2d.requires_grad)
+        pairs = int(spans.prod(dim=1).sum())
+        if means2d.requires_grad:  # the backward pass needs them all
+            check_memory(100 * pairs, f"{pairs:,} pairs of a tile and a Gaussian")
+        else:
+            check_pairs(pairs, len(ids), columns * rows)
 
     channels = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1)  # ones blend to alpha
     absolute = torch.zeros_like(means2d) if absgrad else None
@@ -209,7 +202,7 @@ def _blend_tile(
     for part in ids.split(_SEGMENT):
         if (through <= MIN_TRANSMITTANCE).all():
             break
-        segment = partial(_blend_segment, ids=part, absolute=absolute)
+        segment = partial(_blend_segment, part, absolute)
         arguments = (pixels, through, *(value[part] for value in values))
         # Evaluate the pixels again in the backward pass, because all alphas of an image may exceed the memory.
         if torch.is_grad_enabled():
@@ -221,17 +214,10 @@ def _blend_tile(
 
 
 def _blend_segment(
-    pixels: Tensor,
-    through: Tensor,
-    centres: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    channels: Tensor,
-    *,
-    ids: Tensor,
-    absolute: Tensor | None,
+    ids: Tensor, absolute: Tensor | None, pixels: Tensor, through: Tensor, *values: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Blend M Gaussians: their part of the channels ``[P, C]``, and the transmittance behind them ``[1, P]``."""
+    centres, conics, opacities, channels = values
     dx, dy = pixels[0] - centres[:, :1], pixels[1] - centres[:, 1:]
     if absolute is not None and dx.requires_grad:
         for axis, offset in enumerate((dx, dy)):
@@ -256,9 +242,8 @@ def _add_absolute(gradient: Tensor, sums: Tensor, ids: Tensor) -> None:
 def write_basis(degree: int, x: Any, y: Any, z: Any, out: Any) -> None:
     """Write the real spherical harmonics of a unit vector, up to degree 4, to ``out``; numbers or tensors.
 
-    Within a degree l the order m runs from -l to l. The constants normalise each polynomial over the sphere (P.-P.
-    Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013). The signs are those of 3DGS: odd orders m carry the
-    Condon-Shortley phase.
+    Within a degree l the order m runs from -l to l (P.-P. Sloan, "Efficient Spherical Harmonic Evaluation", JCGT
+    2013). The signs are those of 3DGS: odd orders m carry the Condon-Shortley phase.
     """
     out[0] = 0.5 / sqrt(pi)
     if degree < 1:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+from mmap import PAGESIZE
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -47,16 +49,12 @@ class Rasterization:
 
     colors: Tensor
     """Blended colours ``[H, W, C]``, without background."""
-
     depth: Tensor | None
     """Expected camera z ``[H, W, 1]``, world units, 0 where nothing was blended; None unless requested."""
-
     alpha: Tensor
     """Accumulated opacity ``[H, W, 1]`` in [0, 1]."""
-
     radii: Tensor
     """Screen radius ``[N]`` in whole pixels, int32, 0 where the Gaussian was culled; not differentiable."""
-
     info: dict[str, Any]
     """Statistics that the ``DefaultStrategy`` of the installed gsplat reads, in the shapes it expects.
 
@@ -81,37 +79,26 @@ class Backend(Protocol):
 
 
 def result_of(image: Tensor, alpha: Tensor, means2d: Tensor, radii: Tensor, inputs: Inputs) -> Rasterization:
-    """The result of a backend.
-
-    Args:
-        image: Blended channels ``[H, W, C]``; the last is camera z if depth was requested.
-        alpha: Accumulated opacity ``[H, W, 1]``.
-        means2d: Centres ``[1, N, 2]``.
-        radii: ``[1, N]``, or one per axis ``[1, N, 2]``.
-        inputs: Arguments of the rasterisation.
+    """The result of a backend: channels ``[H, W, C]``, the last is camera z if depth was requested; alpha
+    ``[H, W, 1]``; centres ``[1, N, 2]``; radii ``[N]``, or those of gsplat.
     """
     depth = None
     if inputs.render_depth:
         image, depth = image[..., :-1], image[..., -1:] / alpha.clamp(min=1e-10)  # less than any blended alpha
+    if radii.dim() == 1:
+        radii = (radii[:, None].expand(-1, 2) if is_gsplat_1_5() else radii)[None]
     size = {"width": inputs.camera.width, "height": inputs.camera.height}
     info = {"means2d": means2d, "radii": radii, **size, "n_cameras": 1, "gaussian_ids": None}
-    largest = radii[0] if radii.dim() == 2 else radii[0].amax(dim=-1)
-    return Rasterization(image, depth, alpha, largest, info)
-
-
-def strategy_radii(radii: Tensor) -> Tensor:
-    """Radii ``[N]`` as strategies of the installed gsplat expect them: ``[1, N]``, or ``[1, N, 2]`` from 1.5 on."""
-    return (radii[:, None].expand(-1, 2) if is_gsplat_1_5() else radii)[None]
+    return Rasterization(image, depth, alpha, radii[0] if radii.dim() == 2 else radii[0].amax(dim=-1), info)
 
 
 @cache
 def is_gsplat_1_5() -> bool:
     """Whether gsplat 1.5 or newer is installed: a radius for each axis, fitted to the opacity."""
     try:
-        major, minor = version("gsplat").split(".")[:2]
+        return tuple(map(int, version("gsplat").split(".")[:2])) >= (1, 5)
     except PackageNotFoundError:
         return False
-    return (int(major), int(minor)) >= (1, 5)
 
 
 @cache
@@ -121,46 +108,27 @@ def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device
         return torch.tensor(values, dtype=dtype, device=device)
 
 
-# Bounds of a view on a CPU, checked before memory is taken: a small file can describe a view of terabytes.
+# Bounds of a view on a CPU, checked before memory and time are taken: a small file can describe a view of terabytes.
 MOST_PER_TILE = 8192
 """Most Gaussians in a tile, on average over the image; a scene of 504,143 has at most 400 in tiles of 8 x 8 pixels."""
 ALWAYS = 1 << 22
-"""Pairs beside these that any view may have, which take 40 MB."""
+"""Pairs of a tile and a Gaussian beside these that any view may have."""
 _NEGLIGIBLE = 1 << 28  # bytes that are taken without a look at the memory
-_CONTROL_GROUP, _MEMORY = Path("/sys/fs/cgroup"), Path("/proc/meminfo")
+_CONTROL_GROUP, _PROCESS = Path("/sys/fs/cgroup"), Path("/proc")
 
 
-def check_pairs(pairs: int, gaussians: int, tiles: int, size: int, *, training: bool) -> None:
-    """Refuse a view whose lists of tiles are longer than any scene needs, or than the memory.
-
-    Args:
-        pairs: number of pairs of a tile and a Gaussian.
-        gaussians: number of visible ones.
-        tiles: number of tiles of the image.
-        size: bytes that a pair takes.
-        training: whether gradients are needed; then only the memory is a bound.
-
-    Raises:
-        MemoryExhaustedError: there are too many pairs.
-    """
-    # A small Gaussian lies in up to four tiles.
-    if not training and pairs > MOST_PER_TILE * tiles + 4 * gaussians + ALWAYS:
+def check_pairs(pairs: int, gaussians: int, tiles: int) -> None:
+    """Raise ``MemoryExhaustedError`` for more pairs of a tile and a visible Gaussian than any scene needs."""
+    if pairs > MOST_PER_TILE * tiles + 4 * gaussians + ALWAYS:  # a small Gaussian lies in up to four tiles
         raise MemoryExhaustedError(
             f"the view has {pairs // tiles:,} Gaussians in each tile of its image, but a real scene has less than "
             f"{MOST_PER_TILE:,}; choose another camera"
         )
-    check_memory(size * pairs, f"{pairs:,} pairs of a tile and a Gaussian")
 
 
 def check_memory(size: int, what: str) -> None:
-    """Refuse what would take more bytes than are available; ``what`` names it in the error.
-
-    Raises:
-        MemoryExhaustedError: it would take more.
-    """
-    if size < _NEGLIGIBLE:
-        return
-    available = available_memory()
+    """Raise ``MemoryExhaustedError``, which names ``what``, for more bytes than are available."""
+    available = None if size < _NEGLIGIBLE else available_memory()
     if available is not None and size > available:
         raise MemoryExhaustedError(
             f"{what} take {size / 1e9:,.1f} GB, but {available / 1e9:,.1f} GB are available; give a smaller image"
@@ -168,14 +136,12 @@ def check_memory(size: int, what: str) -> None:
 
 
 def available_memory() -> int | None:
-    """Bytes that this process can still take: of the machine, and of its control group; None if unknown."""
+    """Bytes that this process can still take: of the machine, its control group, its own limit; None if unknown."""
     available = []
-    try:
-        lines = dict(line.split(":", 1) for line in _MEMORY.read_text(encoding="utf-8").splitlines())
-        available.append(1024 * int(lines["MemAvailable"].split()[0]))
-    except (OSError, KeyError, ValueError):
-        pass
-    try:
+    with suppress(OSError, KeyError, ValueError):
+        lines = (_PROCESS / "meminfo").read_text(encoding="utf-8").splitlines()
+        available.append(1024 * int(dict(line.split(":", 1) for line in lines)["MemAvailable"].split()[0]))
+    with suppress(OSError, KeyError, ValueError):  # no control group, one of another kind, or no limit
         most, used, parts = (
             (_CONTROL_GROUP / f"memory.{name}").read_text(encoding="utf-8") for name in ("max", "current", "stat")
         )
@@ -183,6 +149,9 @@ def available_memory() -> int | None:
         sizes = dict(line.split() for line in parts.splitlines())
         cached = int(sizes["active_file"]) + int(sizes["inactive_file"])
         available.append(max(int(most) - int(used) + cached, 0))
-    except (OSError, KeyError, ValueError):  # no control group, one of another kind, or no limit
-        pass
+    with suppress(OSError, KeyError, ValueError):  # no limit
+        lines = (_PROCESS / "self" / "limits").read_text(encoding="utf-8").splitlines()
+        most = next(line.split()[3] for line in lines if line.startswith("Max address space"))
+        pages = int((_PROCESS / "self" / "statm").read_text(encoding="utf-8").split()[0])
+        available.append(max(int(most) - PAGESIZE * pages, 0))
     return min(available, default=None)

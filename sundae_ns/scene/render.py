@@ -151,9 +151,7 @@ def draw(
 ) -> tuple[dict[str, Any], Rasterization]:
     """Splat colours, features and depth in one pass; ``primitives`` have ``features`` if the head is enabled.
 
-    Returns:
-        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result. The head
-        has not run, so ``rgb`` is ``base_rgb``.
+    Returns images as :func:`render_view` does. The head has not run, so ``rgb`` is ``base_rgb``.
     """
     channels = primitives["colors"]
     if settings.head is not None:
@@ -168,8 +166,7 @@ def draw(
 def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, background: Tensor) -> Tensor:
     """The corrected image of one splatting pass ``[H, W, 3]``, not clamped. Only this function runs the head.
 
-    ``base`` is the image without the head, ``splatted`` holds colours and features without background. On a CPU,
-    ``MemoryExhaustedError`` if the layers of the head need more memory than there is.
+    ``base`` is the image without the head, ``splatted`` has no background. ``MemoryExhaustedError`` on a full CPU.
     """
     height, width = base.shape[:2]
     if base.device.type == "cpu":
@@ -222,13 +219,12 @@ def contribution(
     *,
     console: Console | None = None,
 ) -> Tensor:
-    """Blending weight of each Gaussian, summed over the pixels of all views ``[N]``.
+    """Blending weight of each Gaussian over a fixed background, summed over the pixels of all views ``[N]``.
 
-    The background is fixed, so that the result does not depend on a random one. With ``count``, the number of Gaussians
-    that a prune will keep, pixels are weighted by the detail that these cannot show
-    (:func:`sundae_ns.pruning.scores.pixel_detail`). ``DataError`` if a mask has another size than its view.
+    With ``count``, the number of Gaussians that a prune will keep, pixels are weighted by the detail that these cannot
+    show (:func:`.pixel_detail`). ``DataError`` if a mask has another size than its view.
     """
-    total = torch.zeros(source.gaussians.num_gaussians, device=source.gaussians["means"].device)
+    total = source.gaussians["means"].new_zeros(source.gaussians.num_gaussians)
     tracked: Iterable[TrainingCamera] = cameras
     if console is not None:
         from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
@@ -262,8 +258,7 @@ def _detail_weights(
     fixed["colors"].requires_grad_()
     with torch.enable_grad():
         images, splatted = draw(fixed, camera, background, settings.without_head(), depth=False)
-    # A prune keeps the same share of the visible Gaussians as of all.
-    detail = pixel_detail(images["base_rgb"], share * float((splatted.radii > 0).sum()))
-    with torch.enable_grad():
+        # A prune keeps the same share of the visible Gaussians as of all.
+        detail = pixel_detail(images["base_rgb"].detach(), share * float((splatted.radii > 0).sum()))
         blended = (splatted.colors[..., 0] * (detail if pixels is None else detail * pixels)).sum()
     return torch.autograd.grad(blended, fixed["colors"])[0][:, 0]

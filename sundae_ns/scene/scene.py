@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import DataError
+from sundae_ns.core.errors import BackendError, DataError
 from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.core.metrics import Quality, evaluate
 from sundae_ns.cuda.kernels import naming_full_memory
@@ -84,7 +84,7 @@ class Scene:
     @property
     def background(self) -> Tensor:
         """Colour behind the scene ``[3]``, on the device of the scene."""
-        return torch.tensor(SHOWN_BACKGROUNDS[self.background_color], device=self.device)
+        return torch.tensor(SHOWN_BACKGROUNDS[self.background_color], dtype=torch.float32, device=self.device)
 
     def to(self, device: torch.device | str) -> Scene:
         """The scene on another device; stored cameras stay on the CPU."""
@@ -130,9 +130,10 @@ def image_of(rgb: Tensor) -> Image.Image:
     return Image.fromarray((rgb * 255).round().byte().cpu().numpy())
 
 
-@torch.no_grad()
 def render(scene: Scene, camera: Camera, *, head: bool = True, backend: BackendName = "auto") -> Rendering:
     """Render one view of a scene, on the device of the scene.
+
+    Differentiable once if a tensor of the Gaussians or the camera requires a gradient, or the head is in training mode.
 
     Args:
         scene: from :func:`sundae_ns.load`, or made by hand.
@@ -141,7 +142,7 @@ def render(scene: Scene, camera: Camera, *, head: bool = True, backend: BackendN
         backend: the rasteriser.
 
     Raises:
-        BackendError: the rasteriser cannot run on the device of the scene.
+        BackendError: the rasteriser cannot run on the device of the scene, or gives no gradient for ``camera.K``.
         MemoryExhaustedError: the memory is full, or, on a CPU, the view has more Gaussians than any real scene.
 
     >>> import torch, sundae_ns as sn
@@ -150,8 +151,12 @@ def render(scene: Scene, camera: Camera, *, head: bool = True, backend: BackendN
     >>> sn.render(scene, camera).rgb.shape
     torch.Size([48, 64, 3])
     """
-    with naming_full_memory(lambda: scene.num_gaussians):
-        settings = scene.settings(backend, head=head)
+    settings = scene.settings(backend, head=head)
+    wanted = any(value.requires_grad for value in (*scene.gaussians.values(), camera.viewmat, camera.K))
+    wanted |= settings.head is not None and settings.head.training
+    with naming_full_memory(lambda: scene.num_gaussians), torch.set_grad_enabled(wanted and torch.is_grad_enabled()):
+        if camera.K.requires_grad and settings.backend.name == "gsplat":
+            raise BackendError("gsplat has no gradient for camera.K; detach it, or use the backend 'reference'")
         images, _ = render_view(GaussianSource(scene.gaussians), camera.to(scene.device), scene.background, settings)
     return Rendering(*(images[name] for name in Rendering._fields))
 

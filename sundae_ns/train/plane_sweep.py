@@ -16,7 +16,7 @@ from torch.nn.functional import grid_sample, interpolate, normalize, pad
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.cuda.kernels import kernels_where_possible
-from sundae_ns.cuda.sweep import WINDOW, FusedCorrelations, Patches, sweep_kernels
+from sundae_ns.cuda.sweep import WINDOW, Patches, fused_correlations, sweep_kernels
 from sundae_ns.train.state import Photo
 
 CONTRAST = 0.02  # Least standard deviation of the grey values of a patch: a flat one fits anywhere
@@ -227,7 +227,7 @@ def _number_of_planes(photo: _Reduced, others: Sequence[_Reduced], normal: Tenso
 def _correlations(
     photo: _Reduced, others: Sequence[_Reduced], rays: Tensor, inverses: tuple[float, float]
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """The function of :meth:`FusedCorrelations.__call__` for a view, its rays ``[H, W, 3]`` and its neighbours."""
+    """The function of :func:`.fused_correlations` for a view, its rays ``[H, W, 3]`` and its neighbours."""
     patches = _patches(photo.grey)
     # X' = R X + t with s normal . X = 1: the ray r projects to K (R r + s (normal . r) t).
     ways = [other.camera.K @ (other.camera.viewmat @ photo.pose)[:3] for other in others]
@@ -236,7 +236,7 @@ def _correlations(
     if kernels:
         maps = torch.stack([torch.cat([way[:, :3] @ photo.unproject, way[:, 3:]], dim=1) for way in ways])
         images = [other.grey[0, 0] for other in others]
-        return FusedCorrelations(kernels, patches, images, maps, inverses, LEAST_VARIANCE)
+        return fused_correlations(kernels, patches, images, maps, inverses, LEAST_VARIANCE)
     starts = [rays @ way[:, :3].T for way in ways]
     return lambda facing, s: torch.cat(
         [_scores(patches, others, starts, ways, facing * part[:, None, None], inverses) for part in s.split(_BATCH)]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sundae_ns.core.errors import SundaeError
-from sundae_ns.rasterize import gsplat_backend, gsplat_kernels
+from sundae_ns.rasterize import gsplat_backend, gsplat_kernels, interface
 from sundae_ns.rasterize.gsplat_backend import GsplatBackend, RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import TILE, Capacity, GsplatLists, Splats, blend, tile_lists
 from sundae_ns.rasterize.interface import harmonic_colors, select_backend
@@ -26,7 +26,8 @@ Gaussians = dict[str, Tensor]
 def on_cpu(load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gsplat_kernels, "load_kernels", load_on_cpu)
     monkeypatch.setattr(gsplat_kernels, "LANES", 1)
-    monkeypatch.setattr(gsplat_backend, "_check_kernels_take", lambda _: None)
+    for module in (gsplat_backend, interface):
+        monkeypatch.setattr(module, "check_kernels_take", lambda _: None)
 
 
 def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch) -> None:

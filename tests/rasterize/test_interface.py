@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from splat_inputs import blending_weights, rasterize, rasterize_cameras, several_views
+from splat_inputs import blending_weights, inputs_of, rasterize, rasterize_cameras, several_views
 from torch import Tensor
 
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, MemoryExhaustedError
+from sundae_ns.rasterize import interface
 from sundae_ns.rasterize import types as limits
+from sundae_ns.rasterize.cpu import backend as backend_of_cpu
+from sundae_ns.rasterize.cpu import tiles
 from sundae_ns.rasterize.interface import BackendName, select_backend, spherical_harmonics
 
 REFERENCE = select_backend("reference", "cpu")
@@ -54,7 +58,7 @@ except BackendError as error:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     (line,) = done.stdout.splitlines()
-    assert line.startswith("the cpu backend cannot rasterize: numba does not import (")
+    assert line.startswith("cpu cannot rasterize: numba does not import (")
     assert line.endswith("; pip install numba; or use the backend 'reference'")
 
 
@@ -203,9 +207,9 @@ def camera(
 def test_more_primitives_than_in_any_scene_are_refused(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "MOST_PER_TILE", 100)
     monkeypatch.setattr(limits, "ALWAYS", 0)
-    tiles = {"cpu": 64, "reference": 16}[backend]
+    bins = {"cpu": 64, "reference": 16}[backend]
     # Each Gaussian touches all tiles; four of them are its own.
-    most = 100 * tiles // (tiles - 4)
+    most = 100 * bins // (bins - 4)
     assert camera(most, 64, 20.0, backend=backend).shape == (64, 64, 1)
     with pytest.raises(MemoryExhaustedError, match=r"the view has \d+ Gaussians in each tile .* less than 100;"):
         camera(most + 1, 64, 20.0, backend=backend)
@@ -235,24 +239,90 @@ def test_a_small_image_of_large_primitives_is_drawn(backend: str) -> None:
     assert camera(20_000, 40, 20.0, backend=backend).shape == (40, 40, 1)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_lists_that_exceed_the_memory_are_refused(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_whose_lists_exceed_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "_NEGLIGIBLE", 0)
-    monkeypatch.setattr(limits, "available_memory", lambda: 100_000)
-    # In a training too, where the memory would be full all the same.
+    monkeypatch.setattr(limits, "available_memory", lambda: 1_000_000)
     with pytest.raises(MemoryExhaustedError, match="pairs of a tile and a Gaussian take .* GB, but .* are available"):
-        camera(1000, 64, 20.0, backend=backend, training=True)
+        camera(1000, 64, 20.0, training=True)
+
+
+def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Full-screen Gaussians beside lines in one row of tiles: the lists of each region fit the limit."""
+    count, most, regions, lists = 60, 400, [], tiles.tile_lists
+
+    def limited(*arguments: Any) -> Iterator[tiles.Lists]:
+        for region in lists(*arguments):
+            regions.append(region)
+            yield region
+
+    def drawn() -> list[Tensor]:
+        torch.manual_seed(0)
+        values = {
+            "means": torch.cat([torch.rand(count, 2) - 0.5, torch.full((count, 1), 2.0)], dim=1).requires_grad_(),
+            "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+            "scales": torch.cat([torch.full((30, 3), 20.0), torch.tensor([[20.0, 1e-3, 1e-3]]).repeat(30, 1)]),
+            "opacities": torch.full((count,), 0.05).requires_grad_(),
+            "colors": torch.rand(count, 3).requires_grad_(),
+        }
+        values["means"].data[30:, 1] = 0.01
+        K = torch.tensor([[64.0, 0, 40], [0, 64, 26], [0, 0, 1]])
+        ours = rasterize(
+            **values, viewmat=torch.eye(4), K=K, width=80, height=52, absgrad=True, backend=select_backend("cpu", "cpu")
+        )
+        (ours.colors * torch.rand(52, 80, 3) + ours.alpha).sum().backward()
+        grads = [values[name].grad for name in ("means", "opacities", "colors")]
+        return [ours.colors, ours.alpha, *grads, ours.info["means2d"].absgrad]  # type: ignore[list-item]
+
+    once = drawn()
+    monkeypatch.setattr(tiles, "MOST_PAIRS", most)
+    monkeypatch.setattr(backend_of_cpu, "tile_lists", limited)
+    image, alpha, *grads = drawn()
+    assert torch.equal(image, once[0])
+    assert torch.equal(alpha, once[1])
+    for ours, exact in zip(grads, once[2:], strict=True):
+        torch.testing.assert_close(ours, exact, rtol=1e-5, atol=1e-5)
+    half = len(regions) // 2
+    assert len(regions) == 2 * half >= 10  # the backward pass makes them again
+    assert all(len(region.slots) <= most for region in regions)
+    drawn_tiles = torch.cat([torch.from_numpy(region.longest_first) for region in regions[:half]])
+    assert sorted(drawn_tiles.tolist()) == list(range(70))
+    monkeypatch.setattr(tiles, "MOST_PAIRS", 0)  # a tile is not cut
+    assert torch.equal(drawn()[0], once[0])
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_defaults_of_torch_do_not_matter(name: BackendName) -> None:
+    shared, cameras = several_views()
+    inputs = inputs_of(
+        **shared,
+        **dict(zip(("colors", "viewmat", "K"), (v[0] for v in cameras.values()))),
+        width=9,
+        height=7,
+        render_depth=True,
+    )
+    expected = interface.rasterize(inputs, backend=select_backend(name, "cpu"))
+    interface.numba_problem.cache_clear()
+    torch.set_default_dtype(torch.float64)
+    torch.set_default_device("meta")
+    try:
+        ours = interface.rasterize(inputs, backend=select_backend(name, "cpu"))
+    finally:
+        torch.set_default_dtype(torch.float32)
+        torch.set_default_device(None)
+    assert ours.depth is not None
+    for value, same in ((ours.colors, expected.colors), (ours.depth, expected.depth), (ours.radii, expected.radii)):
+        assert torch.equal(value, same)  # type: ignore[arg-type]
 
 
 def test_images_that_exceed_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "available_memory", lambda: 1 << 30)
-    with pytest.raises(MemoryExhaustedError, match=r"images of 65,536 x 65,536 pixels take 51\.5 GB, but 1\.1 GB are"):
+    with pytest.raises(MemoryExhaustedError, match=r"images of 65,536 x 65,536 pixels take 274\.9 GB, but 1\.1 GB are"):
         camera(10, 65_536, 1e-3)
 
 
 def test_the_memory_is_that_of_machine_and_control_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     memory = tmp_path / "meminfo"
-    monkeypatch.setattr(limits, "_MEMORY", memory)
+    monkeypatch.setattr(limits, "_PROCESS", tmp_path)
     monkeypatch.setattr(limits, "_CONTROL_GROUP", tmp_path)
     assert limits.available_memory() is None
     memory.write_text("MemTotal:  9000 kB\nMemAvailable:    5000 kB\n")
@@ -263,3 +333,8 @@ def test_the_memory_is_that_of_machine_and_control_group(tmp_path: Path, monkeyp
     assert limits.available_memory() == 800_000
     (tmp_path / "memory.max").write_text("max\n")
     assert limits.available_memory() == 5000 * 1024
+    (tmp_path / "self").mkdir()
+    (tmp_path / "self" / "statm").write_text("100 50 1 1 0 1 0\n")
+    for limit, available in (("unlimited", 5000 * 1024), (str(limits.PAGESIZE * 350), limits.PAGESIZE * 250)):
+        (tmp_path / "self" / "limits").write_text(f"Limit  Soft\nMax address space   {limit}  unlimited  bytes\n")
+        assert limits.available_memory() == available

@@ -31,7 +31,7 @@ from sundae_ns.rasterize.cpu.lanes import (
     store_sums,
 )
 from sundae_ns.rasterize.cpu.parallel import compiled
-from sundae_ns.rasterize.cpu.tiles import HALF_XX, HALF_YY, LIMIT, STEP, TILE, XY, U, V, build_lists
+from sundae_ns.rasterize.cpu.tiles import HALF_XX, HALF_YY, LIMIT, STEP, TILE, XY, U, V, tile_lists
 
 DTYPES = [np.float32, np.float64]
 
@@ -102,11 +102,11 @@ def test_every_blended_pixel_is_listed_and_few_others(dtype: torch.dtype) -> Non
     values = (means, torch.randn(n, 4, generator=generator), scales, *camera)
     projection = project(geometry(*(value.to(dtype) for value in values), width, height))
     # The faint opacity ends footprints inside gsplat's three-sigma bins, so the bins do not matter here.
-    lists = build_lists(projection, torch.full((n,), 0.2, dtype=dtype), width, height)
+    (lists,) = tile_lists(projection, torch.full((n,), 0.2, dtype=dtype), width, height)
     table = lists.table.astype(np.float64)
-    y, x = np.mgrid[: lists.rows * TILE, : lists.columns * TILE] + 0.5
+    y, x = np.mgrid[: -(-height // TILE) * TILE, : lists.columns * TILE] + 0.5
     listed = np.zeros((len(lists.ids), *x.shape), bool)
-    for tile in range(lists.rows * lists.columns):
+    for tile in range(len(lists.starts) - 1):
         left, top = tile % lists.columns * TILE, tile // lists.columns * TILE
         for entry in range(lists.starts[tile], lists.starts[tile + 1]):
             first, beyond = (top + STEP * int(step) for step in lists.spans[entry])

@@ -12,8 +12,17 @@ from fields import random_field
 from packed_scenes import KINDS, write_kind
 
 import sundae_ns as sn
-from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, PackError
+from sundae_ns.core.errors import (
+    BackendError,
+    CheckpointError,
+    ConfigError,
+    DataError,
+    MemoryExhaustedError,
+    PackError,
+)
 from sundae_ns.core.gaussians import Gaussians
+from sundae_ns.rasterize.gsplat_backend import GsplatBackend
+from sundae_ns.rasterize.interface import BackendName
 
 
 def scene(n: int = 200, degree: int = 2) -> sn.Scene:
@@ -246,3 +255,74 @@ def test_quality_against_images_and_against_a_scene() -> None:
 def test_both_scenes_have_the_background_of_the_reference() -> None:
     truth, seen = sn.Scene(scene().gaussians, background_color="white"), cameras()
     assert sn.measure(scene(), truth, seen).psnr > 80
+
+
+# ------------------------------------------------------------------------------------------------- gradients and memory
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize(
+    "name", ["means", "quats", "scales", "opacities", "features_dc", "features_rest", "viewmat", "K"]
+)
+def test_an_image_has_a_gradient_for_each_tensor_that_asks_for_one(name: str, backend: BackendName) -> None:
+    """The gradient is the slope of the image's sum."""
+    field, camera = scene(40).gaussians, cameras(1)[0]
+    on_camera = name in ("viewmat", "K")
+    value = (getattr(camera, name) if on_camera else field[name]).clone().requires_grad_()
+
+    def total(value: torch.Tensor) -> torch.Tensor:
+        there = camera._replace(**{name: value}) if on_camera else camera
+        made = sn.Scene(field if on_camera else field.replaced({name: value}))
+        return (sn.render(made, there, backend=backend).rgb.double() * weights).sum()
+
+    weights = torch.rand(32, 32, 3, dtype=torch.float64)
+    (gradient,) = torch.autograd.grad(total(value), value)
+    assert gradient.norm() > 0
+    step = 1e-3 * gradient / gradient.norm()
+    slope = (total((value + step).detach()) - total((value - step).detach())) / 2
+    assert float(slope) == pytest.approx(float((gradient * step).sum()), rel=0.1)
+
+
+def test_an_image_has_no_graph_unless_something_asks_for_it(tmp_path: Path) -> None:
+    field, camera = scene().gaussians, cameras(1)[0]
+    asking = sn.Scene(field.replaced({"means": field["means"].clone().requires_grad_()}))
+    assert sn.render(asking, camera).rgb.requires_grad
+    with torch.no_grad():
+        assert not sn.render(asking, camera).rgb.requires_grad
+    packed = sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
+    assert not sn.render(sn.Scene(field), camera).rgb.requires_grad
+    assert packed.head is not None
+    image = sn.render(packed, packed.cameras[0])
+    assert not image.rgb.requires_grad
+    packed.head.train()
+    image = sn.render(packed, packed.cameras[0])
+    assert torch.autograd.grad(image.rgb.sum(), packed.head.net.out.weight)[0].any()
+    assert not image.base_rgb.requires_grad
+
+
+def test_gsplat_refuses_a_gradient_that_it_would_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = cameras(1)[0]
+    monkeypatch.setattr("sundae_ns.scene.scene.select_backend", lambda *_: GsplatBackend())
+    with pytest.raises(BackendError, match="no gradient for camera.K; detach it, or use the backend 'reference'"):
+        sn.render(scene(), camera._replace(K=camera.K.clone().requires_grad_()))
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("Unable to allocate 11.2 GiB for an array with shape (3, 4)"),
+        RuntimeError("[enforce fail] . DefaultCPUAllocator: can't allocate memory: you tried to allocate 11 bytes."),
+    ],
+    ids=["numpy", "torch"],
+)
+def test_full_memory_is_one_line(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise error
+
+    camera = cameras(1)[0]
+    monkeypatch.setattr("sundae_ns.scene.scene.render_view", full)
+    with pytest.raises(MemoryExhaustedError, match=r"^the memory is full with 200 Gaussians \(.*llocate .*\); give"):
+        sn.render(scene(), camera)
+    error.args = ("another error",)
+    with pytest.raises(MemoryExhaustedError if isinstance(error, MemoryError) else RuntimeError, match="another error"):
+        sn.render(scene(), camera)

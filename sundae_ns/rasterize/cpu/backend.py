@@ -1,12 +1,12 @@
 """The CPU backend: the stages of the reference in compiled loops, with hand-written derivatives.
 
 The equations are in :mod:`sundae_ns.rasterize.reference`; this module has the backend, the projection and the
-harmonics. Their loops read and write the tensors' dtype and compute in float64, which costs little next to the
-blending.
+harmonics. Their loops compute in float64, which costs little next to the blending.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from math import pi, sqrt
 from typing import Any, cast
 
@@ -19,9 +19,9 @@ from sundae_ns.core.errors import BackendError
 from sundae_ns.rasterize import reference
 from sundae_ns.rasterize.cpu.compositing import composite
 from sundae_ns.rasterize.cpu.parallel import as_array, compiled, inlined, parallel_for
-from sundae_ns.rasterize.cpu.tiles import build_lists
+from sundae_ns.rasterize.cpu.tiles import tile_lists
 from sundae_ns.rasterize.reference import BLUR, FOV_MARGIN, MAX_RADIUS, Projection, blended_values
-from sundae_ns.rasterize.types import Inputs, Rasterization, result_of, strategy_radii
+from sundae_ns.rasterize.types import Inputs, Rasterization, result_of
 
 _MIN_PER_THREAD = 2_500  # Gaussians to project: below 0.1 ms of work, waking a thread costs more than it saves
 _MIN_TO_EVALUATE = 5_000
@@ -32,30 +32,25 @@ _write_basis = compiled(reference.write_basis)
 
 
 class CpuBackend:
-    """The reference in compiled loops, for float32 and float64 on a CPU; independent of the number of threads."""
+    """The reference in compiled loops, the same on any number of threads; ``BackendError`` unless the tensors are
+    float32 or float64 on a CPU.
+    """
 
     name = "cpu"
 
     def rasterize(self, inputs: Inputs) -> Rasterization:
-        """Render one view.
-
-        Raises:
-            BackendError: The tensors are not float32 or float64 on a CPU.
-        """
+        """Render one view."""
         _check(inputs.means)
         projection = project(inputs)
         opacities, colors = blended_values(inputs, projection)
         means2d = projection.means2d[None]
-        lists = build_lists(projection, opacities, inputs.camera.width, inputs.camera.height)
-        image, alpha = composite(means2d, projection.conics, opacities, colors, lists, inputs.absgrad)
-        return result_of(image, alpha, means2d, strategy_radii(projection.radii), inputs)
+        size = inputs.camera.width, inputs.camera.height
+        lists = partial(tile_lists, projection, opacities, *size)
+        image, alpha = composite(means2d, projection.conics, opacities, colors, size, lists, inputs.absgrad)
+        return result_of(image, alpha, means2d, projection.radii, inputs)
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-        """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``.
-
-        Raises:
-            BackendError: The tensors are not float32 or float64 on a CPU.
-        """
+        """See :meth:`.Backend.spherical_harmonics`."""
         _check(directions)
         outputs = (torch.empty_like(directions, memory_format=torch.contiguous_format),)
         loops = _evaluate, _evaluate_backward, _MIN_TO_EVALUATE
@@ -64,18 +59,15 @@ class CpuBackend:
 
 def _check(tensor: Tensor) -> None:
     if tensor.dtype not in (torch.float32, torch.float64) or tensor.device.type != "cpu":
-        raise BackendError(
-            f"the cpu rasterizer takes float32 or float64 on a CPU, not {tensor.dtype} on {tensor.device}; "
-            "convert, or use 'reference'"
-        )
+        wrong = f"{tensor.dtype} on {tensor.device}; convert, or use 'reference'"
+        raise BackendError(f"the cpu rasterizer takes float32 or float64 on a CPU, not {wrong}")
 
 
 class _Loops(torch.autograd.Function):
-    """A function of N rows, once differentiable, from two compiled loops.
+    """A function of N rows, once differentiable, from two compiled loops; its first outputs have gradients."""
 
-    They are called as ``forward(begin, end, options, *inputs, outputs)`` and ``backward(begin, end, options, *inputs,
-    gradients, outputs)``. The first ``differentiable`` outputs have gradients.
-    """
+    # They are called as forward(begin, end, options, *inputs, outputs) and
+    # backward(begin, end, options, *inputs, gradients, outputs).
 
     @staticmethod
     def forward(
@@ -119,12 +111,9 @@ def project(inputs: Inputs) -> Projection:
     planes = np.array([inputs.near_plane, inputs.far_plane], np.float32 if means.dtype == torch.float32 else np.float64)
     camera = (as_array(viewmat.double()), lens, size, planes.astype(np.float64), limits)
     n = len(means)
-    outputs = (
-        *(means.new_empty(n, 2), means.new_empty(n, 3), means.new_empty(n), means.new_empty(n), means.new_empty(n, 3)),
-        torch.empty(n, dtype=torch.int32),
-    )
+    new = (*(means.new_empty(n, *size) for size in ((2,), (3,), (), (), (3,))), means.new_empty(n, dtype=torch.int32))
     loops = _project, _project_backward, _MIN_PER_THREAD
-    outputs = _Loops.apply(loops, camera, outputs, 4, means, inputs.quats, inputs.scales)
+    outputs = _Loops.apply(loops, camera, new, 4, means, inputs.quats, inputs.scales)
     means2d, conics, depths, compensations, covars2d, radii = outputs
     return Projection(means2d, covars2d, conics, depths, compensations, radii)
 
@@ -161,10 +150,8 @@ def _arrays() -> Any:
 
 @inlined
 def _footprint(camera: Any, quats: Any, scales: Any, i: int, x: float, y: float, z: float, arrays: Any) -> Any:
-    """Length of the quaternion, slopes, zooms, covariance before the blur, and its determinants before and after.
-
-    The zoomed ``rows`` are a root of the covariance; ``normal`` is their cross product.
-    """
+    """Length of the quaternion, slopes, zooms, covariance before the blur, and its determinants before and after."""
+    # The zoomed rows are a root of the covariance; normal is their cross product.
     matrix, lens, _, _, limits = camera
     rotation, axes, sharp, rows, normal = arrays
     length = _rotation(quats, i, rotation)

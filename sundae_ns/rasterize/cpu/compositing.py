@@ -6,13 +6,14 @@ For pixel p and list entry m, with g the gradient of the loss with respect to th
 - T_m = prod over k < m of (1 - alpha_k), w_m = alpha_m T_m, and the image is sum_m w_m c_m;
 - -dL/de_m = w_m <g, c_m> - alpha_m / (1 - alpha_m) * sum over k > m of w_k <g, c_k>, and 0 where alpha is clamped.
 
-A loop over the pixels of a tile handles one Gaussian at a time, many pixels in SIMD lanes, without branches. The
-backward pass starts from the final transmittance and divides by (1 - alpha) where the forward pass multiplied; the
-position of the last blended entry of each pixel tells which entries were blended.
+A loop over the pixels of a tile handles one Gaussian at a time, many pixels in SIMD lanes. The backward pass starts
+from the final transmittance and divides by (1 - alpha) where the forward pass multiplied; the position of the last
+blended entry of each pixel tells which entries were blended.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -51,46 +52,56 @@ _MIN_PER_THREAD_TO_SUM = 5_000  # Gaussians
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, lists: Lists, absgrad: bool
+        ctx: Any,
+        means2d: Tensor,
+        conics: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        size: tuple[int, int],
+        lists: Callable[[], Iterable[Lists]],
+        absgrad: bool,
     ) -> tuple[Tensor, Tensor]:
-        dtype, tiles = lists.table.dtype, lists.columns * lists.rows
-        image = np.zeros((lists.height, lists.width, colors.shape[1]), dtype)
-        alpha = np.zeros((lists.height, lists.width, 1), dtype)
-        transmittances, last = np.empty((tiles, _PIXELS), dtype), np.empty((tiles, _PIXELS), np.int32)
-        arguments = (lists.for_blending(), as_array(colors), image, alpha, transmittances, last)
-        parallel_for(_blend, len(lists.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
+        (width, height), values = size, as_array(colors)
+        tiles = -(-width // TILE) * -(-height // TILE)
+        image, alpha = (np.zeros((height, width, channels), values.dtype) for channels in (values.shape[1], 1))
+        ends = np.empty((tiles, _PIXELS), values.dtype), np.empty((tiles, _PIXELS), np.int32)
+        regions = 0
+        for region in lists():
+            regions += 1
+            arguments = (tuple(region), values, image, alpha, *ends)
+            parallel_for(_blend, len(region.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
         ctx.save_for_backward(means2d, conics, opacities, colors)
-        ctx.lists, ctx.transmittances, ctx.last, ctx.absgrad = lists, transmittances, last, absgrad
+        ctx.lists = lists if regions > 1 else lambda: [region]  # lists of several regions may exceed the memory
+        ctx.ends, ctx.absgrad = ends, absgrad
         return torch.from_numpy(image), torch.from_numpy(alpha)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor, grad_alpha: Tensor) -> tuple[Tensor | None, ...]:
-        means2d, conics, opacities, colors = ctx.saved_tensors
-        lists: Lists = ctx.lists
+        means2d, _, _, colors = ctx.saved_tensors
         needs_geometry, needs_colors = any(ctx.needs_input_grad[:3]), ctx.needs_input_grad[3]
-        absgrad = ctx.absgrad and needs_geometry
+        absgrad, values = ctx.absgrad and needs_geometry, as_array(colors)
         padded = -(-colors.shape[1] // _CHANNEL_GROUP) * _CHANNEL_GROUP
-        parts = np.empty((len(lists.slots), padded + _MOMENTS), lists.table.dtype)
-        blended = (as_array(colors), lists.slots, ctx.transmittances, ctx.last)
         gradients, needs = (as_array(grad_image), as_array(grad_alpha)), (needs_geometry, needs_colors, absgrad)
-        arguments = (lists.for_blending(), blended, gradients, needs, parts)
-        parallel_for(_blend_backward, len(lists.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
-        outputs = tuple(np.zeros(value.shape, lists.table.dtype) for value in ctx.saved_tensors)
-        absolute_grads = np.zeros(means2d.shape if absgrad else (0, 0, 0), lists.table.dtype)
-        summed = (lists.ids, lists.first_slots, lists.table, parts, outputs, absolute_grads)
-        parallel_for(_sum_slots, len(lists.ids), *summed, min_per_thread=_MIN_PER_THREAD_TO_SUM)
+        outputs = tuple(np.zeros(value.shape, values.dtype) for value in ctx.saved_tensors)
+        absolute_grads = np.zeros(means2d.shape if absgrad else (0, 0, 0), values.dtype)
+        for region in ctx.lists():
+            parts = np.empty((len(region.slots), padded + _MOMENTS), values.dtype)
+            arguments = (tuple(region), (values, *ctx.ends), gradients, needs, parts)
+            parallel_for(_blend_backward, len(region.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
+            summed = (tuple(region), parts, outputs, absolute_grads)
+            parallel_for(_sum_slots, len(region.ids), *summed, min_per_thread=_MIN_PER_THREAD_TO_SUM)
         if ctx.absgrad:
             means2d.absgrad = torch.from_numpy(absolute_grads) if absgrad else torch.zeros_like(means2d)
-        return *map(torch.from_numpy, outputs), None, None
+        return *map(torch.from_numpy, outputs), None, None, None
 
 
 composite = _Composite.apply
 """Blend to an image ``[H, W, C]`` and its alpha ``[H, W, 1]``; once differentiable.
 
 It takes centres ``[1, N, 2]`` in pixels, conics ``[N, 3]``, opacities ``[N]`` and colours ``[N, C]``, for their
-gradients; the lists, which hold the geometry that is read; and ``absgrad``: the backward pass sets ``absgrad``
-``[1, N, 2]`` of the centres, as :func:`sundae_ns.rasterize.reference.composite` does.
+gradients; width and height; a function that gives the lists of each region, which hold the geometry that is read; and
+``absgrad``: the backward pass sets that of the centres, as :func:`sundae_ns.rasterize.reference.composite` does.
 """
 
 
@@ -113,7 +124,7 @@ def _pixel_centres(like: Any) -> Any:
 def _blend(
     begin: int, end: int, lists: Any, colors: Any, image: Any, alpha_image: Any, transmittances: Any, last: Any
 ) -> None:
-    columns, tiles, starts, ranks, spans, ids, table = lists
+    columns, tiles, starts, ranks, _, spans, ids, _, table = lists
     number = table.dtype.type
     height, width, channels = image.shape
     across, down = _pixel_centres(table)
@@ -169,7 +180,6 @@ def _blend(
 
 @inlined
 def _any_unfinished(through: Any) -> bool:
-    """Whether any pixel of a tile is unfinished."""
     unfinished = False
     for p in range(0, _PIXELS, WIDTH):
         unfinished = unfinished or any_lane(load(through, p) > 0.0)
@@ -179,8 +189,8 @@ def _any_unfinished(through: Any) -> bool:
 @compiled
 def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: Any, needs: Any, parts: Any) -> None:
     """Write for each slot the gradients of channels, the moments of dL/de, and the absolute gradient of the centre."""
-    columns, tiles, starts, ranks, spans, ids, table = lists
-    colors, slots, transmittances, last = blended
+    columns, tiles, starts, ranks, slots, spans, ids, _, table = lists
+    colors, transmittances, last = blended
     grad_image, grad_alpha = gradients
     needs_geometry, needs_colors, absgrad = needs
     number = table.dtype.type
@@ -232,9 +242,8 @@ def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: A
                     gain = weight * (load(alpha_grads, p) + _product(grads, p * padded, colors, color, channels))
                     later = load(behind, p)
                     store(behind, p, later + gain)
-                    grad_exponent = select(
-                        logical_and(blends, unclamped < MAX_ALPHA), gain - alphas * inverse * later, 0.0
-                    )
+                    varies = logical_and(blends, unclamped < MAX_ALPHA)
+                    grad_exponent = select(varies, gain - alphas * inverse * later, 0.0)
                     grad_x, grad_y = grad_exponent * dx, grad_exponent * dy
                     m, mx, my = m + grad_exponent, mx + grad_x, my + grad_y
                     mxx, mxy, myy = fma(grad_x, dx, mxx), fma(grad_x, dy, mxy), fma(grad_y, dy, myy)
@@ -276,10 +285,9 @@ def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: in
 
 
 @compiled
-def _sum_slots(
-    begin: int, end: int, ids: Any, first_slots: Any, table: Any, parts: Any, outputs: Any, absolute_grads: Any
-) -> None:
-    """Sum the slots of each Gaussian in float64, and convert moments to gradients."""
+def _sum_slots(begin: int, end: int, lists: Any, parts: Any, outputs: Any, absolute_grads: Any) -> None:
+    """Sum the slots of each Gaussian in float64, convert moments to gradients, and add them to the outputs."""
+    _, _, _, _, _, _, ids, first_slots, table = lists
     grad_means2d, grad_conics, grad_opacities, grad_colors = outputs
     channels, width = parts.shape[1] - _MOMENTS, parts.shape[1]
     sums = np.empty(width)
@@ -290,14 +298,15 @@ def _sum_slots(
             for d in range(width):
                 sums[d] += parts[slot, d]
         for c in range(grad_colors.shape[1]):
-            grad_colors[i, c] = sums[c]
+            grad_colors[i, c] += sums[c]
         xx, xy, yy = 2 * float(table[rank, HALF_XX]), table[rank, XY], 2 * float(table[rank, HALF_YY])
         mx, my = sums[channels + 1], sums[channels + 2]
-        grad_means2d[0, i, 0], grad_means2d[0, i, 1] = xx * mx + xy * my, xy * mx + yy * my
-        grad_conics[i, 0] = -0.5 * sums[channels + 3]
-        grad_conics[i, 1] = -sums[channels + 4]
-        grad_conics[i, 2] = -0.5 * sums[channels + 5]
-        grad_opacities[i] = sums[channels] / table[rank, OPACITY]
+        grad_means2d[0, i, 0] += xx * mx + xy * my
+        grad_means2d[0, i, 1] += xy * mx + yy * my
+        grad_conics[i, 0] -= 0.5 * sums[channels + 3]
+        grad_conics[i, 1] -= sums[channels + 4]
+        grad_conics[i, 2] -= 0.5 * sums[channels + 5]
+        grad_opacities[i] += sums[channels] / table[rank, OPACITY]
         if len(absolute_grads) > 0:
-            absolute_grads[0, i, 0] = sums[channels + 6]
-            absolute_grads[0, i, 1] = sums[channels + 7]
+            absolute_grads[0, i, 0] += sums[channels + 6]
+            absolute_grads[0, i, 1] += sums[channels + 7]

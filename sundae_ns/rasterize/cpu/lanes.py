@@ -1,12 +1,8 @@
 """SIMD values for loops compiled by numba: sixteen numbers that a loop holds in one variable.
 
-LLVM vectorises simple loops only, and no sums, whose order it must not change. These types make vectorisation explicit:
-a variable holds sixteen pixels, every sum has a fixed order, and only :func:`fma` leaves a product unrounded. Results
-do not depend on the width of the processor's registers. A plain numba loop takes seven times as long (5,000 Gaussians
-at 128 x 128 pixels: 34 ms for the blending alone, where the whole rasteriser takes 4.7).
-
-    alphas = exp_negative(exponents) * opacity
-    weights = select(alphas >= MIN_ALPHA, alphas * through, 0.0)
+LLVM vectorises simple loops only, and no sums, whose order it must not change. Here a variable holds sixteen pixels,
+every sum has a fixed order, and only :func:`fma` leaves a product unrounded, so results do not depend on the width of
+the processor's registers. A plain numba loop takes seven times as long.
 
 Operators and functions take lanes, or a scalar that is broadcast to all of them.
 """
@@ -15,6 +11,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
+from functools import partial
 from math import factorial
 from typing import Any, cast
 
@@ -25,8 +22,7 @@ from numba.extending import intrinsic, overload, register_model
 from numba.np import arrayobj
 
 WIDTH = 16
-"""Number of lanes: in float32 one register of AVX-512, two of AVX, four of SSE or NEON. Several registers are
-worthwhile too, because their latencies overlap."""
+"""Number of lanes: in float32 one register of AVX-512, or four of SSE or NEON, whose latencies overlap."""
 
 _WORD = ir.IntType(32)
 
@@ -99,23 +95,19 @@ def _operator(function: Callable[..., Any], write: Callable[..., Any], result: L
         return call if isinstance(a, Lanes) or isinstance(b, Lanes) else None
 
 
-def _comparison(sign: str) -> Callable[..., Any]:
-    def write(builder: Any, a: Any, b: Any) -> Any:
-        if isinstance(a.type.element, ir.IntType):
-            return builder.icmp_signed(sign, a, b)
-        return builder.fcmp_ordered(sign, a, b)
-
-    return write
+def _compared(sign: str, builder: Any, a: Any, b: Any) -> Any:
+    compare = builder.icmp_signed if isinstance(a.type.element, ir.IntType) else builder.fcmp_ordered
+    return compare(sign, a, b)
 
 
 _operator(operator.add, lambda builder, a, b: builder.fadd(a, b))
 _operator(operator.sub, lambda builder, a, b: builder.fsub(a, b))
 _operator(operator.mul, lambda builder, a, b: builder.fmul(a, b))
 _operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
-_operator(operator.lt, _comparison("<"), MASK)
-_operator(operator.le, _comparison("<="), MASK)
-_operator(operator.gt, _comparison(">"), MASK)
-_operator(operator.ge, _comparison(">="), MASK)
+_operator(operator.lt, partial(_compared, "<"), MASK)
+_operator(operator.le, partial(_compared, "<="), MASK)
+_operator(operator.gt, partial(_compared, ">"), MASK)
+_operator(operator.ge, partial(_compared, ">="), MASK)
 
 
 @_intrinsic
@@ -248,10 +240,8 @@ def store_sums(
 
 @_intrinsic
 def exp_negative(typing: Any, x: Any) -> Any:
-    """exp(-x) for lanes between 0 and 80, within one and a half units in the last place.
-
-    2^n exp(-r), with n the integer nearest to -x / log(2), and a Taylor series in r, which is at most log(2) / 2.
-    """
+    """exp(-x) for lanes between 0 and 80, within one and a half units in the last place."""
+    # 2^n exp(-r), with n the integer nearest to -x / log(2), and a Taylor series in r, which is at most log(2) / 2.
 
     def write(builder: Any, x: Any) -> Any:
         single = isinstance(x.type.element, ir.FloatType)

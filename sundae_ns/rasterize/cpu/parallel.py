@@ -1,8 +1,7 @@
 """Compiled loops, and the threads that run them.
 
-Loops are compiled without the interpreter's lock and run on ordinary threads. Numba's own thread pools do not serve.
-With the OpenMP pool a forked process dies, and data loaders fork. With the built-in pool two concurrent callers die,
-and a viewer is one. ``parallel=True`` takes several times as long to compile.
+Loops run on ordinary threads without the interpreter's lock. With numba's OpenMP pool a forked process dies, such as a
+data loader; with its built-in pool two callers at once die, such as a viewer; ``parallel=True`` compiles far longer.
 
 A loop writes only the elements of its own range, so results do not depend on the number of threads.
 """
@@ -47,8 +46,8 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
     """
     # x / 0 gives inf or NaN, as in torch: raising would cost a branch.
     options |= {"nogil": True, "error_model": "numpy"}
-    # numba renews its cache when the function's own file changes. But constants and functions of other modules are
-    # compiled in too. Their hash becomes part of the function's name, so that a change selects another cache file.
+    # numba's cache follows the function's own file only. But constants and functions of other modules are compiled in
+    # too: their hash becomes part of the function's name, so that a change selects another cache file.
     numbers = sorted((k, v) for k, v in function.__globals__.items() if isinstance(v, (int, float)))
     function.__qualname__ += "_" + hashlib.sha256(f"{numbers} {_SOURCES}".encode()).hexdigest()[:8]
     try:
@@ -60,11 +59,7 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
 def parallel_for(loop: Callable[..., None], count: int, *arguments: Any, min_per_thread: int = 1) -> None:
     """Run ``loop(begin, end, *arguments)`` on ranges that cover ``range(count)``, on as many threads as torch uses.
 
-    Args:
-        loop: a loop from :func:`compiled`.
-        count: number of iterations.
-        arguments: further arguments of the loop.
-        min_per_thread: fewest iterations for which another thread is worthwhile.
+    ``loop`` is from :func:`compiled`; ``min_per_thread`` are the fewest iterations that are worth another thread.
     """
     types = (loop, *(argument.dtype for argument in arguments if isinstance(argument, np.ndarray)))
     if types not in _ready:
@@ -107,14 +102,11 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="sundae-rasterizer")
 
 
-# Threads do not survive a fork, so a child process makes its own pool.
-if hasattr(os, "register_at_fork"):
+if hasattr(os, "register_at_fork"):  # threads do not survive a fork: a child process makes its own pool
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def as_array(tensor: Tensor) -> Any:
-    """A tensor as a C-contiguous numpy array, because each other layout would be compiled anew.
-
-    If a copy is needed, numpy makes it: after a copy by torch, its threads spin on the cores that these loops need.
-    """
+    """A tensor as a C-contiguous numpy array, because each other layout would be compiled anew."""
+    # numpy makes the copy: after a copy by torch, its threads spin on the cores that these loops need.
     return np.ascontiguousarray(tensor.detach().numpy())

@@ -1,23 +1,22 @@
 """Depth-ordered lists of the Gaussians of each tile.
 
-gsplat 1.4 bins Gaussians into 16-pixel tiles by their three-sigma square and blends them in every pixel of those
-tiles. So its images depend on that grid. The lists here use a finer grid and leave out only Gaussians that cannot
-reach an alpha of 1/255 in a tile: the image is that of the 16-pixel grid, with fewer evaluations. (gsplat 1.5 fits the
-bins to the opacity instead, which also keeps the rim of opaque Gaussians from 3 to 3.33 sigma.)
+gsplat 1.4 blends a Gaussian in every 16-pixel tile that its three-sigma square touches, so its images depend on that
+grid. The lists here use a finer grid and leave out only Gaussians that cannot reach an alpha of 1/255 in a tile: the
+image is the same, with fewer evaluations. (gsplat 1.5 fits the squares to the opacity instead, which also keeps the rim
+of opaque Gaussians from 3 to 3.33 sigma.)
 
 Gaussians are sorted by depth once and are then identified by their rank. A rank owns consecutive slots, one per tile
-that it can touch; the list of a tile is a list of slots. The backward pass writes its sums per tile into the slots. The
-sum over the tiles of a Gaussian then reads adjacent memory in a fixed order.
+that it can touch. The backward pass writes its sums per tile into the slots, so that the sum over the tiles of a
+Gaussian reads adjacent memory in a fixed order.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 from math import log, sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from sundae_ns.rasterize.cpu.lanes import WIDTH
@@ -33,68 +32,77 @@ U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT, HALF_WIDTH, HALF_HEIGHT = range(9)
 
 STEP = WIDTH // TILE
 """Rows of pixels of a tile that are blended in one step."""
-
 ROUNDING = 1e-3
 """Slack on exponents, so that rounding never drops a Gaussian that is blended."""
-
-_PAIR_BYTES = 10
+MOST_PAIRS = 1 << 23
+"""Pairs of a tile and a Gaussian in memory at a time: 84 MB, and in a backward pass at least six times as much."""
 _MIN_PER_THREAD = 2_500  # Gaussians: below 0.1 ms of work, waking a thread costs more than it saves
 _DIGIT_BITS = 11  # bits per pass of the radix sort
 
 
-@dataclass(frozen=True)
-class Lists:
-    """V visible Gaussians in T tiles, row by row; L slots."""
+class Lists(NamedTuple):
+    """V visible Gaussians in those of the T tiles of an image, row by row, that are in a region; L slots."""
 
-    width: int  # of the image, pixels
-    height: int
     columns: int
-    rows: int
-    ids: Any  # [V], int32: Gaussian of each rank
-    table: Any  # [V, 9]: see the column names above
-    first_slots: Any  # [V + 1], int64: first slot of each rank
+    longest_first: Any  # [B], int32: tiles with a list, the longest first
     starts: Any  # [T + 1], int64: start of each tile's list
     ranks: Any  # [L], int32, in list order
     slots: Any  # [L], int32, in list order
     spans: Any  # [L, 2], uint8, in list order: the steps of a tile that are touched, the last excluded
-    longest_first: Any  # [B], int32: tiles with a list, the longest first
-
-    def for_blending(self) -> tuple[Any, ...]:
-        """The arrays that both loops over the tiles read."""
-        return self.columns, self.longest_first, self.starts, self.ranks, self.spans, self.ids, self.table
+    ids: Any  # [V], int32: Gaussian of each rank
+    first_slots: Any  # [V + 1], int64: first slot of each rank
+    table: Any  # [V, 9]: see the column names above
 
 
-@torch.no_grad()
-def build_lists(projection: Projection, opacities: Tensor, width: int, height: int) -> Lists:
+def tile_lists(projection: Projection, opacities: Tensor, width: int, height: int) -> Iterator[Lists]:
     """List the Gaussians of each tile; ``opacities`` ``[N]`` are those to blend.
 
+    An image with more than :data:`MOST_PAIRS` is halved until each region has fewer, or is a single tile.
+
     Raises:
-        MemoryExhaustedError: the lists would be too long.
+        MemoryExhaustedError: without gradients, the image has more Gaussians than that of any real scene.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
-    training = projection.means2d.requires_grad
     depths, radii, opacity = (as_array(value) for value in (projection.depths, projection.radii, opacities))
+    splats = (*map(as_array, (projection.means2d, projection.covars2d, projection.conics)), radii, opacity)
     # The bits of positive floats have the order of the floats.
     keys = depths.view(np.uint32 if depths.dtype == np.float32 else np.uint64)
     ids = _visible_by_depth(keys, radii, opacity)
-    count = len(ids)
-    table, boxes = np.empty((count, 9), depths.dtype), np.empty((count, 4), np.int32)
-    first_intervals, first_slots = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
-    splats = (*map(as_array, (projection.means2d, projection.covars2d, projection.conics)), radii, opacity)
-    measured = (ids, splats, (columns, rows), table, boxes, first_intervals)
-    parallel_for(_measure, count, *measured, min_per_thread=_MIN_PER_THREAD)
-    np.cumsum(first_intervals, out=first_intervals)
-    # A Gaussian touches at least one tile in each of its columns.
-    check_pairs(int(first_intervals[-1]), count, columns * rows, _PAIR_BYTES, training=training)
-    intervals = np.empty((first_intervals[-1], 2), np.int32)
-    touched = (table, boxes, first_intervals, intervals, first_slots)
-    parallel_for(_find_intervals, count, *touched, min_per_thread=_MIN_PER_THREAD)
-    np.cumsum(first_slots, out=first_slots)
-    check_pairs(int(first_slots[-1]), count, columns * rows, _PAIR_BYTES, training=training)
-    starts, ranks, slots, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
-    lengths = np.diff(starts)
-    longest_first = np.argsort(-lengths, kind="stable").astype(np.int32)[: np.count_nonzero(lengths)]
-    return Lists(width, height, columns, rows, ids, table, first_slots, starts, ranks, slots, spans, longest_first)
+    count, listed = len(ids), 0
+    regions = [(0, 0, columns, rows)]
+    while regions:
+        region = regions.pop()
+        table, boxes = np.empty((count, 9), depths.dtype), np.empty((count, 4), np.int32)
+        first_intervals, first_slots = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
+        measured = (ids, splats, region, table, boxes, first_intervals)
+        parallel_for(_measure, count, *measured, min_per_thread=_MIN_PER_THREAD)
+        np.cumsum(first_intervals, out=first_intervals)
+        halves = _halves(*region)
+        pairs = int(first_intervals[-1])  # a Gaussian touches at least one tile in each of its columns
+        if pairs <= MOST_PAIRS or not halves:
+            intervals = np.empty((pairs, 2), np.int32)
+            touched = (table, boxes, first_intervals, intervals, first_slots)
+            parallel_for(_find_intervals, count, *touched, min_per_thread=_MIN_PER_THREAD)
+            np.cumsum(first_slots, out=first_slots)
+            pairs = int(first_slots[-1])
+        if not projection.means2d.requires_grad:
+            check_pairs(listed + pairs, count, columns * rows)
+        if pairs > MOST_PAIRS and halves:
+            regions += halves
+            continue
+        listed += pairs
+        starts, ranks, slots, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
+        lengths = np.diff(starts)
+        longest_first = np.argsort(-lengths, kind="stable").astype(np.int32)[: np.count_nonzero(lengths)]
+        yield Lists(columns, longest_first, starts, ranks, slots, spans, ids, first_slots, table)
+
+
+def _halves(left: int, top: int, right: int, bottom: int) -> list[tuple[int, int, int, int]]:
+    """A region of tiles cut across its longer side; nothing for a single tile."""
+    x, y = (left + right) // 2, (top + bottom) // 2
+    if right - left > bottom - top:
+        return [(left, top, x, bottom), (x, top, right, bottom)]
+    return [(left, top, right, y), (left, y, right, bottom)] if bottom - top > 1 else []
 
 
 @compiled
@@ -128,8 +136,8 @@ def _visible_by_depth(keys: Any, radii: Any, opacities: Any) -> Any:
 
 
 @compiled
-def _measure(begin: int, end: int, ids: Any, splats: Any, grid: Any, table: Any, boxes: Any, counts: Any) -> None:
-    """Write a rank's row of the table and its rectangle of tiles, and at rank + 1 the number of columns of tiles."""
+def _measure(begin: int, end: int, ids: Any, splats: Any, region: Any, table: Any, boxes: Any, counts: Any) -> None:
+    """Write a rank's row of the table and its rectangle of tiles in a region, and at rank + 1 its number of columns."""
     means2d, covars2d, conics, radii, opacities = splats
     number = table.dtype.type
     per_bin = BIN // TILE
@@ -143,8 +151,8 @@ def _measure(begin: int, end: int, ids: Any, splats: Any, grid: Any, table: Any,
             half = number(sqrt(number(2) * reach * covars2d[i, 2 * axis]))
             low = max(np.floor((centre - radius) / BIN) * per_bin, np.floor((centre - half) / TILE))
             high = min(np.ceil((centre + radius) / BIN) * per_bin, np.ceil((centre + half) / TILE))
-            boxes[rank, axis] = np.int32(min(max(low, 0), grid[axis]))
-            boxes[rank, 2 + axis] = np.int32(min(max(high, 0), grid[axis]))
+            boxes[rank, axis] = np.int32(min(max(low, region[axis]), region[2 + axis]))
+            boxes[rank, 2 + axis] = np.int32(min(max(high, region[axis]), region[2 + axis]))
             table[rank, HALF_WIDTH + axis] = half
         table[rank, U], table[rank, V] = means2d[i, 0], means2d[i, 1]
         table[rank, HALF_XX] = number(0.5) * conics[i, 0]
@@ -183,12 +191,9 @@ def _num_tiles(first: int, beyond: int) -> int:
 
 @compiled
 def _touched_rows(table: Any, rank: int, left: int) -> tuple[float, float]:
-    """The lowest and highest position, in pixel rows, of exponents that are blended within a column of tiles.
-
-    These exponents fill an ellipse, from ``slope dx - rise`` to ``slope dx + rise`` at ``dx`` from its centre. If its
-    topmost point is outside the column, the highest position is on the nearer edge of the column; the lowest is
-    symmetric.
-    """
+    """The lowest and highest position, in pixel rows, of exponents that are blended within a column of tiles."""
+    # They fill an ellipse, from slope dx - rise to slope dx + rise at dx from its centre. If its topmost point is
+    # outside the column, the highest position is on the nearer edge of the column; the lowest is symmetric.
     xx, xy, yy = float(table[rank, HALF_XX]), float(table[rank, XY]), float(table[rank, HALF_YY])
     half_width, half_height = float(table[rank, HALF_WIDTH]), float(table[rank, HALF_HEIGHT])
     begin, end = left + 0.5 - table[rank, U], left + TILE - 0.5 - table[rank, U]
