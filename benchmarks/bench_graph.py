@@ -1,19 +1,16 @@
 """Time the neighbour graph of many points and its high-pass response, with their errors; print one JSON line a row.
 
     python benchmarks/bench_graph.py --points 5000000 --device cuda
-    python benchmarks/bench_graph.py --points 1000000 --distributions field clusters duplicates uniform --sample 0
-    python benchmarks/bench_graph.py --points 10000000 --device cuda --field RUN
+    python benchmarks/bench_graph.py --points 1000000 --distributions field uniform --sample 0
 
 Seconds are medians; the clock waits for the device. ``index_mismatches`` counts rows of neighbours that differ from
 those of scipy's k-d tree beyond ties, in a sample of the points. ``--sample 0`` compares every row and times scipy as
 well. ``response_rel_error`` is relative to the same in float64; ``isolation_mismatches`` counts points that are
-isolated in one precision only. ``peak_mib`` is the memory of a build beyond that of the points. Lines belong in
+isolated in one precision only. ``peak_mib`` is the memory of a build on CUDA beyond that of the points. Lines belong in
 results/graph.jsonl.
 
 - field: like a trained field. A thousand discs of equal counts, 0.001 to 3 units wide and a fiftieth as thick; one
   point in 50 floats up to 100 units away, one in 100 is a clone of another.
-- clusters: half in clusters of 1e-5, a quarter in clusters of 1e-2, the rest spread over 1e3.
-- duplicates: as clusters, half of the points upon others.
 - uniform: in the unit cube.
 """
 
@@ -25,7 +22,6 @@ import os
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,12 +33,11 @@ from torch import Tensor
 from sundae_ns.core.timing import now
 from sundae_ns.graph.filters import high_pass
 from sundae_ns.graph.graph import NeighborGraph, build_graph
-from sundae_ns.io.formats import read_gaussians
 
 NEIGHBORS = 16
 TIE = 1e-12
 """Relative difference up to which two distances in float64 are equal."""
-DISCS, CLUSTERS = 1000, 50
+DISCS = 1000
 
 
 def field_points(n: int, random: np.random.Generator) -> NDArray[np.float64]:
@@ -54,43 +49,21 @@ def field_points(n: int, random: np.random.Generator) -> NDArray[np.float64]:
     floaters = random.normal(size=(n // 50, 3))
     floaters *= 10 ** random.uniform(0, 2, (n // 50, 1)) / np.linalg.norm(floaters, axis=1, keepdims=True)
     points[: n // 50] = floaters
-    return cloned(points, n // 100, random)
-
-
-def cluster_points(n: int, random: np.random.Generator) -> NDArray[np.float64]:
-    """Points whose spacings differ by eight orders of magnitude, float64 ``[n, 3]``."""
-    points = random.normal(size=(n, 3))
-    points[3 * n // 4 :] *= 1e3
-    for part, width in ((slice(0, n // 2), 1e-5), (slice(n // 2, 3 * n // 4), 1e-2)):
-        # Near the origin, where float32 tells points of a narrow cluster apart.
-        centres = 1e-3 * random.normal(size=(CLUSTERS, 3))
-        points[part] = centres[random.integers(CLUSTERS, size=len(points[part]))] + width * points[part]
-    return random.permutation(points)
-
-
-def cloned(points: NDArray[np.float64], count: int, random: np.random.Generator) -> NDArray[np.float64]:
-    """The points, ``count`` of them (at most half) moved upon others."""
-    order = random.permutation(len(points))
-    points[order[:count]] = points[order[len(points) - count :]]
+    order = random.permutation(n)
+    points[order[: n // 100]] = points[order[n - n // 100 :]]
     return points
 
 
 DISTRIBUTIONS: dict[str, Callable[[int, np.random.Generator], NDArray[np.float64]]] = {
     "field": field_points,
-    "clusters": cluster_points,
-    "duplicates": lambda n, random: cloned(cluster_points(n, random), n // 2, random),
     "uniform": lambda n, random: random.uniform(size=(n, 3)),
 }
 
 
 def measure(points: Tensor, device: str, repeats: int, sample: int) -> dict[str, Any]:
-    """Seconds, errors and memory of graph and response.
+    """Seconds, errors and memory of graph and response of points, float32 on the CPU ``[N, 3]``.
 
-    Args:
-        points: positions, float32 on the CPU ``[N, 3]``.
-        device: device to measure on.
-        repeats: timed runs after an untimed one.
-        sample: number of rows to compare with scipy; 0 compares all, and times scipy.
+    ``repeats`` runs are timed after an untimed one; ``sample`` rows are compared with scipy, 0 compares all.
     """
     placed = points.to(device)
     times: list[tuple[float, float]] = []
@@ -107,13 +80,17 @@ def measure(points: Tensor, device: str, repeats: int, sample: int) -> dict[str,
     times.clear()
     for _ in range(repeats):
         run()
-    (graph, response), peak = with_peak(run, device)
-    builds, responses, wholes = zip(*((a, b, a + b) for a, b in times[:repeats]), strict=True)
-    seconds = statistics.median(wholes)
+    peak = None
+    if device == "cuda":
+        before = torch.cuda.memory_allocated()
+        torch.cuda.reset_peak_memory_stats()
+    graph, response = run()
+    if device == "cuda":
+        peak = round((torch.cuda.max_memory_allocated() - before) / 2**20, 1)
+    builds, responses, totals = zip(*((a, b, a + b) for a, b in times[:repeats]), strict=True)
+    seconds = statistics.median(totals)
     error, isolated = response_error(placed, response)
-    rows = (
-        np.arange(len(points)) if not sample else np.linspace(0, len(points) - 1, min(sample, len(points))).astype(int)
-    )
+    rows = np.linspace(0, len(points) - 1, min(sample or len(points), len(points))).astype(int)
     reference, wrong = compare_with_scipy(points.double().numpy(), graph.indices.cpu().numpy(), rows)
     return {
         "seconds": rounded(seconds),
@@ -124,20 +101,15 @@ def measure(points: Tensor, device: str, repeats: int, sample: int) -> dict[str,
         "index_mismatches": wrong,
         "response_rel_error": rounded(error, 3),
         "isolation_mismatches": isolated,
-        "peak_mib": None if peak is None else round(peak / 2**20, 1),
+        "peak_mib": peak,
     }
 
 
 def compare_with_scipy(points: NDArray[np.float64], found: NDArray[np.int64], rows: NDArray[Any]) -> tuple[float, int]:
-    """Seconds of scipy's tree and its query, and the number of wrong rows of neighbours.
+    """Seconds of scipy's tree and its query, and the number of wrong ones of the ``rows`` of neighbours ``[N, K]``.
 
     A row is right if its points are distinct, leave out the point itself, and lie at the true distances. It
     may differ from scipy's in points of equal distance.
-
-    Args:
-        points: positions ``[N, 3]``.
-        found: neighbours ``[N, K]``.
-        rows: points to query, ascending indices ``[M]``.
     """
     started = time.perf_counter()
     true = cKDTree(points).query(points[rows], k=NEIGHBORS + 1, workers=-1)[0][:, 1:]
@@ -162,43 +134,14 @@ def response_error(placed: Tensor, response: Tensor) -> tuple[float, int]:
     return float(error), int((known != found).sum())
 
 
-def with_peak(run: Callable[[], Any], device: str) -> tuple[Any, int | None]:
-    """Result of a run, and the most memory that it took, bytes; None where this cannot be measured."""
-    if device == "cuda":
-        before = torch.cuda.memory_allocated()
-        torch.cuda.reset_peak_memory_stats()
-        return run(), torch.cuda.max_memory_allocated() - before
-    try:
-        Path("/proc/self/clear_refs").write_text("5")  # Linux: the peak of the resident memory starts anew
-        before = resident("VmRSS")
-        result = run()
-        return result, resident("VmHWM") - before
-    except OSError:
-        return run(), None
-
-
-def resident(name: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
-
-
 def rounded(value: float, digits: int = 4) -> float:
     return float(f"{value:.{digits}g}")
-
-
-def tiled(path: Path, count: int) -> Tensor:
-    """Centres of a field, copied side by side up to a count."""
-    from multi_gpu import tile
-
-    gaussians = read_gaussians(path)[0]
-    return tile({"means": gaussians["means"][gaussians["means"].isfinite().all(dim=1)]}, count)["means"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, nargs="+", default=[1_000_000])
     parser.add_argument("--distributions", nargs="+", choices=DISTRIBUTIONS, default=["field", "uniform"])
-    parser.add_argument("--field", type=Path, help="in their place: copies of a field (run, checkpoint or .ply)")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--repeats", type=int, default=5, help="timed runs; their median counts")
     parser.add_argument("--sample", type=int, default=100_000, help="rows compared with scipy; 0 for all")
@@ -210,14 +153,8 @@ def main() -> None:
     threads = f"{os.cpu_count()} threads for neighbours, {torch.get_num_threads()} for torch"
     name = torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {threads}"
     for n in options.points:
-        for distribution in (
-            options.distributions if options.field is None else [f"{options.field}, copies side by side"]
-        ):
-            if options.field is None:
-                drawn = DISTRIBUTIONS[distribution](n, np.random.default_rng(0))
-                points = torch.from_numpy(drawn).float()
-            else:
-                points = tiled(options.field, n)
+        for distribution in options.distributions:
+            points = torch.from_numpy(DISTRIBUTIONS[distribution](n, np.random.default_rng(0))).float()
             row = {"benchmark": "graph", "points": n, "neighbors": NEIGHBORS, "device": options.device}
             row |= {"device_name": name, "distribution": distribution}
             row |= measure(points, options.device, options.repeats, options.sample)

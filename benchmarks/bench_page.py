@@ -114,13 +114,7 @@ def psnr(found: NDArray[Any], truth: NDArray[Any]) -> float:
 
 
 def compared(scene: Path, side: int = SIDE, *, half: bool = False) -> dict[str, Any]:
-    """A packed scene in the page: sizes, times, and the PSNR of six images against Python's of the same file.
-
-    Args:
-        scene: written by ``sundae pack``.
-        side: longest side of the images, pixels.
-        half: also render in half precision; ``psnr_half`` is missing where that is impossible.
-    """
+    """A packed scene in the page: sizes, times, and the PSNR of six images against Python's of the same file."""
     chromium = find_chromium()
     if chromium is None:
         sys.exit("no Chromium here: apt-get install chromium")
@@ -169,11 +163,7 @@ def has_packages() -> bool:
 
 
 def half_images(packed: Path) -> tuple[str, list[NDArray[np.float64]]] | None:
-    """Images of all cameras by the page's renderer in half precision, head included; None without such an adapter.
-
-    Returns:
-        The adapter, and images ``[H, W, 3]`` in [0, 1].
-    """
+    """Images of all cameras by the page's renderer in half precision, head included; None without such an adapter."""
     if not has_packages():
         return None
     # Beside the packages, where Node looks for Dawn.

@@ -5,8 +5,6 @@
 
 Every arm trains in a process of its own, on images of full size on the GPU, with every 8th image for the test and the
 head as the method decides. Nothing is evaluated or saved while the clock runs; the clock waits for the GPU.
-``gpu_busy_share`` is the share of 100 steps in which a kernel runs, after each of the steps of ``--profile``, and
-``kernels`` has the microseconds of a step in each of them (in a further training, because the profiler takes time).
 ``curve`` lists seconds, PSNR and SSIM of the test views on the way, measured with the clock stopped.
 """
 
@@ -14,19 +12,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import subprocess
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable
-from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-from bench_pack import commit
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
@@ -41,8 +34,6 @@ ARMS: dict[str, list[str]] = {
     "sundae-fast": ["sundae-fast"],
     "sundae-with-head": ["sundae", "--pipeline.model.head.mode", "residual"],
 }
-PROFILED = 100
-"""Steps of a profile."""
 
 
 def steps_of(options: argparse.Namespace, arm: str) -> int:
@@ -91,10 +82,6 @@ def quality(trainer: Any) -> tuple[float, float]:
     return tuple(torch.tensor(figures).mean(dim=0).tolist())
 
 
-def after_step(trainer: Any, act: Callable[[int], None]) -> None:
-    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], act))
-
-
 def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
     """Train with the clock running."""
     trainer = trainer_of(options, arm, out)
@@ -110,7 +97,7 @@ def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
         curve.append([round(stopped - started - spent, 2), *(round(value, 4) for value in quality(trainer))])
         spent += time.perf_counter() - stopped
 
-    after_step(trainer, look)
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], look))
     torch.cuda.reset_peak_memory_stats()
     torch.cuda.synchronize()
     started = time.perf_counter()
@@ -130,59 +117,10 @@ def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
     }
 
 
-def busy(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
-    """Shares of time in which a kernel runs, and the time of each; by default after a quarter, and at the end."""
-    trainer, steps = trainer_of(options, arm, out), steps_of(options, arm)
-    starts = sorted(options.profile) if options.profile else [steps // 4, steps - PROFILED - 1]
-    shares: list[float] = []
-    kernels: list[dict[str, float]] = []
-    profile: Any = None
-    began = 0.0
-
-    def look(step: int) -> None:
-        nonlocal profile, began
-        if step + 1 in starts:
-            torch.cuda.synchronize()
-            profile = torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA])
-            profile.__enter__()
-            began = time.perf_counter()
-        elif profile is not None and step + 1 - PROFILED in starts:
-            torch.cuda.synchronize()
-            span = time.perf_counter() - began
-            profile.__exit__(None, None, None)
-            shares.append(round(covered(profile) / span, 3))
-            kernels.append(by_kernel(profile))
-            profile = None
-
-    after_step(trainer, look)
-    trainer.train()
-    return {"profiled_after": starts, "gpu_busy_share": shares, "kernels": kernels}
-
-
-def by_kernel(profile: Any) -> dict[str, float]:
-    """Microseconds of a step in each kernel, the longest first; those below 1% of all are summed as ``other``."""
-    spent: Counter[str] = Counter()
-    for event in profile.events():
-        if event.device_type == torch.autograd.DeviceType.CUDA:
-            name = re.sub(r"<.*|\(.*|^void ", "", event.name.replace("(anonymous namespace)::", ""))
-            spent[name] += (event.time_range.end - event.time_range.start) / PROFILED
-    least = 0.01 * spent.total()
-    found = {name: round(value, 1) for name, value in spent.most_common() if value >= least}
-    return {**found, "other": round(sum(value for value in spent.values() if value < least), 1)}
-
-
-def covered(profile: Any) -> float:
-    """Seconds in which at least one kernel runs."""
-    spans = sorted(
-        (event.time_range.start, event.time_range.end)
-        for event in profile.events()
-        if event.device_type == torch.autograd.DeviceType.CUDA
-    )
-    total, reached = 0.0, 0.0
-    for start, end in spans:
-        total += max(end - max(start, reached), 0.0)
-        reached = max(reached, end)
-    return total / 1e6
+def commit() -> str | None:
+    """The checked-out commit; None outside of a repository."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() or None
 
 
 def main() -> None:
@@ -194,32 +132,25 @@ def main() -> None:
     parser.add_argument(
         "--curve", type=int, nargs="*", default=[], help="steps after which the test views are measured"
     )
-    parser.add_argument(
-        "--profile", type=int, nargs="*", metavar="STEP", help="also train under a profiler, for 100 steps after each"
-    )
     parser.add_argument("--option", action="append", default=[], help="a further word of ns-train")
     parser.add_argument("-o", "--output", type=Path, help="file to append the lines to")
-    parser.add_argument("--child", choices=("timed", "busy"), help=argparse.SUPPRESS)
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if any(abs(a - b) <= PROFILED for a, b in combinations(options.profile or (), 2)):
-        parser.error(f"steps of --profile must be more than {PROFILED} apart")
-    if options.child is not None:
+    if options.child:
         with TemporaryDirectory() as out:
-            print("ROW " + json.dumps({"timed": timed, "busy": busy}[options.child](options, options.arms[0], out)))
+            print("ROW " + json.dumps(timed(options, options.arms[0], out)))
         return
     for arm in options.arms:
         steps = steps_of(options, arm)
         row: dict[str, Any] = {"arm": arm, "scene": options.capture.name, "steps": steps, "seed": options.seed}
-        for child in ("timed",) if options.profile is None else ("timed", "busy"):
-            words = [sys.executable, __file__, str(options.capture), "--arms", arm, "--steps", str(steps)]
-            words += ["--seed", str(options.seed), "--child", child, "--curve", *map(str, options.curve)]
-            words += ["--profile", *map(str, options.profile or ())]
-            words += [f"--option={word}" for word in options.option]
-            done = subprocess.run(words, check=False, capture_output=True, text=True)
-            lines = [line for line in done.stdout.splitlines() if line.startswith("ROW ")]
-            if not lines:
-                sys.exit(f"{arm} failed:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}")
-            row |= json.loads(lines[0][4:])
+        words = [sys.executable, __file__, str(options.capture), "--arms", arm, "--steps", str(steps), "--child"]
+        words += ["--seed", str(options.seed), "--curve", *map(str, options.curve)]
+        words += [f"--option={word}" for word in options.option]
+        done = subprocess.run(words, check=False, capture_output=True, text=True)
+        lines = [line for line in done.stdout.splitlines() if line.startswith("ROW ")]
+        if not lines:
+            sys.exit(f"{arm} failed:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}")
+        row |= json.loads(lines[0][4:])
         row |= {"gpu": torch.cuda.get_device_name(0), "commit": commit()}
         print(json.dumps(row), flush=True)
         if options.output is not None:

@@ -60,14 +60,16 @@ def settings(kind: str, antialiased: bool) -> dict[str, dict[str, Options]]:
         "spark": {
             "default": {},
             "blur": {"renderer": blur},
-            "order by depth": {"renderer": {"sortRadial": False}},
-            "reach": {"renderer": {"maxStdDev": REACH, "minAlpha": 1 / 255}},
-            "full precision": {"renderer": {"accumExtSplats": True}, "scene": {"extSplats": True}},
+            "full precision": {
+                "renderer": {"sortRadial": False, "maxStdDev": REACH, "minAlpha": 1 / 255, "accumExtSplats": True},
+                "scene": {"extSplats": True},
+            },
         },
         "gaussianSplats3D": {
             "default": {},
-            "harmonics": {"renderer": {"sphericalHarmonicsDegree": 2, "antialiased": antialiased}},
-            "exact order": {"renderer": {"integerBasedSort": False}},
+            "exact order": {
+                "renderer": {"sphericalHarmonicsDegree": 2, "antialiased": antialiased, "integerBasedSort": False}
+            },
         },
         "three": {"default": {}},
         "playcanvas": {
@@ -136,8 +138,7 @@ class Viewers:
             raise RuntimeError(f"{viewer}: {found}")
         pixels = [np.frombuffer(base64.b64decode(image), np.uint8) for image in found]
         # WebGL begins with the lowest row.
-        shaped = [image.reshape(h, w, 4)[::-1, :, :3] for image, (w, h) in zip(pixels, self._sizes, strict=True)]
-        return [image / 255 for image in shaped]
+        return [image.reshape(h, w, 4)[::-1, :, :3] / 255 for image, (w, h) in zip(pixels, self._sizes, strict=True)]
 
 
 @contextmanager

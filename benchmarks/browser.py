@@ -101,21 +101,12 @@ def main() -> None:
     late = seconds > seconds[-1] / 2
     growth = float(np.polyfit(seconds[late], memory[late], 1)[0]) * 60
     slices = np.diff(arrived).tolist()
-    result = {
-        "seconds": round(float(seconds[-1]), 1),
-        "steps": int(steps[-1]) - first_step,
-        "controls_used": acted,
-        "camera_moves": len(samples),
-        "images": arrived[-1] - arrived[0],
-        "images_in_the_poorest_30_s": min(slices),
-        "page_errors": errors,
-        "log_errors": complaints,
-        "host_mb_first": round(float(memory[0]), 1),
-        "host_mb_middle": round(float(memory[late][0]), 1),
-        "host_mb_last": round(float(memory[-1]), 1),
-        "host_mb_a_minute_second_half": round(growth, 2),
-        "device": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "cpu",
-    }
+    moves = {"controls_used": acted, "camera_moves": len(samples), "images": arrived[-1] - arrived[0]}
+    result: dict[str, object] = {"seconds": round(float(seconds[-1]), 1), "steps": int(steps[-1]) - first_step, **moves}
+    result |= {"images_in_the_poorest_30_s": min(slices), "page_errors": errors, "log_errors": complaints}
+    points = {"first": memory[0], "middle": memory[late][0], "last": memory[-1], "a_minute_second_half": growth}
+    result |= {f"host_mb_{name}": round(float(value), 2) for name, value in points.items()}
+    result["device"] = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "cpu"
     print(json.dumps(result))
     stuck = min(slices) == 0 or steps[-1] <= steps[late][0]
     sys.exit(int(stuck or bool(errors) or bool(complaints) or not listening or growth > options.allowed))

@@ -136,7 +136,6 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
     psnr = [] if exact else [quality(run_folder(config)) for config in undisturbed]
 
     tally: Counter[str] = Counter()
-    decisions: Counter[str] = Counter()
     resumed_psnr: list[float] = []
     lost = 0
     # One kill at each place, then random ones; half of the rest at any time. Ranks have modules of their own.
@@ -170,7 +169,6 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
         if not exact:
             resumed_psnr.append(quality(folder))
         equal = same(result, reference) if exact else resumed_psnr[-1] > min(psnr) - SPREAD
-        decisions[result["trials"].get("trials.json", {}).get("head", {}).get("decision", "")] += 1
         for name, held in (("one prune", one_prune), ("the same result", equal), ("nothing left lying", clean)):
             tally[name] += held
         lost += not (killed and one_prune and equal and clean)
@@ -180,7 +178,6 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
         "save_every": save_every,
         "primitives": [reference["prunes"][0]["before"], reference["prunes"][0]["after"]],
         **({"decision": reference["trials"]["trials.json"]["head"]["decision"]} if kind == "trials" else {}),
-        **({"decisions after kills": decisions} if kind == "trials" and not exact else {}),
         "same seed, same result": repeatable if exact else None,
         **({} if exact else {"psnr, undisturbed": psnr, "psnr, resumed": resumed_psnr}),
     }
@@ -193,7 +190,6 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def write_all(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Counterpart of :func:`contents`."""
     for path, content in files.items():
         (folder / path).write_bytes(content)
 
@@ -243,10 +239,8 @@ def kill_commands(kind: str, options: argparse.Namespace, bench: Bench, root: Pa
         else:
             killed = bench.ended(start(place)) == -signal.SIGKILL
         left = contents(output)
-        kept = all(
-            left.get(path) in (older[path], fresh[name][path]) or (not exact and is_whole(output / path))
-            for path in older
-        )
+        either = {path: (older[path], fresh[name][path]) for path in older}
+        kept = all(left.get(path) in either[path] or (not exact and is_whole(output / path)) for path in older)
         bench.finish(command_here, words(name))
         last = contents(output)
         again = last == fresh[name] if exact else all(is_whole(output / path) for path in last)

@@ -38,18 +38,7 @@ class QualityOptions(Options):
 
 
 def run_quality(options: QualityOptions, runner: Runner | None = None, console: Console | None = None) -> int:
-    """Compare arms on one capture; the exit code.
-
-    Args:
-        options: those of the command.
-        runner: runs a job; by default in a process of its own.
-        console: for progress and messages.
-
-    Raises:
-        ConfigError: an option or an arm cannot work, or the folder holds results of other jobs with the same names.
-        DataError: the folder is no capture.
-        StorageError: the folder cannot be written to.
-    """
+    """Compare arms on one capture; the exit code."""
     arms = choose_arms(options.arms, options.method, options.steps_scale)
     check_out(options.out, reads=[options.folder])
     data = options.folder.resolve()

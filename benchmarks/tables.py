@@ -354,11 +354,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
 
 
 def with_tables(text: str) -> str:
-    """A page with its tables made anew.
-
-    Raises:
-        KeyError: a marker names no table.
-    """
+    """A page with its tables made anew."""
     return MARKED.sub(lambda found: found[1] + "\n".join(TABLES[found["name"]]()) + "\n" + found[3], text)
 
 

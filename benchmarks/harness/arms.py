@@ -39,14 +39,7 @@ class Entry:
 
 
 def choose_arms(words: Sequence[str], method: str, scale: float = 1.0, *, from_scratch: bool = False) -> list[Arm]:
-    """The arms that a command names, with their lengths; ``ConfigError`` if one cannot work.
-
-    Args:
-        words: names of default arms and files of arms (``.yaml``); none for all default arms.
-        method: method of this package that prunes once, for arms without a method.
-        scale: factor on all lengths of training.
-        from_scratch: train arms without options from scratch, not from a shared warm-up.
-    """
+    """The arms that a command names, with their lengths; ``ConfigError`` if one cannot work."""
     if not scale > 0:
         raise ConfigError(f"steps-scale is {scale}; give a positive factor, 0.01 for a trial")
     defaults = {entry.name: entry for entry in read_entries(DEFAULT_FILE)}

@@ -1,6 +1,6 @@
 """One job of a comparison: trained by nerfstudio, saved, opened again from its files, and measured.
 
-``OUT/jobs/KEY/job.json`` describes it. quality.py, suite.py and paper.py start a process of it.
+``OUT/jobs/KEY/job.json`` describes it. quality.py and suite.py start a process of it.
 """
 
 from __future__ import annotations
@@ -111,10 +111,6 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
     """Train, save, open the saved run, measure it, and pack it; the plain values of its result.
 
     Nothing is evaluated or saved while training is timed. A job that was not ``alone`` on its GPU has no times.
-
-    Raises:
-        BackendError: the method needs a CUDA device and there is none.
-        CheckpointError: its warm-up is not done.
     """
     config, command = configure(job, out)
     ours = isinstance(config.pipeline.model, SundaeModelConfig)
@@ -283,12 +279,7 @@ def _forget() -> None:
 
 
 def job(out: Annotated[Path, tyro.conf.Positional], key: Annotated[str, tyro.conf.Positional]) -> int:
-    """Train, save and measure; a job that is done is not done again.
-
-    Args:
-        out: folder of the comparison.
-        key: name of the job.
-    """
+    """Train, save and measure; a job that is done is not done again."""
     plain = json.loads((job_folder(out, key) / "job.json").read_text(encoding="utf-8"))
     perform(Job(**{**plain, "options": tuple(plain["options"]), "parser": tuple(plain["parser"])}), out)
     return 0

@@ -67,12 +67,7 @@ class Job:
 
 
 def parser_of(data: Path, downscale: int = 1) -> Words:
-    """Words of the data parser for a capture: none for a ``transforms.json``; for COLMAP every 8th image is for test.
-
-    Raises:
-        ConfigError: smaller images of a capture that is not in COLMAP layout.
-        DataError: neither layout, or no such images.
-    """
+    """Words of the data parser for a capture: none for a ``transforms.json``; for COLMAP every 8th is for test."""
     if (data / "sparse" / "0").is_dir():
         images = data / ("images" if downscale == 1 else f"images_{downscale}")
         if not images.is_dir():
@@ -190,11 +185,7 @@ def _check(
 
 
 def jobs_of_shard(jobs: Sequence[Job], shard: str) -> list[Job]:
-    """The jobs of a part, ``"2/5"`` for the second of five, with the warm-ups that they need; parts share only those.
-
-    Raises:
-        ConfigError: the shard has another form.
-    """
+    """The jobs of a part, ``"2/5"`` for the second of five, with their warm-ups, which parts share."""
     part, _, parts = shard.partition("/")
     if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
         raise ConfigError(f"{shard!r} is no shard: use i/n with i from 1 to n")

@@ -19,11 +19,7 @@ Result = Mapping[str, Any]
 
 
 def read_results(out: Path) -> list[Result]:
-    """All results in a folder, each job once: of ``done/``, and of ``*.jsonl`` beside it, which may be concatenated.
-
-    Raises:
-        DataError: a line is damaged.
-    """
+    """All results in a folder, each job once: of ``done/``, and of ``*.jsonl`` beside it, which may be concatenated."""
     found: dict[str, Result] = {}
     for path in (*sorted(out.glob("*.jsonl")), *sorted((out / "done").glob("*.json"))):
         for count, line in enumerate(path.read_bytes().splitlines(), start=1):

@@ -70,11 +70,11 @@ class Options:
     def command(self) -> str:
         """The command of the whole comparison, without the shard."""
         words = ["python", f"benchmarks/{self.script}", str(self.folder), "-o", str(self.out)]
-        for gaussians in fields(self):
-            value = getattr(self, gaussians.name)
-            values = value if isinstance(value, tuple) else (value,)
-            if values and gaussians.name not in ("folder", "out", "shard", "jobs"):
-                words += [f"--{gaussians.name.replace('_', '-')}", *map(str, values)]
+        for option in fields(self):
+            value = getattr(self, option.name)
+            values = value if isinstance(value, tuple) else () if value is True else (value,)
+            if value not in ((), False) and option.name not in ("folder", "out", "shard", "jobs"):
+                words += [f"--{option.name.replace('_', '-')}", *map(str, values)]
         return shlex.join(words)
 
 
@@ -98,20 +98,7 @@ def compare(
     *,
     whole_captures: bool = False,
 ) -> int:
-    """List the jobs, or run them and write the tables; the exit code, 1 if a job failed.
-
-    Args:
-        plan: all jobs, each after the one that it needs.
-        options: those of the command.
-        page: makes ``table.md``.
-        runner: runs a job; by default in a process of its own (:func:`spawn`).
-        console: for progress and messages.
-        whole_captures: leave a capture out whose first job fails: it is damaged, or too large for this machine.
-
-    Raises:
-        ConfigError: the shard has another form, or the folder holds results of other jobs with the same names.
-        StorageError: the folder cannot be written to.
-    """
+    """List the jobs, or run them and write the tables; the exit code, 1 if a job failed."""
     out, jobs = options.out, jobs_of_shard(plan, options.shard)
     if options.jobs:
         show_jobs(jobs, out, console)

@@ -24,18 +24,7 @@ def write_still_life(
     points: int = 2000,
     **_: Any,
 ) -> Path:
-    """Write views of the demo's capture, spread evenly around it, as a capture of its own.
-
-    Args:
-        out: folder without images; created if missing.
-        train_views: number of training images.
-        test_views: number of held-out images, spread between the training views; 56 with those at most.
-        width, height: pixels; the longer side shows 50 degrees, and the shorter one is cropped.
-        points: number of points in the sparse cloud, at most 5,000.
-
-    Returns:
-        ``out``, the value for ``--data``.
-    """
+    """Write views of the demo's capture, spread evenly around it, as a capture of its own."""
     total, side = train_views + test_views, max(width, height)
     (out / "images").mkdir(parents=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -112,10 +112,10 @@ class ViewerPage(Browser):
         return left, top, width, height
 
     def settle(self, act: Callable[[], Any] | None = None, longest: int = 512) -> Any:
-        """Call ``act`` and wait for the viewer's image at full size; the result of ``act``.
+        """Call ``act`` and wait for the viewer's image at full size, ``longest``; the result of ``act``.
 
-        The viewer answers with a small image first and then, if nothing more happens, with one whose longer side is
-        ``longest``. An image that was on its way before the act is of full size too.
+        The viewer answers with a small image first, and with a full one if nothing more happens. A fast machine draws
+        the first at full size; a single full image may also have been on its way before the act.
         """
         start = len(self.images)
         result = None if act is None else act()
@@ -127,16 +127,12 @@ class ViewerPage(Browser):
                 latest[:] = [start + len(sizes), time.monotonic()]
             if not sizes or sizes[-1] != longest:
                 return False
-            # A fast machine draws the first image at full size; a single image may also have been on its way before.
             return min(sizes) < longest or time.monotonic() - latest[1] > (2 if len(sizes) > 1 else 6)
 
-        try:
-            wait_for(done, "an image of full size", 2 * SLOW)
-        except BrowserError as error:
-            raise BrowserError(f"{error}; images were {self.images[start:]}") from error
+        wait_for(done, "an image of full size", 2 * SLOW)
         width, height = self.images[-1]
-        shown = f"document.body.innerText.includes('Resolution: {width}x{height}px')"
-        wait_for(lambda: bool(self.evaluate(shown)), "the page to show it", SLOW)
+        resolution = f"document.body.innerText.includes('Resolution: {width}x{height}px')"
+        wait_for(lambda: bool(self.evaluate(resolution)), "the page to show it", SLOW)
         self.seen = self.still()
         return result
 
@@ -165,13 +161,7 @@ class ViewerPage(Browser):
 
 
 class Server:
-    """A command of nerfstudio's with its viewer on this machine's loopback, in a process of its own.
-
-    Args:
-        command: name in the environment's folder of commands, and its arguments without those of the viewer.
-        log: file for its output.
-        ready: words in its output that say that it is ready.
-    """
+    """A command of nerfstudio's with its viewer on this machine's loopback, in a process of its own."""
 
     def __init__(self, command: Sequence[object], log: Path, ready: str) -> None:
         with socket.socket() as free:
@@ -195,11 +185,7 @@ class Server:
         return [word for word in ("Traceback", "Exception", "Error") if word in self.output()]
 
     def listens(self) -> bool:
-        """Whether it accepts a browser.
-
-        Raises:
-            BrowserError: it has ended.
-        """
+        """Whether it accepts a browser."""
         if self.process.poll() is not None:
             raise BrowserError(f"it ended with {self.process.returncode}: {self.output()[-3000:]}")
         with suppress(OSError), socket.create_connection(("127.0.0.1", self._port), 1):

@@ -1,4 +1,4 @@
-"""``quality.py``, ``suite.py`` and ``paper.py`` with tiny trainings: stopped and resumed, and published layouts."""
+"""``quality.py`` and ``suite.py`` with tiny trainings: stopped and resumed, and published layouts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import forked
 import numpy as np
 import pytest
 from csv_rows import read_rows
-from paper import PaperOptions, run_paper
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from suite import SuiteOptions, run_suite
@@ -187,7 +186,8 @@ def published(scene: Path, out: Path, *, factor: int) -> None:
 def test_a_scene_as_it_is_published(tiny: Any, tmp_path: Path) -> None:
     published(tiny.scene, tmp_path / "360_v2" / "bicycle", factor=4)
     published(tiny.scene, tmp_path / "360_v2" / "counter", factor=2)
-    options = PaperOptions(
+    options = SuiteOptions(
+        paper=True,
         folder=tmp_path,
         out=tmp_path / "out",
         arms=("sundae",),
@@ -195,8 +195,7 @@ def test_a_scene_as_it_is_published(tiny: Any, tmp_path: Path) -> None:
         method="sundae-tiny",
         steps_scale=SCALE,
     )
-    code = run_paper(options, runner=in_process)
-    assert code == 0
+    assert run_suite(options, runner=in_process) == 0
     rows = [row for row in read_rows(tmp_path / "out" / "results.csv") if row.variant == "sundae"]
     meta = json.loads((tiny.scene / "transforms.json").read_text())
     assert {row.scene for row in rows} == {"bicycle", "counter"}
