@@ -1,28 +1,31 @@
-"""The exported page in a headless Chromium with a software adapter, against Python's images of the same file.
+"""The exported page in a headless Chromium with a software adapter: its images, its controls, and lost GPUs.
 
-The page's images are bytes, whose rounding alone gives 58.9 dB. ``make browser SCENE=scene.sundae`` adds a scene.
+Images are compared with Python's of the same file. The page's are bytes, whose rounding alone gives 58.9 dB.
+``make browser SCENE=scene.sundae`` adds a scene.
 """
 
 from __future__ import annotations
 
 import base64
 import dataclasses
+import io
 import json
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
-from http.server import ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packages
+from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packages, touch
 from numpy.typing import NDArray
 from packed_scenes import KINDS, write_bomb, write_kind
-from pages import SAID, SECONDS, SIZE, STOP, TICKING, WEBGL, Quiet, hold, opened, rested, touch
+from PIL import Image
 
 from sundae_ns.cli.view import serve
 from sundae_ns.io.pack import container
@@ -33,12 +36,97 @@ from sundae_ns.scene.packing import contents_of, stated_start
 from sundae_ns.scene.page import page_of, write_page
 
 pytestmark = needs_chromium
+in_browser = pytest.mark.browser
 image, psnr, truths = bench_page.image, bench_page.psnr, bench_page.truths
 
 LEAST = 57.0
 """Lowest PSNR of an image of the page against Python's; the worst is 58.7."""
 LEAST_HALF = 55.0
 """The same with the head in half precision; the worst is 57.6."""
+SECONDS = 180.0
+"""Shaders compile in software."""
+SIZE = (160, 120)
+WEBGL = ["--disable-features=WebGPU"]  # flags for a browser without WebGPU
+TICKING = """
+const dot = document.createElement('div');
+dot.style = 'position: absolute; width: 1px; height: 1px';
+document.body.append(dot);
+let odd = 0;
+setInterval(() => { dot.style.background = (odd ^= 1) ? 'red' : 'blue'; }, 30);
+"""
+"""A pixel in the corner that changes: headless Chromium takes screenshots only of frames that differ from the last."""
+STOP = "document.getElementById('stop').textContent"
+SAID = "document.getElementById('said').textContent"
+
+
+@contextmanager
+def opened(
+    address: str, *, state: str = "ready", flags: Any = browser.WEBGPU, size: tuple[int, int] = SIZE, before: str = ""
+) -> Iterator[Any]:
+    """The page of an address, once it has a state; ``before`` is a script that runs before those of the page."""
+    with browser.Browser(CHROMIUM, *size, flags) as page:
+        page.call("Page.addScriptToEvaluateOnNewDocument", {"source": before})
+        page.open(address)
+        found = "window.sundae && window.sundae.state !== 'loading'"
+        browser.wait_for(lambda: bool(page.evaluate(found)), "the page", SECONDS)
+        assert page.evaluate("sundae.state") == state, page.evaluate("sundae.message")
+        yield page
+        assert page.errors == []
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        pass
+
+
+def rested(page: Any) -> NDArray[np.int64]:
+    """The canvas once it rests, without what lies over it."""
+    browser.wait_for(lambda: page.evaluate("sundae.still"), "the image of a camera at rest", SECONDS)
+    over = "'panel', 'message', 'status'"
+    page.evaluate(f"for (const id of [{over}]) document.getElementById(id).style.visibility = 'hidden'")
+    page.evaluate(f"if (!window.dot) {{ window.dot = 1; {TICKING} }}")
+    shots = [page.screenshot().astype(int)]
+    while len(shots) < 2 or np.abs(shots[-1] - shots[-2]).any():
+        assert len(shots) < 20, "the canvas does not rest"
+        shots.append(page.screenshot().astype(int))
+        shots[-1][0, 0] = 0
+    return shots[-1]
+
+
+def hold(page: Any, code: str) -> None:
+    """Hold a key for two frames."""
+    before = page.evaluate("sundae.frames")
+    page.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": code, "code": code})
+    browser.wait_for(lambda: page.evaluate("sundae.frames") > before + 1, "two frames", SECONDS)
+    page.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": code, "code": code})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the packed scene a.sundae, its page a.html, and its page as a folder, ``site``."""
+    folder = tmp_path_factory.mktemp("page")
+    scene = packed_file(write_kind(folder / "a.sundae", KINDS["residual"]))
+    write_page(folder / "a.html", *scene, title="a")
+    write_page(folder / "site", *scene, title="A b/c")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def site(folder: Path) -> Iterator[str]:
+    """Address of the folder's site."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder / "site")) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
+@pytest.fixture
+def at(folder: Path) -> str:
+    """Address of the folder's page."""
+    return (folder / "a.html").as_uri()
+
+
+# -------------------------------------------------------------------------------------------------------------- images
 
 
 def check(page: Any, packed: Path, cameras: list[int]) -> None:
@@ -51,16 +139,10 @@ def check(page: Any, packed: Path, cameras: list[int]) -> None:
         assert page.evaluate("sundae.message") == ""
 
 
-def test_images_of_the_page_are_those_of_python(tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual, folded"])
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
-    with opened((tmp_path / "a.html").as_uri()) as page:
-        check(page, packed, [0, 1])
-
-
-@pytest.mark.browser
-@pytest.mark.parametrize("name", [name for name in KINDS if name != "residual, folded"])
-def test_every_kind_of_scene(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "residual, folded" else in_browser) for name in KINDS]
+)
+def test_images_of_the_page_are_those_of_python(name: str, tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS[name])
     write_page(tmp_path / "a.html", *packed_file(packed), title="a")
     with opened((tmp_path / "a.html").as_uri()) as page:
@@ -77,7 +159,7 @@ def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return tmp_path / "tiny.sundae"
 
 
-@pytest.mark.browser
+@in_browser
 def test_six_cameras_of_a_packed_capture(capture: Path) -> None:
     row = bench_page.compared(capture, half=True)
     print(json.dumps(row))
@@ -88,7 +170,7 @@ def test_six_cameras_of_a_packed_capture(capture: Path) -> None:
 
 
 @needs_packages
-@pytest.mark.browser
+@in_browser
 @pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.head])
 def test_the_head_in_half_precision(name: str, tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS[name])
@@ -100,10 +182,9 @@ def test_the_head_in_half_precision(name: str, tmp_path: Path) -> None:
     assert min(found) > LEAST_HALF
 
 
-@pytest.mark.browser
-def test_the_controls(tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    server = serve(page_of(*packed_file(packed), title="a"), 0)
+@in_browser
+def test_the_controls(folder: Path) -> None:
+    server = serve(page_of(*packed_file(folder / "a.sundae"), title="a"), 0)
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
     def look(page: Any) -> tuple[NDArray[np.int64], str]:
@@ -163,9 +244,9 @@ def test_the_controls(tmp_path: Path) -> None:
         server.server_close()
 
 
-@pytest.mark.browser
-def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(tmp_path: Path) -> None:
-    plain, content = packed_file(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
+@in_browser
+def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(folder: Path, tmp_path: Path) -> None:
+    plain, content = packed_file(folder / "a.sundae")
     second = plain.views[1]
     free = second._replace(viewmat=second.viewmat + 0.05 * torch.eye(4)[[3, 3, 3, 3]])
     shots = {}
@@ -198,11 +279,9 @@ def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(tmp_path: 
     assert differ("free", "z", 0) > 1
 
 
-@pytest.mark.browser
-def test_a_hostile_file_ends_in_a_message(tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    page = page_of(*packed_file(packed), title="a")
-    content = packed.read_bytes()
+@in_browser
+def test_a_hostile_file_ends_in_a_message(folder: Path, tmp_path: Path) -> None:
+    page, content = (folder / "a.html").read_text(), (folder / "a.sundae").read_bytes()
     wrong = page.replace(base64.b64encode(content).decode(), base64.b64encode(content[:-1] + b"~").decode())
     (tmp_path / "a.html").write_text(wrong)
     with opened((tmp_path / "a.html").as_uri(), state="failed") as found:
@@ -210,7 +289,7 @@ def test_a_hostile_file_ends_in_a_message(tmp_path: Path) -> None:
         assert found.evaluate("!document.getElementById('poster').hidden")
 
 
-@pytest.mark.browser
+@in_browser
 @pytest.mark.parametrize("drawn", ["webgpu", "webgl"])
 def test_a_view_of_too_many_primitives_is_not_drawn(drawn: str, tmp_path: Path) -> None:
     packed = write_bomb(tmp_path / "a.sundae")
@@ -224,16 +303,306 @@ def test_a_view_of_too_many_primitives_is_not_drawn(drawn: str, tmp_path: Path) 
         browser.wait_for(lambda: "Gaussians cover" not in page.evaluate(SAID), "another message", SECONDS)
 
 
-@pytest.mark.browser
-def test_a_folder_is_served_and_says_so_when_opened_from_disk(tmp_path: Path) -> None:
-    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(tmp_path / "site", *packed_file(packed), title="a")
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=tmp_path / "site")) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        with opened(f"http://127.0.0.1:{server.server_port}/") as page:
-            assert psnr(image(page, 0, True), truths(read_scene(packed))[0]["rgb"]) > LEAST
-        server.shutdown()
+@in_browser
+def test_a_folder_is_served_and_says_so_when_opened_from_disk(site: str, folder: Path) -> None:
+    with opened(site) as page:
+        assert psnr(image(page, 0, True), truths(read_scene(folder / "a.sundae"))[0]["rgb"]) > LEAST
     with browser.Browser(CHROMIUM, *SIZE, browser.WEBGPU) as page:
-        page.open((tmp_path / "site" / "index.html").as_uri())
+        page.open((folder / "site" / "index.html").as_uri())
         browser.wait_for(lambda: bool(page.evaluate("window.sundae?.state === 'failed'")), "the message", SECONDS)
         assert "serve this folder" in page.evaluate("sundae.message")
+
+
+# ------------------------------------------------------------------------------------------------------------ controls
+
+WEIGHTS = """
+window.weights = [];
+const write = GPUQueue.prototype.writeBuffer;
+GPUQueue.prototype.writeBuffer = function (buffer, offset, data, ...rest) {
+  if (buffer.label === 'image') weights.push(new Float32Array(data, 28, 1)[0]);
+  return write.call(this, buffer, offset, data, ...rest);
+};
+"""
+"""Records the weight of the head's correction in each image."""
+
+
+@in_browser
+def test_the_head_fades_in_once_the_camera_rests(site: str) -> None:
+    key = {"key": "w", "code": "KeyW"}
+    with opened(site, before=WEIGHTS) as page:
+        rested(page)
+        page.evaluate("weights.length = 0")
+        frames = page.evaluate("sundae.frames")
+        page.call("Input.dispatchKeyEvent", {"type": "keyDown", **key})
+        browser.wait_for(lambda: page.evaluate("sundae.frames") > frames + 4, "images of a moving camera", SECONDS)
+        found = page.evaluate("[sundae.still, weights, document.querySelector('canvas').width]")
+        page.call("Input.dispatchKeyEvent", {"type": "keyUp", **key})
+        # A software adapter takes longer than a thirtieth of a second.
+        assert found[0] is False
+        assert set(found[1]) == {0}
+        assert found[2] < SIZE[0]
+        rested(page)
+        weights = page.evaluate("weights")
+        assert weights == sorted(weights)
+        assert weights[-1] == 1
+        assert page.evaluate("document.querySelector('canvas').width") == SIZE[0]
+        # Neither a switch nor a moved camera is shown with the correction at once.
+        page.evaluate("weights.length = 0; head.click()")
+        rested(page)
+        assert set(page.evaluate("weights")) == {0}
+        page.evaluate("weights.length = 0; head.click()")
+        browser.wait_for(lambda: page.evaluate("weights.at(-1)") == 1, "the head", SECONDS)
+        assert page.evaluate("weights[0]") == 0
+
+
+PINCH = [[(70, 60), (90, 60)], [(60, 60), (100, 60)], [(50, 60), (110, 60)]]
+
+
+@in_browser
+@pytest.mark.parametrize("drawn", ["webgpu", "webgl"])
+def test_fingers_turn_and_zoom(drawn: str, site: str) -> None:
+    def linked() -> list[float]:
+        page.evaluate("document.getElementById('link').click()")
+        return [float(word) for word in page.evaluate("location.hash").removeprefix("#camera=").split(",")]
+
+    with opened(site, flags=browser.WEBGPU if drawn == "webgpu" else WEBGL) as page:
+        assert page.evaluate("sundae.drawn") == drawn
+        rested(page)
+        assert linked() == [1]
+        touch(page, (80, 60), (110, 60))
+        browser.wait_for(lambda: len(linked()) > 1, "the turn", SECONDS)  # frames in software take seconds
+        turned = linked()
+        for i, points in enumerate(PINCH):
+            event = {"type": "touchMove" if i else "touchStart", "touchPoints": [{"x": x, "y": y} for x, y in points]}
+            page.call("Input.dispatchTouchEvent", event)
+        page.call("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        nearer = 0.8 * np.linalg.norm(turned[3:6])
+        browser.wait_for(lambda: np.linalg.norm(linked()[3:6]) < nearer, "the zoom", SECONDS)
+
+
+@in_browser
+def test_the_panel_of_a_phone(site: str) -> None:
+    with opened(site, flags=WEBGL, size=(390, 844)) as page:
+        assert "W A S D" in page.evaluate("panel.innerText")
+    with browser.Browser(CHROMIUM, 390, 844, WEBGL) as page:
+        phone = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+        page.call("Emulation.setDeviceMetricsOverride", phone)
+        page.call("Emulation.setTouchEmulationEnabled", {"enabled": True, "maxTouchPoints": 2})
+        page.open(site)
+        browser.wait_for(lambda: page.evaluate("window.sundae?.state === 'ready'"), "the page", SECONDS)
+        hint = page.evaluate("panel.innerText")
+        assert "One finger turns" in hint
+        assert "W A S D" not in hint
+        assert "Fly" not in hint
+        height = "panel.getBoundingClientRect().height"
+        assert 100 < page.evaluate(height) <= 844 / 3
+        assert page.evaluate("panel.scrollHeight <= panel.clientHeight")
+        page.evaluate("panel.querySelector('summary').click()")
+        assert page.evaluate(height) < 60
+
+
+@in_browser
+def test_links_lead_to_views(site: str) -> None:
+    copy = "{ value: { writeText: async (text) => { window.copied = text } } }"
+    before = f"Object.defineProperty(navigator, 'clipboard', {copy})"
+    with opened(f"{site}#camera=2", flags=WEBGL, before=before) as page:
+        assert page.evaluate(STOP) == "2 of 2"
+        rested(page)
+        page.drag(80, 60, 110, 70)
+        browser.wait_for(lambda: page.evaluate(STOP) == "free", "another view", SECONDS)
+        seen = rested(page)
+        page.evaluate("link.click()")
+        browser.wait_for(lambda: page.evaluate("window.copied"), "the link", SECONDS)
+        link = page.evaluate("copied")
+        assert page.evaluate("location.href") == link
+        page.evaluate("after.click()")
+        browser.wait_for(lambda: page.evaluate(STOP) == "1 of 2", "a camera", SECONDS)
+        assert np.abs(rested(page) - seen).mean() > 1
+        page.evaluate("location.hash = '#camera=NaN'")
+        page.evaluate("location.hash = '#camera=1,2,3,0,0,1e999,1'")
+        assert page.evaluate(STOP) == "1 of 2"
+        page.evaluate(f"location.href = {json.dumps(link)}")
+        browser.wait_for(lambda: page.evaluate(STOP) == "free", "the view", SECONDS)
+        assert np.abs(rested(page) - seen).mean() < 0.1
+    with opened(f"{site}#camera=1e999,<b>", flags=WEBGL) as page:
+        assert page.evaluate(STOP) == "1 of 2"
+        assert page.evaluate("sundae.message").startswith("This browser has no WebGPU")
+
+
+@in_browser
+@pytest.mark.parametrize("drawn", ["webgpu", "webgl"])
+def test_a_picture_of_what_is_seen(drawn: str, site: str) -> None:
+    before = """
+      const make = URL.createObjectURL;
+      URL.createObjectURL = (blob) => { window.blob = blob; return make(blob) };
+      HTMLAnchorElement.prototype.click = function () { window.saved = this.download };
+    """
+    read = "blob.arrayBuffer().then((data) => btoa(String.fromCharCode(...new Uint8Array(data))))"
+    with opened(site, flags=browser.WEBGPU if drawn == "webgpu" else WEBGL, before=before) as page:
+        seen = rested(page)
+        page.evaluate("picture.click()")
+        browser.wait_for(lambda: page.evaluate("window.saved"), "the picture", SECONDS)
+        assert page.evaluate("[saved, blob.type]") == ["A_b_c.png", "image/png"]
+        with Image.open(io.BytesIO(base64.b64decode(page.evaluate(read)))) as found:
+            pixels = np.asarray(found.convert("RGB")).astype(int)
+        pixels[0, 0] = seen[0, 0]
+        assert np.abs(pixels - seen).max() <= 1
+        np.testing.assert_array_equal(rested(page)[1:], seen[1:])
+
+
+@in_browser
+def test_keys(site: str) -> None:
+    before = "HTMLElement.prototype.requestFullscreen = async function () { window.whole = this.tagName };"
+    with opened(site, flags=WEBGL, before=before) as page:
+        page.key("PageDown", 34)
+        browser.wait_for(lambda: page.evaluate(STOP) == "2 of 2", "the next camera", SECONDS)
+        page.key("PageUp", 33)
+        browser.wait_for(lambda: page.evaluate(STOP) == "1 of 2", "the camera before", SECONDS)
+        page.key("KeyF", 70)
+        browser.wait_for(lambda: page.evaluate("window.whole") == "HTML", "the full screen", SECONDS)
+        start = rested(page)
+        hold(page, "ArrowLeft")
+        assert np.abs(rested(page) - start).mean() > 1
+        assert page.evaluate(STOP) == "free"
+        # Arrows that move the slider do not move the camera.
+        page.key("PageUp", 33)
+        page.evaluate("panel.style.visibility = 'visible'; panel.open = true; scale.focus()")
+        page.key("ArrowLeft", 37)
+        browser.wait_for(lambda: page.evaluate("scale.value") == "95", "the slider", SECONDS)
+        rested(page)
+        assert page.evaluate(STOP) != "free"
+
+
+@in_browser
+def test_controls_have_names_and_loading_a_bar(site: str) -> None:
+    before = """
+      window.bar = [];
+      const { set } = Object.getOwnPropertyDescriptor(HTMLProgressElement.prototype, 'value');
+      Object.defineProperty(HTMLProgressElement.prototype, 'value', {
+        set(value) { bar.push(value); set.call(this, value) },
+      });
+    """
+    with opened(site, flags=WEBGL, size=(640, 480), before=before) as page:
+        values = page.evaluate("bar")
+        assert values == sorted(values)
+        assert len(set(values)) > 5
+        assert 0.3 < values[-1] < 1
+        assert page.evaluate("progress.hidden")
+        nodes = page.call("Accessibility.getFullAXTree")["nodes"]
+        parts = [
+            (node["role"]["value"], node.get("name", {}).get("value")) for node in nodes if not node.get("ignored")
+        ]
+        assert ("application", "3D view of A b/c") in parts
+        roles = {"button", "checkbox", "slider", "application", "DisclosureTriangle"}
+        assert roles <= {role for role, _ in parts}
+        assert all(name and name.strip("‹›×") for role, name in parts if role in roles), parts
+
+
+# ---------------------------------------------------------------------------------------------------------- lost GPUs
+
+DEVICES = """
+window.devices = [];
+const request = GPUAdapter.prototype.requestDevice;
+GPUAdapter.prototype.requestDevice = async function (...words) {
+  const device = await request.apply(this, words);
+  devices.push(device);
+  //
+  return device;
+};
+"""
+"""Keeps the devices of the page, for tests to end."""
+NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null;"
+REFUSALS = {
+    "no adapter": "navigator.gpu.requestAdapter = async () => null",
+    "no answer about adapters": "navigator.gpu.requestAdapter = async () => { throw new Error('blocked') }",
+    "no device": "GPUAdapter.prototype.requestDevice = async () => { throw new Error('refused') }",
+    "a device that is lost at once": DEVICES.replace("//", "device.destroy();"),
+    "no canvas": """
+        const found = HTMLCanvasElement.prototype.getContext;
+        HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+          return kind === 'webgpu' ? null : found.call(this, kind, ...rest);
+        }""",
+}
+"""How WebGPU fails at the start, as scripts."""
+
+
+def check_base_colours(page: Any, packed: Path) -> None:
+    """The page draws by WebGL2 and says so."""
+    assert page.evaluate("[sundae.state, sundae.drawn]") == ["ready", "webgl"]
+    assert page.evaluate(SAID).endswith("base colours; the compensation head is not shown.")
+    assert page.evaluate("document.getElementById('head-label').hidden")
+    assert page.evaluate("document.getElementById('poster').hidden")
+    # Quads have no tiles, and their sums are rounded to bytes; the worst is 50.0.
+    for camera, truth in enumerate(truths(read_scene(packed))):
+        assert psnr(image(page, camera, True), truth["base_rgb"]) > 47
+
+
+@in_browser
+def test_without_webgpu_the_page_shows_base_colours(at: str, folder: Path) -> None:
+    with opened(at, flags=WEBGL) as page:
+        assert page.evaluate(SAID).startswith("This browser has no WebGPU")
+        check_base_colours(page, folder / "a.sundae")
+
+
+@in_browser
+@pytest.mark.parametrize("refusal", REFUSALS)
+def test_a_gpu_that_fails_at_the_start_leaves_base_colours(refusal: str, at: str, folder: Path) -> None:
+    with opened(at, before=REFUSALS[refusal]) as page:
+        check_base_colours(page, folder / "a.sundae")
+
+
+@in_browser
+@pytest.mark.parametrize("loss", ["the device", "an error of its work", "the GPU process"])
+def test_a_lost_gpu_leaves_camera_and_controls(loss: str, at: str, folder: Path) -> None:
+    with opened(at, before=DEVICES) as page:
+        assert page.evaluate("sundae.drawn") == "webgpu"
+        page.evaluate("{ head.click(); scale.value = 80; scale.dispatchEvent(new Event('input')) }")
+        rested(page)  # the panel covers so small a page
+        page.drag(80, 60, 110, 70)
+        browser.wait_for(lambda: page.evaluate(STOP) == "free", "another view", SECONDS)
+        seen = rested(page)
+        if loss == "the device":
+            page.evaluate("devices[0].destroy()")
+        elif loss == "an error of its work":
+            page.evaluate("{ devices[0].createBuffer({ size: 16, usage: 0 }); devices[0].queue.submit([]) }")
+        else:
+            page.call("Browser.crashGpuProcess", browser=True)
+        browser.wait_for(lambda: page.evaluate("sundae.drawn") == "webgl", "the other drawer", SECONDS)
+        assert "lost the GPU" in page.evaluate(SAID)
+        assert page.evaluate(f"[{STOP}, document.getElementById('scale-value').textContent]") == ["free", "80%"]
+        # Both drawers show base colours; the worst is 0.6.
+        assert np.abs(rested(page) - seen).mean() < 2
+        check_base_colours(page, folder / "a.sundae")
+        page.drag(80, 60, 110, 70)
+        browser.wait_for(lambda: np.abs(rested(page) - seen).mean() > 4, "another view", SECONDS)
+
+
+@in_browser
+def test_a_gpu_lost_without_webgl_leaves_the_image(at: str) -> None:
+    with opened(at, before=DEVICES) as page:
+        page.evaluate(f"{{ {NO_WEBGL} devices[0].destroy() }}")
+        browser.wait_for(lambda: page.evaluate("sundae.state") == "failed", "the end", SECONDS)
+        assert "WebGL2 is missing too" in page.evaluate(SAID)
+        assert page.evaluate("[poster.hidden, stage.hidden, panel.hidden]") == [False, True, True]
+
+
+@in_browser
+def test_a_lost_webgl_context_is_opened_again(at: str, folder: Path) -> None:
+    lose = "document.querySelector('canvas').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
+    with opened(at, flags=WEBGL) as page:
+        for _ in range(2):
+            frames = page.evaluate("sundae.frames")
+            page.evaluate(lose)
+            browser.wait_for(lambda: page.evaluate("sundae.frames") > frames, "a frame", SECONDS)  # noqa: B023
+            check_base_colours(page, folder / "a.sundae")
+        page.evaluate(lose)
+        browser.wait_for(lambda: page.evaluate("sundae.state") == "failed", "the end", SECONDS)
+        assert page.evaluate("[poster.hidden, stage.hidden, panel.hidden]") == [False, True, True]
+
+
+@in_browser
+def test_without_webgl_the_page_shows_an_image(at: str) -> None:
+    flags = ["--disable-features=WebGPU", "--disable-3d-apis"]
+    with opened(at, state="failed", flags=flags) as page:
+        assert "no WebGPU, and WebGL2 is missing too" in page.evaluate(SAID)
+        assert page.evaluate("[poster.hidden, poster.naturalWidth, poster.naturalHeight]") == [False, 50, 37]

@@ -28,7 +28,6 @@ ELSEWHERE = {
     "train CAPTURE": "becomes ns-train, in place of this process; cli/test_train.py reads its command",
     "python benchmarks/quality.py": "trains a dozen runs; test_comparisons.py runs it with two short ones",
     "python benchmarks/suite.py": "trains every method on every capture; test_comparisons.py trains one method",
-    "python benchmarks/paper.py": "needs the archives of the paper's captures; test_comparisons.py makes two",
     "view scene.sundae": "serves until Ctrl-C; cli/test_view.py serves a page, and opens and ends it",
     "ns-train sundae --machine.num-devices 2": "needs two GPUs; plugin/test_whole_runs.py trains on two",
 }

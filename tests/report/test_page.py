@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from chromium import CHROMIUM, browser, needs_chromium
-from pages import touch
+from chromium import CHROMIUM, browser, needs_chromium, touch
 from PIL import Image
 
 from sundae_ns.core.errors import DataError

@@ -32,3 +32,13 @@ needs_node = pytest.mark.skipif(
     shutil.which("node") is None or not (bench_page.WEB / "node_modules").is_dir(),
     reason="the page's build tools are not installed (make web)",
 )
+
+
+def touch(page: Any, at: tuple[int, int], to: tuple[int, int]) -> None:
+    """Drag one finger."""
+    page.call("Emulation.setTouchEmulationEnabled", {"enabled": True})
+    points = [tuple(a + (b - a) * i / 4 for a, b in zip(at, to, strict=True)) for i in range(5)]
+    for i, (x, y) in enumerate(points):
+        event = {"type": "touchMove" if i else "touchStart", "touchPoints": [{"x": x, "y": y}]}
+        page.call("Input.dispatchTouchEvent", event)
+    page.call("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
