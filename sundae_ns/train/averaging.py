@@ -18,7 +18,6 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 log = logging.getLogger(__name__)
 
 AVERAGED_EVERY = 10  # Steps between two weights that count: neighbours differ by little
-
 NamedTensors = Mapping[str, Tensor]
 
 

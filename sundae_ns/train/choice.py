@@ -26,8 +26,7 @@ PSNR_WEIGHTS, SSIM_WEIGHTS = (0.75, 0.1), (0.75, 0.003)
 HEAD_PSNR, HEAD_SSIM = (3.0, 0.4), (2.0, 1.0)
 """Gain of a head at the end as a multiple of that in its trial, and the power of the count by which it falls."""
 LOST = 4.0  # times the tolerance, beyond two standard errors: such a count is clearly too small
-LEAST_GAIN = 0.1
-"""Least PSNR that a larger scene must gain over a smaller one, dB. Two runs of one seed differ by as much."""
+LEAST_GAIN = 0.1  # PSNR that a larger scene must gain, dB: two runs of one seed differ by as much
 GAIN_PER_DOUBLING = 0.4
 """PSNR that a larger scene must gain for each doubling of the stored bytes, dB. Twice as many Gaussians gain about
 twice this at the end of a run, and a trial shows a part of a gain."""
@@ -35,8 +34,7 @@ LEAST_LOSS = 0.005  # Growth of the loss over the best measurement, as a share, 
 
 HELD_OUT_EVERY, MOST_HELD_OUT = 8, 16  # Every 8th training view is held out, at most 16
 FEW_VIEWS = 12  # With fewer training views, two are held out in turn, for trials of half the length
-HEAD_STEPS = 1200
-"""Length of a trial of a head, if it is between the shares below: shorter ones show too little of what it gains."""
+HEAD_STEPS = 1200  # Length of a trial of a head within the shares below: shorter ones show too little
 LEAST_TRIAL, MOST_TRIAL = 0.04, 0.05
 """Shortest and longest trial of a head as shares of the schedule. All but the chosen one's cost at most a tenth."""
 

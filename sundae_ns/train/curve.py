@@ -21,8 +21,7 @@ class CurvePoint:
     """What to expect of one number of Gaussians, on the held-out training views."""
 
     count: int  # Number of Gaussians
-    bytes: int | None
-    """Bytes of the packed scene, with a head if trials have found that it pays, estimated; None if unknown."""
+    bytes: int | None  # Estimated bytes of the packed scene, with a head if it pays; None if unknown
     psnr: float  # Expected PSNR after a fit of colours to each photo, dB; differences to other points are more certain
     ssim: float  # Expected SSIM
     psnr_loss: float  # PSNR that is lost against the best count for it, dB

@@ -17,8 +17,7 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 STATISTICS = ("grad2d", "count", "radii")  # Tensors [N] in the running state of gsplat's strategy
 
-COUNTED = "counted"
-"""Entry of ``info`` of a step that has added its statistics to the running state: recorded, or of several ranks."""
+COUNTED = "counted"  # Entry of info of a step that has added its statistics: captured, or of several ranks
 
 
 def limit_growth(
@@ -61,8 +60,7 @@ def count_view(state: Mapping[str, Any], grads: Tensor, radii: Tensor, width: in
         state: with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used; changed in place.
         grads: gradients of the projected centres, per pixel ``[N, 2]``.
         radii: on the screen, pixels ``[N]``, or one per axis ``[N, 2]``; 0 where a Gaussian is not drawn.
-        width: image width in pixels.
-        height: image height in pixels.
+        width, height: of the image, pixels.
     """
     drawn = radii > 0 if radii.ndim == 1 else (radii > 0).all(dim=-1)
     norms = torch.hypot(grads[:, 0] * (width / 2), grads[:, 1] * (height / 2))

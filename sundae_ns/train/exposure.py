@@ -26,7 +26,6 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
-
 NEIGHBORS = 8  # Neighbours of a camera in the graph
 SMOOTHING = 8.0  # Strength of the filter that computes the smooth part of the gains
 NOISE = 0.03  # Relative differences between neighbours by errors of the Gaussians, where the light is constant
@@ -127,11 +126,8 @@ class ExposureCompensation(Callback):
             return
         exposure = self._gains.double().cpu().log().mean(dim=1)
         most = float(exposure.abs().max().exp()) - 1
-        log.info(
-            f"photos are up to {most:.0%} brighter or darker than those beside them; training has taken that out"
-            if most > 0
-            else "photos are as bright as those beside them; none was changed"
-        )
+        changed = f"up to {most:.0%} brighter or darker than those beside them; training has taken that out"
+        log.info(f"photos are {changed if most > 0 else 'as bright as those beside them; none was changed'}")
 
     def _update(self, sums: NDArray[np.float64]) -> None:
         """Add measurements to the means, and compute the gains from them."""

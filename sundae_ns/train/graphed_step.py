@@ -48,10 +48,7 @@ class Buffers:
     def hold(self, state: TrainingState, trained: tuple[str, ...], *, growing: bool) -> bool:
         """Let the tensors of a state be the first rows of the buffers; those replaced since the last call are copied.
 
-        Args:
-            state: its optimizers have states for the trained parameters.
-            trained: names of the parameters that are trained.
-            growing: whether the number of Gaussians will change.
+        The optimizers have states for the parameters ``trained``. Buffers of ``growing`` Gaussians have spare rows.
 
         Returns:
             Whether the buffers are new, so that work on the older ones is void.
@@ -118,7 +115,6 @@ MAX_RECORDINGS = 8  # Recordings kept at a time: one for each image size and SH 
 UNUSED = 1000
 """Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by
 kernel, because recording takes longer than a step."""
-
 StepWork = Callable[[StepInputs, RenderSettings, Capacity | None], StepResult]
 """The GPU work of a step, with the capacity of the rasteriser that is set; None for another rasteriser."""
 
@@ -255,10 +251,8 @@ class _Held:
 
     trained: tuple[str, ...]  # Names of the parameters of the Gaussians that are trained
     growing: bool  # Whether the buffers have spare rows
-    groups: list[tuple[str, torch.optim.Optimizer, dict[str, Any]]]
-    """Groups of parameters that a step trains: name of the optimizer, optimizer, group."""
-    tensors: list[tuple[Mapping[Any, Any], Any, Any]]
-    """Mapping, key and value of everything that surgery and restored snapshots replace."""
+    groups: list[tuple[str, torch.optim.Optimizer, dict[str, Any]]]  # Name, optimizer, group
+    tensors: list[tuple[Mapping[Any, Any], Any, Any]]  # What surgery and snapshots replace: mapping, key, value
     addresses: Hashable  # What a recording reads beside the buffers: the head's weights, and the counts of steps
 
     def unchanged(self, state: TrainingState, settings: RenderSettings) -> bool:

@@ -22,8 +22,7 @@ from sundae_ns.train.state import Photo
 CONTRAST = 0.02  # Least standard deviation of the grey values of a patch: a flat one fits anywhere
 LEAST_VARIANCE = 1e-5  # Lower limit for the variance of a patch of another view, so that a flat one does not correlate
 CORRELATION = 0.6  # Least correlation with one of the views
-NEIGHBORS = 3
-"""Number of views that a view is compared with. The best one counts at a pixel, as often only one sees the place."""
+NEIGHBORS = 3  # Views that a view is compared with; the best one counts at a pixel, as often only one sees it
 CONFIRMING = 24  # Number of best neighbours whose depths may confirm those of a view
 JUDGES = 5000  # Most sparse points, evenly drawn, that decide which views are neighbours
 STEP, FEWEST, MOST = 1.5, 16, 256
@@ -36,8 +35,7 @@ LARGEST_ERROR, LARGEST_SHIFT = 0.1, 1.5
 STEEPEST = 0.15  # Least cosine between the ray of a pixel and the normal of a plane
 _TILT = 0.766, 0.643  # Cosine and sine of 40 degrees, by which planes are turned
 _BATCH = 16  # Planes at a time
-_LOOKED_AT = 16
-"""Pixels examined for each wanted point: views do not agree on all of them, and even ones are chosen afterwards."""
+_LOOKED_AT = 16  # Pixels examined for each wanted point: views do not agree on all, and even ones are chosen
 
 
 @dataclass(frozen=True)

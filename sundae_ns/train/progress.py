@@ -97,8 +97,7 @@ def long_on_cpu(seconds: float, left: int) -> str | None:
     )
 
 
-COMMANDS = ("ns-eval", "ns-render", "ns-export", "ns-viewer")
-"""Commands that open a finished run; ns-train also has --load-config, and writes to the folder that it names."""
+COMMANDS = ("ns-eval", "ns-render", "ns-export", "ns-viewer")  # They only read the run of --load-config
 
 
 def loaded_run(program: Sequence[str]) -> Path | None:

@@ -166,12 +166,7 @@ def prune_when_due(
 ) -> dict[str, Any] | None:
     """Prune if it is due; add Gaussians that lack to the target. Call it after optimizers and densification.
 
-    Args:
-        config: valid options.
-        pruner, state, step, contribute: as for :func:`prune_to`, also for errors.
-
-    Returns:
-        The report of :func:`prune_to`, or None if no prune was due.
+    Arguments and errors are those of :func:`prune_to`, and so is the report; None if no prune was due.
     """
     report = None
     state["peak"] = max(state["peak"], pruner.total)
@@ -289,8 +284,7 @@ class ScheduledPruning(Callback):
         after = run.evaluate() if due and self.evaluate else {}
         for label, results in (("warm-up", before), ("pruned", after)):
             if results:
-                psnr, ssim = results["psnr"], results["ssim"]
-                log.info(f"{label}: PSNR {psnr:.2f} dB, SSIM {ssim:.4f} on all test views")
+                log.info("{}: PSNR {psnr:.2f} dB, SSIM {ssim:.4f} on all test views".format(label, **results))
         run.log_scalars("Prune", {name: report[name] for name in ("before", "after", "seconds", "peak")})
         if run.folder is not None:
             # A run that was killed between a prune and the next save repeats that prune.
@@ -366,10 +360,8 @@ class FloaterRemoval(Callback):
             return
         self._done = True
         assert self._points is not None
-        eyes = [view.camera.center for view in run.training_views()]
-        if not eyes:
+        if not (eyes := [view.camera.center for view in run.training_views()]):
             return
         pruner = Pruner(state.gaussians, state.optimizers, [state.densification])
-        removed = pruner.drop(near_cameras(state.gaussians["means"], torch.stack(eyes), self._points), at_most=MOST)
-        if removed:
+        if removed := pruner.drop(near_cameras(pruner.params["means"], torch.stack(eyes), self._points), at_most=MOST):
             log.info(f"step {state.step}: removed {removed:,} floaters right in front of a camera")

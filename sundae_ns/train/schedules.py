@@ -31,6 +31,8 @@ DecayShape = Literal["exponential", "cosine"]
 
 SPARSE = 15_000  # With fewer Gaussians after the prune centres move faster: on surfaces they are farther apart
 MOST_FACTOR = 5.0  # Largest factor on the learning rate of the centres: fewer than 600 Gaussians were not measured
+NETWORK_BETAS = (0.9, 0.95)
+FULL_RATE_INPUTS = 1152  # 3 x 3 of 128 channels, the most in the default head
 
 
 @dataclass
@@ -55,15 +57,13 @@ class Decay:
     def __call__(self, step: int) -> float:
         """The multiplier at ``step``."""
         start, begin, end, rise, factor = 1.0, 0, self.max_steps, 1.0, 1.0
-        if self.pruned_at is None:
-            if self.hold_until_prune:
-                return 1.0
-        elif self.restart is not None and step >= self.pruned_at:
+        if self.pruned_at is None and self.hold_until_prune:
+            return 1.0
+        if self.pruned_at is not None and self.restart is not None and step >= self.pruned_at:
             start, begin, factor = self.restart, self.pruned_at, self.after_prune
             end = self.max_steps if self.ends_at is None else self.ends_at
             rise = min((step - begin + 1) / (self.warmup_steps + 1), 1.0)
-        t = (step - begin) / max(end - begin, 1)
-        t = min(max(t, 0.0), 1.0)
+        t = min(max((step - begin) / max(end - begin, 1), 0.0), 1.0)
         if self.shape == "cosine":
             return float(rise * factor * (self.final + (start - self.final) * (1.0 + math.cos(math.pi * t)) / 2.0))
         return float(rise * factor * start ** (1.0 - t) * self.final**t)
@@ -73,10 +73,6 @@ def fused_adam(groups: list[dict[str, Any]], **options: Any) -> torch.optim.Adam
     """Adam that updates each parameter by one fused kernel on CUDA instead of a dozen."""
     fused = all(value.is_cuda for group in groups for value in group["params"])
     return torch.optim.Adam(groups, fused=fused, **options)
-
-
-NETWORK_BETAS = (0.9, 0.95)
-FULL_RATE_INPUTS = 1152  # 3 x 3 of 128 channels, the most in the default head
 
 
 def network_groups(
@@ -174,14 +170,10 @@ SCHEDULE = (
 ).split()
 """Options of the model that count steps. Learning rates have more."""
 
-LEAST_IMAGES = 50
-"""Images that densification sees between two rounds, at least: fewer say too little of a Gaussian's gradient."""
-LEAST_RECOVERY = 1000
-"""Least steps between two resets of the opacities: shorter runs have no time to recover, and do without."""
+LEAST_IMAGES = 50  # Images between two rounds of densification: fewer say too little of a Gaussian's gradient
+LEAST_RECOVERY = 1000  # Least steps between two resets of the opacities: shorter runs have no time to recover
 LONGEST_RISE = 12  # A learning rate rises over at most this fraction of the run
-
-_SHAPES = ("sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle")
-"""Options of the model that the shapes in a checkpoint depend on."""
+_SHAPES = ("sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle")  # Shapes in a checkpoint follow them
 RESETS = "pipeline.model.reset_alpha_every"  # Counts rounds of densification, not steps
 
 
@@ -208,10 +200,8 @@ def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
                 step = checkpoint.newest_step(saved) if config.load_step is None else config.load_step
                 left = config.schedule_length - (0 if step is None else step + 1)
                 if left < 1:
-                    raise ConfigError(
-                        f"the run has trained all of its {config.schedule_length:,} steps; give the number of further "
-                        "ones with --max-num-iterations"
-                    )
+                    done = f"the run has trained all of its {config.schedule_length:,} steps"
+                    raise ConfigError(f"{done}; give the number of further ones with --max-num-iterations")
                 config.max_num_iterations = left
         # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
         config.schedule_length = config.schedule_length or config.max_num_iterations
@@ -229,24 +219,20 @@ def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
 
 def _leave_finetune(config: Any, done: int) -> None:
     """End the training before the steps that a fine-tune takes the place of, unless all others are done."""
-    steps = config.finetune_steps
-    if steps is None:
-        return
-    if steps < 1:
+    steps, length = config.finetune_steps, config.schedule_length
+    if steps is not None and steps < 1:
         raise ConfigError(f"finetune-steps is {steps}; give {FINETUNE_STEPS}, or leave it out")
-    left = config.schedule_length - tuned_steps(config.schedule_length, steps) - done
-    if left > 0:
+    if steps is not None and (left := length - tuned_steps(length, steps) - done) > 0:
         config.max_num_iterations = min(config.max_num_iterations, left)
 
 
 def _resumed_run(config: Any, saved: Path) -> Any:
     """The configuration of the run that is resumed; None if it is not beside its checkpoints."""
-    path = find_config(saved)
+    run, path = None, find_config(saved)
     try:
-        run = None if path is None else load_config(path)
+        run = path and load_config(path)
     except CheckpointError as error:
         log.warning(f"{error}; the run is resumed with the options of this command")
-        return None
     return run if isinstance(run, type(config)) else None
 
 

@@ -32,8 +32,7 @@ class TrainingState:
     """
 
     gaussians: Gaussians  # The Gaussians of this process
-    networks: torch.nn.ModuleDict
-    """Holds the head under ``head``. The model registers this module, so checkpoints lack a head that was removed."""
+    networks: torch.nn.ModuleDict  # Holds the head, if there is one; registered by the model, so in checkpoints
     optimizers: Mapping[str, Optimizer] = dataclasses.field(default_factory=dict)
     """By parameter name; ``compensation`` is the head's."""
     schedulers: Mapping[str, LRScheduler] = dataclasses.field(default_factory=dict)
@@ -43,8 +42,7 @@ class TrainingState:
     pruning: dict[str, Any] = dataclasses.field(default_factory=dict)  # Running state of pruning: plain integers
     info: dict[str, Any] = dataclasses.field(default_factory=dict)
     """What the rasteriser says of the last training image, with gradients after the backward pass."""
-    trained_focal: tuple[float, float] | None = None
-    """Shortest and longest focal length of the images that the head was trained on, pixels."""
+    trained_focal: tuple[float, float] | None = None  # Shortest and longest focal length that the head has seen, pixels
 
     step: int = 0  # Training step
     offset: int = 0  # Steps of the schedule that a warm start skips
@@ -52,8 +50,7 @@ class TrainingState:
     head_starts_at: float = math.inf  # Step of the schedule after which the head is enabled
     provisional: bool = False  # Whether a trial is trained whose field may be dropped
     restored: int = 0  # Number of times in this process that other weights took the place of the trained ones
-    sh_degree_interval: int | None = None
-    """Steps after which the next SH degree is enabled; None enables all at once, as after a warm start."""
+    sh_degree_interval: int | None = None  # Steps after which the next SH degree is enabled; None enables all at once
 
     @property
     def schedule_step(self) -> int:
@@ -160,8 +157,7 @@ class Photo(NamedTuple):
     mask: Tensor | None  # Pixels that count, bool [H, W]; None for all
 
 
-TrainingRun: TypeAlias = Any
-"""What callbacks act on: :class:`sundae_ns.plugin.callbacks.NerfstudioRun`, which this floor cannot import."""
+TrainingRun: TypeAlias = Any  # A plugin.callbacks.NerfstudioRun, which this floor cannot import; callbacks act on it
 
 
 class Callback:

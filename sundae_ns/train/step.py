@@ -186,8 +186,7 @@ class StepInputs:
     background: Tensor  # Colour [3]
     crop: Crop | None = None  # The part of the training image that is shown; None for the whole image
     rates: Tensor | None = None  # Learning rates of the groups of parameters [G]; None where the optimizer holds them
-    count: Tensor | None = None
-    """Number of Gaussians ``[]``, where parameters have rows for more and a loss is a mean over them."""
+    count: Tensor | None = None  # Number of Gaussians [], where parameters have rows for more
 
     def _tensors(self) -> list[Tensor]:
         always = (self.camera.viewmat, self.camera.K, self.target, self.background)

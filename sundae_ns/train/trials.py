@@ -108,15 +108,15 @@ def packed_size(gaussians: Mapping[str, Tensor], head: torch.nn.Module | None = 
     Neighbouring ones are packed as a sample. None if they cannot be packed.
     """
     n = len(gaussians["means"])
-    packed = {name: value.detach() for name, value in gaussians.items() if head is not None or name != FEATURES}
+    rows = torch.arange(n)
     if n > SAMPLE:
-        order = scene_order(packed["means"].float().cpu().numpy())
-        middle = torch.from_numpy(order[(n - SAMPLE) // 2 :][:SAMPLE])
-        packed = {name: value[middle.to(value.device)] for name, value in packed.items()}
+        order = scene_order(gaussians["means"].detach().float().cpu().numpy())
+        rows = torch.from_numpy(order[(n - SAMPLE) // 2 :][:SAMPLE])
+    used = {name: value.detach() for name, value in gaussians.items() if head is not None or name != FEATURES}
+    sample = {name: value[rows.to(value.device)].float().cpu() for name, value in used.items()}
     weights = {} if head is None else {name: value.float().cpu() for name, value in head.state_dict().items()}
     try:
-        sample = PackedScene({name: value.float().cpu() for name, value in packed.items()}, weights)
-        data, sections = pack_bytes(*fit_scene(sample))
+        data, sections = pack_bytes(*fit_scene(PackedScene(sample, weights)))
     except PackError:
         return None
     fixed = sum(size for name, size in sections.items() if name.startswith("head/"))
@@ -133,8 +133,7 @@ class Trial:
     length: int  # Training steps
     held_out: list[int] = field(default_factory=list)  # Indices of the training views that are held out
     averaged: float = 0  # Steps at its end over which weights are averaged; 0 measures the last weights
-    num_features: int | None = None
-    """Width of the features: 0 disables the head, another width begins with a fresh one. None changes nothing."""
+    num_features: int | None = None  # Width of the features; 0 disables the head, None changes nothing
     counts: bool = True  # Whether its Gaussians are kept in any case; those of others are TrainingState.provisional
     began: int = 0  # Step of the schedule at which it began
 
@@ -144,8 +143,7 @@ class Progress:
     """Where the trials of a run are; plain values, for checkpoints."""
 
     stage: str = ""  # The stage whose candidates are tried; empty between stages, and paused at the end of the last
-    steps: int = 0
-    """Length of the schedule when training started: a resumed run may be longer or shorter, its trials may not."""
+    steps: int = 0  # Length of the schedule when training started; that of a resumed run may be another
     full: int = 0  # Number of Gaussians before the prune
     tried: list[Tried] = field(default_factory=list)  # All candidates after their trials
     chosen: dict[str, Any] = field(default_factory=dict)
@@ -153,8 +151,7 @@ class Progress:
     (steps on all views; None for all that are left)."""
     reason: str = ""  # Why the head was chosen without trials
     watched_until: int = 0  # Step of the schedule at which the trial of the length ends at the latest
-    records: dict[str, Any] = field(default_factory=dict)
-    """What ``trials.json`` holds, by decided stage; a resumed run writes it again."""
+    records: dict[str, Any] = field(default_factory=dict)  # What trials.json holds; a resumed run writes it again
 
     def of(self, stage: str) -> list[Tried]:
         """The candidates of a stage."""
@@ -266,11 +263,13 @@ class Trials(Callback):
         self._folds, self._length = choice.plan_heads(indices, progress.steps)
         self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // choice.HELD_OUT_EVERY), 0)
         if self.config.decides and "count" not in progress.chosen:
+            steps, left = len(SHARES) * self._window, _steps_of(run) - self.config.prune_at
+            steps += 2 * self._length if self.decides_head else 0
             obstacles = {
                 "trials of counts need a single GPU": several,
                 "a warm start has seen all training views before": state.offset > 0,
                 f"{num_views} training views are too few to compare counts": num_views < MANY_VIEWS,
-                "the steps after the prune are too few to compare counts": not self._counts_fit(run),
+                "the steps after the prune are too few to compare counts": steps > MOST_TRIALS * left,
             }
             reason = next((reason for reason, holds in obstacles.items() if holds), None)
             if state.pruning["num_prunes"] and not progress.stage:  # by a share that was given
@@ -369,13 +368,9 @@ class Trials(Callback):
 
     def keep(self, name: str, state: TrainingState, *, head: bool) -> None:
         """Keep a copy of the Gaussians, and of the head if asked for, until the stage ends."""
-        self.kept[name] = {
-            "counted": state.schedule_step - self.taken_back,
-            "taken_back": self.taken_back,
-            "pruning": dict(state.pruning),
-            "restarts": restarts(state.schedulers),
-            **state.snapshot(head=head),
-        }
+        steps = {"counted": state.schedule_step - self.taken_back, "taken_back": self.taken_back}
+        running = {"pruning": dict(state.pruning), "restarts": restarts(state.schedulers)}
+        self.kept[name] = {**steps, **running, **state.snapshot(head=head)}
 
     def go_back(self, name: str, state: TrainingState) -> None:
         """Continue with a kept copy, its learning rates and its counted steps."""
@@ -439,11 +434,6 @@ class Trials(Callback):
     def _tolerance(self) -> Tolerance:
         return Tolerance.of_drop(self.config.max_drop)
 
-    def _counts_fit(self, run: TrainingRun) -> bool:
-        """Whether the trials leave enough of the steps after the prune."""
-        heads = 2 * self._length if self.decides_head else 0
-        return len(SHARES) * self._window + heads <= MOST_TRIALS * (_steps_of(run) - self.config.prune_at)
-
     def _begin_counts(self, run: TrainingRun) -> None:
         state = run.state
         Pruner(state.gaussians, state.optimizers, [state.densification]).drop_nonfinite()
@@ -504,24 +494,14 @@ class Trials(Callback):
         log.info("\n".join(["expected at the end, on held-out training views:", *curve_table(curve)]))
         log.info(f"keeping {count:,} of {progress.full:,} Gaussians: {reason}")
         if choice.still_climbs(curve, self._tolerance):
-            log.info(
-                "quality still grows at the full count: the scene may need more Gaussians than densification made; "
-                "a lower --pipeline.model.densify-grad-thresh makes more"
-            )
+            more = "a lower --pipeline.model.densify-grad-thresh makes more Gaussians, which the scene may need"
+            log.info(f"quality still grows at the full count: {more}")
         run.log_scalars("Curve", {"chosen": count, "full": progress.full})
-        record: dict[str, Any] = {
-            "chosen": count,
-            "full": progress.full,
-            "reason": reason,
-            "step": run.state.step,
-            "tolerance": self._tolerance._asdict(),
-            "held_out_views": self._judges,
-            "steps_per_trial": self._window,
-            "curve": [
-                {**asdict(point), "measured": [view._asdict() for view in row.qualities]}
-                for point, row in zip(curve, progress.of("count"), strict=True)
-            ],
-        }
+        record: dict[str, Any] = {"chosen": count, "full": progress.full, "reason": reason, "step": run.state.step}
+        record |= {"tolerance": self._tolerance._asdict(), "held_out_views": self._judges}
+        measured = [[view._asdict() for view in row.qualities] for row in progress.of("count")]
+        points = [{**asdict(point), "measured": views} for point, views in zip(curve, measured, strict=True)]
+        record |= {"steps_per_trial": self._window, "curve": points}
         if "tenth" in progress.chosen:
             figures = _figures(progress.of("tenth"))
             log.info(f"a tenth of the Gaussians after {self._length:,} steps: {_in_words(figures)}")
@@ -611,10 +591,8 @@ class Trials(Callback):
         progress.watched_until = state.schedule_step + watched
         self.keep("start", state, head=state.head_enabled)
         self.start(run, "length", self._window, views)
-        log.info(
-            f"step {state.step}: {num_views} training views are few; {len(views)} stay held out, to see when training "
-            "stops helping"
-        )
+        held = f"{num_views} training views are few; {len(views)} stay held out"
+        log.info(f"step {state.step}: {held}, to see when training stops helping")
 
     def _try_length(self, run: TrainingRun) -> None:
         """Train another window; or go back, to train on all views for as many steps as were best."""
@@ -628,10 +606,8 @@ class Trials(Callback):
         length = best * self._window if lost else None
         if length is not None:
             then, now = (f"{row['psnr']:.2f} dB, SSIM {row['ssim']:.4f}" for row in (measured[best - 1], measured[-1]))
-            log.info(
-                f"step {state.step}: the held-out views were best after {length:,} steps, {then}; now {now}. "
-                "Going back, to train as long on all views"
-            )
+            best_at = f"the held-out views were best after {length:,} steps, {then}; now {now}"
+            log.info(f"step {state.step}: {best_at}. Going back, to train as long on all views")
             self.go_back("start", state)
             self._end_length(run, "repeat", length)
             self.start(run, "repeat", length, [])
