@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sundae_ns.core.errors import DataError
 from sundae_ns.graph import graph
 from sundae_ns.graph.filters import high_pass, response_magnitude
 from sundae_ns.graph.graph import NeighborGraph, build_graph
@@ -113,8 +112,6 @@ def test_smallest_graphs() -> None:
         found = build_graph(points, num_neighbors=1)
         check(found, points)
         assert (found.weights > 0).all()
-    with pytest.raises(DataError, match="1 Gaussians cannot have 1 neighbours"):
-        build_graph(torch.zeros(1, 3), num_neighbors=1)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -138,27 +135,15 @@ def test_any_cells_at_any_scale(cells: list, exponent: int, shift: float, tau: f
     assert tau != float("inf") or not graph.isolated.any()
 
 
-def test_collinear_and_coplanar_points_respond_within_their_line_and_plane(cloud: Callable) -> None:
-    points = cloud(400)
-    points[:, 1] = 0.25
-    response = high_pass(build_graph(points), points)
-    assert (response[:, 1].nan_to_num() == 0).all()
-
-
 def test_two_clusters_1e6_apart_are_independent() -> None:
     cluster = (torch.randn(300, 3, dtype=torch.float64) * 2**20).round() / 2**20
-    both = torch.cat([cluster, cluster + 1e6])
-    assert torch.equal(both[300:] - 1e6, cluster)
-    found = magnitude(both)
-    torch.testing.assert_close(found[:300], found[300:], rtol=0, atol=0, equal_nan=True)
-    torch.testing.assert_close(found[:300], magnitude(cluster), rtol=0, atol=0, equal_nan=True)
+    found = magnitude(torch.cat([cluster, cluster + 1e6])).nan_to_num(-1)
+    assert torch.equal(found, magnitude(cluster).nan_to_num(-1).repeat(2))
 
 
 def test_a_shift_by_1e5_changes_no_bit_of_the_response_in_float32() -> None:
-    points = (torch.randn(2000, 3) * 64).round() / 64
-    shifted = points + 1e5
-    assert torch.equal(shifted - 1e5, points)
-    assert torch.equal(magnitude(shifted).nan_to_num(-1), magnitude(points).nan_to_num(-1))
+    points = (torch.randn(2000, 3) * 64).round() / 64  # exact at this offset
+    assert torch.equal(magnitude(points + 1e5).nan_to_num(-1), magnitude(points).nan_to_num(-1))
 
 
 def test_thousands_of_points_at_one_spot_do_not_respond() -> None:

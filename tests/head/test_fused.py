@@ -30,11 +30,6 @@ def on_cpu(load_on_cpu: Callable[..., fused.Launches]) -> Iterator[None]:
         yield
 
 
-def compiled(head: CompensationHead) -> fused.Launches:
-    options = fused.head_options(head.net, head.config.mode == "residual")
-    return fused.head_kernels(torch.device("cpu"), torch.float32, options)
-
-
 def make(**options: object) -> CompensationHead:
     torch.manual_seed(0)
     head = CompensationHead(HeadConfig(**{"size": "tiny", "num_features": 5, **options}))  # type: ignore[arg-type]
@@ -57,12 +52,13 @@ def by_kernels(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor]) ->
     return fused.compensated(head.net, head.config.mode == "residual", *images, torch.float32)
 
 
-@pytest.mark.parametrize("mode", ["residual", "features"])
-@pytest.mark.parametrize("pixel_unshuffle", [1, 2, 3, 4])
+KINDS = [{"mode": mode, "pixel_unshuffle": fold} for mode in ("residual", "features") for fold in (1, 2, 3, 4)]
+
+
+@pytest.mark.parametrize("options", [*KINDS, {"size": "compact"}, {"size": "wide"}], ids=str)
 @torch.no_grad()
-def test_same_image(mode: str, pixel_unshuffle: int) -> None:
-    head = make(mode=mode, pixel_unshuffle=pixel_unshuffle)
-    images = splatted(37, 50, 5)
+def test_same_image(options: dict[str, object]) -> None:
+    head, images = make(**options), splatted(37, 50, 5)
     torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
 
 
@@ -75,14 +71,6 @@ def test_same_image_at_any_size(height: int, width: int, num_features: int, seed
 
 
 @torch.no_grad()
-def test_sizes_of_the_network() -> None:
-    for size in ("compact", "wide"):
-        head = make(size=size, num_features=13)
-        images = splatted(20, 33, 13)
-        torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
-
-
-@torch.no_grad()
 def test_overflowing_pixels_are_not_corrected() -> None:
     head = make()
     base, seen, alpha = splatted(16, 16, 5)
@@ -92,10 +80,10 @@ def test_overflowing_pixels_are_not_corrected() -> None:
     assert torch.equal(out[3, 4], base[3, 4])
 
 
-Gradients = list[Tensor]
+Images = tuple[Tensor, Tensor, Tensor]
 
 
-def layer_gradients(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor], grad_out: Tensor) -> Gradients:
+def layer_gradients(head: CompensationHead, images: Images, grad_out: Tensor) -> list[Tensor]:
     """The image, and gradients of splatted values, accumulation and parameters, by autograd."""
     base, *leaves = images[0], *(image.clone().requires_grad_() for image in images[1:])
     head.zero_grad()
@@ -105,8 +93,7 @@ def layer_gradients(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor
     return [out.detach(), *grads, *(p.grad.clone() for p in head.parameters() if p.grad is not None)]
 
 
-def kernel_gradients(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor], grad_out: Tensor) -> Gradients:
-    """The image and gradients by the fused."""
+def kernel_gradients(head: CompensationHead, images: Images, grad_out: Tensor) -> list[Tensor]:
     base, *leaves = images[0], *(image.clone().requires_grad_() for image in images[1:])
     head.zero_grad()
     residual = head.config.mode == "residual"
@@ -116,40 +103,23 @@ def kernel_gradients(head: CompensationHead, images: tuple[Tensor, Tensor, Tenso
     return [out.detach(), *(leaf.grad for leaf in leaves), *(p.grad.clone() for p in head.parameters())]
 
 
-def assert_same(found: Gradients, expected: Gradients) -> None:
-    assert len(found) == len(expected)
-    for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5 * max(1.0, float(b.abs().max())))
-
-
-@pytest.mark.parametrize("mode", ["residual", "features"])
-@pytest.mark.parametrize("pixel_unshuffle", [1, 2, 4])
-def test_same_gradients(mode: str, pixel_unshuffle: int) -> None:
-    head = make(mode=mode, pixel_unshuffle=pixel_unshuffle)
-    for size in ((37, 50), (16, 16)):
-        images, grad_out = splatted(*size, 5), torch.randn(*size, 3)
-        assert_same(
-            kernel_gradients(head, images, grad_out),
-            layer_gradients(head, images, grad_out),
-        )
-
-
-def test_sums_over_pixels_by_few_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fused, "MOST_WORKERS", 37)
-    head, images, grad_out = make(), splatted(37, 50, 5), torch.randn(37, 50, 3)
-    assert_same(kernel_gradients(head, images, grad_out), layer_gradients(head, images, grad_out))
+@pytest.mark.parametrize("workers", [37, fused.MOST_WORKERS])
+@pytest.mark.parametrize("options", KINDS, ids=str)
+def test_same_gradients(options: dict[str, object], workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where few threads sum over the pixels."""
+    monkeypatch.setattr(fused, "MOST_WORKERS", workers)
+    head, images, grad_out = make(**options), splatted(37, 50, 5), torch.randn(37, 50, 3)
+    both = kernel_gradients(head, images, grad_out), layer_gradients(head, images, grad_out)
+    for found, expected in zip(*both, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5 * max(1.0, float(expected.abs().max())))
 
 
 @given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
 def test_same_gradients_at_any_size(height: int, width: int, num_features: int, seed: int) -> None:
     head = make(num_features=num_features)
     images, grad_out = splatted(height, width, num_features, seed=seed), torch.randn(height, width, 3)
-    both = zip(
-        kernel_gradients(head, images, grad_out),
-        layer_gradients(head, images, grad_out),
-        strict=True,
-    )
-    for found, expected in both:
+    both = kernel_gradients(head, images, grad_out), layer_gradients(head, images, grad_out)
+    for found, expected in zip(*both, strict=True):
         # Compare norms: some image has an activation so near zero that rounding decides its slope.
         assert float((found - expected).norm()) <= 2e-3 * max(float(expected.norm()), 1e-3)
 

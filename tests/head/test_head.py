@@ -25,10 +25,9 @@ from sundae_ns.head.head import (
 )
 
 
-def inputs(height: int = 33, width: int = 40, features: int = 5) -> tuple[torch.Tensor, ...]:
-    colors = torch.rand(height, width, 3)
-    alpha = torch.rand(height, width, 1)
-    splatted = torch.cat([colors, torch.randn(height, width, features)], dim=2)
+def inputs(height: int = 33, width: int = 40) -> tuple[torch.Tensor, ...]:
+    colors, alpha = torch.rand(height, width, 3), torch.rand(height, width, 1)
+    splatted = torch.cat([colors, torch.randn(height, width, 5)], dim=2)
     return (colors + (1 - alpha) * 0.5).clamp(0, 1), splatted, alpha
 
 
@@ -74,16 +73,14 @@ def test_a_few_steps_learn(mode: str) -> None:
     splatted.requires_grad_()
     optimizer = torch.optim.Adam([*module.parameters(), splatted], lr=1e-2)
 
-    def loss() -> torch.Tensor:
-        return (module(base, splatted, alpha) - target).abs().mean()
-
-    first = loss().item()
+    losses = []
     for _ in range(60):
         optimizer.zero_grad()
-        value = loss()
-        value.backward()
+        loss = (module(base, splatted, alpha) - target).abs().mean()
+        loss.backward()
         optimizer.step()
-    assert value.item() < 0.6 * first
+        losses.append(loss.item())
+    assert losses[-1] < 0.6 * losses[0]
     assert splatted.grad is not None
     assert splatted.grad[..., 3:].abs().sum() > 0
 
@@ -175,22 +172,16 @@ def test_inside_the_image(width: int, height: int, limit: int, seed: int) -> Non
     assert (crop is None) == (width * height <= limit)
     if crop is None:
         return
-    assert 0 <= crop.left <= crop.left + crop.width <= width
-    assert 0 <= crop.top <= crop.top + crop.height <= height
-    assert 1 <= crop.width
-    assert 1 <= crop.height
+    assert 0 <= crop.left < crop.left + crop.width <= width
+    assert 0 <= crop.top < crop.top + crop.height <= height
     # A side of a window is at least the grid, however low the limit.
     assert crop.width * crop.height <= limit or min(crop.width, crop.height) <= 16
 
 
-def test_determined_by_the_seed_and_without_a_limit() -> None:
+def test_windows_follow_the_seed_keep_the_aspect_and_use_the_limit() -> None:
     assert training_crop(10_000, 10_000, 0, seed=1) is None
-    crops = [training_crop(1061, 1893, 2**20, seed) for seed in (3, 3, 4)]
-    assert crops[0] == crops[1] != crops[2]
-
-
-def test_windows_keep_the_aspect_and_use_the_limit() -> None:
-    crop = training_crop(1061, 1893, 2**20, seed=0)
+    crop, again, other = (training_crop(1061, 1893, 2**20, seed) for seed in (3, 3, 4))
+    assert crop == again != other
     assert crop is not None
     assert crop.width / crop.height == pytest.approx(1061 / 1893, rel=0.03)
     assert 0.95 * 2**20 < crop.width * crop.height <= 2**20
@@ -198,8 +189,7 @@ def test_windows_keep_the_aspect_and_use_the_limit() -> None:
 
 def test_both_edges_are_seen_often() -> None:
     seen = np.zeros(1000)
-    for seed in range(2000):
-        crop = training_crop(1000, 1000, 490_000, seed)
+    for crop in (training_crop(1000, 1000, 490_000, seed) for seed in range(2000)):
         assert crop is not None
         seen[crop.left : crop.left + crop.width] += 1
     assert seen.min() > 0.3 * seen.max()
@@ -241,12 +231,9 @@ def test_a_scale_near_the_trained_one_gets_its_correction() -> None:
 
 def test_the_head_fades_out_without_a_jump() -> None:
     """For thumbnails, and for wide views with too many pixels at the trained scale."""
-    shrinks = torch.linspace(1.3, 5, 200).tolist()
-    sizes = torch.linspace(2**18, 1.1 * 2**23, 400).tolist()
-    for weights in (
-        [plan(1000 / shrink, (1000.0, 1000.0), 100).weight for shrink in shrinks],
-        [plan(1000.0, (1950.0, 1950.0), int(pixels)).weight for pixels in sizes],
-    ):
+    shrunk = [plan(1000 / shrink, (1000.0, 1000.0), 100).weight for shrink in np.linspace(1.3, 5, 200)]
+    wide = [plan(1000.0, (1950.0, 1950.0), int(size)).weight for size in np.linspace(2**18, 1.1 * 2**23, 400)]
+    for weights in (shrunk, wide):
         assert (weights[0], weights[-1]) == (1, 0)
         assert all(0 <= a - b < 0.02 for a, b in zip(weights, weights[1:], strict=False))
     assert plan(1000 / FADE[0], (1000.0, 1000.0), 100).weight == 0

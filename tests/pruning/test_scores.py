@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 from prunes import PAPER, gaussians
@@ -78,12 +80,16 @@ def test_edges_weigh_more_than_flat_areas_and_flat_areas_more_than_0() -> None:
     assert found.min() > 0
 
 
-def test_more_cells_are_smaller() -> None:
-    image = torch.zeros(64, 64, 3)
-    image[:, 32:] = 1
-    widths = [int((pixel_detail(image, cells)[0] > 1).sum()) for cells in (10, 100, 4096)]
-    assert widths == sorted(widths, reverse=True)
-    assert widths[0] > 2 * widths[-1]
+@pytest.mark.parametrize(("cells", "half"), [(3, 9), (20, 4), (1500, 1)])
+def test_detail_is_the_deviation_within_the_window_of_a_cell(cells: int, half: int) -> None:
+    """By windows one by one, also at the edges; for 3 cells the window is as high as the image."""
+    image = torch.rand(19, 76, 2, generator=torch.Generator().manual_seed(0))
+    variance = torch.empty(19, 76, dtype=torch.float64)
+    for y, x in itertools.product(range(19), range(76)):
+        window = image[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1].double()
+        variance[y, x] = window.var(dim=(0, 1), correction=0).sum()
+    expected = (variance + variance.mean() / 16).sqrt()
+    torch.testing.assert_close(pixel_detail(image, cells).double(), expected / expected.mean(), rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("cells", [0.0, 1.0, 1e9])

@@ -14,7 +14,7 @@ from sundae_ns.core.errors import DataError
 from sundae_ns.pruning.rule import kept_count
 from sundae_ns.pruning.selection import inclusion_probabilities, neighbor_order, select_band, select_systematic
 
-VALUES = st.one_of(st.floats(0, 1e30), st.sampled_from([0.0, 1.0, math.nan, math.inf, -math.inf, 1e-300]))
+VALUES = st.one_of(st.floats(), st.sampled_from([0.0, 1.0, math.nan, math.inf, -math.inf, 1e-300]))
 SCORES = st.lists(VALUES, min_size=1, max_size=40).map(lambda v: torch.tensor(v, dtype=torch.float64))
 
 
@@ -22,22 +22,22 @@ def chosen(mask: Tensor) -> list[int]:
     return mask.nonzero().squeeze(1).tolist()
 
 
-@given(SCORES, st.floats(0, 1, exclude_min=True), st.floats(0, 1))
-def test_any_scores_keep_the_exact_count(score: Tensor, keep_ratio: float, gamma: float) -> None:
+@given(SCORES, st.floats(0, 1, exclude_min=True), st.floats(0, 1), st.integers(0, 2**31))
+def test_any_scores_keep_the_exact_count_and_unusable_ones_come_last(
+    score: Tensor, keep_ratio: float, gamma: float, seed: int
+) -> None:
     count = kept_count(keep_ratio, len(score))
     assert count == max(1, round(keep_ratio * len(score)))
-    mask = select_band(score, count, gamma)
-    assert mask.dtype == torch.bool
-    assert mask.shape == score.shape
-    assert int(mask.sum()) == count
+    assert int(select_band(score, count, gamma).sum()) == count
+    mask = select_systematic(score, count, torch.randperm(len(score)), seed)
+    assert (mask.dtype, mask.shape, int(mask.sum())) == (torch.bool, score.shape, count)
+    for usable in (score == math.inf, score > 0):
+        assert int((mask & usable).sum()) == min(count, int(usable.sum()))
 
 
 @pytest.mark.parametrize(
     ("magnitude", "count", "gamma", "kept"),
     [
-        ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 0.5, [1, 2, 3, 4]),
-        ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 1.0, [2, 4, 6, 7]),
-        ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 0.0, [0, 1, 3, 5]),
         ([3.0, 0, 9, 1, 8, 2, 7, 4], 4, 0.25, [1, 2, 3, 5]),
         # Isolated Gaussians fill neither end.
         ([math.nan, 3.0, math.nan, 1.0, 2.0, 4.0], 2, 0.5, [3, 5]),
@@ -124,23 +124,6 @@ def test_draws_are_spread_more_evenly_than_independent_ones() -> None:
     even = [unevenness(select_systematic(torch.ones(4000), 400, order, seed)) for seed in range(10)]
     independent = [unevenness(torch.randperm(4000) < 400) for _ in range(10)]
     assert max(even) < 0.5 * min(independent)  # measured 0.2
-
-
-@given(
-    st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=40),
-    st.integers(1, 40),
-    st.integers(0, 2**31),
-)
-def test_any_scores_keep_the_exact_count_and_unusable_ones_come_last(
-    values: list[float], count: int, seed: int
-) -> None:
-    count = min(count, len(values))
-    found = torch.tensor(values, dtype=torch.float64)
-    mask = select_systematic(found, count, torch.randperm(len(values)), seed)
-    assert int(mask.sum()) == count
-    infinite, usable = found == math.inf, found > 0
-    assert int((mask & infinite).sum()) == min(count, int(infinite.sum()))
-    assert int((mask & usable).sum()) == min(count, int(usable.sum()))
 
 
 def test_scores_that_differ_by_1e300_lose_no_draw() -> None:
