@@ -140,7 +140,7 @@ class Sweep:
             total += torch.where(agrees[:, None], theirs, 0.0)
             count += agrees
         good = count >= 2
-        return total[good] / count[good][:, None], photo.image[rows, columns][good] / 255
+        return total[good] / count[good][:, None], photo.image[rows, columns][good].float() / 255
 
 
 def _reduced(photo: Photo, longest: int) -> _Reduced:
