@@ -9,12 +9,14 @@ import tyro
 from rich.console import Console
 
 from sundae_ns.cli.inputs import Cleaning, copies_rows, open_packed
-from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file, check_folder
+from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file, check_folder, check_suffix
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.io.formats import check_format
+from sundae_ns.core.gaussians import sh_degree
+from sundae_ns.io.formats import FORMATS
 from sundae_ns.io.pack import container
 from sundae_ns.io.ply import keep_vertices
 from sundae_ns.io.run_folder import files_of
+from sundae_ns.io.spz import clamped
 from sundae_ns.scene.cameras import with_start
 from sundae_ns.scene.load_save import load, load_with_mask, save_for_viewers
 from sundae_ns.scene.packing import packed_bytes, stated_start
@@ -40,8 +42,7 @@ def export(
     Args:
         out: file to write; its suffix selects the format: .html, .ply or .glb (exact), .spz or .sog (quantised,
             much smaller). A name without a suffix is a folder of page and scene, for a web server.
-        upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
-            Do not use the rotated file for a warm start.
+        upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers; not for a warm start.
         start_view: what a page opens with: index of a stored camera, or a camera file as sundae render reads it; by
             default that of a packed scene, else the first camera.
         up: direction about which a page turns, for example 0 0 1; by default that of the scene, else of its cameras.
@@ -49,9 +50,8 @@ def export(
     """
     page = out.suffix.lower() in (".html", "")
     if not page:
-        check_format(out)
-    check = check_file if out.suffix else check_folder
-    check(out, reads=[*files_of(scene), data], overwrite=overwrite)
+        check_suffix(out, (*FORMATS, ".html"))
+    (check_file if out.suffix else check_folder)(out, reads=[*files_of(scene), data], overwrite=overwrite)
     started = start_view is not None or up is not None
     if page:
         if upright:
@@ -83,10 +83,10 @@ def export(
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
     with Console(stderr=True).status(f"Writing {opened.num_gaussians:,} Gaussians"):  # a .sog takes minutes
         written = save_for_viewers(opened, out, upright=upright)
-    degree = f"degree {written.degree}{', antialiased' * opened.antialiased}"
-    print(f"{out}: {written.primitives:,} Gaussians, {degree}, {written.bytes:,} bytes")
-    if written.clamped:
-        print(f"clamped scales or colours of {written.clamped:,} Gaussians to the range of a .spz; a .sog has none")
-    if written.cut:
-        print(f"left out harmonics above SH degree {written.degree}, which {out.suffix} cannot store; .ply can")
+    mode, degree = ", antialiased" if opened.antialiased else "", sh_degree(written["features_rest"])
+    print(f"{out}: {len(written['means']):,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
+    if out.suffix.lower() == ".spz" and (beyond := clamped(written)):
+        print(f"clamped scales or colours of {beyond:,} Gaussians to the range of a .spz; a .sog has none")
+    if degree < opened.gaussians.sh_degree:
+        print(f"left out harmonics above SH degree {degree}, which {out.suffix} cannot store; .ply can")
     return 0

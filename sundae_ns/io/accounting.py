@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import chain
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -28,15 +27,3 @@ def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
         return bytes_of(params)
     with torch.device("meta"):
         return bytes_of(params) + bytes_of_module(CompensationHead(head))
-
-
-class Sizes(NamedTuple):
-    """Stored bytes of Gaussians and of their head."""
-
-    primitives: int
-    head: int = 0
-
-    @property
-    def total(self) -> int:
-        """Bytes of both."""
-        return sum(self)

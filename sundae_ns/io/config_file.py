@@ -74,15 +74,11 @@ def _make_value(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
     module, _, name = suffix.rpartition(".")
     if module.partition(".")[0] == "pathlib" and name in _PATHS and all(isinstance(a, str) for a in arguments):
         return Path(*arguments)
-    if suffix == "builtins.getattr":  # as Python before 3.11.4 saves a member of an enumeration
-        kind, name = arguments if len(arguments) == 2 else (None, "")
-        if isinstance(kind, type) and issubclass(kind, Enum) and isinstance(name, str) and name in kind.__members__:
-            return kind[name]
+    by_name = suffix == "builtins.getattr"  # as Python before 3.11.4 saves a member of an enumeration
+    kind, *value = arguments if by_name and arguments else (_named(suffix, node), *arguments)
+    if not isinstance(kind, type) or not issubclass(kind, Enum) or len(value) != 1:
         raise _refused(f"it asks to call {suffix}", node)
-    kind = _named(suffix, node)
-    if not isinstance(kind, type) or not issubclass(kind, Enum) or len(arguments) != 1:
-        raise _refused(f"it asks to call {suffix}", node)
-    return kind(arguments[0])
+    return kind.__members__[value[0]] if by_name else kind(value[0])
 
 
 _PYTHON = "tag:yaml.org,2002:python/"
@@ -118,12 +114,10 @@ def find_config(path: Path) -> Path | None:
 
 
 def load_config(path: Path) -> Any:
-    """A run's ``config.yml`` as objects of nerfstudio, with the options that were saved.
+    """A run's ``config.yml`` as objects of nerfstudio, with the options that were saved; nothing is called.
 
-    Only classes of nerfstudio, of this package, of torch, and of installed plug-ins are known; nothing is called.
-
-    Raises:
-        CheckpointError: it cannot be read, is no configuration, or asks for something else.
+    ``CheckpointError`` if it cannot be read, or asks for more than classes of nerfstudio, of this package, of torch,
+    and of installed plug-ins.
     """
     config = _read(path, lambda text: yaml.load(text, Loader=_ConfigLoader))
     find_capture(config, path.absolute().parent)
@@ -165,10 +159,9 @@ def model_options(path: Path) -> dict[str, Any]:
     return options
 
 
-def parser_options(path: Path) -> dict[str, Any]:
-    """As :func:`model_options`, those of the data parser; empty for a run without one."""
-    options = _value(path, "pipeline", "datamanager", "dataparser")
-    return options if isinstance(options, dict) else {}
+def orientation_of(path: Path) -> Any:
+    """How a run's data parser has turned the capture; None if it does not say."""
+    return _value(path, "pipeline", "datamanager", "dataparser", "orientation_method")
 
 
 def capture_and_source(path: Path) -> tuple[Path | None, Path | None]:
@@ -188,14 +181,7 @@ def schedule_length(path: Path) -> int:
 
 
 def check_run(run: Path) -> None:
-    """Refuse a path that is no run, nor its ``config.yml``, before the slow import of nerfstudio.
-
-    Raises:
-        CheckpointError: it is a file of another kind, or has no ``config.yml`` of a run.
-    """
-    refuse(
-        run,
-        packed="give the run that was packed",
-        primitives="give the folder of a run; sundae prune and sundae export read such files",
-    )
+    """``CheckpointError`` for a path that is no run, nor its ``config.yml``, before the slow import of nerfstudio."""
+    advice = "give the folder of a run; sundae prune and sundae export read such files"
+    refuse(run, packed="give the run that was packed", primitives=advice)
     model_options(config_of(run))

@@ -14,16 +14,11 @@ from sundae_ns.core.covariance import quaternions
 from sundae_ns.core.gaussians import sh_degree
 from sundae_ns.rasterize.reference import harmonic_basis
 
-MAX_BITS = 21
-"""Maximum number of bits per coordinate; three fit in 64 bits."""
-
-_SPREADS = (
-    (32, 0x001F00000000FFFF),
-    (16, 0x001F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
+Direction = tuple[float, float, float]
+MAX_BITS = 21  # of a coordinate; three fit in 64 bits
+FINE_STEP = 1e-5  # of float32 at the centres, as a share of their distances: from it on they are moved
+_SPREADS = [(32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F)]
+_SPREADS += [(4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)]
 
 
 def multiply_quaternions(a: Tensor, b: Tensor) -> Tensor:
@@ -39,9 +34,8 @@ def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tenso
     A rotation maps the functions of each degree onto themselves. Its matrix follows exactly from their values on 64
     directions before and after the rotation.
 
-    Args:
-        features_rest: ``[N, K, 3]`` coefficients of degrees 1 and up, K = (degree + 1)^2 - 1.
-        rotation: ``[..., 3, 3]``, or a reflection; the result is ``[..., N, K, 3]``.
+    ``features_rest`` are coefficients ``[N, K, 3]`` of degrees 1 and up. ``rotation`` ``[..., 3, 3]`` may be a
+    reflection; the result is ``[..., N, K, 3]``.
     """
     max_degree = sh_degree(features_rest)
     generator = torch.Generator().manual_seed(0)
@@ -75,6 +69,53 @@ def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) ->
     moved["quats"] = multiply_quaternions(turn.to(params["quats"]), params["quats"])
     moved["features_rest"] = rotate_spherical_harmonics(params["features_rest"], rotation)
     return moved
+
+
+def _sample(means: Tensor, most: int) -> NDArray[np.float64]:
+    """Up to ``most`` finite centres ``[M, 3]``, evenly from all."""
+    points = means[:: -(-len(means) // most) or 1].double().numpy()
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def recentred(means: Tensor) -> tuple[Tensor, Direction | None]:
+    """Centres ``[N, 3]`` in float32, and what was subtracted in float64 where float32 is too coarse; None for nothing.
+
+    Survey coordinates lie millions of metres from the origin, where float32 has steps of half a metre.
+    """
+    points = _sample(means, 10_000)
+    middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+    distance = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 0.0
+    step = float(np.spacing(np.float32(np.abs(middle).max().clip(max=1e30))))
+    if not step > FINE_STEP * distance > 0:
+        return means.float(), None
+    unit = 2.0 ** math.floor(math.log2(distance))  # a short number, without rounding
+    x, y, z = (np.round(middle / unit) * unit).tolist()
+    return (means.double() - torch.tensor([x, y, z], dtype=torch.float64)).float(), (x, y, z)
+
+
+def upward(means: Tensor, convention: Direction) -> tuple[Direction, bool]:
+    """Upward direction of centres ``[N, 3]``, and whether the scene's ground shows it, not the ``convention``.
+
+    The ground is the largest of planes through three centres (RANSAC; Fischler and Bolles, 1981), above which are most
+    others. Within 45 degrees of the convention it has at least a fifth of the centres, of +z or +y two.
+    """
+    points = _sample(means, 1024).astype(np.float32)
+    if len(points) < 100:
+        return convention, False
+    points = points - np.median(points, axis=0)
+    corners = points[np.random.default_rng(0).integers(len(points), size=(3, 512))]
+    normals = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)
+    heights = points @ normals.T - (corners[0] * normals).sum(axis=1)
+    reach = 0.02 * np.median(np.linalg.norm(points, axis=1))
+    above, below = (heights > reach).mean(axis=0), (heights < -reach).mean(axis=0)
+    share = np.where(np.abs(above - below) > 0.6 * (above + below), 1 - above - below, 0)
+    normals = np.where(above < below, -normals.T, normals.T)
+    for direction, least in ((convention, 0.2), ((0.0, 0.0, 1.0), 0.4), ((0.0, 1.0, 0.0), 0.4)):
+        x, y, z = largest = normals[:, (share * (direction @ normals > 0.7)).argmax()]
+        if (share * (direction @ normals > 0.7)).max() >= least:
+            return direction if direction @ largest > 0.99 else (float(x), float(y), float(z)), True
+    return convention, False
 
 
 def interleave(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:

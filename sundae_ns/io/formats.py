@@ -3,64 +3,42 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, SundaeError, regular
-from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, Sanitised, sanitise, sh_degree_of
+from sundae_ns.core.errors import CheckpointError, DataError, SundaeError, regular
+from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, Sanitised, sanitise
 from sundae_ns.io import checkpoint
-from sundae_ns.io.coordinates import similarity
+from sundae_ns.io.coordinates import Direction, recentred, similarity, upward
 from sundae_ns.io.gltf import read_glb, write_glb
-from sundae_ns.io.ply import (
-    MAX_SH_DEGREE,
-    MODEL_FRAME,
-    check_gaussians,
-    is_nerfstudio_ply,
-    ply_comments,
-    read_ply,
-    write_ply,
-)
+from sundae_ns.io.ply import MAX_SH_DEGREE, Marks, check_gaussians, comments_of, ply_marks, read_ply, write_ply
 from sundae_ns.io.sog import METAS, read_sog, write_sog
 from sundae_ns.io.splat import read_gsplat, read_ksplat, read_splat
-from sundae_ns.io.spz import clamped, read_spz, write_spz
+from sundae_ns.io.spz import read_spz, write_spz
 
 Kind = Literal["packed", "ply", "spz", "sog", "glb", "splat", "ksplat", "gsplat"]
-PRIMITIVES: dict[Kind, str] = {
-    "ply": ".ply file",
-    "spz": ".spz file",
-    "sog": ".sog file",
-    "glb": ".glb file",
-    "splat": ".splat file",
-    "ksplat": ".ksplat file",
-    "gsplat": "checkpoint of gsplat",
-}
-"""Kinds of files that hold Gaussians alone, and their names."""
 FORMATS = (".ply", ".spz", ".sog", ".glb")  # that write_for_viewers writes
-ANTIALIASED = "SplatRenderMode: mip"
-"""Header comment of a .ply whose scene was trained with antialiasing."""
-_FIRST_BYTES: dict[bytes, Kind] = {
-    b"\x89SUNDAE\n": "packed",
-    b"ply\n": "ply",
-    b"ply\r": "ply",
-    b"\x1f\x8b": "spz",
-    b"NGSP": "spz",
-    b"PK\x03\x04": "sog",
-    b"glTF": "glb",
-}
-_HEADERLESS: dict[str, Kind] = {".splat": "splat", ".ksplat": "ksplat"}
-_ZIPS: dict[str, Kind] = {".sog": "sog", ".zip": "sog", ".pt": "gsplat"}
-_BY_SUFFIX: dict[str, Kind] = {".ply": "ply", ".spz": "spz", ".glb": "glb", **_ZIPS, **_HEADERLESS}
+_BY_SUFFIX: dict[str, Kind] = {".ply": "ply", ".spz": "spz", ".sog": "sog", ".glb": "glb"}
+_BY_SUFFIX |= {".splat": "splat", ".ksplat": "ksplat", ".pt": "gsplat"}
+PRIMITIVES = {kind: f"{suffix} file" for suffix, kind in _BY_SUFFIX.items()} | {"gsplat": "checkpoint of gsplat"}
+"""Kinds of files that hold Gaussians alone, and their names."""
+_BY_SUFFIX[".zip"] = "sog"
+_FIRST_BYTES: dict[bytes, Kind] = {b"\x89SUNDAE\n": "packed", b"ply\n": "ply", b"ply\r": "ply"}
+_FIRST_BYTES |= {b"\x1f\x8b": "spz", b"NGSP": "spz", b"PK\x03\x04": "sog", b"glTF": "glb"}
 _UNREAD = {
     ".lcc": "is a scene of XGRIDS; convert it to .ply with SuperSplat or splat-transform",
     ".rad": "is a scene of Spark; convert the .ply that it was made of",
     ".gltf": "is a glTF scene in several files; export it as .glb",
     ".pth": "is a checkpoint of another trainer; give its .ply, such as point_cloud/iteration_*/point_cloud.ply",
 }
-# In nerfstudio, z points up; in a 3DGS .ply, -y does.
+_READERS: dict[Kind | None, Callable[[Path], Any]] = {"spz": read_spz, "sog": read_sog, "glb": read_glb}
+_READERS |= {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}
+# In nerfstudio and in gsplat's trainer, z points up; in a 3DGS .ply, -y does.
+_MODEL_UP, _PLY_UP = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
 _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
 _log = logging.getLogger(__name__)
 
@@ -73,8 +51,11 @@ def kind_of(path: Path) -> Kind | None:
     except OSError:
         return None
     kind = next((kind for begin, kind in _FIRST_BYTES.items() if first.startswith(begin)), None)
-    others = _ZIPS if kind == "sog" else _HEADERLESS  # a checkpoint is a zip file too
-    return others.get(path.suffix.lower()) if kind in ("sog", None) else kind
+    if kind not in ("sog", None):
+        return kind
+    # A checkpoint is a zip file too; the others have no header.
+    suffixes = (".sog", ".zip", ".pt") if kind == "sog" else (".splat", ".ksplat")
+    return _BY_SUFFIX[path.suffix.lower()] if path.suffix.lower() in suffixes else None
 
 
 def kind_of_gaussians(path: Path) -> Kind | None:
@@ -114,66 +95,57 @@ def refuse(path: Path, *, packed: str | None = None, primitives: str | None = No
         raise CheckpointError(f"{path} {other}")
 
 
-class StoredGaussians(NamedTuple):
-    """The Gaussians of a file, and what the file says of its antialiasing and coordinates."""
-
-    sanitised: Sanitised
-    """Those that have a meaning, with finite values, float32 on the CPU; and what was clamped or dropped."""
-    antialiased: bool
-    in_model_frame: bool
-
-
-def read_gaussian_file(path: Path) -> StoredGaussians:
+def read_gaussian_file(path: Path) -> tuple[Sanitised, Marks]:
     """Read a file of Gaussians of any program. Nothing in it is executed.
+
+    Returns:
+        The Gaussians that have a meaning, with finite values, float32 on the CPU, and what was clamped or dropped; and
+        what the file states of them.
 
     Raises:
         DataError: the file is missing, damaged, of another kind, or has no finite Gaussian.
     """
-    antialiased = in_model_frame = False
-    match kind_of_gaussians(path):
-        case "glb":
-            params, antialiased, in_model_frame = read_glb(path)
-        case "spz":
-            params, antialiased = read_spz(path)
-        case "sog":
-            params, antialiased = read_sog(path)
-        case "splat" | "ksplat" | "gsplat" as kind:
-            params = {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}[kind](path)
-        case _:
-            params, antialiased = read_ply(path), ANTIALIASED in ply_comments(path)
-            in_model_frame = is_nerfstudio_ply(path)
-    params["means"] = params["means"].float()
-    return StoredGaussians(usable(params, path, DataError, "export it again"), antialiased, in_model_frame)
+    kind = kind_of_gaussians(path)
+    read = _READERS[kind](path) if kind in _READERS else (read_ply(path), *ply_marks(path))
+    params, *stated = read if isinstance(read, tuple) else (read,)
+    params["means"], offset = recentred(params["means"])
+    marks = Marks(*stated)
+    if offset is not None:
+        _log.warning("%s lies where float32 is too coarse; its coordinates are less %.10g %.10g %.10g", path, *offset)
+        x, y, z = map(sum, zip(offset, marks.offset or (0.0, 0.0, 0.0), strict=True))
+        marks = marks._replace(offset=(x, y, z))
+    return usable(params, path, DataError), marks
 
 
-def usable(
-    params: Mapping[str, Tensor],
-    path: Path,
-    failure: type[SundaeError] = CheckpointError,
-    remedy: str = "give another file",
-) -> Sanitised:
-    """The Gaussians of a file that have a meaning, with finite values; logs what was changed.
+def up_of(path: Path, means: Tensor, marks: Marks) -> Direction:
+    """Upward direction that a file states; else that of its format or its ground, by its centres, which is logged."""
+    kind = kind_of_gaussians(path)
+    up = _MODEL_UP if kind == "gsplat" or marks.in_model_frame else _PLY_UP
+    if marks.up is None and not marks.in_model_frame and kind != "glb":
+        up, shown = upward(means, up)
+        why = "its largest plane shows" if shown else "files of its kind have"
+        _log.warning("%s states no upward direction; it is %.2g %.2g %.2g, as %s", path, *up, why)
+    return marks.up or up
 
-    Raises:
-        failure: no Gaussian has a meaning.
-    """
+
+def usable(params: Mapping[str, Tensor], path: Path, failure: type[SundaeError] = CheckpointError) -> Sanitised:
+    """The Gaussians of a file that have a meaning, with finite values; logs what was changed. None is a ``failure``."""
     sanitised = sanitise(params)
     if not sanitised.gaussians.num_gaussians:
-        raise failure(f"{path} has {len(sanitised.mask):,} Gaussians, and none is finite; {remedy}")
+        raise failure(
+            f"{path} has {len(sanitised.mask):,} Gaussians, and none is finite; export it again or give another"
+        )
     if summary := sanitised.summary():
         _log.warning("%s: %s", path, summary)
     return sanitised
 
 
 def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
-    """Read a splatfacto or SUNDAE checkpoint, a packed scene without its head, or a file of Gaussians.
-
-    Args:
-        path: ``.ckpt`` file, a folder of them (the newest counts), or a file of Gaussians or packed scene.
+    """Read a checkpoint, the newest of a folder, a packed scene without its head, or a file of Gaussians.
 
     Returns:
-        Finite Gaussians without features, float32 on the CPU, colours as harmonics; and whether coordinates are those
-        of nerfstudio's model (checkpoints, ``ns-export``), not the capture's (others).
+        Finite Gaussians without features, float32 on the CPU (centres of survey coordinates are float64), colours as
+        harmonics; and whether coordinates are those of nerfstudio's model, not of a capture.
 
     Raises:
         CheckpointError: there is no such file, it holds no Gaussians, or has another format.
@@ -184,10 +156,13 @@ def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
         raise CheckpointError(f"{path} does not exist; {wanted}")
     if kind_of_gaussians(path) is not None:
         try:
-            stored = read_gaussian_file(path)
+            sanitised, marks = read_gaussian_file(path)
         except DataError as error:
             raise CheckpointError(str(error)) from error
-        return dict(stored.sanitised.gaussians), stored.in_model_frame
+        params = dict(sanitised.gaussians)
+        if marks.offset is not None:
+            params["means"] = params["means"].double() + torch.tensor(marks.offset, dtype=torch.float64)
+        return params, marks.in_model_frame
     if kind_of(path) == "packed":
         from sundae_ns.io.pack.packed_scene import read_scene  # its decoder needs a compiler, which other files do not
 
@@ -207,74 +182,40 @@ def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
     return dict(usable(checkpoint.gaussians_of(loaded, path), path).gaussians.as_harmonics()), True
 
 
-class ViewerFile(NamedTuple):
-    """Summary of a written file."""
-
-    primitives: int
-    dropped: int
-    """Gaussians left out because they are not finite."""
-    degree: int
-    """SH degree of the file."""
-    clamped: int
-    """Gaussians with values beyond the range of a .spz, which stores the nearest value."""
-    cut: bool
-    """Whether the scene has a higher SH degree than the file."""
-    bytes: int
-
-
-def check_format(path: Path) -> None:
-    """Raise ``ConfigError`` unless the suffix of a file names a supported format."""
-    if path.suffix.lower() not in FORMATS:
-        raise ConfigError(f"{path} has no supported suffix; name it {' or '.join((*FORMATS, '.html'))}")
-
-
 def write_for_viewers(
-    path: Path,
-    params: Mapping[str, Tensor],
-    *,
-    antialiased: bool = False,
-    upright: bool = False,
-    in_model_frame: bool = True,
-) -> ViewerFile:
-    """Write Gaussians in the format of the file's suffix, atomically.
+    path: Path, params: Mapping[str, Tensor], marks: Marks | None = None, *, upright: bool = False
+) -> dict[str, Tensor]:
+    """Write Gaussians in the format of the file's suffix, one of :data:`FORMATS`, atomically.
 
     Drops Gaussians without a meaning (``gaussians.sanitise``), and SH coefficients above the format's degree.
 
     Args:
         path: its folder must exist.
         params: see :mod:`sundae_ns.core.gaussians`. A :class:`Gaussians` says how it stores colours.
-        antialiased: mark the scene as trained with antialiasing.
+        marks: what the file states of the scene, as far as its format can; None for nothing.
         upright: rotate from nerfstudio's axes to those of a 3DGS .ply, which viewers show upright; a .glb always is.
-        in_model_frame: coordinates are those of nerfstudio's model, as a .ply then says.
+
+    Returns:
+        The Gaussians of the file, on the CPU, before its format rounds them.
 
     Raises:
-        ConfigError: the suffix is not supported.
         DataError: wrong shapes, or the format cannot store the Gaussians.
         StorageError: the disk is full or not writable.
     """
-    check_format(path)
     check_gaussians(params)
-    sanitised = sanitise(params)
-    gaussians = {name: value.detach().cpu() for name, value in sanitised.gaussians.as_harmonics().items()}
+    marks, sanitised = marks or Marks(), sanitise(params).gaussians
+    gaussians = {name: value.detach().cpu() for name, value in sanitised.as_harmonics().items()}
     kind = path.suffix.lower()
     if upright and kind != ".glb":
         gaussians = similarity(gaussians, _UPRIGHT, 1.0)
-    coefficients = gaussians["features_rest"].shape[1]
-    if kind != ".ply":
-        gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
+        x, y, z = (_UPRIGHT[:, :3] @ torch.tensor(marks.up or _MODEL_UP)).tolist()
+        marks = marks._replace(in_model_frame=False, up=(x, y, z))
     if kind == ".ply":
-        marks = {MODEL_FRAME: in_model_frame and not upright, ANTIALIASED: antialiased}
-        write_ply(path, gaussians, comments=[comment for comment, applies in marks.items() if applies])
-    elif kind == ".glb":
-        write_glb(path, gaussians, antialiased=antialiased, in_model_frame=in_model_frame)
+        write_ply(path, gaussians, comments=comments_of(marks))
+        return gaussians
+    gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
+    if kind == ".glb":
+        write_glb(path, gaussians, antialiased=marks.antialiased, in_model_frame=marks.in_model_frame)
     else:
-        (write_spz if kind == ".spz" else write_sog)(path, gaussians, antialiased=antialiased)
-    kept = gaussians["features_rest"].shape[1]
-    return ViewerFile(
-        primitives=len(gaussians["means"]),
-        dropped=sanitised.dropped,
-        degree=sh_degree_of(kept) or 0,
-        clamped=clamped(gaussians) if kind == ".spz" else 0,
-        cut=kept < coefficients,
-        bytes=path.stat().st_size,
-    )
+        (write_spz if kind == ".spz" else write_sog)(path, gaussians, antialiased=marks.antialiased)
+    return gaussians

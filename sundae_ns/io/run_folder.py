@@ -44,13 +44,8 @@ def files_of(run: Path) -> list[Path]:
 def reserve(run: Path, busy: str = "trains in {}; wait for it, or give another --timestamp") -> int:
     """Make a run's folder, reserve it for this process, and remove files that killed processes left unfinished.
 
-    ``busy`` ends the error message, after the name of the other process; ``{}`` stands for the folder.
-
-    Returns:
-        Descriptor of the locked file. The lock lasts while a process has it open.
-
-    Raises:
-        StorageError: another process has reserved it, or the folder cannot be written.
+    Returns the descriptor of the locked file; the lock lasts while a process has it open. ``StorageError`` if another
+    process, whose name stands before the words ``busy``, has reserved the folder ``{}``, or it cannot be written.
     """
     run = run.resolve()
     if run in _held:
@@ -108,13 +103,9 @@ def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
 def take_records(source: Path, run: Path, step: int) -> None:
     """Copy the records of a run's prunes up to a ``step`` to the folder of another run that resumes it there.
 
-    Damaged records are passed over; a record that the other run has is kept.
-
-    Raises:
-        StorageError: no space or no right to write.
+    Damaged records are passed over; a record that the other run has is kept. ``StorageError`` without space or rights.
     """
-    prunes = prunes_of(source)
-    before = [record for record in prunes if isinstance(record.get("step"), int) and record["step"] <= step]
+    before = [prune for prune in prunes_of(source) if isinstance(prune.get("step"), int) and prune["step"] <= step]
     if before and not (run / PRUNES).exists():
         write_text(run / PRUNES, json.dumps(before, indent=2))
 

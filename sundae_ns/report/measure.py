@@ -13,7 +13,7 @@ import torch
 from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.core.metrics import Lpips, ViewQuality, quality_of
 from sundae_ns.core.timing import median_ms
-from sundae_ns.io.accounting import Sizes, bytes_of, bytes_of_module
+from sundae_ns.io.accounting import bytes_of, bytes_of_module
 from sundae_ns.plugin.finished_runs import Opened
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.report.measured import HEAD_OFF, HEAD_ON, Configuration, Measured
@@ -57,9 +57,9 @@ def frame_times(model: SundaeModel, camera: Any, *, warmup: int = 3, repeats: in
     return FrameTimes(frame, splat, milliseconds(run_head))
 
 
-def sizes(model: SundaeModel) -> Sizes:
-    """Bytes of everything that a render needs: Gaussians in fp32 with features, and the head."""
-    return Sizes(bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head))
+def sizes(model: SundaeModel) -> tuple[int, int]:
+    """Bytes of what a render needs: of Gaussians in fp32 with features, and of the head."""
+    return bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head)
 
 
 @torch.no_grad()
@@ -105,11 +105,11 @@ def measure_scene(
             progress()
     bare = {name: value for name, value in model.gauss_params.items() if name != FEATURES}
     # A disabled head is not needed, and neither are its features.
-    stored = sizes(model) if has_head else Sizes(bytes_of(bare), 0)
-    needed = {HEAD_ON: stored.total, HEAD_OFF: bytes_of(bare)}
+    stored = sizes(model) if has_head else (bytes_of(bare), 0)
+    needed = {HEAD_ON: sum(stored), HEAD_OFF: bytes_of(bare)}
     if opened.packed_bytes is not None:
         # A packed file is read completely, with the head enabled or disabled.
-        stored, needed = Sizes(opened.packed_bytes), dict.fromkeys(needed, opened.packed_bytes)
+        stored, needed = (opened.packed_bytes, 0), dict.fromkeys(needed, opened.packed_bytes)
     resolutions = [f"{int(camera.width)}x{int(camera.height)}" for camera in opened.cameras]
     precision = "" if model.head is None or not has_head else model.head.config.precision
     return Measured(
@@ -122,8 +122,8 @@ def measure_scene(
         seed=opened.seed,
         steps=opened.steps,
         primitives=model.num_points,
-        bytes_primitives=stored.primitives,
-        bytes_head=stored.head,
+        bytes_primitives=stored[0],
+        bytes_head=stored[1],
         resolution=resolutions[0] + (" and others" if len(set(resolutions)) > 1 else ""),
         configurations=tuple(
             Configuration(name, median(times[name]) if repeats else None, needed[name], tuple(views[name]))

@@ -121,7 +121,7 @@ def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple
 
     A run states both relative to the capture before its ``applied_transform``.
     """
-    frame = scene.meta.get("frame") if scene is not None and scene.in_model_frame else None
+    frame = scene.meta.get("frame") if scene is not None else None
     if frame is None:
         return np.eye(4), 1.0
     transform, applied = np.eye(4), np.eye(4)

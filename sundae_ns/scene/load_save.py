@@ -15,16 +15,16 @@ from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.data.capture import read_json
 from sundae_ns.head.head import SIZES, CompensationHead, HeadConfig
 from sundae_ns.io import checkpoint, formats
-from sundae_ns.io.config_file import find_config, model_options, parser_options
-from sundae_ns.io.formats import FORMATS, ViewerFile, kind_of, kind_of_gaussians
+from sundae_ns.io.config_file import find_config, model_options, orientation_of
+from sundae_ns.io.formats import FORMATS, kind_of
+from sundae_ns.io.ply import Marks
 from sundae_ns.scene.cameras import is_frame
 from sundae_ns.scene.page import write_page
 from sundae_ns.scene.render import degree_in_use
 from sundae_ns.scene.scene import Scene
 
 SUFFIXES = (*FORMATS, ".sundae", ".html")  # of the files that save() writes
-# Transform from the capture's coordinates to the model's, which nerfstudio writes into the folder of a run.
-FRAME_FILE = "dataparser_transforms.json"
+FRAME_FILE = "dataparser_transforms.json"  # of nerfstudio, in the folder of a run
 
 
 def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
@@ -61,11 +61,14 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
         from sundae_ns.scene.packing import scene_of  # its decoder needs a compiler, which other files do not
 
         return scene_of(read_scene(path)).to(device), None
-    if kind_of_gaussians(path) is None:
+    if formats.kind_of_gaussians(path) is None:
         return _of_run(path).to(device), None
-    read = formats.read_gaussian_file(path)
-    gaussians, mask = read.sanitised.gaussians.to(device), read.sanitised.mask
-    return Scene(gaussians, antialiased=read.antialiased, in_model_frame=read.in_model_frame), mask
+    sanitised, marks = formats.read_gaussian_file(path)
+    up = formats.up_of(path, sanitised.gaussians["means"], marks)
+    facts: dict[str, Any] = {"antialiased": marks.antialiased, "in_model_frame": marks.in_model_frame, "up": up}
+    if rows := [[*(float(i == j) for j in range(3)), -value] for i, value in enumerate(marks.offset or ())]:
+        facts["meta"] = {"frame": {"transform": rows, "scale": 1.0}}
+    return Scene(sanitised.gaussians.to(device), **facts), sanitised.mask
 
 
 def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
@@ -101,28 +104,31 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
     with writing(f"cannot write {path}"):
         if suffix in FORMATS:
             save_for_viewers(scene, path, upright=upright)
-            return
-        from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other files do not
-
-        packed = packed_bytes(scene)
-        if suffix == ".html":
-            write_page(path, scene, packed, title=path.resolve().stem)
+        elif suffix == ".html":
+            write_page(path, scene, _packed(scene), title=path.resolve().stem)
         else:
-            write_bytes(path, packed)
+            write_bytes(path, _packed(scene))
+
+
+def _packed(scene: Scene) -> bytes:
+    from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other files do not
+
+    return packed_bytes(scene)
 
 
 def packed_file(path: Path) -> tuple[Scene, bytes]:
     """A scene and the bytes of its packed file; a file that is not packed is packed with default settings."""
-    from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other files do not
-
     scene = load(path)
-    return scene, path.read_bytes() if kind_of(path) == "packed" else packed_bytes(scene)
+    return scene, path.read_bytes() if kind_of(path) == "packed" else _packed(scene)
 
 
-def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:
-    """Write base colours in a format of other viewers; returns what was left out or clamped. See :func:`save`."""
-    facts = {"antialiased": scene.antialiased, "in_model_frame": scene.in_model_frame}
-    return formats.write_for_viewers(path, scene.gaussians, upright=upright, **facts)
+def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> dict[str, Tensor]:
+    """Write base colours in a format of other viewers; returns the written Gaussians. See :func:`save`."""
+    offset = None
+    if not scene.in_model_frame and "frame" in scene.meta:  # that of survey coordinates, which load() made
+        offset = tuple(-row[3] for row in scene.meta["frame"]["transform"][:3])
+    marks = Marks(scene.antialiased, scene.in_model_frame, scene.up, offset)
+    return formats.write_for_viewers(path, scene.gaussians, marks, upright=upright)
 
 
 def _of_run(path: Path) -> Scene:
@@ -131,9 +137,8 @@ def _of_run(path: Path) -> Scene:
         reason = "is no run" if path.exists() else "does not exist"
         wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .glb, .splat, .ksplat or .pt file"
         raise CheckpointError(f"{path} {formats.unread(path) or f'{reason}; {wanted}'}")
-    if path.suffix == ".ckpt":
-        return scene_of_checkpoint(path, checkpoint.read(path), config)
-    return scene_of_checkpoint(*checkpoint.read_newest(config.parent), config)
+    source = (path, checkpoint.read(path)) if path.suffix == ".ckpt" else checkpoint.read_newest(config.parent)
+    return scene_of_checkpoint(*source, config)
 
 
 def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -> Scene:
@@ -151,13 +156,10 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         gaussians[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
     degree, interval = gaussians.sh_degree, options.get("sh_degree_interval")
     if options.get("warm_start") is None and isinstance(interval, int):
-        # Coefficients of degrees that training has not reached are not in use.
-        degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))
+        degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))  # training did not reach the others
     gaussians["features_rest"] = gaussians["features_rest"][:, : (degree + 1) ** 2 - 1]
     gaussians = formats.usable(gaussians, source).gaussians
-    frame = _frame_of(config.parent)
-    # nerfstudio turns captures so that z is upwards, unless the options forbid it.
-    upright = parser_options(config).get("orientation_method") in ("up", "vertical")
+    frame, upright = _frame_of(config.parent), orientation_of(config) in ("up", "vertical")  # by default z is up
     return Scene(
         gaussians,
         head,
@@ -174,16 +176,14 @@ def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path)
     """The head of a checkpoint. Its size is that of its weights: training may choose another than configured."""
     prefix = "networks.head."
     weights = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-    features = state.get(f"gauss_params.{FEATURES}")
-    if not weights or not isinstance(features, Tensor):
+    if not weights or not isinstance(features := state.get(f"gauss_params.{FEATURES}"), Tensor):
         return None
     known = options["head"] if isinstance(options.get("head"), dict) else {}
     fields = {name: known[name] for name in ("pixel_unshuffle", "precision") if name in known}
-    mode = "features" if known.get("mode") == "features" else "residual"
+    fields["mode"] = "features" if known.get("mode") == "features" else "residual"
     for size in sorted(SIZES, key=lambda size: size != known.get("size")):
-        config = HeadConfig(mode=mode, size=size, num_features=features.shape[1], **fields)  # type: ignore[arg-type]
-        head = CompensationHead.of_weights(config, weights)
-        if head is not None:
+        config = HeadConfig(size=size, num_features=features.shape[1], **fields)  # type: ignore[arg-type]
+        if (head := CompensationHead.of_weights(config, weights)) is not None:
             return head
     raise CheckpointError(f"{source} has a head that does not fit its own config.yml; give another run")
 
@@ -191,8 +191,8 @@ def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path)
 def _frame_of(run: Path) -> dict[str, Any] | None:
     """Transform and scale from the capture's coordinates to the model's; None without a usable file."""
     try:
-        frame = read_json(run / FRAME_FILE)
-        frame = {"transform": frame["transform"], "scale": float(frame["scale"])}
+        stated = read_json(run / FRAME_FILE)
+        frame = {"transform": stated["transform"], "scale": float(stated["scale"])}
     except (DataError, KeyError, TypeError, ValueError):
         return None
     return frame if is_frame(frame) else None

@@ -34,7 +34,6 @@ FEWEST_POINTS = 50  # With fewer sparse points a user hears that photos overlap 
 SIDES = {"cuda": 640, "cpu": 160}  # Longest side of the swept images, pixels; a CPU takes a second a view
 MOST_ON_CPU = 24  # Most views that a CPU sweeps
 FILLED = {"cuda": 100_000, "cpu": 20_000}  # Points up to which a sparse cloud is filled; a larger one stays as it is
-
 Points = tuple[Tensor, Tensor]  # Positions [N, 3] and colours in 0 to 255 [N, 3]
 Frame = tuple[Tensor, float]  # Transform [3, 4] and scale from the capture's coordinates to those of the model
 
@@ -122,6 +121,7 @@ def _warm_gaussians(options: Any, source: Path, frame: Frame | None, num_feature
                 "train with it, or give --pipeline.model.warm-start-frame model"
             )
         params = similarity(params, *frame)
+        params["means"] = params["means"].float()  # survey coordinates are float64 until here
     columns = (options.sh_degree + 1) ** 2 - 1
     rest = params["features_rest"][:, :columns]
     missing = rest.new_zeros(len(rest), columns - rest.shape[1], 3)

@@ -24,7 +24,7 @@ import sundae_ns as sn
 from sundae_ns.core.gaussians import SH_C0, SPLAT_NAMES
 from sundae_ns.io.formats import read_gaussian_file, write_for_viewers
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
-from sundae_ns.io.ply import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply
+from sundae_ns.io.ply import MODEL_FRAME, Marks, ply_marks, read_ply, write_ply
 from sundae_ns.scene import prune_scene as pruning
 from sundae_ns.scene.initialization import from_points
 
@@ -45,7 +45,7 @@ def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply") == 0
     found, truth = read_ply(tmp_path / "a.ply"), read_scene(tmp_path / "a.sundae").gaussians
     assert all(torch.equal(found[name], truth[name]) for name in SPLAT_NAMES)
-    assert is_nerfstudio_ply(tmp_path / "a.ply")
+    assert ply_marks(tmp_path / "a.ply").in_model_frame
     assert ("SplatRenderMode: mip" in PlyData.read(tmp_path / "a.ply").comments) == (mode == "antialiased")
 
 
@@ -78,10 +78,10 @@ def test_export_of_a_ply_of_any_program(
     output = " ".join(capsys.readouterr().out.split())
     mode = ", antialiased" if comments else ""
     assert f"a{kind}: 199 Gaussians, degree 1{mode}, {out.stat().st_size:,} bytes" in output
-    (line,) = caplog.messages
-    assert line.endswith("unnamed.bin: 200 Gaussians: dropped 1 that were not finite (NaN or infinite)")
+    assert caplog.messages[0].endswith("unnamed.bin: 200 Gaussians: dropped 1 that were not finite (NaN or infinite)")
+    assert caplog.messages[1].endswith("states no upward direction; it is 0 -1 0, as files of its kind have")
     finite = {name: value[torch.arange(200) != 3] for name, value in given.items()}
-    write_for_viewers(same, finite, antialiased=bool(comments))
+    write_for_viewers(same, finite, Marks(antialiased=bool(comments)))
     assert out.read_bytes() == same.read_bytes()
 
 
@@ -161,11 +161,11 @@ def test_every_command_reads_files_of_other_programs(
     monkeypatch.chdir(tmp_path)
     truth = KSPLAT if name == "a.ksplat" else small_field()
     FOREIGN[name](Path(name), truth)
-    colors = read_gaussian_file(Path(name)).sanitised.gaussians["features_dc"]
+    colors = read_gaussian_file(Path(name))[0].gaussians["features_dc"]
     assert run("prune", name, "-o", "pruned/a/b.ply", "--keep", "0.5", "--num-cameras", "4") == 0
     assert len(read_ply(Path("pruned/a/b.ply"))["means"]) == len(truth["means"]) // 2
     assert run("prune", name, "-o", "same/a.ply", "--keep", "1", "--num-cameras", "4") == 0
-    torch.testing.assert_close(read_gaussian_file(Path("same/a.ply")).sanitised.gaussians["features_dc"], colors)
+    torch.testing.assert_close(read_gaussian_file(Path("same/a.ply"))[0].gaussians["features_dc"], colors)
     assert run("export", name, "-o", "exported/a.spz") == 0
     assert run("export", name, "-o", "pages/a.html") == 0
     assert run("pack", name, "-o", "packed/a.sundae") == 0
@@ -180,7 +180,7 @@ def test_every_command_reads_files_of_other_programs(
     else:
         assert run("export", name, "-o", "plain/a.ply") == 0
         assert torch.equal(read_ply(Path("plain/a.ply"))["features_dc"], colors)
-    assert not caplog.messages
+    assert all("states no upward direction" in message for message in caplog.messages)
 
 
 WITHOUT = """

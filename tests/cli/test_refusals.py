@@ -43,7 +43,7 @@ REFUSALS = {
     "distill in.ply -o b.sundae --keep 10% --count 5": "--keep and --count exclude each other",
     "distill in.ply -o b.sundae --steps 0": "steps is 0; give 1 or more",
     "export none.ply -o a.spz": "none.ply has 5 Gaussians, and none is finite; export it again",
-    "export in.ply -o a.splat": "name it .ply or .spz or .sog or .glb",
+    "export in.ply -o a.splat": "name it .ply, .spz, .sog, .glb, .html",
     "export in.ply -o in.bin/new/a.sog": "in.bin is no folder",
     "export in.ply -o a.ply": "in.ply is a .ply already; give an output name that ends in .spz or",
     "export in.ply -o a.sog --upright": "not in nerfstudio's coordinates",

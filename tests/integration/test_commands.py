@@ -15,7 +15,7 @@ from PIL import Image
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import SPLAT_NAMES
-from sundae_ns.io.ply import is_nerfstudio_ply, read_ply
+from sundae_ns.io.ply import ply_marks, read_ply
 
 
 def test_ns_eval(tiny: Any, call_here: Any, tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_other_projections_of_a_camera_path_are_refused(tiny: Any, call_here: An
 
 
 def test_ns_export(tiny: Any, exported: Path) -> None:
-    assert is_nerfstudio_ply(exported)
+    assert ply_marks(exported).in_model_frame
     found = read_ply(exported)
     state = torch.load(tiny.checkpoint(tiny.steps - 1), map_location="cpu")["pipeline"]
     for name in SPLAT_NAMES:

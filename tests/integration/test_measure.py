@@ -35,8 +35,8 @@ def test_figures_of_a_run(tiny: Any) -> None:
     times = frame_times(model, cameras[0], warmup=0, repeats=1)
     assert min(times.frame, times.splat, times.head) > 0
     floats = sum(value.numel() for value in model.gauss_params.values())
-    assert sizes(model).primitives == 4 * floats
-    assert sizes(model).head == sum(p.numel() * p.element_size() for p in model.head.parameters())
+    assert sizes(model)[0] == 4 * floats
+    assert sizes(model)[1] == sum(p.numel() * p.element_size() for p in model.head.parameters())
     # Before the head is enabled there is none to time.
     model.state.head_starts_at = 10**9
     assert frame_times(model, cameras[0], warmup=0, repeats=1).head == 0

@@ -81,7 +81,7 @@ def test_a_head_that_pays_stays_and_all_views_are_trained_on_again(make: Make, j
     assert record["decision"] == "head"
     assert record["step"] == DECIDED
     assert record["arms"]["head"]["psnr"] == pytest.approx(20.5, abs=0.01)
-    assert record["arms"]["head"]["bytes"] == sizes(model).total
+    assert record["arms"]["head"]["bytes"] == sum(sizes(model))
     assert model.head is not None
     assert model.state.head_enabled
     assert len(held) == 2

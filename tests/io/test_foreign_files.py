@@ -40,7 +40,7 @@ FIELD = small_field()
 
 
 def found(path: Path) -> dict[str, Tensor]:
-    return dict(read_gaussian_file(path).sanitised.gaussians)
+    return dict(read_gaussian_file(path)[0].gaussians)
 
 
 def check(values: dict[str, Tensor], tolerances: dict[str, float], truth: dict[str, Tensor] = FIELD) -> None:
@@ -69,7 +69,7 @@ def test_ends_of_a_splat_have_a_meaning(tmp_path: Path) -> None:
     given["scales"][2, 1] = -math.inf
     given["quats"][3] = 0
     write_small_splat(tmp_path / "a.splat", given)
-    sanitised = read_gaussian_file(tmp_path / "a.splat").sanitised
+    sanitised = read_gaussian_file(tmp_path / "a.splat")[0]
     assert sanitised.dropped == 0
     assert (sanitised.flat, sanitised.unrotated) == (1, 1)
     assert sanitised.gaussians["opacities"].sigmoid()[:2, 0].tolist() == pytest.approx([1, 0], abs=2e-6)
@@ -101,12 +101,9 @@ def test_compressed_ply_as_another_reader_reads_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("dtype", "most"), [("u1", 255), ("<u2", 65535), ("<f4", 1), ("<f4", 255)])
 def test_colours_in_place_of_harmonics(tmp_path: Path, dtype: str, most: float) -> None:
     write_colored_ply(tmp_path / "a.ply", FIELD, dtype, most)
-    read = read_gaussian_file(tmp_path / "a.ply")
-    check(
-        dict(read.sanitised.gaussians),
-        {"means": 0, "scales": 0, "quats": 1e-6, "features_dc": 0.002, "opacities": 1e-6},
-    )
-    assert read.in_model_frame
+    sanitised, marks = read_gaussian_file(tmp_path / "a.ply")
+    check(dict(sanitised.gaussians), {"means": 0, "scales": 0, "quats": 1e-6, "features_dc": 0.002, "opacities": 1e-6})
+    assert marks.in_model_frame
 
 
 def test_gsplat(tmp_path: Path) -> None:

@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 import gzip
+import json
 import re
 import shutil
 import subprocess
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import hypothesis.strategies as st
 import pytest
 import torch
-from foreign_files import small_field
+from foreign_files import small_field, write_gsplat
 from hypothesis import HealthCheck, given, settings
+from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sundae_ns.core.errors import CheckpointError, ConfigError, DataError
-from sundae_ns.core.gaussians import Gaussians
+import sundae_ns as sn
+from sundae_ns.core.errors import CheckpointError, DataError
+from sundae_ns.core.gaussians import Gaussians, sh_degree
 from sundae_ns.io.accounting import bytes_of, bytes_of_module
-from sundae_ns.io.formats import ANTIALIASED, FORMATS, kind_of, read_gaussian_file, refuse, write_for_viewers
+from sundae_ns.io.formats import FORMATS, kind_of, read_gaussian_file, read_gaussians, refuse, write_for_viewers
 from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
-from sundae_ns.io.ply import read_ply, write_ply
-from sundae_ns.io.spz import fractional_bits
+from sundae_ns.io.ply import Marks, keep_vertices, read_ply, read_point_cloud, write_ply
+from sundae_ns.io.spz import clamped, fractional_bits
 from sundae_ns.rasterize.reference import harmonic_basis
 
 PROGRAM = shutil.which("splat-transform")
@@ -60,10 +65,10 @@ def check(params: dict[str, Tensor], truth: dict[str, Tensor], kind: str) -> Non
 def test_what_is_written_is_read(tmp_path: Path, kind: str, n: int, degree: int, marks: tuple[bool, bool]) -> None:
     truth, path = small_field(n, degree), tmp_path / f"a{kind}"
     antialiased, in_model_frame = marks
-    written = write_for_viewers(path, truth, antialiased=antialiased, in_model_frame=in_model_frame)
-    assert written == (n, 0, degree, 0, False, path.stat().st_size)
-    read = read_gaussian_file(path)
-    check(dict(read.sanitised.gaussians), truth, kind)
+    written = write_for_viewers(path, truth, Marks(antialiased, in_model_frame))
+    assert len(written["means"]) == n
+    sanitised, read = read_gaussian_file(path)
+    check(dict(sanitised.gaussians), truth, kind)
     assert read.antialiased == antialiased
     assert read.in_model_frame == (in_model_frame and kind in (".ply", ".glb"))
 
@@ -82,11 +87,11 @@ def test_equal_fields_give_equal_bytes(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize(("degree", "antialiased"), [(3, True), (0, False)])
 def test_another_program_reads_the_same_scene(tmp_path: Path, kind: str, degree: int, antialiased: bool) -> None:
     truth, file, back = small_field(300, degree), tmp_path / f"a{kind}", tmp_path / "back.ply"
-    write_for_viewers(file, truth, antialiased=antialiased)
+    write_for_viewers(file, truth, Marks(antialiased))
     subprocess.run([str(PROGRAM), "--quiet", str(file), str(back)], check=True, capture_output=True, timeout=120)
-    read = read_gaussian_file(back)
-    check(dict(read.sanitised.gaussians), truth, kind)
-    assert read.antialiased == antialiased
+    sanitised, marks = read_gaussian_file(back)
+    check(dict(sanitised.gaussians), truth, kind)
+    assert marks.antialiased == antialiased
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -96,13 +101,13 @@ def test_primitives_that_are_not_finite_are_dropped(tmp_path: Path, kind: str) -
     gaussians["scales"][7, 1] = torch.inf
     gaussians["scales"][9, 1] = -torch.inf  # a flat Gaussian
     written = write_for_viewers(tmp_path / f"a{kind}", gaussians)
-    assert (written.primitives, written.dropped) == (298, 2)
+    assert len(written["means"]) == 298
 
 
 @pytest.mark.parametrize(("kind", "degree"), [(".ply", 4), (".spz", 3), (".sog", 3), (".glb", 3)])
 def test_sh_degree_4_is_cut_to_the_format(tmp_path: Path, kind: str, degree: int) -> None:
     written = write_for_viewers(tmp_path / f"a{kind}", small_field(30, 4))
-    assert (written.degree, written.cut) == (degree, degree == 3)
+    assert sh_degree(written["features_rest"]) == degree
 
 
 def test_colours_of_models_of_sh_degree_0(tmp_path: Path) -> None:
@@ -112,13 +117,91 @@ def test_colours_of_models_of_sh_degree_0(tmp_path: Path) -> None:
     torch.testing.assert_close(colors, gaussians["features_dc"].sigmoid(), rtol=0, atol=1e-6)
 
 
+def write_survey(path: Path, far: float) -> Tensor:
+    """Write a .ply with centres in double, 50 units around a place far away; returns them."""
+    means = far + 50 * torch.rand(300, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    write_ply(path, small_field())
+    rows = PlyData.read(str(path), mmap=False)["vertex"].data
+    kinds = [(name, "<f8" if name in "xyz" else "<f4") for name in rows.dtype.names]
+    rows = rows.astype(kinds)
+    for i, name in enumerate("xyz"):
+        rows[name] = means[:, i].numpy()
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
+    return means
+
+
+@pytest.mark.parametrize("kind", [*FORMATS, ".sundae"])
+def test_survey_coordinates_are_moved_stated_and_kept(
+    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    truth = write_survey(tmp_path / "a.ply", 4e6)
+    scene = sn.load(tmp_path / "a.ply")
+    assert "lies where float32 is too coarse; its coordinates are less 4000032 " in caplog.text
+    offset = -torch.tensor(scene.meta["frame"]["transform"], dtype=torch.float64)[:, 3]
+    torch.testing.assert_close(scene.gaussians["means"].double() + offset, truth, rtol=0, atol=2e-6)
+    sn.save(scene, tmp_path / f"b{kind}")
+    back = sn.load(tmp_path / f"b{kind}")
+    error = torch.cdist(scene.gaussians["means"].double(), back.gaussians["means"].double()).amin(dim=1).max()
+    assert error < {".ply": 1e-9, ".glb": 1e-5, ".spz": 1e-5}.get(kind, 0.01)
+    if kind in (".ply", ".sundae"):
+        assert back.meta["frame"] == scene.meta["frame"]
+        assert not back.in_model_frame
+    # Cameras of the survey see the moved scene, and rows of the file keep their doubles.
+    camera = {"fl_x": 50, "fl_y": 50, "cx": 32, "cy": 24, "w": 64, "h": 48}
+    pose = [[1, 0, 0, 4e6 + 1], [0, 1, 0, 4e6], [0, 0, 1, 4e6], [0, 0, 0, 1]]
+    (tmp_path / "c.json").write_text(json.dumps({**camera, "frames": [{"transform_matrix": pose}]}))
+    assert sn.cameras_of(tmp_path / "c.json", back if kind == ".sundae" else scene)[0].center[0] == 4e6 + 1 - offset[0]
+
+
+def test_pruned_rows_of_a_survey_are_its_own_coordinates(tmp_path: Path) -> None:
+    truth, mask = write_survey(tmp_path / "a.ply", 5e5), torch.arange(300) < 200
+    moved, _ = read_gaussian_file(tmp_path / "a.ply")
+    keep_vertices(tmp_path / "a.ply", tmp_path / "b.ply", mask, moved.gaussians.rows(mask))
+    means = read_point_cloud(tmp_path / "b.ply", precise=True)[0]
+    torch.testing.assert_close(means, truth[mask], rtol=0, atol=2e-6)
+    warm, in_model_frame = read_gaussians(tmp_path / "a.ply")
+    torch.testing.assert_close(warm["means"], truth, rtol=0, atol=2e-6)
+    assert not in_model_frame
+
+
+def test_up_is_stated_else_by_convention_and_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_ply(tmp_path / "a.ply", small_field(), comments=["Vertical axis: 3 0 4"])
+    stated = sn.load(tmp_path / "a.ply")
+    assert stated.up == (0.6, 0.0, 0.8)
+    assert not caplog.messages
+    for kind in (".ply", ".sundae"):
+        sn.save(stated, tmp_path / f"b{kind}")
+        assert sn.load(tmp_path / f"b{kind}").up == (0.6, 0.0, 0.8)
+    write_ply(tmp_path / "c.ply", small_field())
+    assert sn.load(tmp_path / "c.ply").up == (0, -1, 0)
+    (line,) = caplog.messages
+    assert line.endswith("c.ply states no upward direction; it is 0 -1 0, as files of its kind have")
+    write_gsplat(tmp_path / "d.pt", small_field())
+    assert sn.load(tmp_path / "d.pt").up == (0, 0, 1)
+    sn.save(replace(stated, in_model_frame=True, up=None), tmp_path / "e.ply", upright=True)
+    assert sn.load(tmp_path / "e.ply").up == (0, -1, 0)
+    for in_model_frame, up in ((False, (0, -1, 0)), (True, (0, 0, 1))):
+        write_for_viewers(tmp_path / "f.glb", small_field(), Marks(in_model_frame=in_model_frame))
+        assert sn.load(tmp_path / "f.glb").up == up
+
+
+@pytest.mark.parametrize("name", ["features_dc", "scales", "opacities"])
+@pytest.mark.parametrize("kind", [*FORMATS, ".sundae"])
+def test_what_cannot_be_loaded_is_not_saved(tmp_path: Path, kind: str, name: str) -> None:
+    gaussians, path = small_field(), tmp_path / f"a{kind}"
+    gaussians[name] *= 1e37
+    with suppress(sn.SundaeError):
+        sn.save(sn.Scene(Gaussians(gaussians)), path)
+    assert not path.exists() or sn.load(path).num_gaussians == 300
+
+
 def test_upright_rotates_z_to_minus_y(tmp_path: Path) -> None:
     gaussians = small_field()
     gaussians["means"][0] = torch.tensor([1.0, 2.0, 3.0])
     write_for_viewers(tmp_path / "b.ply", gaussians, upright=True)
-    read = read_gaussian_file(tmp_path / "b.ply")
-    assert not read.in_model_frame
-    turned = read.sanitised.gaussians
+    sanitised, marks = read_gaussian_file(tmp_path / "b.ply")
+    assert marks == Marks(up=(0.0, -1.0, 0.0))
+    turned = sanitised.gaussians
     torch.testing.assert_close(turned["means"][0], torch.tensor([1.0, -3.0, 2.0]))
     # SH rotate, too: from above, along +z before and -y after, the colours are the same.
     above, turned_above = (harmonic_basis(1, torch.tensor([d]))[0, 1:] for d in ([0.0, 0.0, 1.0], [0.0, -1.0, 0.0]))
@@ -129,7 +212,6 @@ def test_upright_rotates_z_to_minus_y(tmp_path: Path) -> None:
 
 BAD = {"opacities": torch.zeros(300)}, {"features_rest": torch.zeros(300, 4, 3)}
 REFUSED: list[tuple[str, dict[str, Tensor], type[Exception], str]] = [
-    ("a.splat", {}, ConfigError, "name it .ply or .spz or .sog or .glb"),
     *((f"a{kind}", change, DataError, "has shape") for kind in FORMATS for change in BAD),
     *((f"a{kind}", {"means": torch.full((300, 3), torch.nan)}, DataError, "no Gaussians") for kind in FORMATS[1:]),
     ("a.spz", {"means": torch.full((300, 3), 1e5)}, DataError, "1e+05 from the origin"),
@@ -156,14 +238,14 @@ def test_positions_of_a_spz_get_as_many_bits_as_fit(tmp_path: Path, farthest: fl
     write_for_viewers(tmp_path / "a.spz", gaussians)
     raw = gzip.decompress((tmp_path / "a.spz").read_bytes())
     assert len(raw) == 16 + 50 * (9 + 1 + 3 + 3 + 4 + 9)
-    means = read_gaussian_file(tmp_path / "a.spz").sanitised.gaussians["means"]
+    means = read_gaussian_file(tmp_path / "a.spz")[0].gaussians["means"]
     assert (means - gaussians["means"]).abs().max() <= 2.0 ** -(bits + 1) + 1e-7
 
 
 def test_values_beyond_the_range_of_a_spz_are_counted(tmp_path: Path) -> None:
     gaussians = small_field()
     gaussians["scales"][0, 0], gaussians["features_dc"][1, 2], gaussians["features_rest"][2, 0, 0] = 7.0, 4.0, -1.5
-    assert write_for_viewers(tmp_path / "a.spz", gaussians).clamped == 3
+    assert clamped(write_for_viewers(tmp_path / "a.spz", gaussians)) == 3
 
 
 @pytest.mark.parametrize("kind", [".spz", ".sog", ".glb"])
@@ -173,7 +255,7 @@ def test_zero_quaternions_become_the_identity(tmp_path: Path, kind: str) -> None
     gaussians["quats"][0] = 0
     write_for_viewers(tmp_path / f"a{kind}", gaussians)
     quats = matched(
-        dict(read_gaussian_file(tmp_path / f"a{kind}").sanitised.gaussians), {**gaussians, "quats": torch.ones(3, 4)}
+        dict(read_gaussian_file(tmp_path / f"a{kind}")[0].gaussians), {**gaussians, "quats": torch.ones(3, 4)}
     )
     torch.testing.assert_close(quats["quats"][0].abs(), torch.tensor([1.0, 0, 0, 0]), rtol=0, atol=0.006)
 
@@ -192,11 +274,6 @@ def test_kinds_follow_from_first_bytes(tmp_path: Path) -> None:
         refuse(tmp_path / "points.sundae", packed="unpack it", primitives="give a run")
     refuse(tmp_path / "points.sundae", packed="unpack it")
     refuse(tmp_path / "word.ply", packed="unpack it", primitives="give a run")
-
-
-def test_the_mark_of_antialiased_scenes(tmp_path: Path) -> None:
-    write_for_viewers(tmp_path / "a.PLY", small_field(), antialiased=True)
-    assert f"comment {ANTIALIASED}".encode() in (tmp_path / "a.PLY").read_bytes()
 
 
 def test_bytes_of_fields_and_modules() -> None:

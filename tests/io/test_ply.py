@@ -18,8 +18,18 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.gaussians import SPLAT_NAMES
-from sundae_ns.io.ply import MODEL_FRAME, is_nerfstudio_ply, ply_comments, read_ply, read_point_cloud, write_ply
+from sundae_ns.core.gaussians import SPLAT_NAMES, sanitise
+from sundae_ns.io.formats import read_gaussian_file
+from sundae_ns.io.ply import (
+    MODEL_FRAME,
+    Marks,
+    comments_of,
+    keep_vertices,
+    ply_marks,
+    read_ply,
+    read_point_cloud,
+    write_ply,
+)
 
 XYZ = np.array([[0.5, -1.25, 2.0], [3.0, 4.0, -5.5]], np.float32)
 RGB = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
@@ -87,39 +97,130 @@ def test_same_vertices_as_nerfstudio_exports(tmp_path: Path, monkeypatch: pytest
     ours, theirs = (rows_of(tmp_path / name) for name in ("ours.ply", "splat.ply"))
     assert ours.dtype == theirs.dtype
     assert ours.tobytes() == theirs.tobytes()
-    assert is_nerfstudio_ply(tmp_path / "splat.ply")
-    assert not is_nerfstudio_ply(tmp_path / "ours.ply")
+    assert ply_marks(tmp_path / "splat.ply") == Marks(in_model_frame=True, up=(0.0, 0.0, 1.0))
+    assert ply_marks(tmp_path / "ours.ply") == Marks()
 
 
-def test_other_properties_types_and_orders_are_read(tmp_path: Path) -> None:
-    params = small_field(4)
-    write_ply(tmp_path / "a.ply", params)
-    rows = rows_of(tmp_path / "a.ply")
+def _big_endian_doubles(path: Path) -> None:
+    rows = rows_of(path)
     columns = {name: rows[name].astype(">f8") for name in sorted(rows.dtype.names or (), reverse=True)}
-    write_rows(tmp_path / "b.ply", {"segment": np.zeros(4, "<i4"), **columns}, byte_order=">")
-    back = read_ply(tmp_path / "b.ply")
-    assert all(torch.equal(back[name], params[name]) for name in SPLAT_NAMES)
+    write_rows(
+        path, {"segment": np.zeros(len(rows), "<i4"), "semantic_0": np.ones(len(rows)), **columns}, byte_order=">"
+    )
 
 
-def test_harmonics_come_before_colours(tmp_path: Path) -> None:
-    """Some programs write both, the colours for viewers of points."""
-    write_ply(tmp_path / "a.ply", small_field())
-    content = (tmp_path / "a.ply").read_bytes()
-    (tmp_path / "b.ply").write_bytes(content.replace(b"nx", b"red", 1).replace(b"ny", b"green").replace(b"nz", b"blue"))
-    assert torch.equal(read_ply(tmp_path / "b.ply")["features_dc"], small_field()["features_dc"])
+def _header(old: bytes, new: bytes, newline: bytes = b"\n") -> Callable[[Path], object]:
+    def change(path: Path) -> None:
+        header, end, rows = path.read_bytes().partition(b"end_header\n")
+        assert old in header + end
+        path.write_bytes((header + end).replace(old, new, 1).replace(b"\n", newline) + rows + bytes(9))
+
+    return change
 
 
-@pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
-def test_a_header_with_other_letters(tmp_path: Path, newline: bytes) -> None:
-    params = small_field()
-    write_ply(tmp_path / "a.ply", params)
-    header, end, rows = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
-    comment = "comment Aufnahme: Küche, 東京, end_header\n".encode()
-    changed = header.replace(b"element", comment + b"comment \xff\xe9\nelement", 1) + end
-    (tmp_path / "b.ply").write_bytes(changed.replace(b"\n", newline) + rows)
-    values = read_ply(tmp_path / "b.ply")
+def _text(path: Path) -> None:
+    data = PlyData.read(str(path), mmap=False)
+    data.text = True
+    data.write(str(path))
+
+
+def _faces(path: Path) -> None:
+    corners = np.empty(2, [("vertex_indices", "O")])
+    corners["vertex_indices"] = [np.arange(3, dtype=np.int32)] * 2
+    PlyData([PlyElement.describe(rows_of(path), "vertex"), PlyElement.describe(corners, "face")]).write(str(path))
+
+
+COMMENT = "comment Küche, 東京, end_header\n".encode() + b"comment \xff\xe9\nelement"
+SAME: dict[str, Callable[[Path], object]] = {
+    "more properties, doubles, another order": _big_endian_doubles,
+    "text": _text,
+    "faces": _faces,
+    "no faces": _header(b"end_header", b"element face 0\nproperty list uchar uint vertex_indices\nend_header"),
+    "no faces first": _header(b"element", b"element face 0\nproperty list uchar uint vertex_indices\nelement"),
+    "harmonics and colours": _header(
+        b"nx\nproperty float ny\nproperty float nz", b"red\nproperty float green\nproperty float blue"
+    ),
+    "other letters": _header(b"element", COMMENT),
+    "lines of DOS": _header(b"element", COMMENT, b"\r\n"),
+    "lines of old Macs": _header(b"element", COMMENT, b"\r"),
+}
+
+
+@pytest.mark.parametrize("form", SAME)
+def test_other_forms_are_the_same_gaussians(tmp_path: Path, form: str) -> None:
+    params, path = small_field(9), tmp_path / "a.ply"
+    write_ply(path, params)
+    SAME[form](path)
+    values = read_gaussian_file(path)[0].gaussians
     assert all(torch.equal(values[name], params[name]) for name in SPLAT_NAMES)
-    assert ply_comments(tmp_path / "b.ply")[0] == "Aufnahme: Küche, 東京, end_header"
+    assert torch.equal(read_point_cloud(path)[0], params["means"])
+
+
+def test_the_filter_of_mip_splatting_is_fused_and_never_stale(tmp_path: Path) -> None:
+    """As its ``get_scaling_with_3D_filter`` and ``get_opacity_with_3D_filter``."""
+    params, path, n = small_field(9), tmp_path / "a.ply", 9
+    write_ply(path, params)
+    rows, widths = rows_of(path), np.linspace(0, 0.3, n, dtype=np.float32)
+    write_rows(path, {**{name: rows[name] for name in rows.dtype.names or ()}, "filter_3D": widths})
+    read = read_ply(path)
+    before, width = params["scales"].exp().square(), torch.from_numpy(widths)[:, None].square()
+    torch.testing.assert_close(read["scales"].exp(), (before + width).sqrt(), rtol=1e-6, atol=0)
+    share = (before.prod(dim=1) / (before + width).prod(dim=1)).sqrt()[:, None]
+    torch.testing.assert_close(read["opacities"].sigmoid(), params["opacities"].sigmoid() * share, rtol=1e-5, atol=0)
+    assert torch.equal(read["opacities"][0], params["opacities"][0])
+    mask = torch.arange(n) > 4
+    keep_vertices(path, tmp_path / "copied.ply", mask)
+    keep_vertices(path, tmp_path / "merged.ply", mask, {name: value[mask] for name, value in read.items()})
+    for name in ("copied.ply", "merged.ply"):
+        for key, value in read_ply(tmp_path / name).items():
+            torch.testing.assert_close(value, read[key][mask], rtol=1e-6, atol=1e-6)
+    assert rows_of(tmp_path / "merged.ply")["filter_3D"].tolist() == [0] * 4
+
+
+def test_2dgs_is_flat_and_opacities_of_bytes_are_shares(tmp_path: Path) -> None:
+    params, path = small_field(5), tmp_path / "a.ply"
+    write_ply(path, params)
+    _without("scale_2")(path)
+    rows = rows_of(path)
+    shares = np.array([0, 51, 102, 204, 255], np.uint8)
+    write_rows(path, {**{name: rows[name] for name in rows.dtype.names or ()}, "opacity": shares})
+    read = sanitise(read_ply(path))
+    assert (read.flat, read.dropped) == (5, 0)
+    assert torch.equal(read.gaussians["scales"][:, :2], params["scales"][:, :2])
+    torch.testing.assert_close(
+        read.gaussians["opacities"].sigmoid()[:, 0], torch.tensor([0, 0.2, 0.4, 0.8, 1]), atol=2e-6, rtol=0
+    )
+
+
+@pytest.mark.parametrize(
+    ("comments", "marks"),
+    [
+        (["SplatRenderMode: mip"], Marks(antialiased=True)),
+        (["  SPLATRENDERMODE:  MIP  "], Marks(antialiased=True)),
+        (["antialiased 1"], Marks(antialiased=True)),
+        (["train_flags antialiasing"], Marks(antialiased=True)),
+        (["antialiased 1", "SplatRenderMode: default"], Marks()),
+        (["SplatRenderMode: default", "Antialiased 1"], Marks(antialiased=True)),
+        (["antialiased 0", "SplatRenderMode: 2dgs", "antialiased edges are nice"], Marks()),
+        (["Vertical axis: 0 -2 0"], Marks(up=(0.0, -1.0, 0.0))),
+        (["vertical AXIS: 3, 0, 4"], Marks(up=(0.6, 0.0, 0.8))),
+        (["Vertical Axis: z"], Marks(up=(0.0, 0.0, 1.0))),
+        (["Vertical axis: -y"], Marks(up=(0.0, -1.0, 0.0))),
+        (["Exported from Brush", "Vertical axis: y"], Marks(up=(0.0, -1.0, 0.0))),
+        (["Vertical axis: 0 0 0", "Vertical axis of a column", "Offset: nan 0 0"], Marks()),
+        (["Vertical axis: up"], Marks()),
+        (["first", MODEL_FRAME], Marks(in_model_frame=True)),
+        (["Generated by Nerstudio 1.1.5"], Marks(in_model_frame=True)),
+        ([f"not {MODEL_FRAME}"], Marks()),
+        (
+            comments_of(Marks(True, True, (0.6, 0.0, 0.8), (1e6 / 3, 0.1, -4e6))),
+            Marks(True, True, (0.6, 0.0, 0.8), (1e6 / 3, 0.1, -4e6)),
+        ),
+    ],
+)
+def test_marks_of_a_header(tmp_path: Path, comments: list[str], marks: Marks) -> None:
+    write_ply(tmp_path / "a.ply", small_field(3), comments=comments)
+    assert ply_marks(tmp_path / "a.ply") == marks
 
 
 def _without(*names: str) -> Callable[[Path], object]:
@@ -130,16 +231,27 @@ def _without(*names: str) -> Callable[[Path], object]:
     return write
 
 
-def _ascii(path: Path) -> None:
-    data = PlyData.read(str(path), mmap=False)
-    data.text = True
-    data.write(str(path))
+def _with(*names: str, without: str = "") -> Callable[[Path], object]:
+    """With further properties, and without those of a prefix."""
+
+    def write(path: Path) -> None:
+        rows = rows_of(path)
+        columns = {name: rows[name] for name in rows.dtype.names or () if not without or not name.startswith(without)}
+        write_rows(path, {**columns, **dict.fromkeys(names, np.zeros(len(rows), "f4"))})
+
+    return write
+
+
+def _lists(path: Path) -> None:
+    rows = rows_of(path)
+    corners = np.empty(len(rows), "O")
+    corners[:] = [np.arange(3, dtype=np.int32)] * len(rows)
+    write_rows(path, {**{name: rows[name] for name in rows.dtype.names or ()}, "corners": corners})
 
 
 WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "gone": (lambda path: path.unlink(), "cannot be read"),
     "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
-    "ascii": (_ascii, "ascii"),
     "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-5]), "not a complete"),
     "empty": (lambda path: path.write_bytes(b""), "not a complete"),
     "an image": (lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe" * 9), "not a complete"),
@@ -148,7 +260,25 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
         "no vertices",
     ),
     "no opacity": (_without("opacity"), "lacks opacity"),
-    "no scale": (_without("scale_2"), "lacks scale_2"),
+    "no scale": (_without("scale_1", "scale_2"), "lacks scale_1, scale_2"),
+    "2DGS without rotations": (_without("scale_2", "rot_0"), "lacks scale_2, rot_0"),
+    "Spacetime Gaussians": (_with("trbf_center", "motion_0"), "holds 4D Gaussians"),
+    "4D Gaussians with a time": (_with("t"), "holds 4D Gaussians"),
+    "Brush's 4D": (_header(b"end_header", b"element delta_vertex_0 0\nproperty uchar x\nend_header"), "holds 4D"),
+    "Scaffold-GS": (
+        _with("f_offset_0", "f_anchor_feat_0", without="f_"),
+        "a network for its colours .f_anchor_feat_0.",
+    ),
+    "features for colours": (_with("color_feature_0", without="f_"), "a network for its colours"),
+    "lists": (_lists, "property corners of each vertex .* is a list"),
+    "lists before": (
+        _header(b"element", b"element face 1\nproperty list uchar uint vertex_indices\nelement"),
+        "each face",
+    ),
+    "text that is too short": (
+        lambda path: (_text(path), path.write_bytes(path.read_bytes()[:-400])),
+        "it has 6|columns",
+    ),
     "no last coefficient": (_without("f_rest_8"), "8 f_rest"),
     "no first coefficient": (_without("f_rest_0"), "8 f_rest"),
     "no blue coefficients": (_without("f_rest_6", "f_rest_7", "f_rest_8"), "6 f_rest"),
@@ -164,37 +294,6 @@ def test_wrong_files_are_refused_in_one_line(tmp_path: Path, wrong: str) -> None
     with pytest.raises(DataError, match=cause) as caught:
         read_ply(path)
     assert "\n" not in str(caught.value)
-
-
-def _lists(path: Path, element: str) -> None:
-    """Give the vertices, or another element, a list property."""
-    rows = rows_of(path).copy()
-    corners = np.empty(len(rows), [("corners", "O")])
-    corners["corners"] = [np.arange(3, dtype=np.int32)] * len(rows)
-    if element == "vertex":
-        write_rows(path, {**{name: rows[name] for name in rows.dtype.names or ()}, "corners": corners["corners"]})
-    else:
-        elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(corners, element)]
-        PlyData(elements).write(str(path))
-
-
-@pytest.mark.parametrize("kind", ["vertex", "face", "ascii"])
-def test_what_is_read_row_by_row_is_refused_by_the_header(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
-    path = tmp_path / "a.ply"
-    write_ply(path, small_field(7))
-    _ascii(path) if kind == "ascii" else _lists(path, kind)
-    if kind == "face":  # of points, they are ignored
-        assert torch.equal(read_point_cloud(path)[0], small_field(7)["means"])
-    monkeypatch.setattr(PlyData, "read", lambda *_: pytest.fail("the rows were read"))
-    with pytest.raises(
-        DataError, match="ascii" if kind == "ascii" else f"property corners of each {kind} .* is a list"
-    ):
-        read_ply(path)
-    if kind == "vertex":
-        with pytest.raises(DataError, match="is a list"):
-            read_point_cloud(path)
 
 
 # -------------------------------------------------------------------------------------------------------------- points
@@ -246,36 +345,9 @@ def test_precise_positions(tmp_path: Path) -> None:
     assert read_point_cloud(tmp_path / "a.ply", precise=True)[0].tolist() == [far]
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_a_cloud_with_a_comment_in_utf_8(tmp_path: Path, text: bool) -> None:
-    points_and_colors(tmp_path / "a.ply", RGB, text=text)
-    content = (tmp_path / "a.ply").read_bytes().replace(b"element", "comment Küche 東京\nelement".encode(), 1)
-    (tmp_path / "b.ply").write_bytes(content)
-    points, colors = read_point_cloud(tmp_path / "b.ply")
-    assert (points.tolist(), colors.tolist()) == (XYZ.tolist(), RGB.tolist())
-
-
 def test_files_without_points_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="cannot be read"):
         read_point_cloud(tmp_path / "gone.ply")
     write_rows(tmp_path / "a.ply", {"x": np.zeros(2), "y": np.zeros(2)})
     with pytest.raises(DataError, match="without x, y and z"):
         read_point_cloud(tmp_path / "a.ply")
-
-
-@pytest.mark.parametrize(
-    ("lines", "in_model_frame"),
-    [
-        (("ply", "comment first", f"comment {MODEL_FRAME}"), True),
-        (("ply", "comment Generated by Nerstudio 1.1.5"), True),
-        (("ply",), False),
-        (("ply", f"comment not {MODEL_FRAME}"), False),
-        (("txt", f"comment {MODEL_FRAME}"), False),
-        (None, False),
-    ],
-)
-def test_frame_of_the_coordinates(tmp_path: Path, lines: tuple[str, ...] | None, in_model_frame: bool) -> None:
-    if lines is not None:
-        content = [lines[0], "format binary_little_endian 1.0", *lines[1:], "element vertex 0", "end_header", ""]
-        (tmp_path / "a.ply").write_text("\n".join(content))
-    assert is_nerfstudio_ply(tmp_path / "a.ply") is in_model_frame

@@ -1,4 +1,4 @@
-"""A transformed field, rendered from the transformed camera, gives the same image up to rounding."""
+"""Transformed fields give the same images from transformed cameras; survey coordinates; which way is up."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.io.coordinates import rotate_spherical_harmonics, similarity
+from sundae_ns.io.coordinates import recentred, rotate_spherical_harmonics, similarity, upward
 from sundae_ns.rasterize.interface import rasterize, select_backend, spherical_harmonics
 from sundae_ns.rasterize.reference import ReferenceBackend
 from sundae_ns.rasterize.types import Inputs
@@ -117,3 +117,60 @@ def test_there_and_back_in_float32() -> None:
     back["quats"] = back["quats"] * (back["quats"] * params["quats"]).sum(dim=1, keepdim=True).sign()
     for name, value in params.items():
         torch.testing.assert_close(back[name], value, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("far", [5e5, -4e6, 3e12])
+def test_survey_coordinates_are_moved_without_loss(far: float) -> None:
+    means = far + 50 * torch.rand(100, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    means[3, 1] = torch.nan
+    moved, offset = recentred(means)
+    assert offset is not None
+    assert moved.dtype == torch.float32
+    whole = moved.double() + torch.tensor(offset, dtype=torch.float64)
+    torch.testing.assert_close(whole, means, rtol=0, atol=abs(far) * 2.0**-53 + 2e-6, equal_nan=True)
+    # A capture's own transform leads back to the origin before anything is rounded.
+    back = torch.cat([torch.eye(3), -torch.tensor(offset, dtype=torch.float64)[:, None]], dim=1)
+    assert torch.equal(similarity({**gaussians(n=100), "means": whole}, back, 1.0)["means"][4:].float(), moved[4:])
+
+
+@pytest.mark.parametrize(
+    "means", [torch.rand(50, 3) + 9, torch.full((5, 3), 9e9), torch.zeros(0, 3), torch.rand(9, 3) / 0]
+)
+def test_other_coordinates_stay(means: Tensor) -> None:
+    moved, offset = recentred(means.double())
+    assert offset is None
+    assert torch.equal(moved, means)
+
+
+Y_DOWN, Z, Y = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
+
+
+def ground(up: tuple[float, float, float], share: float) -> Tensor:
+    """Centres of which a share lies on the ground, and the others up to half its width above it."""
+    axis = torch.nn.functional.normalize(torch.tensor(up), dim=0)
+    side = torch.nn.functional.normalize(torch.linalg.cross(axis, torch.tensor([1.0, 0.2, 0.3])), dim=0)
+    values = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0))
+    heights = torch.where(torch.arange(4000) < share * 4000, 0.004 * values[:, 2], 0.05 + values[:, 2])
+    turn = torch.stack([side, torch.linalg.cross(axis, side), axis])
+    return torch.cat([2 * values[:, :2] - 1, heights[:, None]], dim=1) @ turn
+
+
+@pytest.mark.parametrize(
+    ("up", "share", "found"),
+    [
+        (Y_DOWN, 0.3, Y_DOWN),
+        ((0.0, -0.9, 0.43), 0.3, (0.0, -0.9, 0.43)),  # a first camera that looks down
+        (Z, 0.5, Z),
+        (Y, 0.5, Y),
+        (Z, 0.3, Y_DOWN),  # a wall may be as large
+        ((1.0, 0.0, 0.0), 0.6, Y_DOWN),
+        (Z, 0.0, Y_DOWN),
+    ],
+)
+def test_up_is_that_of_the_ground_else_by_convention(
+    up: tuple[float, float, float], share: float, found: tuple[float, float, float]
+) -> None:
+    direction, shown = upward(ground(up, share), Y_DOWN)
+    assert torch.tensor(direction) @ torch.nn.functional.normalize(torch.tensor(found), dim=0) > 0.998
+    assert shown == (up == found)
+    assert upward(ground(Z, 0.5)[:50], Y_DOWN) == (Y_DOWN, False)
