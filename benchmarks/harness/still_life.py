@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
-from sundae_ns.data.demo_capture import write_demo_capture
+from sundae_ns.data.capture_files import write_demo_capture
 
 
 def write_still_life(

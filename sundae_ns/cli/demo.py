@@ -17,7 +17,7 @@ from sundae_ns.core.errors import writing
 from sundae_ns.core.files import write_bytes, write_text
 from sundae_ns.core.metrics import Lpips
 from sundae_ns.core.tables import number, table
-from sundae_ns.data.demo_capture import write_demo_capture
+from sundae_ns.data.capture_files import write_demo_capture
 from sundae_ns.io.run_folder import prunes_of
 
 METHOD = "sundae-tiny"

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from sundae_ns.data.capture_files import Placed
 
 
+_warn = partial(print, "# warning:", flush=True)
+
+
 @dataclass(frozen=True)
 class PoseOptions:
     """How poses are found."""
@@ -63,7 +66,7 @@ def poses(
 
     pycolmap()
     request = Request(photos, out, options.matching, options.frames, masks)
-    placed = _interruptible(lambda: find_poses(request, _report), request.work)
+    placed = _interruptible(lambda: find_poses(request, _report, _warn), request.work)
     cameras = "1 camera" if placed.cameras == 1 else f"{placed.cameras} cameras"
     counts = f"{len(placed.placed):,} of {placed.total:,} photos have a pose, of {cameras}"
     print(f"{out}: {counts}; mean reprojection error {placed.error:.2f} px")
@@ -79,10 +82,7 @@ def poses(
 
 
 def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool = True) -> Path | None:
-    """Check photos or a video by headers; the folder of masks, with ``remarks`` by default one beside the photos.
-
-    ``remarks`` prints what is left out.
-    """
+    """Check photos or a video by headers, print ``remarks``; the folder of masks, by default one beside the photos."""
     from sundae_ns.data.photos import LEAST_PHOTOS, find_photos, left_out, masks_beside, masks_of
     from sundae_ns.data.reconstruct import check_installed
     from sundae_ns.data.video import SUFFIXES, check_video, is_video
@@ -100,20 +100,18 @@ def check_poses(photos: Path, frames: int, masks: Path | None, *, remarks: bool 
         return None
     if photos.is_file():
         raise DataError(f"{photos} is neither a folder of photos nor a video ({', '.join(SUFFIXES)})")
-    files = find_photos(photos)
+    warn: Callable[[str], object] = _warn if remarks else str
+    files = find_photos(photos, warn)
     if masks is not None:
         masks_of(files, masks)
-    if not remarks:
-        return masks
-    warnings = [left_out(photos)]
+    if (remark := left_out(photos)) is not None:
+        warn(remark)
     if masks is None and (beside := masks_beside(photos)) is not None:
         try:
             masks_of(files, beside)
             masks = beside
         except DataError as error:
-            warnings.append(f"{beside} is left out: {error}")
-    for warning in filter(None, warnings):
-        print(f"# warning: {warning}", flush=True)
+            warn(f"{beside} is left out: {error}")
     return masks
 
 
@@ -144,5 +142,5 @@ def _interruptible(work: Callable[[], Placed], folder: Path) -> Placed:
     except (SundaeError, OSError):
         raise
     except BaseException as error:
-        cause = one_line(error)
-        raise DataError(f"COLMAP failed ({cause}); remove {quoted(folder)} and start again, or report it") from error
+        remedy = f"remove {quoted(folder)} and start again, or report it"
+        raise DataError(f"COLMAP failed ({one_line(error)}); {remedy}") from error

@@ -1,8 +1,4 @@
-"""Checks of a capture before it is parsed: ``transforms.json`` and the headers of its images.
-
-nerfstudio's parsers assume a well-formed capture; on any other they raise an assertion or train on NaN. These functions
-read text and image headers, no pixels.
-"""
+"""Checks of a ``transforms.json`` before nerfstudio parses it, which raises assertions or trains on NaN."""
 
 from __future__ import annotations
 
@@ -16,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
-from sundae_ns.core.errors import DataError, one_line, reading, regular
+from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.data.lenses import DISTORTION, FISHEYE624, INTRINSICS, kind_of_model, lens_of, with_focal_lengths
 
 _MAX_SIDE = 65535  # pixels: JPEG's limit
@@ -28,11 +23,11 @@ _LARGEST = 1e12  # its square must stay in the range of float32
 def finite(value: Any, name: str, where: str, *, positive: bool = False) -> float:
     """``value`` as a float; ``DataError`` if it is no number, not finite, too large, or not positive if asked."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise DataError(f"{where}: {name} is {_short(value)}; it must be a number")
+        raise DataError(f"{where}: {name} is {value!r:.80}; it must be a number")
     if not abs(value) <= _LARGEST:
-        raise DataError(f"{where}: {name} is {_short(value)}; it must be finite and at most {_LARGEST:g}")
+        raise DataError(f"{where}: {name} is {value!r:.80}; it must be finite and at most {_LARGEST:g}")
     if positive and not value > 1e-6:
-        raise DataError(f"{where}: {name} is {_short(value)}; it must be positive")
+        raise DataError(f"{where}: {name} is {value!r:.80}; it must be positive")
     return float(value)
 
 
@@ -40,9 +35,7 @@ def side(value: Any, name: str, where: str) -> int:
     """``value`` as the side of an image in pixels; ``DataError`` unless it is a whole number from 1 to 65,535."""
     length = finite(value, name, where)
     if length != int(length) or not 1 <= length <= _MAX_SIDE:
-        raise DataError(
-            f"{where}: {name} is {_short(value)}; it must be a whole number of pixels from 1 to {_MAX_SIDE}"
-        )
+        raise DataError(f"{where}: {name} is {value!r:.80}; it must be a whole number of pixels, at most {_MAX_SIDE}")
     return int(length)
 
 
@@ -60,11 +53,7 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
 
 
 def rigid(pose: np.ndarray, where: str) -> np.ndarray:
-    """A camera pose ``[3 or 4, 4]`` without the scale that programs may leave in its rotation.
-
-    Raises:
-        DataError: the axes of the camera differ in length, or are not at right angles.
-    """
+    """A camera pose ``[3 or 4, 4]`` without a scale in its rotation; ``DataError`` if its axes are no rotation."""
     axes = pose[:3, :3]
     scale = abs(float(np.linalg.det(axes))) ** (1 / 3)
     if np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() > 0.1:
@@ -86,15 +75,12 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any]:
-    """Check the ``transforms.json`` of a capture, and its lists of ``splits`` if it has any; returns its contents.
-
-    Raises:
-        DataError: names the first unusable entry, its frame, and what it must be.
-    """
+    """Contents of a ``transforms.json``, after a check with its lists of ``splits``; ``DataError`` names the entry."""
     meta = read_json(path)
     frames = meta.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise DataError(f"{path} lists no frames; a capture needs at least one image with its pose")
+    if not isinstance(frames, list) or len(frames) < 2:
+        count = len(frames) if isinstance(frames, list) else 0
+        raise DataError(f"{path} lists {count} image{'s' * (count != 1)}; training needs 2 or more, with their poses")
     _check_values(meta, path.name)
     meta = with_focal_lengths(meta, path.parent)
     kinds: Counter[str] = Counter()
@@ -103,7 +89,7 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
         if not isinstance(frame, dict):
             raise DataError(f"{where}: it must be an object with file_path and transform_matrix")
         _path(frame.get("file_path"), "file_path", where)
-        where += f" ({_short(frame['file_path'])})"
+        where += f" ({frame['file_path']!r:.80})"
         _check_values({"transform_matrix": None, **frame}, where)
         missing = [key for key in INTRINSICS if key not in meta and key not in frame]
         if missing:
@@ -113,22 +99,28 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> dict[str, Any
         count = sum(key in frame for frame in frames)
         if count not in (0, len(frames)):
             raise DataError(f"{path.name}: {count} of {len(frames)} frames have a {key}; give it in all or in none")
-    if FISHEYE624 in kinds:
-        # nerfstudio makes the masks of such a lens, and reads it with no other kind.
-        radius = meta.get("fisheye_crop_radius")
+    if FISHEYE624 in kinds:  # nerfstudio makes the masks of such a lens, and reads it with no other kind
         counts = ", ".join(f"{count} images with {kind}" for kind, count in sorted(kinds.items()))
-        for wrong, remedy in (
-            (len(kinds) > 1, f"FISHEYE624 cannot be mixed with other lenses ({counts}); undistort the images first"),
-            (
-                not isinstance(radius, float) or not 0 < radius < math.inf,
-                f"fisheye_crop_radius is {_short(radius)}; a FISHEYE624 camera needs it, a positive number of pixels "
-                "with a decimal point",
-            ),
-            ("mask_path" in frames[0], "nerfstudio makes the masks of a FISHEYE624 camera; remove mask_path"),
-        ):
-            if wrong:
-                raise DataError(f"{path.name}: {remedy}")
-    _check_splits(meta, splits, path.name)
+        if len(kinds) > 1:
+            raise DataError(
+                f"{path.name}: FISHEYE624 cannot be mixed with other lenses ({counts}); undistort the images"
+            )
+        _radius(meta.get("fisheye_crop_radius"), "fisheye_crop_radius", path.name)
+        if "mask_path" in frames[0]:
+            raise DataError(f"{path.name}: nerfstudio makes the masks of a FISHEYE624 camera; remove mask_path")
+    listed = [split for split in ("train", "val", "test") if f"{split}_filenames" in meta]
+    known = {str(Path(frame["file_path"])) for frame in frames}
+    for split in splits if listed else ():
+        name = f"{split}_filenames"
+        files = meta.get(name)
+        if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
+            remedy = f"add {name} as a list of paths, or remove all such lists"
+            raise DataError(f"{path.name} lists images for {', '.join(listed)}, but none for {split}; {remedy}")
+        for file in files:
+            if str(Path(file)) not in known:
+                raise DataError(
+                    f"{path.name}: {name} has {file!r:.80}, which no frame has as its file_path; correct it"
+                )
     return meta
 
 
@@ -141,83 +133,50 @@ def _check_values(entries: Mapping[str, Any], where: str) -> None:
 def _must(holds: Callable[[Any], object], requirement: str) -> Callable[[Any, str, str], None]:
     def check(value: Any, name: str, where: str) -> None:
         if not holds(value):
-            raise DataError(f"{where}: {name} is {_short(value)}; it must be {requirement}")
+            raise DataError(f"{where}: {name} is {value!r:.80}; it must be {requirement}")
 
     return check
 
 
-def _distortion(value: Any, name: str, where: str) -> None:
-    if not isinstance(value, list) or len(value) not in (4, 6, 12):
-        raise DataError(f"{where}: {name} must be a list of 4, 6 or 12 numbers")
-    for number in value:
-        finite(number, name, where)
+def _numbers(value: Any) -> bool:
+    numbers = isinstance(value, list) and all(type(number) in (int, float) for number in value)
+    return numbers and len(value) in (4, 6, 12) and all(abs(number) <= _LARGEST for number in value)
 
 
 _path = _must(lambda value: isinstance(value, str) and value and "\0" not in value, "the path of a file")
-_angle = _must(
-    lambda value: type(value) in (int, float) and 0 < value < math.pi, "an angle of view in radians, below pi"
+_angle = _must(lambda value: type(value) in (int, float) and 0 < value < math.pi, "an angle in radians, below pi")
+_radius = _must(
+    lambda value: isinstance(value, float) and 0 < value < math.inf, "a positive number of pixels with a decimal point"
 )
+# The check of each entry of a file or of a frame, called with its value, its name and where it stands.
 _CHECKS: dict[str, Callable[[Any, str, str], Any]] = {
     **dict.fromkeys(("w", "h"), side),
     **dict.fromkeys(("fl_x", "fl_y", "applied_scale"), partial(finite, positive=True)),
     **dict.fromkeys(("cx", "cy", *DISTORTION), finite),
     **dict.fromkeys(("camera_angle_x", "camera_angle_y"), _angle),
     **dict.fromkeys(("mask_path", "depth_file_path", "ply_file_path"), _path),
-    "distortion_params": _distortion,
+    "distortion_params": _must(_numbers, "a list of 4, 6 or 12 finite numbers"),
     "camera_model": lambda value, _, where: kind_of_model(value, where),
     "transform_matrix": lambda value, name, where: rigid(matrix(value, (4,), name, where), where),
     "applied_transform": lambda value, name, where: matrix(value, (3,), name, where),
-    "orientation_override": _must(
-        lambda value: value in ("pca", "up", "vertical", "none"), "pca, up, vertical or none"
-    ),
+    "orientation_override": _must({"pca", "up", "vertical", "none"}.__contains__, "pca, up, vertical or none"),
 }
-"""The check of each entry of a file or of a frame, called with its value, its name and where it stands."""
 
 
-def _check_splits(meta: Mapping[str, Any], splits: Sequence[str], where: str) -> None:
-    listed = [split for split in ("train", "val", "test") if f"{split}_filenames" in meta]
-    known = {str(Path(frame["file_path"])) for frame in meta["frames"]}
-    for split in splits if listed else ():
-        name = f"{split}_filenames"
-        files = meta.get(name)
-        if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
-            remedy = f"add {name} as a list of paths, or remove all such lists"
-            raise DataError(f"{where} lists images for {', '.join(listed)}, but none for {split}; {remedy}")
-        for file in files:
-            if str(Path(file)) not in known:
-                raise DataError(f"{where}: {name} has {_short(file)}, which no frame has as its file_path; correct it")
-
-
-def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
-    """Width and height in pixels of an image, after a check by its header that training can use it.
-
-    A ``mask`` has one channel, a photograph 8 bits per channel.
-
-    Raises:
-        DataError: the file is missing, not an image, of another pixel type, or too short for its size in pixels.
-    """
-    try:
-        with Image.open(regular(path)) as image:
-            size, mode = image.size, image.mode
-        length = path.stat().st_size
-    except OSError as error:
-        reason = error.strerror or ("it is not an image" if isinstance(error, Image.UnidentifiedImageError) else error)
-        raise DataError(f"{path} cannot be read ({reason}){beside(path)}; repair it or remove the view") from error
-    except Exception as error:  # decoders raise many types; each means the same to the user
-        raise DataError(f"{path} is not a complete image ({one_line(error)}); repair it or remove the view") from error
-    modes = ("1", "L") if mask else ("L", "RGB", "RGBA")
-    if mode not in modes:
-        wanted = "one channel of 8 bits" if mask else "RGB, RGBA or grey with 8 bits per channel"
-        raise DataError(f"{path} has pixels of type {mode}; save it with {wanted}")
-    # No format stores 4,096 pixels in a byte, even of one flat colour.
-    if size[0] * size[1] > max(4096 * length, 1 << 20):
-        raise DataError(f"{path} claims {size[0]} x {size[1]} px in {length:,} bytes; it is incomplete, save it again")
-    return size
-
-
-def undecodable(path: Path, error: Exception) -> DataError:
-    """The error for an image with a valid header and broken pixels."""
-    return DataError(f"{path} cannot be decoded ({one_line(error)}); repair it or remove the view")
+def check_first_image(path: Path, meta: Mapping[str, Any], factor: int) -> None:
+    """Raise ``DataError`` unless the first image of a ``transforms.json`` is there at 1/factor of its size."""
+    stated = {**meta, **meta["frames"][0]}
+    image = path.parent / stated["file_path"]
+    small = path.parent / f"images_{factor}"
+    if factor == 1 or small.exists():
+        image = image if factor == 1 else small / image.name
+        if not image.exists():
+            raise DataError(f"{image} does not exist{beside(image)}; correct file_path in {path.name}")
+        return
+    made = ", ".join(["1", *(entry.name[7:] for entry in entries(path.parent) if entry.name.startswith("images_"))])
+    size = f"{int(stated['w']) // factor}x{int(stated['h']) // factor}!"
+    make = f"`mkdir {small.name} && magick mogrify -path {small.name} -resize {size} images/*`"
+    raise DataError(f"{small} does not exist; give another --downscale-factor ({made}), or make it with {make}")
 
 
 def beside(path: Path) -> str:
@@ -233,9 +192,3 @@ def entries(folder: Path) -> list[Path]:
         return sorted(folder.iterdir())[:10_000]
     except OSError:
         return []
-
-
-def _short(value: Any) -> str:
-    """A value as one line of at most 80 characters, for an error message."""
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."

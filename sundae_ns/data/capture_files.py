@@ -1,10 +1,11 @@
-"""The files of a capture: images at several sizes, masks, ``transforms.json`` and points, from photos and a model."""
+"""The files of a capture, of photos and a model or of ``sundae demo``: images, masks, poses, points."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,30 +17,30 @@ from plyfile import PlyData, PlyElement
 from sundae_ns.core.camera import OPENGL_TO_OPENCV
 from sundae_ns.core.errors import DataError, writing
 from sundae_ns.core.files import write_text
-from sundae_ns.data.capture import check_image, read_json, undecodable
+from sundae_ns.data.capture import read_json
+from sundae_ns.data.images import JPEG, check_image, decoded
 from sundae_ns.data.layouts import LONGEST_SIDE
-from sundae_ns.data.photos import LEAST_PHOTOS, Photo, upright
+from sundae_ns.data.photos import LEAST_PHOTOS, Photo, upright, usable
 
 TRANSFORMS = "transforms.json"
+MARKER = ".sundae_scene"  # in a copy of the demo's capture; it permits to replace it
+ARCHIVE = Path(__file__).with_name("demo_capture.zip")
+"""The capture of ``sundae demo``: 48 training and 8 test images of 128 x 128 pixels, and 5,000 points, ray-traced."""
 CLOUD = "sparse_pc.ply"
+# From COLMAP's coordinates, whose y points down in most captures, to those of the capture, whose z points up.
 APPLIED = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
-"""From COLMAP's coordinates, whose y points down in most captures, to those of the capture, whose z points up."""
-_JPEG: dict[str, Any] = {"quality": 95, "subsampling": 0}
+_NEAREST = Image.Resampling.NEAREST
 
 
 class Placed(NamedTuple):
-    """Photos of a capture in the order of their names, and what :func:`.find_poses` reports of them."""
+    """Names of the photos of a capture in their order, and what :func:`.find_poses` reports of them."""
 
     placed: tuple[str, ...]
-    left_out: tuple[str, ...]
-    """Those without a pose."""
+    left_out: tuple[str, ...]  # those without a pose
     cameras: int = 1
-    error: float = 0.0
-    """Mean reprojection error, pixels."""
-    models: tuple[int, ...] = ()
-    """Numbers of photos of COLMAP's models, the largest first; it is the capture."""
-    masks: str | None = None
-    """How many frames have a mask, ``24 of 24``; None without masks."""
+    error: float = 0.0  # mean reprojection error, pixels
+    models: tuple[int, ...] = ()  # numbers of images of COLMAP's models; the first and largest is the capture
+    masks: str | None = None  # how many frames have a mask, "24 of 24"
 
     @property
     def total(self) -> int:
@@ -74,116 +75,97 @@ def placed_in(capture: Path) -> Placed:
 
 
 def names_of(photos: Sequence[Photo]) -> list[str]:
-    """Paths of images in the working folder, ``c1/frame_00001.jpg``, in the order of the photos.
-
-    Photos of a folder ``c1``, ``c2``, ... share size, camera, lens and focal length.
-    """
+    """Paths of images in the working folder, ``c1/frame_00001.jpg``; photos of a camera and a size share a folder."""
     cameras: dict[object, int] = {}
-    names = []
-    for number, photo in enumerate(photos, start=1):
-        camera = cameras.setdefault((photo.size, photo.lens), len(cameras) + 1)
-        names.append(f"c{camera}/frame_{number:05d}{photo.suffix}")
-    return names
+    numbers = [cameras.setdefault((photo.size, photo.lens), len(cameras) + 1) for photo in photos]
+    return [
+        f"c{camera}/frame_{number:05d}{photo.suffix}"
+        for number, (camera, photo) in enumerate(zip(numbers, photos, strict=True), start=1)
+    ]
 
 
-def write_images(photos: Sequence[Photo], folder: Path, advance: Callable[[int], None]) -> None:
-    """Write the photos, upright, under their :func:`names_of`; images that exist stay.
+def write_images(
+    photos: Sequence[Photo], folder: Path, warn: Callable[[str], object], advance: Callable[[int], None]
+) -> dict[str, Photo]:
+    """Write the photos, upright and in sRGB, unless their images exist; those :func:`.usable`, by their images."""
 
-    Raises:
-        DataError: the pixels of a photo cannot be decoded, or a raw photo has another size than the others.
-        StorageError: the disk is full or not writable.
-    """
-    raw: set[tuple[int, int]] = set()
-    for photo, name in zip(photos, names_of(photos), strict=True):
-        path = folder / name
-        if not path.exists():
-            with writing(f"cannot write {path}"):
-                path.parent.mkdir(parents=True, exist_ok=True)
-                _write_image(photo, path)
-        if photo.size == (0, 0):
-            raw.add(check_image(path))
-        if len(raw) > 1:
-            raise DataError(f"raw photos of several sizes ({photo.path} differs); save them as JPEG")
+    def write(item: tuple[str, Photo]) -> tuple[str, Photo]:
+        path, photo = folder / item[0], item[1]
         advance(1)
+        if path.exists():
+            return item
+        with writing(f"cannot write {path}"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial = path.with_name(f"{path.name}.partial")
+            image, exif = upright(photo)  # decodes: what is broken is named before the work of hours
+            if photo.as_it_is:
+                shutil.copyfile(photo.path, partial)
+            elif photo.suffix == ".png":
+                image.save(partial, format="PNG", exif=exif)
+            else:
+                image.convert("L" if image.mode == "L" else "RGB").save(partial, format="JPEG", exif=exif, **JPEG)
+            partial.replace(path)
+        return item
+
+    return dict(usable(list(zip(names_of(photos), photos, strict=True)), write, warn))
 
 
-def _write_image(photo: Photo, path: Path) -> None:
-    partial = path.with_name(f"{path.name}.partial")
-    image = upright(photo)  # decodes: what is broken is named before the work of hours
-    if photo.as_it_is:
-        shutil.copyfile(photo.path, partial)
-    else:
-        kind = "PNG" if photo.suffix == ".png" else "JPEG"
-        image = image if kind == "PNG" or image.mode == "L" else image.convert("RGB")
-        image.save(partial, format=kind, exif=image.getexif(), **_JPEG)
-    partial.replace(path)
-
-
-def write_smaller(images: Path, advance: Callable[[int], None]) -> None:
-    """Write ``images_2``, ``images_4``, ... beside a folder: three sizes, or more until one has 1,600 pixels at most.
-
-    Odd sizes are rounded down, as nerfstudio rounds those of cameras.
-    """
+def write_smaller(images: Path, advance: Callable[[int], None] = lambda _: None, *, masks: bool = False) -> None:
+    """Write ``images_2``, ``images_4``, ``images_8`` beside a folder, and more until one has 1,600 pixels at most."""
+    # Odd sizes are rounded down, as nerfstudio rounds those of cameras. Masks get no new values.
     paths = sorted(images.iterdir())
-    longest, factors = max(max(check_image(path)) for path in paths), [2, 4, 8]
+    longest, factors = max(max(check_image(path, mask=masks)) for path in paths), [2, 4, 8]
     while longest / factors[-1] > LONGEST_SIDE:
         factors.append(2 * factors[-1])
-    folders = {factor: images.with_name(f"{images.name}_{factor}") for factor in factors}
-    for folder in folders.values():
-        folder.mkdir(exist_ok=True)
     for path in paths:
-        try:
-            with Image.open(path) as opened:
-                image = opened.copy()
-        except Exception as error:  # decoders raise many kinds
-            raise undecodable(path, error) from error
-        for factor, folder in folders.items():
+        image = decoded(path)
+        for factor in factors:
+            folder = images.with_name(f"{images.name}_{factor}")
+            folder.mkdir(exist_ok=True)
             size = max(1, image.width // factor), max(1, image.height // factor)
-            image.resize(size, Image.Resampling.BOX).save(folder / path.name, **_JPEG)
+            image.resize(size, _NEAREST if masks else Image.Resampling.BOX).save(folder / path.name, **JPEG)
         advance(1)
 
 
 def write_capture(
-    out: Path, model: Any, images: Path, sources: Mapping[str, str], advance: Callable[[int], None]
+    out: Path,
+    model: Any,
+    images: Path,
+    sources: Mapping[str, str],
+    masks: Mapping[str, Path],
+    advance: Callable[[int], None],
 ) -> None:
-    """Write a capture into a folder, ``transforms.json`` last.
+    """Write a capture into a folder, which is replaced, of a ``pycolmap.Reconstruction`` of the ``images`` of a folder.
 
-    Args:
-        out: the folder; it is replaced.
-        model: ``pycolmap.Reconstruction``.
-        images: folder of the images of the model, each in a folder of its camera.
-        sources: names of the photos, by the names of their images; also of those without a pose.
-        advance: called with the number of further images.
+    ``sources`` are names of photos, also of those without a pose, and ``masks`` paths, both by the names of the images.
     """
     shutil.rmtree(out, ignore_errors=True)
-    (out / "images").mkdir(parents=True)
-    for image in model.images.values():
-        if image.has_pose:
-            source, target = images / image.name, out / "images" / Path(image.name).name
-            try:
-                os.link(source, target)
-            except OSError:  # a disk without hard links
-                shutil.copyfile(source, target)
-    write_smaller(out / "images", advance)
     stored = out / "colmap" / "sparse" / "0"
-    stored.mkdir(parents=True)
+    for folder in (out / "images", stored, *([out / "masks"] if masks else [])):
+        folder.mkdir(parents=True)
+    for name in (image.name for image in model.images.values() if image.has_pose):
+        source, target = images / name, out / "images" / Path(name).name
+        try:
+            os.link(source, target)
+        except OSError:  # a disk without hard links
+            shutil.copyfile(source, target)
+        if masks:
+            mask = decoded(masks[name]).convert("L").resize(check_image(source), _NEAREST)
+            mask.save(out / "masks" / f"{target.stem}.png")
+    write_smaller(out / "images", advance)
+    if masks:
+        write_smaller(out / "masks", masks=True)
     model.write(stored)
     kinds = [(axis, "f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
     points = [(*(APPLIED[:, :3] @ point.xyz), *point.color) for point in model.points3D.values()]
     table = PlyElement.describe(np.array(points, dtype=kinds), "vertex")
     with (out / CLOUD).open("wb") as file:
         PlyData([table], byte_order="<").write(file)
-    write_text(out / TRANSFORMS, json.dumps(transforms_of(model, sources), indent=4) + "\n")
+    write_text(out / TRANSFORMS, json.dumps(transforms_of(model, sources, masked=bool(masks)), indent=4) + "\n")
 
 
-def transforms_of(model: Any, sources: Mapping[str, str]) -> dict[str, Any]:
-    """Contents of the ``transforms.json`` of a model: intrinsics at the top if all images share a camera.
-
-    Args:
-        model: ``pycolmap.Reconstruction`` with cameras of the kind OPENCV or SIMPLE_RADIAL.
-        sources: names of the photos, by the names of their images. A frame states its photo as ``original``; photos
-            without a pose are ``left_out``.
-    """
+def transforms_of(model: Any, sources: Mapping[str, str], *, masked: bool = False) -> dict[str, Any]:
+    """Contents of the ``transforms.json`` of a model; ``sources`` without a pose are ``left_out``."""
     cameras = {number: _intrinsics(camera) for number, camera in model.cameras.items()}
     posed = {image.name: image for image in model.images.values() if image.has_pose}
     shared = {image.camera_id for image in posed.values()}
@@ -192,6 +174,7 @@ def transforms_of(model: Any, sources: Mapping[str, str]) -> dict[str, Any]:
         {
             "file_path": f"images/{Path(name).name}",
             "original": sources[name],
+            **({"mask_path": f"masks/{Path(name).stem}.png"} if masked else {}),
             **({} if len(shared) == 1 else cameras[posed[name].camera_id]),
             "transform_matrix": _pose(np.asarray(posed[name].cam_from_world().matrix())).tolist(),
         }
@@ -211,8 +194,7 @@ def transforms_of(model: Any, sources: Mapping[str, str]) -> dict[str, Any]:
 def _intrinsics(camera: Any) -> dict[str, float]:
     values = [float(value) for value in camera.params]
     if len(values) == 4:  # SIMPLE_RADIAL, a special case of OPENCV
-        focal, cx, cy, k1 = values
-        values = [focal, focal, cx, cy, k1, 0.0, 0.0, 0.0]
+        values = [values[0], *values, 0.0, 0.0, 0.0]
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     return {"w": int(camera.width), "h": int(camera.height), **dict(zip(names, values, strict=True))}
 
@@ -226,24 +208,19 @@ def _pose(camera_from_world: np.ndarray) -> np.ndarray:
     return pose
 
 
-def add_masks(capture: Path, masks: Sequence[Path]) -> str:
-    """Copy the masks of all photos into a capture, at the sizes of its images; returns how many frames have one."""
-    by_name = {f"frame_{number:05d}": mask for number, mask in enumerate(masks, start=1)}
-    for images in sorted(capture.glob("images*")):
-        folder = capture / images.name.replace("images", "masks", 1)
-        folder.mkdir(exist_ok=True)
-        for image in images.iterdir():
-            if image.stem in by_name:
-                try:
-                    with Image.open(by_name[image.stem]) as mask:
-                        scaled = mask.convert("L").resize(check_image(image), Image.Resampling.NEAREST)
-                except (OSError, ValueError, SyntaxError) as error:
-                    raise undecodable(by_name[image.stem], error) from error
-                scaled.save(folder / f"{image.stem}.png")
-    meta = read_json(capture / TRANSFORMS)
-    for frame in meta["frames"]:
-        name = Path(frame["file_path"]).stem
-        if name in by_name:
-            frame["mask_path"] = f"masks/{name}.png"
-    write_text(capture / TRANSFORMS, json.dumps(meta, indent=4) + "\n")
-    return f"{sum('mask_path' in frame for frame in meta['frames'])} of {len(meta['frames'])}"
+def write_demo_capture(out: Path) -> Path:
+    """Write the demo's capture as a nerfstudio data set to a folder; returns that folder, the value for ``--data``.
+
+    An earlier copy is replaced, other files are a ``DataError``. An interrupted copy has no ``transforms.json``.
+    """
+    if out.exists() and not out.is_dir():
+        raise DataError(f"{out} is a file; name a folder for the capture")
+    if out.is_dir() and any(out.iterdir()) and not (out / MARKER).exists():
+        raise DataError(f"{out} holds other files than the demo's capture; name a new or an empty folder")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / MARKER).touch()
+    (out / TRANSFORMS).unlink(missing_ok=True)
+    with zipfile.ZipFile(ARCHIVE) as archive:
+        for name in sorted(archive.namelist(), key=lambda name: (name == TRANSFORMS, name)):
+            archive.extract(name, out)
+    return out

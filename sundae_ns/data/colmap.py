@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -35,21 +35,19 @@ _POINT = np.dtype([("number", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("err
 
 
 class ColmapCamera(NamedTuple):
-    """A camera of a model."""
+    """A camera of a model; ``intrinsics`` are fx, fy, cx, cy in pixels."""
 
     width: int
     height: int
     intrinsics: tuple[float, float, float, float]
-    """fx, fy, cx, cy, pixels."""
     lens: Lens
 
 
 class ColmapImage(NamedTuple):
-    """An image of a model."""
+    """An image of a model; its pose is world-to-camera with OpenCV axes: a unit quaternion wxyz and a translation."""
 
     name: str
     pose: tuple[float, ...]
-    """World-to-camera with OpenCV axes: a quaternion wxyz of length 1, and a translation."""
     camera_id: int
     camera: ColmapCamera
 
@@ -57,33 +55,37 @@ class ColmapImage(NamedTuple):
 def read_images(model: Path) -> dict[int, ColmapImage]:
     """The images of a model by their numbers, with their cameras; ``DataError`` names the first unusable entry."""
     if not model.is_dir():
-        raise DataError(
-            f"{model} is not a folder; give the folder of the model with colmap --colmap-path (usually sparse/0)"
-        )
+        raise DataError(f"{model} is not a folder; give that of the model with colmap --colmap-path (usually sparse/0)")
     kind = next((kind for kind in ("txt", "bin") if (model / f"cameras.{kind}").exists()), None)
     if kind is None:
-        raise DataError(
-            f"{model} holds neither cameras.bin nor cameras.txt{beside(model / 'cameras.bin')}; give the folder of the "
-            "model with --colmap-path"
-        )
+        near = beside(model / "cameras.bin")
+        raise DataError(f"{model} holds neither cameras.bin nor cameras.txt{near}; give --colmap-path another folder")
     cameras: dict[int, ColmapCamera] = {}
     with _content(model / f"cameras.{kind}") as content:
-        stated = _text_cameras(content) if kind == "txt" else _binary_cameras(content)
-        for number, name, width, height, params in stated:
-            where = f"cameras.{kind}, camera {number}"
+        for number, name, width, height, params in _cameras(content, kind == "txt"):
+            where = f"{model / f'cameras.{kind}'}, camera {number}"
             if number in cameras:
                 raise DataError(f"{where}: it is listed twice; export it again")
-            cameras[number] = _camera(colmap_model(name, where), width, height, params, where)
+            lens = colmap_model(name, where)
+            names = COLMAP_LENSES[lens][2].split()
+            if len(params) != len(names):
+                raise DataError(f"{where}: {lens} has {len(names)} parameters, not {len(params)}; export it again")
+            for name, value in zip(names, params, strict=True):
+                finite(value, f"parameter {name}", where, positive=name.startswith("f"))
+            size = side(width, "width", where), side(height, "height", where)
+            cameras[number] = ColmapCamera(*size, *colmap_lens(lens, params, where))
     images: dict[int, ColmapImage] = {}
     with _content(model / f"images.{kind}") as content:
-        for number, pose, camera, file in _text_images(content) if kind == "txt" else _binary_images(content):
-            where = f"images.{kind}, image {number}"
+        for number, pose, camera, file in _images(content, kind == "txt"):
+            where = f"{model / f'images.{kind}'}, image {number}"
             for value in pose:
                 finite(value, "the pose", where)
             if not abs(math.hypot(*pose[:4]) - 1) < 0.01:
                 raise DataError(f"{where}: its quaternion is not of length 1, so it is no rotation; remove the image")
             if camera not in cameras:
                 raise DataError(f"{where}: its camera {camera} is not in the model; export it again")
+            if Path(file).is_absolute() or ".." in Path(file).parts:
+                raise DataError(f"{where}: its name {file!r:.80} leads out of the folder of images; rename it")
             images[number] = ColmapImage(file, pose, camera, cameras[camera])
     if not images:
         raise DataError(f"{model} has no images; the reconstruction failed, run it again")
@@ -114,19 +116,16 @@ def read_points(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
 
 
 def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> None:
-    """Check the files of a COLMAP model, and the paths of its images, which nerfstudio passes to a shell.
-
-    ``DataError`` names the first unusable entry. Without a folder of ``images`` they need not exist.
-    """
+    """Check the files of a COLMAP model, and its images, if their folder is given, whose paths reach a shell."""
     names = [image.name for image in read_images(model).values()]
+    if len(names) < 2:
+        raise DataError(f"{model} has {len(names)} image; training needs 2 or more")
     hostile = next((name for name in [str(images or ""), *names] if set(name) & set('"$`\\\n')), None)
     if hostile is not None:
         raise DataError(f"{hostile!r} has quotes, $, ` or backslashes in its name; rename it without them")
     missing = [images / name for name in names if not (images / name).is_file()] if images is not None else []
     if missing:
-        raise DataError(
-            f"{missing[0]} does not exist{beside(missing[0])}; check --images-path, or remove the view from the model"
-        )
+        raise DataError(f"{missing[0]} does not exist{beside(missing[0])}; check --images-path, or remove the view")
     if points and not len(read_points(model)[0]):
         raise DataError(f"{model} has no points; start without them with colmap --load-3D-points False")
 
@@ -137,25 +136,26 @@ def _content(path: Path) -> Iterator[bytes]:
         yield regular(path).read_bytes()
 
 
-def _camera(model: str, width: int, height: int, params: Sequence[float], where: str) -> ColmapCamera:
-    names = COLMAP_LENSES[model][2].split()
-    if len(params) != len(names):
-        raise DataError(f"{where}: {model} has {len(names)} parameters, not {len(params)}; export it again")
-    for name, value in zip(names, params, strict=True):
-        finite(value, f"parameter {name}", where, positive=name.startswith("f"))
-    return ColmapCamera(side(width, "width", where), side(height, "height", where), *colmap_lens(model, params, where))
-
-
-def _binary_cameras(content: bytes) -> Iterator[tuple[int, int, int, int, tuple[float, ...]]]:
+def _cameras(content: bytes, text: bool) -> Iterator[tuple[int, str | int, int, int, tuple[float, ...]]]:
+    if text:
+        for number, name, width, height, *params in _rows(content):
+            yield int(number), name, int(width), int(height), tuple(map(float, params))
+        return
     at = _COUNT.size
     for _ in range(*_COUNT.unpack_from(content)):
         number, kind, width, height = _CAMERA.unpack_from(content, at)
-        params = struct.Struct(f"<{len(COLMAP_LENSES[colmap_model(kind, f'camera {number}')][2].split())}d")
-        yield number, kind, width, height, params.unpack_from(content, at + _CAMERA.size)
-        at += _CAMERA.size + params.size
+        layout = struct.Struct(f"<{len(COLMAP_LENSES[colmap_model(kind, f'camera {number}')][2].split())}d")
+        yield number, kind, width, height, layout.unpack_from(content, at + _CAMERA.size)
+        at += _CAMERA.size + layout.size
 
 
-def _binary_images(content: bytes) -> Iterator[tuple[int, tuple[float, ...], int, str]]:
+def _images(content: bytes, text: bool) -> Iterator[tuple[int, tuple[float, ...], int, str]]:
+    if text:
+        for number, *words, camera, name in _rows(content, images=True):
+            if len(words) != 7:
+                raise ValueError(f"image {number} has {len(words)} numbers as its pose")
+            yield int(number), tuple(map(float, words)), int(camera), name
+        return
     at = _COUNT.size
     for _ in range(*_COUNT.unpack_from(content)):
         number, *pose, camera = _IMAGE.unpack_from(content, at)
@@ -182,15 +182,3 @@ def _rows(content: bytes, *, images: bool = False) -> list[list[str]]:
     if stated and int(stated[1]) != len(rows):
         raise ValueError(f"it states {int(stated[1]):,} entries and has {len(rows):,}")
     return rows
-
-
-def _text_cameras(content: bytes) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
-    for number, name, width, height, *params in _rows(content):
-        yield int(number), name, int(width), int(height), tuple(map(float, params))
-
-
-def _text_images(content: bytes) -> Iterator[tuple[int, tuple[float, ...], int, str]]:
-    for number, *pose, camera, name in _rows(content, images=True):
-        if len(pose) != 7:
-            raise ValueError(f"image {number} has {len(pose)} numbers as its pose")
-        yield int(number), tuple(map(float, pose)), int(camera), name

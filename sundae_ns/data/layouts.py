@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.data.capture import beside, check_image, entries, read_json
+from sundae_ns.data.capture import beside, entries, read_json
 from sundae_ns.data.colmap import read_images
+from sundae_ns.data.images import check_image
 
-LONGEST_SIDE = 1600
-"""Longest side in pixels of the images to train on, if smaller ones are there; as in nerfstudio."""
+LONGEST_SIDE = 1600  # pixels, of the images to train on, if smaller ones are there; as in nerfstudio
+# Folders where programs put COLMAP's models, directly or in numbered folders, and usual names of the folder of images.
 _MODELS = ("sparse", "colmap/sparse", "dense/sparse", "dense", "distorted/sparse", "sparse/aligned")
-"""Folders where programs put COLMAP's models, directly or in numbered folders."""
 _IMAGES = ("images", "input", "photos", "image", "rgb")
-"""Usual names of the folder of images; COLMAP's programs use the first."""
 _BLENDER = "transforms_train.json"
 
 
@@ -23,10 +22,8 @@ class Layout(NamedTuple):
     """A capture that nerfstudio reads by another parser than that of ``transforms.json``."""
 
     description: str
-    words: list[str]
-    """Words of ``ns-train`` that read the capture, behind all other options."""
-    options: tuple[str, ...] = ()
-    """Words of ``ns-train`` before all other options, which can replace them."""
+    words: list[str]  # of ns-train that read the capture, behind all other options
+    options: tuple[str, ...] = ()  # words of ns-train before all other options, which can replace them
 
 
 def is_posed(data: Path) -> bool:
@@ -58,11 +55,7 @@ def models_in(data: Path) -> dict[str, int]:
 
 
 def posed_layout(data: Path) -> Layout | None:
-    """The largest COLMAP model of a capture, or else its files of Blender; None if it has a ``transforms.json``.
-
-    Raises:
-        DataError: a file is damaged or missing, or the images are in none of the usual places.
-    """
+    """The largest COLMAP model of a capture, or else its files of Blender; None if it has a ``transforms.json``."""
     if (data / "transforms.json").is_file():
         return None
     models = models_in(data)
@@ -72,19 +65,14 @@ def posed_layout(data: Path) -> Layout | None:
 
 
 def _colmap_layout(data: Path, model: str, num_models: int) -> Layout:
-    try:
-        names = [image.name for image in read_images(data / model).values()]
-    except DataError as error:
-        raise DataError(f"{data / model}: {error}") from error
+    names = [image.name for image in read_images(data / model).values()]
     # Undistorted images lie beside their model.
     above = [data / model, *(folder for folder in (data / model).parents if folder.is_relative_to(data))]
     candidates = [*(folder / usual for folder in above for usual in _IMAGES), data]
     images = next((folder for folder in candidates if (folder / names[0]).is_file()), None)
     if images is None:
-        raise DataError(
-            f"{data} has no image {names[0]}, which its model {model} states, in {', '.join(_IMAGES)}; put the images "
-            f"into {data / 'images'}"
-        )
+        usual = ", ".join(_IMAGES)
+        raise DataError(f"{data} has no image {names[0]}, which its model {model} states, in {usual}; put it there")
     longest, downscale = max(check_image(images / names[0])), 1
     while longest / downscale > LONGEST_SIDE:
         if not (images.with_name(f"{images.name}_{2 * downscale}") / names[0]).is_file():
@@ -101,21 +89,19 @@ def _colmap_layout(data: Path, model: str, num_models: int) -> Layout:
 
 
 def _blender_layout(data: Path) -> Layout:
-    frames: dict[str, list[dict[str, str]]] = {}
+    lists: list[Any] = []
     for split in ("train", "val", "test"):
         path = data / f"transforms_{split}.json"
         if not path.exists():
-            raise DataError(
-                f"{path} does not exist{beside(path)}; Blender's layout needs it: copy that of another split"
-            )
-        listed = read_json(path).get("frames")
-        named = isinstance(listed, list) and all(isinstance(f, dict) and "file_path" in f for f in listed)
-        if not listed or not named:
+            raise DataError(f"{path} does not exist{beside(path)}, which Blender's layout needs; copy another split's")
+        frames = read_json(path).get("frames")
+        named = isinstance(frames, list) and all(isinstance(frame, dict) and "file_path" in frame for frame in frames)
+        if not frames or not named:
             raise DataError(f"{path} lists no frames with a file_path; export it again")
-        frames[split] = listed
-    check_image(data / f"{frames['train'][0]['file_path']}.png")
+        lists.append(frames)
+    check_image(data / f"{lists[0][0]['file_path']}.png")
     # nerfstudio puts transparent images over white.
-    description = f"Blender layout: {len(frames['train']):,} training images, over white"
+    description = f"Blender layout: {len(lists[0]):,} training images, over white"
     return Layout(description, ["blender-data"], ("--pipeline.model.background-color", "white"))
 
 
@@ -163,8 +149,8 @@ def larger_model(data: Path, model: Path) -> str | None:
     largest, count = next(iter(models), ""), models.get(model.as_posix())
     if count is None or models[largest] <= count:
         return None
-    remedy = f"to train on those, give --colmap-path {largest}"
-    return f"{model} has {count:,} images and {largest} has {models[largest]:,}; {remedy}"
+    more = f"{largest} has {models[largest]:,}; to train on those, give --colmap-path {largest}"
+    return f"{model} has {count:,} images and {more}"
 
 
 def how_to_make_one(images: Path) -> str:
@@ -175,7 +161,5 @@ def how_to_make_one(images: Path) -> str:
 
 def unused_masks(folder: Path) -> str | None:
     """Name of a folder of masks in a capture, if it has one with images."""
-    for name in ("masks", "mask"):
-        if any(path.suffix.lower() in (".png", ".jpg", ".jpeg") for path in entries(folder / name)):
-            return name
-    return None
+    kinds = {name: {path.suffix.lower() for path in entries(folder / name)} for name in ("masks", "mask")}
+    return next((name for name, found in kinds.items() if found & {".png", ".jpg", ".jpeg"}), None)

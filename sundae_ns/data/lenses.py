@@ -1,8 +1,4 @@
-"""Lenses: what a ``transforms.json`` or a COLMAP model states of a camera, and which projections can be trained on.
-
-The rasteriser draws perspective images. Perspective and fisheye images are undistorted before training; other
-projections are refused with the way to make perspective images of them.
-"""
+"""Lenses of a ``transforms.json`` or a COLMAP model; projections that cannot be undistorted are refused."""
 
 from __future__ import annotations
 
@@ -16,11 +12,10 @@ from PIL import Image
 
 from sundae_ns.core.errors import DataError
 
-PERSPECTIVE, FISHEYE, FISHEYE624 = "OPENCV", "OPENCV_FISHEYE", "FISHEYE624"
-"""Names of the three kinds of lenses that nerfstudio undistorts."""
+PERSPECTIVE, FISHEYE, FISHEYE624 = "OPENCV", "OPENCV_FISHEYE", "FISHEYE624"  # the kinds that nerfstudio undistorts
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""Distortion of a ``transforms.json``, in the order of nerfstudio's ``distortion_params``."""
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # in the order of nerfstudio's distortion_params
+_NO_LENSES = {"FOV": 7, "RAD_TAN_THIN_PRISM_FISHEYE": 11, "SIMPLE_DIVISION": 12, "DIVISION": 13, "EUCM": 16}
 COLMAP_LENSES: dict[str, tuple[int, str | None, str, str]] = {
     "SIMPLE_PINHOLE": (0, PERSPECTIVE, "f cx cy", ""),
     "PINHOLE": (1, PERSPECTIVE, "fx fy cx cy", ""),
@@ -29,21 +24,17 @@ COLMAP_LENSES: dict[str, tuple[int, str | None, str, str]] = {
     "OPENCV": (4, PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2", ""),
     "OPENCV_FISHEYE": (5, FISHEYE, "fx fy cx cy k1 k2 k3 k4", ""),
     "FULL_OPENCV": (6, PERSPECTIVE, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "k4 k5 k6"),
-    "FOV": (7, None, "", ""),
     "SIMPLE_RADIAL_FISHEYE": (8, FISHEYE, "f cx cy k1", ""),
     "RADIAL_FISHEYE": (9, FISHEYE, "f cx cy k1 k2", ""),
     "THIN_PRISM_FISHEYE": (10, FISHEYE, "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1", "p1 p2 sx1 sy1"),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (11, None, "", ""),
-    "SIMPLE_DIVISION": (12, None, "", ""),
-    "DIVISION": (13, None, "", ""),
     "SIMPLE_FISHEYE": (14, FISHEYE, "f cx cy", ""),
     "FISHEYE": (15, FISHEYE, "fx fy cx cy", ""),
-    "EUCM": (16, None, "", ""),
-    "EQUIRECTANGULAR": (17, None, "", ""),
+    **{name: (number, None, "", "") for name, number in {**_NO_LENSES, "EQUIRECTANGULAR": 17}.items()},
 }
 """COLMAP's camera models: number, kind (None if there is none), parameters in their order, and those that must be 0."""
 _KINDS = {name: kind for name, (_, kind, _, zeros) in COLMAP_LENSES.items() if kind and not zeros}
 _KINDS[FISHEYE624] = FISHEYE624
+_UNDISTORT = "make undistorted images with `colmap image_undistorter`, or calibrate the capture with OPENCV"
 _ONE_EYE = "render or cut perspective images (cube faces) of one eye, each with its own pose"
 _REMEDIES = {
     "EQUIRECTANGULAR": "the images are panoramas: cut them into perspective images with `ns-process-data images "
@@ -56,26 +47,26 @@ _REMEDIES = {
 
 
 class Lens(NamedTuple):
-    """A kind of lens and its distortion."""
+    """A kind of lens, and its distortion as :data:`DISTORTION`, or the 12 numbers of :data:`FISHEYE624`."""
 
     kind: str
-    """:data:`PERSPECTIVE`, :data:`FISHEYE` or :data:`FISHEYE624`."""
     distortion: tuple[float, ...]
-    """As :data:`DISTORTION`; the 12 numbers of :data:`FISHEYE624` in nerfstudio's order."""
 
 
 def kind_of_model(model: Any, where: str) -> str:
     """The kind of lens of a ``camera_model``; ``DataError`` with the remedy for other projections."""
     if isinstance(model, str) and model in _KINDS:
         return _KINDS[model]
-    _refuse_projection(str(model), f"{where}: camera_model")
-    raise DataError(f"{where}: camera_model is {repr(model)[:80]}; use one of {', '.join(_KINDS)}")
+    raise _refusal(str(model), where) or DataError(
+        f"{where}: camera_model is {model!r:.80}; use one of {', '.join(_KINDS)}"
+    )
 
 
-def _refuse_projection(model: str, what: str) -> None:
-    for start, remedy in _REMEDIES.items():
-        if model.startswith(start):
-            raise DataError(f"{what} {model} is no lens that perspective images can be made of; {remedy}")
+def _refusal(model: str, where: str) -> DataError | None:
+    """The error for a projection that has a remedy of its own."""
+    remedy = next((remedy for start, remedy in _REMEDIES.items() if model.startswith(start)), None)
+    what = f"{where}: camera model {model} is no lens that perspective images can be made of"
+    return DataError(f"{what}; {remedy}") if remedy else None
 
 
 def kind_of_frame(stated: Mapping[str, Any], where: str) -> str:
@@ -87,11 +78,7 @@ def kind_of_frame(stated: Mapping[str, Any], where: str) -> str:
 
 
 def lens_of(meta: Mapping[str, Any], frame: Mapping[str, Any], where: str) -> Lens:
-    """The lens of a frame of a ``transforms.json``, whose entries count before those of the file.
-
-    Raises:
-        DataError: nerfstudio cannot undistort its projection or its distortion.
-    """
+    """The lens of a frame, whose entries count before those of the file; ``DataError`` if nothing undistorts it."""
     stated = {**meta, **frame}
     kind = kind_of_frame(stated, where)
     of_frame = "distortion_params" not in frame and any(key in frame for key in DISTORTION)
@@ -100,10 +87,7 @@ def lens_of(meta: Mapping[str, Any], frame: Mapping[str, Any], where: str) -> Le
         values = [stated.get(key, 0.0) for key in DISTORTION] if kind != FISHEYE624 else []
     if kind != FISHEYE624 and len(values) == 4:
         if kind != FISHEYE and any(values[2:]):
-            raise DataError(
-                f"{where}: four distortion_params may be k1, k2, p1, p2 or k1, k2, k3, k4; give them by these names "
-                "instead"
-            )
+            raise DataError(f"{where}: four distortion_params may be k1, k2, p1, p2 or k1 to k4; give them by name")
         values = [*values, 0.0, 0.0]
     count, names = (12, "") if kind == FISHEYE624 else (6, f" ({', '.join(DISTORTION)})")
     if len(values) != count:
@@ -122,11 +106,8 @@ def colmap_lens(model: str, params: Sequence[float], where: str) -> tuple[tuple[
 
 
 def _unsupported(model: str, where: str) -> DataError:
-    _refuse_projection(model, f"{where}: camera model")
-    return DataError(
-        f"{where}: nerfstudio does not support camera model {model}; make undistorted images with `colmap "
-        "image_undistorter` and train on its output, or calibrate the capture with OPENCV"
-    )
+    unknown = DataError(f"{where}: nerfstudio does not support camera model {model}; {_UNDISTORT}")
+    return _refusal(model, where) or unknown
 
 
 def colmap_model(model: int | str, where: str) -> str:
@@ -140,10 +121,7 @@ def colmap_model(model: int | str, where: str) -> str:
 
 
 def with_focal_lengths(meta: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A ``transforms.json`` that states angles of view, as Blender and instant-ngp do, with focal lengths in pixels.
-
-    One that states focal lengths stays as it is. The size of its first image in ``folder`` counts if it states none.
-    """
+    """A ``transforms.json`` that states angles of view, as Blender and instant-ngp do, with focal lengths in pixels."""
     angles: list[Any] = [meta.get(f"camera_angle_{axis}") for axis in "xy"]
     known = [type(angle) in (int, float) and 0 < angle < math.pi for angle in angles]
     frames = meta.get("frames")
@@ -151,9 +129,8 @@ def with_focal_lengths(meta: dict[str, Any], folder: Path) -> dict[str, Any]:
     if not known[0] or any(isinstance(entry, dict) and "fl_x" in entry for entry in entries):
         return meta
     size: Any = (None, None)
-    with suppress(OSError, KeyError, IndexError, TypeError, ValueError):
-        with Image.open(folder / meta["frames"][0]["file_path"]) as image:
-            size = image.size
+    with suppress(Exception), Image.open(folder / meta["frames"][0]["file_path"]) as image:
+        size = image.size
     width, height = meta.get("w", size[0]), meta.get("h", size[1])
     if not isinstance(width, (int, float)) or not isinstance(height, (int, float)):
         return meta

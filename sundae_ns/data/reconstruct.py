@@ -11,9 +11,8 @@ import json
 import os
 import shutil
 import signal
-import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -22,40 +21,30 @@ import numpy as np
 
 from sundae_ns.core.errors import ConfigError, DataError, writing
 from sundae_ns.core.files import flush, write_text
-from sundae_ns.data.capture_files import TRANSFORMS, Placed, add_masks, names_of, placed_in, write_capture, write_images
+from sundae_ns.data.capture_files import TRANSFORMS, Placed, placed_in, write_capture, write_images
 from sundae_ns.data.layouts import LONGEST_SIDE
 from sundae_ns.data.photos import find_photos, masks_of
 from sundae_ns.data.video import is_video, write_frames
 from sundae_ns.io.run_folder import reserve
 
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
-Advance = Callable[[int], None]
-"""Called with the number of further parts of a stage that are done."""
-Reporter = Callable[[str, int], AbstractContextManager[Advance]]
-"""Shows the progress of a stage with this name and this number of parts."""
+Advance = Callable[[int], None]  # called with the number of further parts of a stage that are done
+Reporter = Callable[[str, int], AbstractContextManager[Advance]]  # a stage by its name and its number of parts
 INSTALL = 'pip install "sundae_ns[photos]"'
-_MOST_EXHAUSTIVE = 200
-"""Number of photos up to which all pairs are compared: 19,900 pairs."""
-_ALIKE = 40
-"""Number of similar photos that each is compared with."""
-_PAIRS_AT_ONCE = 100
-"""Pairs per thread between two reports of progress."""
-_LEAST_MODEL = 3
-"""Images of the smallest model that is kept."""
+_MOST_EXHAUSTIVE = 200  # photos up to which all pairs are compared: 19,900 pairs
+_ALIKE = 40  # similar photos that each is compared with
+_PAIRS_AT_ONCE = 100  # per thread between two reports of progress
+_LEAST_MODEL = 3  # images of the smallest model that is kept
 
 
 class Request(NamedTuple):
     """Photos, and how to make a capture of them."""
 
-    photos: Path
-    """Folder of photos, or a video."""
-    capture: Path
-    """Folder to make."""
+    photos: Path  # a folder, or a video
+    capture: Path  # folder to make
     matching: Matching
-    frames: int
-    """Number of frames of a video."""
-    masks: Path | None
-    """Folder of masks, one for each photo."""
+    frames: int  # of a video
+    masks: Path | None  # folder of masks, one for each photo
 
     @property
     def work(self) -> Path:
@@ -63,21 +52,9 @@ class Request(NamedTuple):
         return self.capture.with_name(f"{self.capture.name}.partial")
 
 
-class Model(NamedTuple):
-    """A model of COLMAP."""
-
-    folder: Path
-    images: tuple[str, ...]
-    """Names of the images with a pose, sorted."""
-    error: float
-    """Mean reprojection error, pixels."""
-
-
 def pycolmap() -> Any:
-    """The silenced module; ``ConfigError`` if it is not installed or cannot be loaded.
-
-    The main thread imports it first: its library takes over SIGTERM to print a stack.
-    """
+    """The silenced module; ``ConfigError`` if it is not installed or cannot be loaded."""
+    # The main thread imports it first: its library takes over SIGTERM to print a stack.
     check_installed()
     before = signal.getsignal(signal.SIGTERM)
     try:
@@ -92,8 +69,7 @@ def pycolmap() -> Any:
 
 def check_installed() -> None:
     """Raise ``ConfigError`` if pycolmap is not installed; imports nothing."""
-    loaded = "pycolmap" in sys.modules
-    if sys.modules.get("pycolmap") is None if loaded else importlib.util.find_spec("pycolmap") is None:
+    if importlib.util.find_spec("pycolmap") is None:
         raise ConfigError(f"camera poses need pycolmap; install it with {INSTALL}")
 
 
@@ -103,45 +79,42 @@ def threads() -> int:
     return int(stated) if stated.isdigit() and int(stated) > 0 else (os.cpu_count() or 1)
 
 
-def find_poses(request: Request, report: Reporter) -> Placed:
-    """Make a capture; continue what an earlier process has begun with the same photos and options.
-
-    Raises:
-        DataError: photos cannot be used, or none could be placed.
-        StorageError: another process works on it, or the disk is full or not writable.
-    """
+def find_poses(request: Request, report: Reporter, warn: Callable[[str], object] = print) -> Placed:
+    """Make a capture; continue what an earlier process has begun with the same photos and options."""
     work, video = request.work, is_video(request.photos)
     images, frames, made = work / "images", work / "frames", work / "capture"
+
+    def stage(name: str, parts: int, function: Callable[..., Any], *words: Any) -> Any:
+        with report(name, parts) as advance:
+            return function(*words, advance)
+
     with writing(f"cannot make {work}"):
         reserve(work, "works in {}; wait for it, or choose another folder")
         photos = [] if video else find_photos(request.photos)
         _keep_or_clear(request, [request.photos] if video else [photo.path for photo in photos])
-        if video:
-            if not frames.exists():
-                with report("frames", request.frames) as advance:
-                    write_frames(request.photos, frames, request.frames, advance)
-            photos = find_photos(frames)
-        names = names_of(photos)
-        with report("images", len(photos)) as advance:
-            write_images(photos, images, advance)
-        with report("features", len(photos)) as advance:
-            _find_features(work, images, names, advance)
+        if video and not frames.exists():
+            stage("frames", request.frames, write_frames, request.photos, frames, request.frames)
+        photos = find_photos(frames) if video else photos
+        written = stage("images", len(photos), write_images, photos, images, warn)
+        names = list(written)
+        stage("features", len(names), _find_features, work, images, names)
         if not (work / "sparse").exists():
             pairs = _pairs(work, names, request.matching, video)
-            with report("matches of pairs", len(pairs)) as advance:
-                _match(work, pairs, advance)
-        with report("poses", len(photos)) as advance:
-            models = _reconstruct(work, images, len(photos), advance)
-        sources = {name: photo.path.name for name, photo in zip(names, photos, strict=True)}
-        with report("capture", len(models[0].images)) as advance:
-            write_capture(made, load_model(models[0].folder), images, sources, advance)
-            masks = None if request.masks is None else add_masks(made, masks_of(photos, request.masks))
+            stage("matches of pairs", len(pairs), _match, work, pairs)
+        models = stage("poses", len(names), _reconstruct, work, images, len(names))
+        sources = {name: photo.path.name for name, photo in written.items()}
+        masks = {} if request.masks is None else dict(zip(names, masks_of([*written.values()], request.masks)))
+        stage("capture", len(_posed(models[0])), write_capture, made, models[0], images, sources, masks)
         flush(made / TRANSFORMS)  # written last; the system has written the other files meanwhile
         made.replace(request.capture)
         shutil.rmtree(work, ignore_errors=True)
-    cameras = len({Path(name).parent for name in models[0].images})
-    sizes = tuple(len(model.images) for model in models)
-    return placed_in(request.capture)._replace(cameras=cameras, error=models[0].error, models=sizes, masks=masks)
+    placed = placed_in(request.capture)
+    return placed._replace(
+        cameras=len({Path(name).parent for name in _posed(models[0])}),
+        error=float(models[0].compute_mean_reprojection_error()),
+        models=tuple(len(_posed(model)) for model in models),
+        masks=f"{len(placed.placed)} of {len(placed.placed)}" if masks else None,
+    )
 
 
 def _keep_or_clear(request: Request, files: Sequence[Path]) -> None:
@@ -175,18 +148,15 @@ def _find_features(work: Path, images: Path, names: Sequence[str], advance: Adva
         have = {image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)}
     missing = [name for name in names if name not in have]
     advance(len(names) - len(missing))
-    for start in range(0, len(missing), 2 * threads()):
-        part = missing[start : start + 2 * threads()]
+    for part in _blocks(missing, 2 * threads(), advance):
         module.extract_features(path, images, part, module.CameraMode.PER_FOLDER, reader, extraction)
-        advance(len(part))
     with module.Database.open(path) as database:
         if database.num_keypoints() == 0:
             raise DataError("the photos show nothing that can be found again; add sharp ones of a scene with texture")
 
 
 def _pairs(work: Path, names: Sequence[str], matching: Matching, video: bool) -> list[tuple[str, str]]:
-    """Pairs of images to compare: in a video neighbours, frames at distances that double, and similar ones that close
-    a loop; otherwise all pairs, or the most similar photos and the next by name."""
+    """Pairs of images to compare: all, the most similar, or neighbours, at distances that double and similar ones."""
     module = pycolmap()
     if matching == "auto":
         matching = "sequential" if video else "exhaustive" if len(names) <= _MOST_EXHAUSTIVE else "similar"
@@ -213,22 +183,14 @@ def _pairs(work: Path, names: Sequence[str], matching: Matching, video: bool) ->
 
 def _vocabulary(module: Any, database: Any, images: Sequence[int], path: Path) -> Path:
     """A visual vocabulary of the largest features of these images, so that none has to be downloaded."""
-    each = 100_000 // len(images)
-    # COLMAP stores the smallest features first.
+    each = 100_000 // len(images)  # COLMAP stores the smallest features first
     largest = [np.asarray(database.read_descriptors(image).data)[-each:] for image in images]
     descriptors = np.concatenate(largest).astype(np.float32)
     options = module.VisualIndex.BuildOptions()
-    options.num_visual_words = min(max(len(descriptors) // 40, 16), 2048)
+    options.num_visual_words = min(max(len(descriptors) // 40, 1), 2048)  # it warns of fewer than 39 a word
     options.num_iterations, options.num_rounds, options.num_threads = 10, 1, threads()
     index = module.VisualIndex.create(descriptors.shape[1], 64)
-    saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)  # the library warns of few words
-        index.build(options, module.FeatureDescriptorsFloat(module.FeatureExtractorType.SIFT, descriptors))
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(nowhere)
+    index.build(options, module.FeatureDescriptorsFloat(module.FeatureExtractorType.SIFT, descriptors))
     index.write(path)
     return path
 
@@ -238,77 +200,67 @@ def _match(work: Path, pairs: Sequence[tuple[str, str]], advance: Advance) -> No
     module = pycolmap()
     options, listed = module.FeatureMatchingOptions(), module.ImportedPairingOptions()
     options.num_threads, listed.match_list_path = threads(), work / "pairs.txt"
-    size = _PAIRS_AT_ONCE * threads()
-    for start in range(0, len(pairs), size):
-        part = pairs[start : start + size]
+    for part in _blocks(pairs, _PAIRS_AT_ONCE * threads(), advance):
         listed.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in part), encoding="utf-8", newline="\n")
         module.match_image_pairs(work / "database.db", options, listed)
-        advance(len(part))
 
 
-def _reconstruct(work: Path, images: Path, count: int, advance: Advance) -> list[Model]:
-    """Find poses and points, unless they are there; the models, the largest first.
+def _blocks(items: Sequence[Any], size: int, advance: Advance) -> Iterator[Sequence[Any]]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]
+        advance(len(items[start : start + size]))
 
-    OPENCV has two focal lengths and four terms of distortion, which diverge where few photos constrain them. If it
-    leaves out more than a twentieth of the photos, SIMPLE_RADIAL is tried, with one of each; as it fits less well, it
-    must place a tenth more.
-    """
+
+def _reconstruct(work: Path, images: Path, count: int, advance: Advance) -> list[Any]:
+    """Find poses and points, unless they are there; the models (``pycolmap.Reconstruction``), the largest first."""
+    # OPENCV has two focal lengths and four terms of distortion, which diverge where few photos constrain them. If it
+    # leaves out more than a twentieth of the photos, SIMPLE_RADIAL is tried, with one of each; as it fits less well, it
+    # must place a tenth more.
     module, folder = pycolmap(), work / "sparse"
-    if not folder.exists():
-        kept: list[Model] = []
-        for attempt in ("database", "simple_radial"):
-            database, partial = work / f"{attempt}.db", work / f"sparse.partial-{attempt}"
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir()
-            if attempt == "simple_radial":
-                _simplify_cameras(module, shutil.copyfile(work / "database.db", database))
-            # COLMAP's own thresholds: weaker ones, and global mapping, join what only looks alike, with small errors.
-            options = module.IncrementalPipelineOptions()
-            # A fixed seed: the same photos give the same poses on the same machine.
-            options.num_threads, options.random_seed, options.min_model_size = threads(), 0, _LEAST_MODEL
-            callbacks = {"initial_image_pair_callback": lambda: advance(2), "next_image_callback": lambda: advance(1)}
-            module.incremental_mapping(database, images, partial, options, **callbacks)
-            models = _models(partial)
-            if models and (not kept or len(models[0].images) > 1.1 * len(kept[0].images)):
-                kept = models
-            if kept and len(kept[0].images) >= 0.95 * count:
-                break
-        if kept:
-            kept[0].folder.parent.replace(folder)
     models = _models(folder)
+    for attempt in () if models else ("database", "simple_radial"):
+        database, partial = work / f"{attempt}.db", work / f"sparse.partial-{attempt}"
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        if attempt == "simple_radial":
+            shutil.copyfile(work / "database.db", database)
+            with module.Database.open(database) as copy:
+                for camera in copy.read_all_cameras():
+                    lens = camera.mean_focal_length(), camera.width, camera.height
+                    simple = module.Camera.create_from_model_name(camera.camera_id, "SIMPLE_RADIAL", *lens)
+                    simple.has_prior_focal_length = camera.has_prior_focal_length
+                    copy.update_camera(simple)
+        # COLMAP's own thresholds: weaker ones, and global mapping, join what only looks alike, with small errors.
+        options = module.IncrementalPipelineOptions()
+        # A fixed seed: the same photos give the same poses on the same machine.
+        options.num_threads, options.random_seed, options.min_model_size = threads(), 0, _LEAST_MODEL
+        callbacks = {"initial_image_pair_callback": lambda: advance(2), "next_image_callback": lambda: advance(1)}
+        module.incremental_mapping(database, images, partial, options, **callbacks)
+        found = _models(partial)
+        if found and (not models or len(_posed(found[0])) > 1.1 * len(_posed(models[0]))):
+            models, best = found, partial
+        if models and len(_posed(models[0])) >= 0.95 * count:
+            break
     if not models:
-        raise DataError(
-            "no photos could be placed relative to each other; add sharp ones that overlap by two thirds, taken from "
-            "places some steps apart"
-        )
+        remedy = "add sharp ones that overlap by two thirds, taken from places some steps apart"
+        raise DataError(f"no photos could be placed relative to each other; {remedy}")
+    if not folder.exists():
+        best.replace(folder)
     return models
 
 
-def _simplify_cameras(module: Any, path: Path) -> None:
-    """Turn the cameras of a database into SIMPLE_RADIAL ones with their known focal lengths."""
-    with module.Database.open(path) as database:
-        for camera in database.read_all_cameras():
-            lens = camera.mean_focal_length(), camera.width, camera.height
-            other = module.Camera.create_from_model_name(camera.camera_id, "SIMPLE_RADIAL", *lens)
-            other.has_prior_focal_length = camera.has_prior_focal_length
-            database.update_camera(other)
-
-
-def _models(folder: Path) -> list[Model]:
-    """The models of a folder, the largest first."""
+def _models(folder: Path) -> list[Any]:
+    """The models of a folder, the largest first, without the poses of images that see hardly a point."""
     models = []
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
-        model = load_model(path)
-        names = sorted(image.name for image in model.images.values() if image.has_pose)
-        if len(names) >= _LEAST_MODEL:
-            models.append(Model(path, tuple(names), float(model.compute_mean_reprojection_error())))
-    return sorted(models, key=lambda model: (-len(model.images), model.error))
+        model = pycolmap().Reconstruction(path)
+        for image in list(model.images.values()):
+            if image.has_pose and image.num_points3D < 15:  # after the removal of outliers it may stand anywhere
+                model.deregister_frame(image.frame_id)
+        if len(_posed(model)) >= _LEAST_MODEL:
+            models.append(model)
+    return sorted(models, key=lambda model: (-len(_posed(model)), float(model.compute_mean_reprojection_error())))
 
 
-def load_model(folder: Path) -> Any:
-    """A stored model (``pycolmap.Reconstruction``), without the poses of images that see hardly a point of it."""
-    model = pycolmap().Reconstruction(folder)
-    for image in list(model.images.values()):
-        if image.has_pose and image.num_points3D < 15:  # after the removal of outliers it may stand anywhere
-            model.deregister_frame(image.frame_id)
-    return model
+def _posed(model: Any) -> list[str]:
+    return [image.name for image in model.images.values() if image.has_pose]

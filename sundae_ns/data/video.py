@@ -1,20 +1,33 @@
-"""Frames of a video: the sharpest of each stretch."""
+"""Frames of a video as upright images in sRGB: the sharpest of each stretch."""
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from sundae_ns.core.errors import DataError, regular, writing
-from sundae_ns.data.photos import LEAST_PHOTOS
+from sundae_ns.data.images import HIGH_RANGE, JPEG, to_srgb_values
+from sundae_ns.data.photos import LEAST_PHOTOS, check_shape
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
+_OPTIONS = {
+    # Formats that open no other file: a playlist would take frames of other videos of this machine.
+    "format_whitelist": "mov,matroska,avi,mpeg,mpegvideo,mpegts,h264,hevc,flv,asf,ogg",
+    "protocol_whitelist": "file",
+}
+_MOST_PIXELS = 1 << 27
+_CONVERT = "convert it to .mp4 (H.264)"
+# By their numbers in ITU-T H.273: matrices of BT.709, FCC, BT.601 (twice), SMPTE 240M, BT.2020; those of RGB or unknown
+# ones; transfers that no player shows as they are.
+_MATRICES, _UNSTATED = (1, 4, 5, 6, 7, 9), (0, 2, 3)
+_NOT_SHOWN = {8: "linear", 9: "logarithmic", 10: "logarithmic", 17: "cinema (SMPTE 428)"}
 
 
 def is_video(path: Path) -> bool:
@@ -23,107 +36,120 @@ def is_video(path: Path) -> bool:
 
 
 def check_video(path: Path) -> None:
-    """Raise ``DataError`` if a video cannot be decoded, or has too few frames."""
-    with _opened(path) as video:
-        length = _length(video, path)
-        if not video.grab():
-            raise DataError(f"{path} has no frame that can be decoded; convert it to .mp4 (H.264)")
+    """Raise ``DataError`` if a video cannot be decoded, has too few frames, or colours that cannot be converted."""
+    length, first = _length(path), next(_frames(path), None)
+    if first is None:
+        raise DataError(f"{path} has no frame that can be decoded; {_CONVERT}")
     if length < LEAST_PHOTOS:
         raise DataError(f"{path} has {length} frames, and camera poses need {LEAST_PHOTOS} or more; give a longer one")
+    check_shape(path, image_of(first, path).size)
 
 
 def write_frames(path: Path, folder: Path, count: int, advance: Callable[[int], None]) -> None:
-    """Write the sharpest frame of each of ``count`` stretches of a video, as ``00001.jpg`` and so on.
-
-    Args:
-        path: the video.
-        folder: for the frames; it appears once all are written.
-        count: number of frames; a shorter video gives all of its own.
-        advance: called with the number of further frames.
-
-    Raises:
-        DataError: the video cannot be decoded.
-        StorageError: the disk is full or not writable.
-    """
-    import cv2
-
-    partial = folder.with_name(f"{folder.name}.partial")
+    """Write the sharpest frame of each of ``count`` stretches of a video to a folder, which appears at the end."""
+    partial, written = folder.with_name(f"{folder.name}.partial"), 0
     with writing(f"cannot write {folder}"):
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
-        with _opened(path) as video:
-            written = 0
-            for frame in _sharpest(video, _length(video, path), count):
-                written += 1
-                encoded, content = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
-                if not encoded:
-                    raise DataError(f"frame {written} of {path} cannot be saved as JPEG; make the video smaller")
-                (partial / f"{written:05d}.jpg").write_bytes(content.tobytes())
-                advance(1)
+        for written, frame in enumerate(_sharpest(path, count), start=1):
+            image_of(frame, path).save(partial / f"{written:05d}.jpg", **JPEG)
+            advance(1)
         if written < LEAST_PHOTOS:
-            raise DataError(f"{path} ends after {written} frames that can be decoded; convert it to .mp4 (H.264)")
+            raise DataError(f"{path} ends after {written} frames that can be decoded; {_CONVERT}")
         partial.replace(folder)
 
 
+def image_of(frame: Any, path: Path) -> Image.Image:
+    """A frame (``av.VideoFrame``) as an upright image in sRGB; ``DataError`` if it states colours not known here.
+
+    Its own matrix and range count; without a matrix BT.709 from 1280 x 577 on and BT.601 below, as in players. A high
+    dynamic range is rolled off; other transfers are shown as they are, and so are wide gamuts.
+    """
+    matrix, transfer = int(frame.colorspace), int(getattr(frame, "color_trc", 2))
+    if matrix in _UNSTATED:
+        matrix = 1 if frame.width >= 1280 or frame.height > 576 else 5
+    if matrix not in _MATRICES or transfer in _NOT_SHOWN:
+        what = f"{_NOT_SHOWN[transfer]} light" if transfer in _NOT_SHOWN else f"a colour matrix of number {matrix}"
+        raise DataError(f"{path} has {what}, which is not read; convert it to BT.709, for example with HandBrake")
+    high = transfer in HIGH_RANGE
+    options = {"src_colorspace": matrix, "src_color_range": int(frame.color_range)}
+    pixels = frame.reformat(format="rgb48le" if high else "rgb24", **options).to_ndarray()
+    if high:
+        pixels = to_srgb_values(pixels, transfer, int(getattr(frame, "color_primaries", 2)))
+    for data in frame.side_data:
+        if data.type.name == "DISPLAYMATRIX":  # of points (x, y) as rows, in 65536ths
+            a, b, _, c, d = np.sign(np.round(np.frombuffer(bytes(data), np.int32)[:5] / 65536)).astype(int)
+            if (a == 0) != (b == 0):  # a right angle
+                pixels = (pixels.swapaxes(0, 1) if a == 0 else pixels)[:: b + d, :: a + c]
+    return Image.fromarray(np.ascontiguousarray(pixels))
+
+
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """The container and its video."""
+    import av
+
     try:
-        regular(path)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror}); check the path") from error
-    # Our error says what is wrong; OpenCV reads both variables when it is imported first.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    import cv2
-
-    video = cv2.VideoCapture(str(path.absolute()))
-    try:
-        if not video.isOpened():
-            raise DataError(f"{path} is not a video that OpenCV decodes; convert it to .mp4 (H.264)")
-        yield video
-    finally:
-        video.release()
+        with av.open(str(regular(path).absolute()), options=_OPTIONS) as container:
+            video: Any = container.streams.best("video")
+            if video is None:
+                raise DataError(f"{path} has no images; give a video")
+            video.thread_type = "AUTO"
+            video.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
+            yield container, video
+    except (av.error.FFmpegError, OSError) as error:
+        raise DataError(f"{path} is not a video that FFmpeg decodes ({error.strerror}); {_CONVERT}") from error
 
 
-def _length(video: Any, path: Path) -> int:
+def _frames(path: Path) -> Iterator[Any]:
+    """The frames that can be decoded, deinterlaced."""
+    import av
+
+    graph: Any = None
+
+    def filtered(frame: Any) -> Iterator[Any]:
+        graph.push(frame)
+        with suppress(BlockingIOError, EOFError):
+            while True:
+                yield graph.pull()
+
+    with _opened(path) as (container, video):
+        for packet in container.demux(video):
+            frames = []
+            with suppress(av.error.InvalidDataError):  # the packet is damaged
+                frames = packet.decode()
+            for frame in frames:
+                if graph is None and frame.interlaced_frame:
+                    graph = av.filter.Graph()
+                    steps = graph.add_buffer(template=video), graph.add("bwdif", "send_frame:auto:interlaced")
+                    graph.link_nodes(*steps, graph.add("buffersink")).configure()
+                yield from [frame] if graph is None else filtered(frame)
+        if graph is not None:
+            yield from filtered(None)
+
+
+def _length(path: Path) -> int:
     """Number of frames: as the file states, or counted."""
-    import cv2
-
-    stated = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-    if stated > 0:
-        return stated
-    with _opened(path) as other:
-        return sum(1 for _ in iter(other.grab, False))
+    with _opened(path) as (container, video):
+        return video.frames or sum(packet.size > 0 for packet in container.demux(video))
 
 
-def _sharpest(video: Any, length: int, count: int) -> Iterator[np.ndarray]:
-    """The sharpest of 12 frames ``[H, W, 3]`` of each of ``count`` equal stretches of a video of ``length`` frames."""
+def _sharpest(path: Path, count: int) -> Iterator[Any]:
+    """The sharpest of 12 frames of each of ``count`` equal stretches of a video."""
+    length = max(_length(path), 1)
     count = min(count, length)
     every = max(1, length // (count * 12))
-    best: tuple[float, np.ndarray] | None = None
-    number = stretch = 0
-    while video.grab():
-        # A file may hold more frames than it states; they belong to the last stretch.
-        current = min(number * count // length, count - 1)
-        if current != stretch:
-            if best is not None:
-                yield best[1]
-            stretch, best = current, None
-        if best is None or number % every == 0:
-            decoded, frame = video.retrieve()
-            if decoded and (best is None or sharpness(frame) > best[0]):
-                best = sharpness(frame), frame
-        number += 1
-    if best is not None:
-        yield best[1]
+    # A file may hold more frames than it states; they belong to the last stretch.
+    stretches = groupby(enumerate(_frames(path)), lambda item: min(item[0] * count // length, count - 1))
+    for _, frames in stretches:
+        _, first = next(frames)
+        yield max(chain([first], (frame for number, frame in frames if number % every == 0)), key=sharpness)
 
 
-def sharpness(frame: np.ndarray) -> float:
-    """Variance of the Laplacian of a frame ``[H, W, 3]`` uint8, at a width of at most 960 pixels."""
+def sharpness(frame: Any) -> float:
+    """Variance of the Laplacian of a frame's grey values, at a width of at most 960 pixels."""
     import cv2
 
-    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    if grey.shape[1] > 960:
-        size = 960, max(1, grey.shape[0] * 960 // grey.shape[1])
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
+    width = min(frame.width, 960)
+    grey = frame.reformat(width, max(1, frame.height * width // frame.width), "gray", interpolation="AREA")
+    return float(cv2.Laplacian(grey.to_ndarray(), cv2.CV_64F).var())

@@ -7,6 +7,7 @@ import random
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal, cast
 
 import cv2
@@ -19,12 +20,12 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
-from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
-from sundae_ns.data.capture import check_image, undecodable
+from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line, reading
+from sundae_ns.data.images import TURNED, check_image, decoded, exif_orientation, turned, wrong_size
 from sundae_ns.data.layouts import larger_model, unused_masks
-from sundae_ns.data.photos import TURNED, exif_orientation, turn, wrong_size
 from sundae_ns.plugin.camera_models import check_cameras, warn_of_cloud, warn_of_stray_tests
 from sundae_ns.plugin.dataparsers import check_capture, rebound, set_parser
 from sundae_ns.train.progress import warn
@@ -85,9 +86,11 @@ class CheckedDataset(InputDataset):
         return [int(side * self.scale_factor) for side in size]
 
     def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
-        """Pixels ``[H, W, 3 or 4]``, turned as the camera sees them."""
-        pixels: NDArray[np.uint8] = super().get_numpy_image(image_idx)
-        return turn(pixels, self.turned[image_idx]) if image_idx in self.turned else pixels
+        """Pixels ``[H, W, 3 or 4]`` in sRGB, turned as the camera sees them."""
+        read = rebound(InputDataset.get_numpy_image, Image=SimpleNamespace(open=decoded, Resampling=Image.Resampling))
+        pixels: NDArray[np.uint8] = read(self, image_idx)
+        turn = self.turned.get(image_idx)
+        return pixels if turn is None else np.array(turned(Image.fromarray(pixels), turn))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """Image, and mask if the capture has masks.
@@ -95,10 +98,8 @@ class CheckedDataset(InputDataset):
         Raises:
             DataError: a file of this view is damaged.
         """
-        try:
+        with reading(self.image_filenames[image_idx], "an image that can be decoded", remedy="repair or remove it"):
             return super().get_data(image_idx, image_type)
-        except Exception as error:  # decoders raise many kinds with one meaning for the user
-            raise undecodable(self.image_filenames[image_idx], error) from error
 
 
 @dataclass

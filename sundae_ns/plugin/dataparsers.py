@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.data.capture import beside, check_transforms, rigid
+from sundae_ns.data.capture import check_first_image, check_transforms, rigid
 from sundae_ns.data.colmap import ColmapImage, check_colmap, read_images, read_points
 from sundae_ns.data.layouts import no_model, no_transforms
 from sundae_ns.data.lenses import (
@@ -82,10 +82,9 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
         path = data if data.suffix == ".json" else data / "transforms.json"
         if not path.is_file():
             raise no_transforms(data)
-        frames = check_transforms(path, splits=splits)["frames"]
-        first = path.parent / frames[0]["file_path"]  # nerfstudio looks at its size
-        if images and parser.downscale_factor in (None, 1) and not first.exists():
-            raise DataError(f"{first} does not exist{beside(first)}; correct file_path in {path.name}")
+        meta = check_transforms(path, splits=splits)
+        if images:  # nerfstudio looks at the size of the first
+            check_first_image(path, meta, parser.downscale_factor or 1)
 
 
 def set_parser(config: DataParserConfig, robust: bool) -> None:

@@ -344,11 +344,12 @@ def test_without_pycolmap_nothing_starts(
 
 
 def test_photos_are_judged_before_anything_starts(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
-    os.mkfifo("photos/x.png")
-    assert "photos/x.png cannot be read (it is a pipe" in refusal(capsys, "photos", "-o", "out")
+    for name in "abcdefghi":
+        os.mkfifo(f"photos/{name}.png")
+    assert "photos/i.png cannot be read (it is a pipe" in refusal(capsys, "photos", "-o", "out")
     assert commands.ran == []
     assert not Path("out").exists()
-    Path("photos/x.png").unlink()
+    Path("photos/i.png").unlink()
     assert run("photos", "-o", "out") == 0
     # Photos are of no more use once there are poses.
     shutil.rmtree("photos")

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.data.capture import check_image, check_transforms
-from sundae_ns.data.demo_capture import ARCHIVE, write_demo_capture
+from sundae_ns.data.capture import check_transforms
+from sundae_ns.data.capture_files import ARCHIVE, write_demo_capture
+from sundae_ns.data.images import check_image
 
 TRAIN, TEST, SIDE = 48, 8, 128
 
@@ -42,18 +43,18 @@ def test_other_folders_are_refused_and_unchanged(tmp_path: Path) -> None:
 def test_an_interrupted_copy_has_no_transforms_and_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: int
 ) -> None:
-    read, count = zipfile.ZipFile.read, 0
+    extract, count = zipfile.ZipFile.extract, 0
 
-    def until_the_end(self: zipfile.ZipFile, name: str) -> bytes:
+    def until_the_end(self: zipfile.ZipFile, name: str, out: Path) -> str:
         nonlocal count
         count += 1
         if count > left:
             raise KeyboardInterrupt
-        return read(self, name)
+        return extract(self, name, out)
 
     write_demo_capture(tmp_path)
     with monkeypatch.context() as patched:
-        patched.setattr(zipfile.ZipFile, "read", until_the_end)
+        patched.setattr(zipfile.ZipFile, "extract", until_the_end)
         with pytest.raises(KeyboardInterrupt):
             write_demo_capture(tmp_path)
     assert not (tmp_path / "transforms.json").exists()

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import re
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -58,36 +61,52 @@ def test_the_suffix_is_that_of_the_contents(tmp_path: Path, kind: str) -> None:
     assert {(photo.suffix, photo.as_it_is) for photo in find_photos(tmp_path)} == {KINDS[kind]}
 
 
-def test_raw_photos(tmp_path: Path) -> None:
-    for index in range(3):
-        (tmp_path / f"{index}.CR2").write_bytes(b"II*\0\x10\0\0\0CR\2\0" + bytes(100))
-    assert [(one.suffix, one.as_it_is) for one in find_photos(tmp_path)] == [(".jpg", False)] * 3
-    (tmp_path / "3.cr2").write_bytes(b"II*\0" + bytes(100))
-    with pytest.raises(DataError, match=r"3\.cr2 is not a raw photo"):
-        find_photos(tmp_path)
+def zipped_text(path: Path) -> None:
+    """A PNG whose text behind the pixels unpacks to 80 MB."""
+    photo(path)
+    content, text = path.read_bytes(), b"zTXta\0\0" + zlib.compress(bytes(80 << 20), 9)
+    chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    path.write_bytes(content[:-12] + chunk + content[-12:])
 
 
 ODD: dict[str, tuple[Callable[[Path], object], str]] = {
     "a pipe": (os.mkfifo, "it is a pipe or a device"),
     "a raw pipe": (lambda path: os.mkfifo(path.with_suffix(".cr2")), "it is a pipe or a device"),
+    "a raw photo of text": (lambda path: path.with_suffix(".cr2").write_text("II*"), "is not a photo"),
     "a device": (lambda path: path.symlink_to("/dev/zero"), "it is a pipe or a device"),
-    "a dangling link": (lambda path: path.symlink_to("gone.png"), "No such file or directory"),
-    "a link to itself": (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
-    "text": (lambda path: path.write_text("not a photo"), "it is not an image"),
-    "nothing": (lambda path: path.touch(), "it is not an image"),
+    "a dangling link": (lambda path: path.symlink_to("gone.png"), "does not exist"),
+    "a link to itself": (lambda path: path.symlink_to(path), "does not exist"),
+    "text": (lambda path: path.write_text("not a photo"), "cannot identify image file"),
+    "nothing": (lambda path: path.touch(), "cannot identify image file"),
     "another format": (lambda path: photo(path, "ppm"), "is a PPM file by its contents"),
-    "16 bits": (lambda path: Image.new("I;16", (16, 12)).save(path), "pixels of type I;16"),
+    "floats": (lambda path: Image.new("F", (16, 12)).save(path, format="TIFF"), "pixels of type F"),
+    "a bomb of text": (zipped_text, "Decompressed data too large"),
+    "a line": (lambda path: Image.new("RGB", (8000, 2)).save(path), "8000 x 2 px, too narrow for camera poses"),
+    "a column": (lambda path: Image.new("RGB", (20, 8000)).save(path), "20 x 8000 px, too narrow for camera poses"),
 }
 
 
 @pytest.mark.parametrize("kind", ODD)
-def test_what_is_no_photo_is_named_in_one_line(photos: Path, kind: str) -> None:
+def test_what_is_no_photo_is_left_out_in_one_line(photos: Path, kind: str) -> None:
     make, cause = ODD[kind]
     make(photos / "x.png")
-    with pytest.raises(DataError, match=cause) as error:
+    said: list[str] = []
+    assert len(find_photos(photos, said.append)) == 3
+    (line,) = said
+    assert re.search(rf"^left out: .*x\.(png|cr2).*{cause}", line)
+    assert "\n" not in line
+    (photos / "0.png").unlink()
+    with pytest.raises(DataError, match=rf"{cause}.*; 1 of 3 photos cannot be used"):
         find_photos(photos)
-    assert "\n" not in str(error.value)
-    assert "x." in str(error.value)
+
+
+def test_half_of_the_photos_must_be_readable(photos: Path) -> None:
+    for name in "abc":
+        (photos / f"{name}.png").touch()
+    assert len(find_photos(photos)) == 3
+    (photos / "d.png").touch()
+    with pytest.raises(DataError, match="; 4 of 7 photos cannot be used"):
+        find_photos(photos)
 
 
 def test_a_photo_that_may_not_be_read(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,9 +139,9 @@ def test_a_folder_that_is_none(tmp_path: Path) -> None:
         (
             ("a.AVIF", "sub/b.avif", "c.dng", ".d.avif"),
             True,
-            "2 .avif files and 1 .dng file are left out; convert them",
+            "2 .avif, 1 .dng left out; convert them",
         ),
-        (("a.HEIC", "b.heic"), False, "2 .heic files are left out; install pillow-heif with pip install"),
+        (("a.HEIC", "b.heic"), False, "2 .heic left out; install pillow-heif with pip install"),
     ],
 )
 def test_photos_that_are_not_read_are_named(
@@ -147,7 +166,7 @@ def test_poses_say_which_photos_they_leave_out(
     (photos / "a.dng").touch()
     monkeypatch.setattr(reconstruct, "check_installed", lambda: None)
     check_poses(photos, 150, None)
-    assert capsys.readouterr().out.startswith("# warning: 1 .dng file is left out")
+    assert capsys.readouterr().out.startswith("# warning: 1 .dng left out")
 
 
 def test_masks_are_no_photos(photos: Path) -> None:

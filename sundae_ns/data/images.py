@@ -1,0 +1,217 @@
+"""Image files: judged by their headers, decoded to sRGB with 8 bits a channel, and turned upright.
+
+Colours of a high dynamic range (Rec. ITU-R BT.2100) or a wide gamut go by the numbers of ITU-T H.273.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import cache, lru_cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, ImageChops, ImageCms, ImageOps
+
+from sundae_ns.core.errors import DataError, reading, regular
+from sundae_ns.data.capture import beside
+
+HEIF = (".heic", ".heif")  # for which Pillow needs the package pillow-heif
+TURNED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
+JPEG: dict[str, Any] = {"quality": 97, "subsampling": 0}
+REPAIR = "repair it or remove the view"
+# Pillow's types of pixels that are read, and those in which their colours are converted.
+_MODES = {"CMYK": "CMYK", **dict.fromkeys(("1", "L", "LA", "I;16", "I;16B", "I;16L"), "L")}
+_MODES |= dict.fromkeys(("P", "PA", "RGB", "RGBA", "YCbCr"), "RGB")
+_PROFILES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}  # types of pixels by the colour space of an ICC profile
+
+PQ, HLG, ADOBE = 16, 18, -1  # transfers; Adobe RGB (1998) has no number
+HIGH_RANGE = (PQ, HLG)
+BT709, BT2020, P3 = 1, 9, 12
+# Chromaticities of red, green and blue; white is D65.
+_PRIMARIES = {
+    BT709: ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06)),
+    BT2020: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
+    P3: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
+    ADOBE: ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06)),
+}
+_WHITE = 203.0  # cd/m2, of a white sheet (Report ITU-R BT.2408); HLG is for a display of 1,000
+_KNEE = 0.46  # share of white from which a high range is rolled off
+
+
+def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
+    """Width and height in pixels of an image or a mask, by its header; ``DataError`` if training cannot use it."""
+    if not path.exists():
+        raise DataError(f"{path} does not exist{beside(path)}; correct the path or remove the view")
+    with reading(path, "a complete image", remedy=REPAIR, missing=REPAIR), opened(path) as image:
+        size, mode, length = image.size, image.mode, path.stat().st_size
+    if mode not in (("1", "L") if mask else _MODES):
+        wanted = "one channel of 8 bits" if mask else "RGB, RGBA or grey with 8 bits per channel"
+        raise DataError(f"{path} has pixels of type {mode}; save it with {wanted}")
+    # No format stores 4,096 pixels in a byte, even of one flat colour.
+    if size[0] * size[1] > max(4096 * length, 1 << 20):
+        raise DataError(f"{path} claims {size[0]} x {size[1]} px in {length:,} bytes; it is incomplete, save it again")
+    return size
+
+
+def opened(path: Path) -> Image.Image:
+    """An image whose header is read."""
+    if path.suffix.lower() in HEIF:
+        reads_heif()
+    return Image.open(regular(path))
+
+
+@cache
+def reads_heif() -> bool:
+    """Whether pillow-heif is installed; then Pillow reads HEIC from now on."""
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        return False
+    register_heif_opener()
+    return True
+
+
+def decoded(path: Path) -> Image.Image:
+    """The pixels of an image as :func:`to_srgb` gives them; ``DataError`` if they are broken."""
+    with reading(path, "an image that can be decoded", remedy=REPAIR, missing=REPAIR), opened(path) as image:
+        image.load()
+        return to_srgb(image)
+
+
+def to_srgb(image: Image.Image) -> Image.Image:
+    """An image of type L, RGB or RGBA in sRGB, by its ICC profile or what else states another colour space.
+
+    As in browsers, a profile that is damaged or of another kind of pixels counts for nothing.
+    """
+    if is_srgb(image):
+        return image
+    convert, deep = _conversion(image), image.mode.startswith("I;16")
+    alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
+    base = Image.fromarray(np.round(np.asarray(image) / 257).astype(np.uint8)) if deep else image
+    base = base.convert(_MODES[image.mode])
+    base = base if convert is None else convert(base)
+    if base.mode == "CMYK" or alpha is not None:
+        base = base.convert("RGB")
+    if alpha is not None:
+        base.putalpha(alpha)
+    return base
+
+
+def is_srgb(image: Image.Image) -> bool:
+    """Whether the pixels are of type L, RGB or RGBA, and in sRGB."""
+    plain = image.mode in ("L", "RGB", "RGBA") and "transparency" not in image.info
+    return plain and _conversion(image) is None
+
+
+def _conversion(image: Image.Image) -> Callable[[Image.Image], Any] | None:
+    """A function to sRGB, by an ICC profile, or by HEIF's numbers or Adobe RGB in EXIF data; None for those of sRGB."""
+    if (profile := image.info.get("icc_profile")) is not None:
+        transform = _transform(profile, _MODES[image.mode])
+        return transform and (lambda base: ImageCms.applyTransform(base.convert(transform.input_mode), transform))
+    stated = 0, 0
+    with suppress(Exception):  # a damaged entry is none
+        if "nclx_profile" in image.info:
+            nclx = image.info["nclx_profile"]
+            stated = int(nclx["transfer_characteristics"]), int(nclx["color_primaries"])
+        elif image.format in ("JPEG", "MPO", "TIFF"):
+            adobe = image.getexif().get_ifd(ExifTags.IFD.Interop).get(1) == "R03"
+            stated = (ADOBE, ADOBE) if adobe else stated
+    if stated[0] not in HIGH_RANGE and stated[1] not in (P3, ADOBE):
+        return None
+    return lambda base: Image.fromarray(to_srgb_values(np.asarray(base.convert("RGB")), *stated))
+
+
+@lru_cache(maxsize=16)
+def _transform(profile: bytes, mode: str) -> Any:
+    """The transform from an ICC profile to sRGB; None if it changes no value by more than 1, or cannot be used."""
+    try:
+        stated = ImageCms.ImageCmsProfile(BytesIO(profile))
+        source = _PROFILES[stated.profile.xcolor_space.strip()]
+        transform = ImageCms.buildTransform(stated, ImageCms.createProfile("sRGB"), source, "RGB")
+    except (KeyError, OSError, ImageCms.PyCMSError):
+        return None
+    levels = (np.indices((6, 6, 6)) * 51).reshape(3, 36, 6).transpose(1, 2, 0).astype(np.uint8)
+    sample = Image.fromarray(levels).convert(mode)
+    converted: Any = ImageCms.applyTransform(sample.convert(source), transform)
+    change = np.asarray(ImageChops.difference(converted, sample.convert("RGB"))).max()
+    return transform if change > 1 and (source == mode or (mode, source) == ("L", "RGB")) else None
+
+
+def to_srgb_values(values: NDArray[np.uint8] | NDArray[np.uint16], transfer: int, primaries: int) -> NDArray[np.uint8]:
+    """sRGB ``[H, W, 3]`` of code values. Unknown primaries count as BT.2020 in a high range, else as those of sRGB."""
+    codes = np.linspace(0, 1, np.iinfo(values.dtype).max + 1)
+    light = _LIGHT.get(transfer, _srgb)(codes).astype(np.float32)[values]
+    known = primaries if primaries in _PRIMARIES else BT2020 if transfer in HIGH_RANGE else BT709
+    if transfer == HLG:
+        luminance = light @ np.array([0.2627, 0.6780, 0.0593], np.float32)
+        light *= 1000 / _WHITE * luminance[..., None] ** np.float32(0.2)
+    light = light @ _to_709(known)
+    if transfer in HIGH_RANGE:
+        brightest = light.max(axis=-1, keepdims=True).clip(1e-6)
+        rolled = 1 - (1 - _KNEE) * np.exp((_KNEE - brightest) / (1 - _KNEE))
+        light *= np.where(brightest > _KNEE, rolled / brightest, 1)
+    light = light.clip(0, 1)
+    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** np.float32(1 / 2.4) - 0.055)
+    return np.round(255 * code).astype(np.uint8)
+
+
+def _to_709(primaries: int) -> NDArray[np.float32]:
+    """Matrix ``[3, 3]`` from the light of these primaries to that of BT.709, for rows."""
+    white = np.array([0.3127, 0.3290, 0.3583]) / 0.3290
+    to_xyz = []
+    for key in (primaries, BT709):
+        columns = np.array([(x, y, 1 - x - y) for x, y in _PRIMARIES[key]]).T
+        to_xyz.append(columns * np.linalg.solve(columns, white))
+    return np.linalg.solve(to_xyz[1], to_xyz[0]).T.astype(np.float32)
+
+
+def _srgb(code: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+
+
+def _pq(code: NDArray[np.float64]) -> NDArray[np.float64]:
+    power = code ** (32 / 2523)
+    return 10000 / _WHITE * ((power - 0.8359375).clip(0) / (18.8515625 - 18.6875 * power)) ** (8192 / 1305)
+
+
+def _hlg(code: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Light of the scene."""
+    return np.where(code <= 0.5, code**2 / 3, (np.exp((code - 0.55991073) / 0.17883277) + 0.28466892) / 12)
+
+
+_LIGHT = {PQ: _pq, HLG: _hlg, ADOBE: lambda code: code ** (563 / 256)}
+
+
+def exif_orientation(path: Path) -> int:
+    """EXIF orientation of an image, from 1 (as stored) to 8; 1 if it states none."""
+    with suppress(Exception), opened(path) as image:  # decoders raise many kinds; a damaged entry is none
+        return orientation_in(image.getexif())
+    return 1
+
+
+def orientation_in(exif: Image.Exif) -> int:
+    """As :func:`exif_orientation`, of EXIF data."""
+    stated = exif.get(ExifTags.Base.Orientation, 1)
+    return stated if stated in range(1, 9) else 1
+
+
+def turned(image: Image.Image, orientation: int) -> Image.Image:
+    """Stored pixels upright by their EXIF orientation."""
+    image = image.copy()
+    image.getexif()[ExifTags.Base.Orientation] = orientation
+    return ImageOps.exif_transpose(image)
+
+
+def wrong_size(path: Path, size: Sequence[int], expected: Sequence[int], orientation: int) -> DataError:
+    """The error for an image whose size is not that of its camera."""
+    remedy = "give each size its own camera, or resize the images"
+    if orientation in TURNED:
+        remedy = "it is also turned by its EXIF entry: turn its pixels and remove the entry"
+    elif max(abs(a - b) for a, b in zip(size, expected, strict=True)) <= 1:
+        remedy = "give colmap --downscale-rounding-mode round (or ceil), or make the smaller images again"
+    stated = f"{size[0]} x {size[1]} px but its camera says {expected[0]} x {expected[1]}"
+    return DataError(f"{path.name} is {stated}; {remedy}")

@@ -1,0 +1,150 @@
+"""Images decoded to sRGB, against Pillow's ImageCms: profiles, types of pixels, colours that are stated otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from icc_profiles import SPACES, judged, profile
+from PIL import Image, ImageCms
+
+from sundae_ns.data.images import decoded, opened, reads_heif, to_srgb
+from sundae_ns.data.photos import find_photos, upright
+
+
+def patches(width: int = 192, height: int = 128) -> Image.Image:
+    """64 fields of colour."""
+    levels = np.array([20, 90, 160, 235], np.uint8)
+    fields = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(8, 8, 3)
+    return Image.fromarray(fields.repeat(height // 8, axis=0).repeat(width // 8, axis=1))
+
+
+def off(image: Image.Image, expected: np.ndarray) -> int:
+    """The largest difference in the middle of the fields; JPEG and HEIC change what lies at their edges."""
+    middles = np.abs(np.arange(192) % 24 - 11.5) < 4, np.abs(np.arange(128) % 16 - 7.5) < 4
+    difference = np.abs(np.asarray(image.convert("RGB"), int) - expected)
+    return int(difference[middles[1]][:, middles[0]].max())
+
+
+KINDS: dict[str, dict[str, Any]] = {
+    "a.png": {},
+    "a.tif": {},
+    "a.webp": {"lossless": True},
+    "a.jpg": {"quality": 100, "subsampling": 0},
+    "a.heic": {"quality": 100, "chroma": 444},
+}
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("name", KINDS)
+def test_a_profile_is_converted_as_imagecms_does(tmp_path: Path, name: str, space: str) -> None:
+    if name == "a.heic" and not reads_heif():
+        pytest.skip("pillow-heif is not installed")
+    for number in range(3):
+        patches().save(tmp_path / f"{number}{name}", icc_profile=profile(space), **KINDS[name])
+    (photo, *_) = find_photos(tmp_path)
+    assert not photo.as_it_is
+    with opened(photo.path) as stored:
+        expected = judged(stored.convert("RGB"), space)
+    assert off(patches(), expected) > 10
+    assert off(Image.fromarray(expected.astype(np.uint8)), judged(patches(), space)) <= 8  # JPEG, HEIC
+    for image in (decoded(photo.path), upright(photo)[0]):
+        assert off(image, expected) <= 1
+
+
+def test_ten_bits_of_heic(tmp_path: Path) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    reads_heif()
+    deep = (np.asarray(patches(), np.uint16) * 257).tobytes()
+    file = heif.from_bytes(mode="RGB;16", size=(192, 128), data=deep)
+    file.save(tmp_path / "a.heic", quality=100, chroma=444, icc_profile=profile("P3"))
+    with opened(tmp_path / "a.heic") as image:
+        assert image.info["bit_depth"] == 10
+    assert off(decoded(tmp_path / "a.heic"), judged(patches(), "P3")) <= 3
+
+
+@pytest.mark.parametrize(("transfer", "primaries", "changed"), [(13, 12, True), (16, 9, True), (13, 1, False)])
+def test_colours_of_heic_without_a_profile(tmp_path: Path, transfer: int, primaries: int, changed: bool) -> None:
+    image = patches()
+    image.format = "HEIF"
+    image.info["nclx_profile"] = {"transfer_characteristics": transfer, "color_primaries": primaries}
+    converted = to_srgb(image)
+    assert (off(converted, np.asarray(image, int)) > 10) == changed
+    if (transfer, primaries) == (13, 12):  # sRGB's own curve, of which that of the profile is off by 8
+        assert off(converted, judged(patches(), "P3")) <= 10
+
+
+def test_adobe_rgb_by_exif(tmp_path: Path) -> None:
+    """Cameras state Adobe RGB by DCF's R03 alone; the photo that is saved states it no more."""
+    exif = Image.Exif()
+    exif[0x8769] = {0xA001: 0xFFFF, 0xA005: {1: "R03"}}
+    for number in range(3):
+        patches().save(tmp_path / f"{number}.jpg", exif=exif, quality=100, subsampling=0)
+    (photo, *_) = find_photos(tmp_path)
+    with Image.open(photo.path) as image:
+        expected = judged(image, "Adobe RGB")
+    pixels, stated = upright(photo)
+    assert off(pixels, expected) <= 2
+    pixels.save(tmp_path / "again.jpg", exif=stated, quality=100, subsampling=0)
+    assert off(decoded(tmp_path / "again.jpg"), expected) <= 3
+
+
+def grey16(path: Path) -> None:
+    Image.fromarray(np.asarray(patches().convert("L"), np.uint16) * 257).save(path)
+
+
+def palette(path: Path) -> None:
+    patches().quantize(64).save(path)
+
+
+def with_profile(mode: str, space: str | bytes) -> Callable[[Path], None]:
+    icc = space if isinstance(space, bytes) else profile(space)
+    return lambda path: patches().convert(mode).save(path, icc_profile=icc)
+
+
+def _same() -> np.ndarray:
+    return np.asarray(patches(), int)
+
+
+def _grey() -> np.ndarray:
+    return np.asarray(patches().convert("L").convert("RGB"), int)
+
+
+TYPES: dict[str, tuple[Callable[[Path], object], str, Callable[[], np.ndarray]]] = {
+    "16 bits": (grey16, "L", _grey),
+    "a palette": (palette, "RGB", _same),
+    "grey and alpha": (lambda path: patches().convert("LA").save(path), "RGBA", _grey),
+    "CMYK": (
+        lambda path: patches().convert("CMYK").save(path, format="TIFF"),
+        "RGB",
+        lambda: np.asarray(patches(), int),
+    ),
+    "a grey profile": (with_profile("L", "grey"), "RGB", lambda: judged(patches().convert("L"), "grey")),
+    "grey in P3": (
+        with_profile("L", "ProPhoto"),
+        "RGB",
+        lambda: judged(patches().convert("L").convert("RGB"), "ProPhoto"),
+    ),
+    "alpha and a profile": (with_profile("RGBA", "P3"), "RGBA", lambda: judged(patches(), "P3")),
+    "a profile of another kind": (with_profile("RGB", "grey"), "RGB", _same),
+    "a damaged profile": (with_profile("RGB", b"none"), "RGB", _same),
+}
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_types_of_pixels(tmp_path: Path, kind: str) -> None:
+    make, mode, expected = TYPES[kind]
+    make(tmp_path / "a.png")
+    image = decoded(tmp_path / "a.png")
+    assert image.mode == mode
+    assert off(image, expected()) <= 1
+
+
+def test_srgb_stays_as_it_is(tmp_path: Path) -> None:
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for number in range(3):
+        patches().save(tmp_path / f"{number}.jpg", icc_profile=srgb)
+    assert all(photo.as_it_is for photo in find_photos(tmp_path))
