@@ -27,7 +27,6 @@ from sundae_ns.core.errors import BackendError
 from sundae_ns.core.metrics import lpips_weights
 
 PACKAGES = ("sundae-ns", "nerfstudio", "gsplat", "torch", "torchvision", "numpy", "scipy", "tyro")
-"""Packages that training needs."""
 
 
 class Part(NamedTuple):
@@ -49,7 +48,7 @@ def doctor(compile: Flag = False) -> int:  # noqa: A002
     with console.status("Building gsplat's kernels, some minutes" if compile else "Checking"):
         checked = parts(compile)
     for part in checked:
-        missing = "[red]missing[/]" if part.name in PACKAGES else "[yellow]-[/]"
+        missing = "[red]missing[/]" if part.name in PACKAGES else "[yellow]-[/]"  # training needs these
         table.add_row("[green]ok[/]" if part.works else missing, part.name, escape(part.text))
     console.print(table)
     remedies = [f"  {part.name}: {part.remedy}" for part in checked if not part.works]

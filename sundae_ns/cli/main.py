@@ -6,6 +6,7 @@ import atexit
 import gc
 import importlib
 import io
+import logging
 import os
 import sys
 import warnings
@@ -38,8 +39,7 @@ COMMANDS = {
     "doctor": "check this machine, and say how to repair it",
 }
 """Commands with their lines in ``sundae --help``. Each is the function of its name in the module of its name."""
-STEP = "SUNDAE_STEP"
-"""Variable of a command that another one started, which tells how to continue after an interrupt."""
+STEP = "SUNDAE_STEP"  # variable of a command that another one started, which tells how to continue
 
 
 def _dispatch(words: Sequence[str]) -> int:
@@ -69,15 +69,17 @@ def exit_with(command: Callable[[], int], name: str) -> NoReturn:
     """Run a command and exit with its code; 2 after the one line of a :class:`SundaeError`, 130 for an interrupt."""
     for variable, value in ENVIRONMENT.items():
         os.environ.setdefault(variable, value)
+    early = f"{name} ended early"
     try:
         # Commands name the file that they cannot write; this covers others, such as a full disk behind stdout.
-        with writing(f"{name} ended early"):
+        with writing(early):
             code = command()
             sys.stdout.flush()
     except SundaeError as error:
         if os.environ.get("SUNDAE_TRACEBACK"):
             raise
-        print(f"sundae: {error}", file=sys.stderr)
+        file = getattr(error.__cause__, "filename", None) if str(error).startswith(early) else None
+        print(f"sundae: {f'{file}: ' if file else ''}{error}", file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:  # the reader of stdout has left, as head does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -94,6 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:
         warnings.simplefilter("ignore")  # of libraries; PYTHONWARNINGS=error would make them errors
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it looks for a home
         for stream in (sys.stdout, sys.stderr):  # names of files may hold bytes that are no text
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="backslashreplace")

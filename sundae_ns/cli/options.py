@@ -15,8 +15,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from sundae_ns.core.errors import ConfigError, StorageError
 
-Source = Annotated[Path, tyro.conf.Positional]
-"""The file or the folder that a command reads."""
+Source = Annotated[Path, tyro.conf.Positional]  # the file or the folder that a command reads
 Scene = Annotated[
     Path,
     tyro.conf.Positional,
@@ -25,11 +24,8 @@ Scene = Annotated[
         "gsplat's .pt."
     ),
 ]
-"""A scene that a command reads."""
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-"""What a command writes: ``--out`` or ``-o``."""
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-"""An option without a ``--no-`` form."""
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]  # an option without a --no- form
 Overwrite = Annotated[Flag, tyro.conf.arg(help="replace an earlier output, once the new one is complete.")]
 Direction = tuple[float, float, float]
 

@@ -12,7 +12,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,8 @@ from sundae_ns.core.errors import STOPPED, SundaeError, writing
 
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _MESSAGES = re.compile(
-    r"Warning: |sundae: |Viewer running|Resuming |trained: |[\d,]+ Gaussians, |[\d,]+( of [\d,]+)? steps\s*$"
-    r"|\[[\d:]{8}\] (?!.*\.py:\d+\s*$)|[┏┃┡└]|│ \S"
+    r"Warning: |sundae: |Viewer running|Stopping |Left without|trained: |[\d,]+ Gaussians, "
+    r"|[\d,]+( of [\d,]+)? steps\s*$|\[[\d:]{8}\] (?!.*\.py:\d+\s*$)|[┏┃┡└]|│ \S"
 )
 """Messages of ns-train by this package, and its table of the schedule. Those of nerfstudio end in a line of code."""
 
@@ -43,7 +43,6 @@ def run_command(words: Sequence[str], log: Path | None = None) -> int:
     print(shlex.join(words), flush=True)
     if log is None:
         return run_logged(words)[0]
-    refusals = list[str]()
     with progress_bar() as bar:
         task = bar.add_task("Training", total=100)
 
@@ -53,10 +52,9 @@ def run_command(words: Sequence[str], log: Path | None = None) -> int:
                 bar.update(task, completed=percent, description=" ".join(["Training", *line.split("  ")[-2:]]))
             if _MESSAGES.match(line) or (percent is not None and bar.disable):
                 print(line, flush=True)
-                refusals.extend([line] if line.startswith("sundae: ") else [])
 
         code, end = run_logged(words, log, show)
-    if code and code not in STOPPED and not refusals:
+    if code and code not in STOPPED and "\nsundae: " not in f"\n{end}":  # else the cause is printed already
         print(end, file=sys.stderr)
     return code
 
@@ -89,7 +87,7 @@ def run_logged(
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, received[-1])
 
-    with writing(f"cannot write {log}"), nullcontext() if log is None else log.open("w", encoding="utf-8") as file:
+    with writing(f"cannot write {log}"), open(log or os.devnull, "w", 1, encoding="utf-8") as file:
         try:
             process = subprocess.Popen([program, *words[1:]], **options)
         except OSError as error:
@@ -99,8 +97,7 @@ def run_logged(
         before = {number: signal.signal(number, pass_on) for number in heard}
         try:
             for line in process.stdout or ():
-                if file is not None:
-                    file.write(line)
+                file.write(line)
                 last.append(line.rstrip())
                 on_line(line)
             code = process.wait()

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import torch
 import tyro
-from rich.console import Console
 from rich.markup import escape
 
 from sundae_ns.cli.options import Out, Overwrite, check_folder, check_least, progress_bar
@@ -63,7 +62,7 @@ def report(
     notes = [] if flip_available() else ["FLIP: the package is not installed; run pip install flip-evaluator."]
     notes += [missing] if lpips is None else []
     measure = partial(measure_scene, lpips=lpips, warmup=warmup, repeats=repeats, command=command)
-    console, done, failures = Console(), list[ShownRun](), list[SundaeError]()
+    done, failures = list[ShownRun](), list[SundaeError]()
     with progress_bar() as progress:
         for path in runs:
             task = progress.add_task(f"Opening {escape(str(path))}", total=None)
@@ -94,15 +93,12 @@ def report(
         if len({(run.resolution, len(run.full.views)) for run in measured_runs}) > 1
     ]
     rows, page = [run.measured.as_json() for run in done], report_page(done, notes, command)
-    files = {"json": json.dumps(rows, indent=1) + "\n", "csv": csv_text(rows), "md": markdown(scenes, notes)}
-    contents = {kind: content.encode(errors="backslashreplace") for kind, content in {**files, "html": page}.items()}
-    write_files({out / f"report.{kind}": content for kind, content in contents.items()})
-    for note in notes:
-        console.print(f"Left out: {note}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+    files = {"json": json.dumps(rows, indent=1), "csv": csv_text(rows), "md": markdown(scenes, notes), "html": page}
+    write_files({out / f"report.{kind}": text.encode(errors="backslashreplace") for kind, text in files.items()})
     shown, total = sum(len(run.views) for run in done), sum(len(run.measured.full.views) for run in done)
-    size = f"{len(page) / 1e6:.1f} MB, {shown} of {total} views"
-    console.print(f"wrote {out / 'report.html'}, to look at in a browser: {size}", highlight=False)
-    console.print(f"wrote {out / 'report.md'}, report.csv and report.json: its table", highlight=False)
+    print("".join(f"Left out: {note}\n" for note in notes), end="")
+    print(f"wrote {out / 'report.html'}, to look at in a browser: {len(page) / 1e6:.1f} MB, {shown} of {total} views")
+    print(f"wrote {out / 'report.md'}, report.csv and report.json: its table")
     return 1 if failures else 0
 
 

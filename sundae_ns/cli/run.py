@@ -28,10 +28,8 @@ from sundae_ns.io.pack import container
 from sundae_ns.io.pack.config import FINETUNED_SIZE, tuned_steps
 from sundae_ns.io.run_folder import LOCK, reserve, steps_left
 
-SETTINGS = "run.json"
-"""File with the settings of the first command; a repeated one must share them."""
-LOG = "train.log"
-"""File with all output of ns-train."""
+SETTINGS = "run.json"  # file with the settings of the first command; a repeated one must share them
+LOG = "train.log"  # file with all output of ns-train
 DRAFT_STEPS = 3000
 
 

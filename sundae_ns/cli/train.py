@@ -20,8 +20,7 @@ from sundae_ns.io.pack.config import FINETUNE_STEPS
 from sundae_ns.io.run_folder import new_name, unfinished_run
 
 PACKED = "scene.sundae"
-FINETUNE_WORDS = ("--finetune-steps", str(FINETUNE_STEPS))
-"""Words of ns-train that leave the last steps to the fine-tune of :func:`pack_run`."""
+FINETUNE_WORDS = ("--finetune-steps", str(FINETUNE_STEPS))  # leaves the last steps to that of pack_run
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from sundae_ns.cli.options import Scene
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.scene.page import page_of
 
-IDLE_SECONDS = 15.0
-"""A connection that sends or takes nothing for this time is closed."""
+IDLE_SECONDS = 15.0  # a connection that sends or takes nothing for this time is closed
 
 
 class _Server(ThreadingHTTPServer):

@@ -50,17 +50,6 @@ def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
 
 
 @pytest.mark.parametrize("kind", [".spz", ".sog"])
-def test_export_to_other_formats(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
-    model = {**MODEL, "rasterize_mode": "antialiased"}
-    write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": model}))
-    out = tmp_path / f"a{kind}"
-    assert run("export", tmp_path / "a.sundae", "-o", out) == 0
-    output = " ".join(capsys.readouterr().out.split())
-    assert f"a{kind}: 200 Gaussians, degree 1, antialiased, {out.stat().st_size:,} bytes" in output
-    assert out.read_bytes()[:2] == {".spz": b"\x1f\x8b", ".sog": b"PK"}[kind]
-
-
-@pytest.mark.parametrize("kind", [".spz", ".sog"])
 @pytest.mark.parametrize("comments", [[], ["SplatRenderMode: mip"]])
 def test_export_of_a_ply_of_any_program(
     tmp_path: Path,

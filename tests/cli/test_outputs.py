@@ -19,7 +19,6 @@ from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
 from sundae_ns.io.ply import write_ply
 from sundae_ns.scene.initialization import from_points
 
-LONG = "x" * 300
 Refused = Callable[..., str]
 
 
@@ -121,22 +120,6 @@ def test_what_is_no_file_is_refused_at_once(here: Path, refused: Refused, words:
             (here / path).symlink_to("/dev/zero")
     refused(*words)
     assert not (here / "x").exists()
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["prune", "a.ply", "-o", LONG + ".ply"],
-        ["prune", LONG, "-o", "x.ply"],
-        ["export", "a.ply", "-o", LONG + ".spz"],
-        ["pack", LONG, "-o", "x.sundae"],
-        ["demo", LONG],
-        ["report", LONG, "-o", "x"],
-    ],
-)
-def test_names_too_long_are_one_line(here: Path, refused: Refused, words: list[str]) -> None:
-    assert "too long" in refused(*words)
-    assert {path.name for path in here.iterdir()} <= {"a.ply", "a.sundae", "outputs"}
 
 
 @pytest.fixture

@@ -17,7 +17,14 @@ from run_commands import PHOTOS, photo, write_video
 
 import sundae_ns as sn
 
+LONG = "x" * 300
 REFUSALS = {
+    f"prune in.ply -o {LONG}.ply": "too long",
+    f"prune {LONG} -o x.ply": "too long",
+    f"export in.ply -o {LONG}.spz": "too long",
+    f"pack {LONG} -o x.sundae": "too long",
+    f"demo {LONG}": "too long",
+    f"report {LONG} -o x": "too long",
     "fly": "there is no command fly; sundae --help lists them",
     "reprot": "use report",
     "demo used": "--overwrite",

@@ -36,7 +36,7 @@ def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     shutil.copytree(tiny.scene / "images", "photos")
     monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
 
-    def here(words: Sequence[str]) -> int:
+    def here(words: Sequence[str], log: Path | None = None) -> int:
         if words[:2] == ["sundae", "poses"]:
             shutil.copytree(tiny.scene, words[words.index("-o") + 1])
             return 0
