@@ -28,7 +28,6 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
-from torch import Tensor
 
 from harness.chromium import WEBGPU, Browser, find_chromium, wait_for
 from sundae_ns.io.pack import container
@@ -46,31 +45,20 @@ SIDE = 320
 WEB = Path(__file__).parents[1] / "web"
 
 
-def sized(scene: PackedScene, intrinsics: Tensor, sizes: Tensor, picks: Tensor, share: float) -> PackedScene:
-    """The scene with some of its cameras, with other lenses, and its head at ``share`` of the scale of its training."""
-    cameras = {name: value[picks].clone() for name, value in arrays_of_cameras(scene_of(scene).cameras).items()}
-    cameras["intrinsics"] = intrinsics.to(cameras["intrinsics"])
-    cameras["sizes"] = sizes.to(cameras["sizes"])
+def scaled(scene: PackedScene, side: int) -> PackedScene:
+    """The scene with six of its cameras, no larger than ``side``, as if the head had been trained at that size."""
+    cameras = arrays_of_cameras(scene_of(scene).cameras)
+    picks = torch.linspace(0, len(cameras["poses"]) - 1, CAMERAS).round().long().unique()
+    sizes = cameras["sizes"][picks].double()
+    targets = (sizes * min(side / int(sizes.max()), 1.0)).round().clamp_min(1)
+    shares = targets / sizes
+    intrinsics = cameras["intrinsics"][picks] * shares.repeat(1, 2)
+    sized = {"poses": cameras["poses"][picks], "intrinsics": intrinsics, "sizes": targets.to(cameras["sizes"])}
     meta = copy.deepcopy(scene.meta)
     focal = meta["model"].get("trained_focal")
     if focal is not None:
-        meta["model"]["trained_focal"] = [value * share for value in focal]
-    return replace(scene, cameras=cameras, meta=meta)
-
-
-def picked(scene: PackedScene) -> tuple[Tensor, Tensor, Tensor]:
-    """Six cameras, fewer if it has fewer: their indices, intrinsics ``[N, 4]`` and sizes ``[N, 2]`` in pixels."""
-    cameras = arrays_of_cameras(scene_of(scene).cameras)
-    picks = torch.linspace(0, len(cameras["poses"]) - 1, CAMERAS).round().long().unique()
-    return picks, cameras["intrinsics"][picks].double(), cameras["sizes"][picks].double()
-
-
-def scaled(scene: PackedScene, side: int) -> PackedScene:
-    """The scene with six of its cameras, no larger than ``side``, as if the head had been trained at that size."""
-    picks, intrinsics, sizes = picked(scene)
-    targets = (sizes * min(side / int(sizes.max()), 1.0)).round().clamp_min(1)
-    shares = targets / sizes
-    return sized(scene, intrinsics * shares.repeat(1, 2), targets, picks, float(shares.mean()))
+        meta["model"]["trained_focal"] = [value * float(shares.mean()) for value in focal]
+    return replace(scene, cameras=sized, meta=meta)
 
 
 def write_changed(out: Path, scene: Path, small: PackedScene) -> PackedScene:

@@ -39,6 +39,7 @@ WEB = Path(__file__).parents[1] / "web"
 SECONDS = 60
 """Time limit of one verdict; it takes milliseconds, so only a hang reaches it."""
 POINTS = 60
+LENS = ("fx", "fy", "cx", "cy", "width", "height")
 
 
 class Verdict(NamedTuple):
@@ -135,16 +136,11 @@ def python_verdict(path: Path) -> Verdict:
         "background": [round(float(value), 4) for value in scene.background],
         "trainedFocal": list(scene.trained_focal) if scene.trained_focal else None,
         "up": packed.meta.get("up"),
-        "start": None if start is None else _camera(start),
+        # As the page has it.
+        "start": start and {"pose": sum(start["pose"], []), **dict(zip(LENS, [*start["intrinsics"], *start["size"]]))},
     }
     assert (scene.up is None, scene.start is None) == (content["up"] is None, start is None)
     return Verdict(None, content)
-
-
-def _camera(stated: dict[str, Json]) -> dict[str, Json]:
-    """A start view as the page has it."""
-    lens = zip(("fx", "fy", "cx", "cy", "width", "height"), [*stated["intrinsics"], *stated["size"]], strict=True)
-    return {"pose": [value for row in stated["pose"] for value in row], **dict(lens)}
 
 
 @contextmanager
@@ -168,11 +164,6 @@ def page_verdicts(folder: Path) -> Iterator[Callable[[Path], Verdict]]:
 
         yield judge
         ask.close()
-
-
-def has_node() -> bool:
-    """Whether Node and the page's build tools are here."""
-    return shutil.which("node") is not None and (WEB / "node_modules").is_dir()
 
 
 def problem_of(python: Verdict, page: Verdict) -> str | None:
@@ -213,7 +204,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the first one")
     parser.add_argument("--keep", type=Path, help="folder for files on which the readers differ")
     options = parser.parse_args()
-    if not has_node():
+    if shutil.which("node") is None or not (WEB / "node_modules").is_dir():
         sys.exit("the page's decoder needs Node and its build tools; run make web")
     torch.set_num_threads(1)
     started = time.perf_counter()

@@ -78,14 +78,11 @@ def device_of(scene: sn.Scene) -> str:
 def jobs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The rows to make, without their figures."""
     for share in options.shares:
-        yield {"tool": OURS, "rule": RULE.selection, "training": "none", "share": share, "steps": 0}
-        for training in options.training:
-            if training != "none":
-                job = {"tool": OURS, "rule": RULE.selection, "training": training, "share": share}
-                yield {**job, "steps": options.steps}
-        if options.splat_transform:
-            for rule in ("decimate", "decimate-adaptive"):
-                yield {"tool": OTHER, "rule": rule, "training": "none", "share": share, "steps": 0}
+        for training in dict.fromkeys(["none", *options.training]):
+            steps = 0 if training == "none" else options.steps
+            yield {"tool": OURS, "rule": RULE.selection, "training": training, "share": share, "steps": steps}
+        for rule in ("decimate", "decimate-adaptive") if options.splat_transform else ():
+            yield {"tool": OTHER, "rule": rule, "training": "none", "share": share, "steps": 0}
 
 
 def made(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: Path) -> tuple[sn.Scene, float]:

@@ -87,13 +87,6 @@ def _mean_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {**mean, "keep_ratio": share}
 
 
-def default_runs() -> list[dict[str, Any]]:
-    """Rows of :func:`runs` without those of other shares than ``sundae`` keeps."""
-    rows = runs()
-    usual = {(row["scene"], row["variant"]) for row in rows if row["keep_ratio"] == SHARE}
-    return [row for row in rows if row["keep_ratio"] == SHARE or (row["scene"], row["variant"]) not in usual]
-
-
 def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
     """Rows whose first cell is left out where it repeats the one above."""
     seen = ""
@@ -107,28 +100,21 @@ def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
 def quality() -> list[str]:
     """All methods on the captures: quality and size; :func:`speed` has times, because suites share their GPUs."""
     heads = ["capture", "method", "keep", "Gaussians", "PSNR, dB", "SSIM", "PSNR, head off", "MB"]
-    rows, found = [], default_runs()
+    rows, found = [], runs()
+    usual = {(row["scene"], row["variant"]) for row in found if row["keep_ratio"] == SHARE}
     compared = {row["scene"] for row in found if row["variant"] in ("sundae", "sundae-auto")}
     headless = {row["scene"] for row in found if row["variant"] == "sundae" and not row["bytes_head"]}
     for row in found:
+        other_share = row["keep_ratio"] != SHARE and (row["scene"], row["variant"]) in usual
         again = row["variant"] == "sundae-no-head" and row["scene"] in headless  # the same run but for chance
-        if row["variant"] in LEFT_OUT or row["scene"] not in compared or again:
+        if other_share or again or row["variant"] in LEFT_OUT or row["scene"] not in compared:
             continue
-        capture, method, *others = cells_of(row)
+        capture = f"{row['scene']}, {row['resolution'].replace('x', ' x ')}"
         keep = "" if row["keep_ratio"] is None else f"{row['keep_ratio']:.0%}"
-        rows.append([capture, method, keep, *others])
+        cells = [METHODS[row["variant"]], keep, number(row["primitives"], 0), row["psnr_cell"], row["ssim_cell"]]
+        base = number(row["psnr_base"], 2) if row["bytes_head"] else ""
+        rows.append([capture, *cells, base, number(row["bytes_total"] / MB, 1)])
     return table(heads, first_of_each(rows))
-
-
-def cells_of(row: dict[str, Any]) -> list[str]:
-    """Capture, method, number of Gaussians, metrics and size of a row of runs.csv."""
-    return [
-        f"{row['scene']}, {row['resolution'].replace('x', ' x ')}",
-        METHODS[row["variant"]],
-        *(number(row["primitives"], 0), row["psnr_cell"], row["ssim_cell"]),
-        number(row["psnr_base"], 2) if row["bytes_head"] else "",
-        number(row["bytes_total"] / MB, 1),
-    ]
 
 
 def speed() -> list[str]:

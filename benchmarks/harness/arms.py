@@ -111,12 +111,13 @@ def _refuse_duplicates(names: Iterable[str], where: str) -> None:
 
 
 def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Arm:
+    from nerfstudio.configs.method_configs import all_methods
     from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
     from sundae_ns.plugin.model import SundaeModelConfig
 
     method = entry.method or default
-    config, whole = _config_of(entry, method), _methods()[method]
+    config, whole = _config_of(entry, method, all_methods), dict[str, Any](all_methods)[method]
     model = whole.pipeline.model
     if not isinstance(model, SplatfactoModelConfig):
         raise ConfigError(f"arm {entry.name}: {method} has no Gaussians; use splatfacto or a method of this package")
@@ -152,16 +153,7 @@ def _scaled(steps: int, scale: float) -> int:
     return max(round(steps * scale), 1)
 
 
-def _methods() -> dict[str, Any]:
-    """Configurations of all methods of ``ns-train``, by name."""
-    # Late, since it loads nerfstudio and all its plug-ins.
-    from nerfstudio.configs.method_configs import all_methods
-
-    return dict(all_methods)
-
-
-def _config_of(entry: Entry, method: str) -> Any:
-    methods = _methods()
+def _config_of(entry: Entry, method: str, methods: Mapping[str, Any]) -> Any:
     if method not in methods:
         near = difflib.get_close_matches(method, methods) or ["sundae", "splatfacto"]
         raise ConfigError(f"arm {entry.name}: ns-train has no method {method!r}; use {' or '.join(near)}")
@@ -186,7 +178,9 @@ def _config_of(entry: Entry, method: str) -> Any:
 @cache  # a parse takes a third of a second
 def _parse(method: str, words: Words) -> Any:
     """A configuration with options of the command line, as ``ns-train`` parses them; not to be changed."""
-    default = _methods()[method]
+    from nerfstudio.configs.method_configs import all_methods
+
+    default = all_methods[method]
     return tyro.cli(tyro.conf.FlagConversionOff[type(default)], default=default, args=words)  # type: ignore[misc]
 
 

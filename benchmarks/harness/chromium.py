@@ -18,10 +18,9 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -58,14 +57,12 @@ class BrowserError(RuntimeError):
     """The browser did not react in time, or refused a call."""
 
 
-@dataclass
-class Camera:
+class Camera(NamedTuple):
     """Camera of the page, from its last message to the viewer: OpenCV axes, in the viewer's units."""
 
-    wxyz: tuple[float, float, float, float]
-    position: tuple[float, float, float]
-    fov: float
-    """Vertical, radian."""
+    wxyz: tuple[float, ...]
+    position: tuple[float, ...]
+    fov: float  # vertical, radian
     aspect: float
 
 
@@ -218,8 +215,9 @@ class Browser:
     def _on_message(self, part: dict[str, Any]) -> None:
         """Note what viser's page and server tell each other."""
         if part.get("type") == "ViewerCameraMessage":
-            place = tuple(part["wxyz"]), tuple(part["position"])
-            self.camera = Camera(*place, float(part["fov"]), float(part["aspect"]))
+            self.camera = Camera(
+                tuple(part["wxyz"]), tuple(part["position"]), float(part["fov"]), float(part["aspect"])
+            )
         elif part.get("type") == "BackgroundImageMessage":
             with Image.open(io.BytesIO(part["rgb_bytes"])) as image:
                 self.images.append(image.size)

@@ -1,15 +1,9 @@
-"""Make a capture of few training views from a COLMAP capture.
+"""Views and points of captures of few training views; ``lab/cut.py`` writes them.
 
-    python benchmarks/harness/few_views.py CAPTURE OUT -n 16
-    ns-train sundae --data OUT colmap --colmap-path sparse/0 --eval-mode filename --downscale-factor 1
-
-Training and test views are spread evenly over the capture; names of images start with train_ or eval_. Points are those
-that structure from motion of the training photos finds: of the capture's own, those that two of them see; where these
-have no tracks, by pycolmap from the capture's poses. --all-points keeps all.
+Points are those that structure from motion of the training photos finds: of the capture's own, those that two of them
+see; where these have no tracks, by pycolmap from the capture's poses.
 """
 
-import argparse
-import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -60,40 +54,3 @@ def triangulated(cameras: dict[int, Any], placed: list[Any], images: Path) -> di
             key: colmap.Point3D(key, point.xyz, point.color, point.error, none, none)
             for key, point in found.points3D.items()
         }
-
-
-def main() -> None:
-    """Write the capture."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("capture", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("-n", type=int, default=16, help="number of training views")
-    parser.add_argument("--tests", type=int, default=40, help="number of test views")
-    parser.add_argument("--all-points", action="store_true", help="keep the points of all photos")
-    args = parser.parse_args()
-    model = args.out / "sparse/0"
-    cameras, images, points = colmap.read_model(str(args.capture / "sparse/0"), ext=".bin")
-    order = sorted(images.values(), key=lambda image: image.name)
-    train = spread(len(order), args.n)
-    left = [i for i in range(len(order)) if i not in train]
-    kinds = {order[i].id: "train" for i in train}
-    kinds |= {order[left[i]].id: "eval" for i in spread(len(left), args.tests)}
-    for folder in ("images", "sparse/0"):
-        (args.out / folder).mkdir(parents=True, exist_ok=True)
-    chosen, none = {}, np.zeros(0, int)
-    for key, kind in kinds.items():
-        image = images[key]
-        name = f"{kind}_{image.name.replace('/', '_')}"
-        chosen[key] = image._replace(name=name, xys=np.zeros((0, 2)), point3D_ids=none)
-        shutil.copyfile(args.capture / "images" / image.name, args.out / "images" / name)
-    tracked = any(len(point.image_ids) for point in points.values())
-    kept = points if args.all_points else seen_twice(points, {order[i].id for i in train}) if tracked else {}
-    if not kept:
-        kept = triangulated(cameras, [chosen[order[i].id] for i in train], args.out / "images")
-    bare = {key: point._replace(image_ids=none, point2D_idxs=none) for key, point in kept.items()}
-    colmap.write_model(cameras, chosen, bare, str(model), ext=".bin")
-    print(f"{args.out}: {len(train)} training and {len(kinds) - len(train)} test views, {len(kept):,} points")
-
-
-if __name__ == "__main__":
-    main()

@@ -111,7 +111,8 @@ def train_here(config: TrainerConfig, log: Path, place: str | None = None, nth: 
 
 
 def command_here(words: Sequence[str], log: Path, place: str | None = None) -> None:
-    """Run a command of sundae in this process; die when ``place`` is reached."""
+    """Run a command of sundae on a CPU in this process; die when ``place`` is reached."""
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""
     _prepare(log, COMMANDS, place, 1)
     sundae(words)
 

@@ -25,45 +25,31 @@ class Arm:
 
     name: str
     kind: Kind
-    method: str
-    """Name of the method in ``ns-train``."""
-    options: Mapping[str, Words] = field(default_factory=dict)
-    """Options of ``ns-train`` by name, without the dashes."""
-    steps: int = 30_000
-    """Length of its own training."""
-    warmup: int = 0
-    """Length of its method's warm-up; 0 for an arm that trains whole."""
-    total: int = 0
-    """Length of its method's warm-up and fine-tuning together; 0 for an arm that trains whole."""
-    keep_ratio: float | None = None
-    """Its own share of the warm-up's Gaussians, in place of the plan's."""
-    at_every_ratio: bool = False
-    """Whether an arm that trains whole runs at every share of the plan, because it prunes once."""
+    method: str  # of ns-train
+    options: Mapping[str, Words] = field(default_factory=dict)  # of ns-train by name, without the dashes
+    steps: int = 30_000  # of its own training
+    warmup: int = 0  # steps of its method's warm-up; 0 for an arm that trains whole
+    total: int = 0  # steps of warm-up and fine-tuning together; 0 for an arm that trains whole
+    keep_ratio: float | None = None  # its own share of the warm-up's Gaussians, in place of the plan's
+    at_every_ratio: bool = False  # an arm that trains whole runs at every share of the plan, because it prunes once
 
 
 @dataclass(frozen=True)
 class Job:
     """One training with its evaluation."""
 
-    key: str
-    """Name, unique in a plan; also of its folder."""
+    key: str  # name, unique in a plan; also of its folder
     kind: Literal["warm-up", "branch", "whole"]
     scene: str
     arm: str
-    data: str
-    """Folder of the capture."""
-    method: str
-    """Name of the method in ``ns-train``."""
+    data: str  # folder of the capture
+    method: str  # of ns-train
     steps: int
     seed: int
-    keep_ratio: float | None = None
-    """Share of the Gaussians to keep; None for an arm that has no share, or decides it."""
-    needs: str | None = None
-    """Key of the warm-up that it starts from."""
-    options: Words = ()
-    """Options of ``ns-train``."""
-    parser: Words = ()
-    """The data parser and its options; empty for the method's own."""
+    keep_ratio: float | None = None  # share of the Gaussians to keep; None where there is none, or the arm decides it
+    needs: str | None = None  # key of the warm-up that it starts from
+    options: Words = ()  # of ns-train
+    parser: Words = ()  # the data parser and its options; empty for the method's own
 
 
 def parser_of(data: Path, downscale: int = 1) -> Words:
@@ -171,14 +157,13 @@ def _command(options: Mapping[str, Words]) -> Words:
 def _check(
     keep_ratios: Sequence[float], seeds: Sequence[int], repeat_at: Sequence[float], own: Sequence[float]
 ) -> None:
-    for ratio in keep_ratios:
-        if not 0 < ratio <= 1:
-            raise ConfigError(f"keep ratio {ratio} cannot be; give shares in (0, 1], 0.1 for a tenth")
+    wrong = [ratio for ratio in keep_ratios if not 0 < ratio <= 1]
+    if wrong:
+        raise ConfigError(f"keep ratio {wrong[0]} cannot be; give shares in (0, 1], 0.1 for a tenth")
     if not keep_ratios or not seeds:
         raise ConfigError("there is nothing to do without a keep ratio and a seed; give one of each")
-    for name, values in (("keep ratio", keep_ratios), ("seed", seeds)):
-        if len(set(values)) < len(values):
-            raise ConfigError(f"the same {name} is given twice; give each once")
+    if len(set(keep_ratios)) < len(keep_ratios) or len(set(seeds)) < len(seeds):
+        raise ConfigError("the same keep ratio or seed is given twice; give each once")
     ratios = [*keep_ratios, *own]
     if len(seeds) > 1 and not set(repeat_at) & set(ratios):
         raise ConfigError(f"no keep ratio is repeated with other seeds; let --repeat-at name one of {ratios}")
