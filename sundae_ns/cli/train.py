@@ -86,14 +86,14 @@ def train(
         raise ConfigError("a resumed run trains its remaining steps; leave out --steps or --resume")
     options.check(capture)
     check_folder(out, reads=[], overwrite=True)
-    unfinished, more = unfinished_run(out, options.method, capture), list(further)
-    if resume and unfinished is None:
+    (old, step, length), more = unfinished_run(out, options.method, capture) or (None, 0, 0), list(further)
+    if resume and old is None:
         raise ConfigError(f"{out} has no unfinished run of {options.method} on {capture}; leave out --resume")
     given = _value_of("--timestamp", more)
     name = given or new_name()
-    if resume and unfinished is not None:
-        folder, name = unfinished.folder, unfinished.folder.name
-        more[:0] = [f"--experiment-name={folder.parent.parent.name}", "--load-dir", word(folder / "nerfstudio_models")]
+    if resume and old is not None:
+        name = old.name
+        more[:0] = [f"--experiment-name={old.parent.parent.name}", "--load-dir", word(old / "nerfstudio_models")]
     if resume or given is None:
         more[:0] = ["--timestamp", name]
     tunes = has_gpu()
@@ -101,12 +101,11 @@ def train(
     if tunes and not any(_value_of(option, further) for option in lengths):
         more[:0] = FINETUNE_WORDS
     words = options.words(capture, out, more)  # refuses a damaged capture before runs are mentioned
-    if not resume and unfinished is not None and not (unfinished.folder / PACKED).exists():
+    if not resume and old is not None and not (old / PACKED).exists():
         resuming = ["sundae", "train", word(capture), "--resume"]
         resuming += ["-o", word(out)] if out != Path("outputs") else []
         resuming += ["--method", options.method] if options.method != "sundae" else []
-        steps = f"{unfinished.step:,} of {unfinished.length:,} steps"
-        print(f"# {unfinished.folder} ended after {steps}; this is a new run. To resume the other:")
+        print(f"# {old} ended after {step:,} of {length:,} steps; this is a new run. To resume the other:")
         print(f"#     {shlex.join(resuming)}")
     code = run_command(words)
     # Options of ns-train may have put the run elsewhere; then its last line names the command that packs it.

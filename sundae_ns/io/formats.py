@@ -130,11 +130,9 @@ def up_of(path: Path, means: Tensor, marks: Marks) -> Direction:
 
 def usable(params: Mapping[str, Tensor], path: Path, failure: type[SundaeError] = CheckpointError) -> Sanitised:
     """The Gaussians of a file that have a meaning, with finite values; logs what was changed. None is a ``failure``."""
-    sanitised = sanitise(params)
+    sanitised, n = sanitise(params), len(params["means"])
     if not sanitised.gaussians.num_gaussians:
-        raise failure(
-            f"{path} has {len(sanitised.mask):,} Gaussians, and none is finite; export it again or give another"
-        )
+        raise failure(f"{path} has {n:,} Gaussians, and none is finite; export it again or give another")
     if summary := sanitised.summary():
         _log.warning("%s: %s", path, summary)
     return sanitised

@@ -101,8 +101,7 @@ def check_gaussians(params: Mapping[str, Tensor], failure: type[Exception] = Dat
 def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The parameters that .spz, .sog and .glb store, float32 on the CPU; quaternions become unit ones.
 
-    Raises:
-        DataError: there are no Gaussians, values that are not finite, an SH degree above 3, or wrong shapes.
+    ``DataError`` for no Gaussians, values that are not finite, an SH degree above 3, or wrong shapes.
     """
     check_gaussians(params)
     gaussians = {name: params[name].detach().to("cpu", torch.float32).contiguous() for name in SPLAT_NAMES}
@@ -160,11 +159,8 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
     """Copy a .ply with only some of its vertices, atomically; properties, comments and other elements are unchanged.
 
     The ``source`` has its values as :func:`has_own_columns` says. ``mask`` is True for vertices to keep, bool ``[N]``;
-    ``params`` are new parameters of these ``[M, ...]``, None to keep their values.
-
-    Raises:
-        DataError: the file cannot be read, or has another number of vertices.
-        StorageError: the disk is full or not writable.
+    ``params`` are new parameters of these ``[M, ...]``, None to keep their values. ``DataError`` if the file cannot be
+    read, or has another number of vertices; ``StorageError`` if the disk is full or not writable.
     """
     file = _Ply(source)
     start, count, kind = file.elements["vertex"]
@@ -426,9 +422,7 @@ def read_point_cloud(path: Path, *, precise: bool = False) -> tuple[Tensor, Tens
 
     Returns:
         Positions ``[N, 3]`` float32 and colours ``[N, 3]`` uint8, on the CPU; points without a colour are mid-grey.
-
-    Raises:
-        DataError: the file is missing, not a .ply, truncated, or its vertices have no position.
+        ``DataError`` if the file is missing, not a .ply, truncated, or its vertices have no position.
     """
     rows = _Ply(path).rows()
     names = {name.lower(): name for name in rows.dtype.names or ()}

@@ -15,7 +15,7 @@ import socket
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, TextIO
 
 from sundae_ns.core.errors import CheckpointError, StorageError, regular, writing
 from sundae_ns.core.files import locked, write_text
@@ -23,8 +23,7 @@ from sundae_ns.io.checkpoint import newest_step
 from sundae_ns.io.config_file import capture_and_source, config_of, schedule_length
 
 LOCK = "training.lock"
-PRUNES = "prune.json"
-"""Record of the prunes, which a resumed run does not repeat."""
+PRUNES = "prune.json"  # record of the prunes, which a resumed run does not repeat
 _held: dict[Path, TextIO] = {}
 
 
@@ -110,14 +109,6 @@ def take_records(source: Path, run: Path, step: int) -> None:
         write_text(run / PRUNES, json.dumps(before, indent=2))
 
 
-class UnfinishedRun(NamedTuple):
-    """A run that can be resumed, with ``step`` steps trained of the ``length`` of its schedule."""
-
-    folder: Path
-    step: int
-    length: int
-
-
 def steps_left(run: Path) -> int | None:
     """Number of steps after the newest whole checkpoint of a run; None if there is nothing to resume."""
     try:
@@ -127,12 +118,13 @@ def steps_left(run: Path) -> int | None:
     return None if step is None else length - step - 1
 
 
-def unfinished_run(out: Path, method: str, capture: Path) -> UnfinishedRun | None:
+def unfinished_run(out: Path, method: str, capture: Path) -> tuple[Path, int, int] | None:
     """The newest run of a method on a capture that nobody trains and that no other run has resumed.
 
     ``out`` is the folder of runs, as of ``ns-train --output-dir``; ``capture`` a folder or its ``transforms.json``.
+    Returns the run's folder, the number of its steps, and that of its schedule's.
     """
-    candidates: list[tuple[float, UnfinishedRun]] = []
+    candidates: list[tuple[float, tuple[Path, int, int]]] = []
     resumed: set[Path] = set()
     for path in out.glob(f"*/{method}/*/config.yml"):
         folder = path.parent
@@ -146,6 +138,6 @@ def unfinished_run(out: Path, method: str, capture: Path) -> UnfinishedRun | Non
             resumed.add(source.resolve().parent)
         if left > 0 and not _in_training(folder):
             length = schedule_length(path)
-            candidates.append((path.stat().st_mtime, UnfinishedRun(folder, length - left, length)))
-    runs = [run for _, run in sorted(candidates) if run.folder.resolve() not in resumed]
+            candidates.append((path.stat().st_mtime, (folder, length - left, length)))
+    runs = [run for _, run in sorted(candidates) if run[0].resolve() not in resumed]
     return runs[-1] if runs else None
