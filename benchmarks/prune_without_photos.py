@@ -43,7 +43,7 @@ COLUMNS = (
 PLACE = ("capture", "tool", "rule", "training", "share", "device", "seed", "steps")
 """Columns that name a row."""
 OURS, OTHER = "sundae_ns", "splat-transform"
-RULE = sn.PruneRule(selection="pairs")
+RULE = sn.PruneRule()
 TRAININGS = ("none", "distill", "distill-no-head")
 HELD_OUT = 32
 

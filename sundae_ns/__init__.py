@@ -18,7 +18,7 @@ from __future__ import annotations
 import gc
 import importlib
 import sys
-from types import ModuleType
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -69,25 +69,21 @@ __all__ = [*_HOMES]  # noqa: PLE0604
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(_imported(_HOMES[name]), name)
-    globals()[name] = value
-    return value
-
-
-def _imported(module: str) -> ModuleType:
-    """Import a module; the first time without looking for garbage among the objects that torch leaves.
-
-    They live as long as the process. If torch is there already, so may be tensors of the caller, and those must not be
-    frozen: they would never be freed if cycles hold them.
-    """
-    if "torch" in sys.modules or not gc.isenabled():
-        return importlib.import_module(module)
-    gc.disable()
+    # Do not look for garbage among the objects that the first import of torch leaves: they live as long as the process.
+    # If torch is there already, so may be tensors of the caller, which would never be freed if they were frozen.
+    first = "torch" not in sys.modules and gc.isenabled()
+    if first:
+        gc.disable()
     try:
-        return importlib.import_module(module)
+        usual_defaults = importlib.import_module("sundae_ns.core.values").usual_defaults
+        with usual_defaults():
+            value = getattr(importlib.import_module(_HOMES[name]), name)
     finally:
-        gc.freeze()
-        gc.enable()
+        if first:
+            gc.freeze()
+            gc.enable()
+    globals()[name] = value = usual_defaults()(value) if isinstance(value, FunctionType) else value
+    return value
 
 
 def __dir__() -> list[str]:

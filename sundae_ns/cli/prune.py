@@ -38,7 +38,7 @@ def prune(
     num_cameras: int | None = None,
     cameras: Path | None = None,
     overwrite: Overwrite = False,
-    rule: Annotated[RuleOptions, tyro.conf.arg(name="")] = RuleOptions(selection="pairs"),  # noqa: B008
+    rule: Annotated[RuleOptions, tyro.conf.arg(name="")] = RuleOptions(),  # noqa: B008
     cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
 ) -> int:
     """Prune a scene of any program, without its photos.

@@ -13,6 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.core.values import AnyArray, numbers, whole
+
 OPENGL_TO_OPENCV = (1.0, -1.0, -1.0)  # sign of each camera axis
 
 
@@ -62,7 +65,7 @@ class Camera(NamedTuple):
     """Focal length in pixels, the mean of both axes. Kept beside K, because reading K back waits for the GPU."""
 
     @classmethod
-    def from_pose(cls, pose: Tensor, intrinsics: Sequence[float], width: int, height: int) -> Camera:
+    def from_pose(cls, pose: AnyArray, intrinsics: AnyArray, width: int, height: int) -> Camera:
         """A pinhole camera from a pose as nerfstudio and Blender write it; all sizes in pixels.
 
         Args:
@@ -70,26 +73,37 @@ class Camera(NamedTuple):
             intrinsics: focal lengths and principal point fx, fy, cx, cy.
             width, height: of the image.
 
+        Raises:
+            ConfigError: the pose has no rotation, or a number is out of its range.
+
         >>> import torch, sundae_ns as sn
         >>> sn.Camera.from_pose(torch.eye(4), (50.0, 50.0, 32.0, 24.0), 64, 48).center
         tensor([0., 0., 0.])
         """
-        fx, fy, cx, cy = (float(value) for value in intrinsics)
-        K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], device=pose.device)
-        return cls(world_to_camera(pose[:3].float()), K, int(width), int(height), (fx + fy) / 2)
+        fx, fy, cx, cy = numbers(intrinsics, "intrinsics", (4,)).tolist()
+        if not min(fx, fy) > 0:
+            raise ConfigError(f"the focal lengths are {fx:g} and {fy:g}; give positive numbers of pixels")
+        checked = numbers(pose, "pose", (3, 4), (4, 4))
+        given, axes = pose if isinstance(pose, Tensor) else checked, checked[:3, :3]
+        if float((axes.T @ axes - torch.eye(3, dtype=axes.dtype, device="cpu")).abs().max()) > 0.25:
+            raise ConfigError("the first three columns of the pose are not a rotation; give unit axes at right angles")
+        K = given.new_tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float32)
+        return cls(world_to_camera(given[:3].float()), K, whole(width, "width"), whole(height, "height"), (fx + fy) / 2)
 
     @classmethod
-    def from_fov(cls, pose: Tensor, fov: float, width: int, height: int) -> Camera:
+    def from_fov(cls, pose: AnyArray, fov: float, width: int, height: int) -> Camera:
         """As :meth:`from_pose`, with the vertical field of view in degrees and the principal point in the middle."""
-        focal = height / 2 / math.tan(math.radians(fov) / 2)
-        return cls.from_pose(pose, (focal, focal, width / 2, height / 2), width, height)
+        if not 0 < (angle := float(numbers(fov, "fov", ()))) < 180:
+            raise ConfigError(f"fov is {angle:g}; give degrees between 0 and 180")
+        focal = whole(height, "height") / 2 / math.tan(math.radians(angle) / 2)
+        return cls.from_pose(pose, (focal, focal, whole(width, "width") / 2, height / 2), width, height)
 
     @classmethod
     def look_at(
         cls,
-        eye: Sequence[float] | Tensor,
-        target: Sequence[float] | Tensor,
-        up: Sequence[float] | Tensor = (0.0, 0.0, 1.0),
+        eye: AnyArray,
+        target: AnyArray,
+        up: AnyArray = (0.0, 0.0, 1.0),
         *,
         fov: float = 60.0,
         width: int = 640,
@@ -98,18 +112,22 @@ class Camera(NamedTuple):
         """A camera on the CPU that looks at a point.
 
         Args:
-            eye: centre of the camera, world units ``[3]``.
-            target: point in the middle of the image ``[3]``.
+            eye, target: centre of the camera, and point in the middle of the image, world units ``[3]``.
             up: direction that is upwards in the image ``[3]``; ignored if it is the viewing direction.
             fov: vertical field of view, degrees.
             width, height: of the image, pixels.
+
+        Raises:
+            ConfigError: the points are one, or a number is out of its range.
 
         >>> import sundae_ns as sn
         >>> sn.Camera.look_at((0, -2, 0), (0, 0, 0)).center
         tensor([ 0., -2.,  0.])
         """
-        eye, target, up = (torch.as_tensor(v, dtype=torch.float64, device="cpu") for v in (eye, target, up))
-        return cls.from_fov(poses_looking_at(eye, target, up), fov, width, height)
+        center, point, above = numbers(eye, "eye", (3,)), numbers(target, "target", (3,)), numbers(up, "up", (3,))
+        if min(float((center - point).norm()), float(above.norm())) < 1e-12:
+            raise ConfigError("eye and target are one point, or up is zero, so there is no direction; give others")
+        return cls.from_fov(poses_looking_at(center, point, above), fov, width, height)
 
     @property
     def center(self) -> Tensor:
@@ -147,12 +165,7 @@ class Camera(NamedTuple):
 
 
 def poses_looking_at(eyes: Tensor, targets: Tensor, up: Tensor) -> Tensor:
-    """Poses of cameras that look at points, camera-to-world with OpenGL axes ``[..., 3, 4]``, dtype of the eyes.
-
-    Args:
-        eyes, targets: centres of the cameras, and points in the middle of their images ``[..., 3]``.
-        up: direction that is upwards in the images ``[3]``.
-    """
+    """Camera-to-world with OpenGL axes ``[..., 3, 4]`` of cameras at ``eyes`` that look at ``targets`` ``[..., 3]``."""
     back = torch.nn.functional.normalize(eyes - targets, dim=-1)
     right = torch.linalg.cross(up.expand_as(back), back)
     other = torch.linalg.cross(torch.roll(back, 1, dims=-1) + back.new_tensor([1.0, 0.0, 0.0]), back)

@@ -31,12 +31,13 @@ def covariances(scales: Tensor, quats: Tensor) -> Tensor:
     return half @ half.transpose(1, 2)
 
 
-def covariances_of(params: Mapping[str, Tensor]) -> Tensor:
-    """Covariances of Gaussians, float64 on their device ``[N, 3, 3]``."""
+def entries_of(params: Mapping[str, Tensor]) -> Tensor:
+    """The six different entries of covariances, diagonal first, float64 on the device of the Gaussians ``[N, 6]``."""
     scales, quats = params["scales"].detach(), params["quats"].detach()
-    result = torch.empty(len(scales), 3, 3, dtype=torch.float64, device=scales.device)
+    result = torch.empty(len(scales), 6, dtype=torch.float64, device=scales.device)
     for rows in chunks(len(scales)):
-        result[rows] = covariances(scales[rows].double().exp(), quats[rows].double())
+        matrices = covariances(scales[rows].double().exp(), quats[rows].double())
+        result[rows] = matrices[:, _LOWER[0], _LOWER[1]]
     return result
 
 
@@ -65,16 +66,10 @@ def quaternions(matrices: Tensor) -> Tensor:
     return chosen / torch.linalg.vector_norm(chosen, dim=1, keepdim=True)
 
 
-def scales_and_quaternions(covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviations ``[N, 3]`` and unit quaternions ``[N, 4]`` of symmetric matrices ``[N, 3, 3]``."""
-    eigenvalues, axes = _eigenvectors(covariance)
-    return eigenvalues.clamp_min(0).sqrt(), quaternions(axes)
+def scales_and_quaternions(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Standard deviations ``[N, 3]``, ascending, and unit quaternions ``[N, 4]`` of covariances ``[N, 3, 3]``.
 
-
-def _eigenvectors(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Ascending eigenvalues ``[N, 3]``, and rotations whose columns are the eigenvectors ``[N, 3, 3]``.
-
-    By Jacobi's method: LAPACK takes the matrices one by one, and CUDA's solver limits their number.
+    Eigenvectors by Jacobi's method: LAPACK takes the matrices one by one, and CUDA's solver limits their number.
     """
     a = [list(row.unbind(dim=1)) for row in matrices.unbind(dim=1)]
     v = [list(row.unbind(dim=1)) for row in torch.eye(3).to(matrices).expand_as(matrices).unbind(dim=1)]
@@ -94,7 +89,7 @@ def _eigenvectors(matrices: Tensor) -> tuple[Tensor, Tensor]:
     values, order = torch.stack([a[axis][axis] for axis in range(3)], dim=1).sort(dim=1)
     axes = torch.stack([torch.stack(row, dim=1) for row in v], dim=1).gather(2, order[:, None].expand_as(matrices))
     axes[:, :, 2] = torch.linalg.cross(axes[:, :, 0], axes[:, :, 1])  # of determinant 1 in every order
-    return values, axes
+    return values.clamp_min(0).sqrt(), quaternions(axes)
 
 
 def mean_projected_area(scales: Tensor) -> Tensor:
@@ -108,71 +103,39 @@ def mean_projected_area(scales: Tensor) -> Tensor:
     return scales.amax(dim=1).square() * ((a * b + a * c + b * c) / 3).pow(1 / exponent)
 
 
-def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: float) -> Tensor:
-    """Bhattacharyya coefficient of each Gaussian with its neighbours ``[N, K]``, in [0, 1]; 1 for equal Gaussians.
+def overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor, least_variance: float = 0.0) -> Tensor:
+    """Bhattacharyya coefficient of Gaussians with others, in [0, 1]; 1 for equal ones, 0 where it overflows.
 
     ``exp(-(d^T S^-1 d) / 8) (|A| |B|)^(1/4) / |S|^(1/2)`` with ``S = (A + B) / 2`` (Bhattacharyya, 1943).
 
     Args:
         means: world units ``[N, 3]``; the result has their dtype.
-        covariance: squared world units ``[N, 3, 3]``.
-        indices: neighbours ``[N, K]``.
-        least_width: standard deviation added to all axes, world units; without it, parallel flat Gaussians would not
-            overlap however close they are.
+        entries: of the covariances, by :func:`entries_of` ``[N, 6]``.
+        first, second: indices ``[P]``, or of a Gaussian ``[P, 1]`` and of its neighbours ``[P, K]``; as the result.
+        least_variance: added to all axes, squared world units; without it, parallel flat Gaussians would not overlap
+            however close they are.
     """
-    indices, least_variance = indices.to(means.device), least_width**2
-    added = least_variance * torch.tensor([1, 1, 1, 0, 0, 0], dtype=torch.float64, device=means.device)
-    points = means.double()
-    entries, log_det = points.new_empty(len(means), 6), points.new_empty(len(means))
+    first, second = first.to(means.device), second.to(means.device)
+    entries = entries + least_variance * entries.new_tensor([1, 1, 1, 0, 0, 0])
+    log_det, points = entries.new_empty(len(means)), means.double()
     for rows in chunks(len(means)):
-        entries[rows] = covariance[rows].double()[:, _LOWER[0], _LOWER[1]] + added
         log_det[rows] = 2 * torch.stack(_cholesky(entries[rows], least_variance)[:3], dim=1).log().sum(dim=1)
-    result = torch.empty(indices.shape, dtype=means.dtype, device=means.device)
-    for rows in chunks(len(means), max(1, PAIRS // max(1, indices.shape[1]))):
-        columns = indices[rows]
-        middle = (entries[rows, None] + entries[columns]) / 2
-        offset, log_dets = points[rows, None] - points[columns], log_det[rows, None] + log_det[columns]
-        result[rows] = _coefficient(middle, offset, log_dets / 4, least_variance).to(means.dtype)
+    result = torch.empty(second.shape, dtype=means.dtype, device=means.device)
+    for rows in chunks(len(second), max(1, PAIRS // max(1, second[:1].numel()))):
+        i, j = first[rows], second[rows]
+        a, b, c, ba, ca, cb = _cholesky((entries[i] + entries[j]) / 2, least_variance)
+        x, y, z = (points[i] - points[j]).unbind(dim=-1)
+        x = x / a
+        y = (y - ba * x) / b
+        z = (z - ca * x - cb * y) / c
+        exponent = -(x * x + y * y + z * z) / 8 + (log_det[i] + log_det[j]) / 4 - (a.log() + b.log() + c.log())
+        result[rows] = exponent.clamp_max(0).exp().nan_to_num(0.0).to(means.dtype)
     return result
-
-
-def lower_entries(scales: Tensor, quats: Tensor) -> Tensor:
-    """The six different entries of the covariances, diagonal first ``[N, 6]``; arguments as for :func:`covariances`."""
-    return covariances(scales, quats)[:, _LOWER[0], _LOWER[1]]
 
 
 def outer_entries(vectors: Tensor) -> Tensor:
-    """Entries of ``v v^T`` in the order of :func:`lower_entries` ``[N, 6]``, of vectors ``[N, 3]``."""
+    """Entries of ``v v^T`` in the order of :func:`entries_of` ``[N, 6]``, of vectors ``[N, 3]``."""
     return vectors[:, _LOWER[0]] * vectors[:, _LOWER[1]]
-
-
-def pair_overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """Bhattacharyya coefficient of pairs of Gaussians ``[P]``, as :func:`overlap`; 0 for one that overflows.
-
-    ``entries`` are those of positive definite covariances, by :func:`lower_entries` ``[N, 6]``.
-    """
-    result = means.new_empty(len(first))
-    for chunk in chunks(len(first), PAIRS):
-        i, j = first[chunk], second[chunk]
-        log_dets = [_cholesky(entries[ends], 0.0)[:3] for ends in (i, j)]
-        middle = (entries[i] + entries[j]) / 2
-        log_det = sum((pivot.log() for pivots in log_dets for pivot in pivots), means.new_zeros(len(i)))
-        result[chunk] = _coefficient(middle, means[i] - means[j], log_det / 2, 0.0)
-    return result
-
-
-def _coefficient(middle: Tensor, offset: Tensor, log_numerator: Tensor, least_variance: float) -> Tensor:
-    """Bhattacharyya coefficient from the entries of the mean covariance ``[..., 6]`` and the offset of the centres.
-
-    ``log_numerator`` is ``log (|A| |B|)^(1/4)``. 0 for a coefficient that overflows.
-    """
-    a, b, c, ba, ca, cb = _cholesky(middle, least_variance)
-    x, y, z = offset.unbind(dim=-1)
-    x = x / a
-    y = (y - ba * x) / b
-    z = (z - ca * x - cb * y) / c
-    exponent = -(x * x + y * y + z * z) / 8 + log_numerator - (a.log() + b.log() + c.log())
-    return exponent.clamp_max(0).exp().nan_to_num(0.0)
 
 
 def _cholesky(entries: Tensor, least_variance: float) -> tuple[Tensor, ...]:

@@ -1,7 +1,6 @@
-"""Errors shown to users: one line each, the cause first and then the remedy.
+"""Errors shown to users: one line each, the cause first and then the remedy, printed without a traceback.
 
-The command line prints a :class:`SundaeError` without a traceback. Each class also derives from the built-in exception
-that a caller would expect.
+Each class also derives from the built-in exception that a caller would expect.
 """
 
 from __future__ import annotations
@@ -65,16 +64,9 @@ class CheckpointError(SundaeError, ValueError):
     """A checkpoint does not fit the model. Not a ``RuntimeError``, on which nerfstudio retries without strictness."""
 
 
-class RankError(SundaeError, RuntimeError):
-    """One of the processes that train a scene together ended early."""
-
-
 @contextmanager
 def writing(failure: str) -> Iterator[None]:
-    """Turn file-system errors that a user can correct into ``StorageError``; others pass.
-
-    ``failure`` starts the message: ``"cannot make runs/a"``.
-    """
+    """Turn file-system errors that a user can correct into ``StorageError``, whose message starts with ``failure``."""
     try:
         yield
     except SundaeError:
@@ -84,10 +76,9 @@ def writing(failure: str) -> Iterator[None]:
         # torch and zipfile replace a failed write by an error of their own when they close the file.
         while cause is not None and not isinstance(cause, OSError):
             cause = cause.__cause__ or cause.__context__
-        reason = None if cause is None else _REASONS.get(cause.errno or 0)
-        if reason is None:
+        if cause is None or cause.errno not in _REASONS:
             raise
-        raise StorageError(f"{failure}: {reason}") from error
+        raise StorageError(f"{failure}: {_REASONS[cause.errno]}") from error
 
 
 @contextmanager
@@ -101,8 +92,7 @@ def reading(
 ) -> Iterator[None]:
     """Turn every error of reading an untrusted file into a ``failure``; decoders raise errors of many kinds.
 
-    ``kind`` names what the file should be: ``"a complete .spz"``. ``remedy`` is for a damaged file, ``missing`` for one
-    that cannot be opened.
+    ``kind`` is what the file should be, ``remedy`` is for a damaged file, ``missing`` for one that cannot be opened.
     """
     try:
         yield
@@ -126,13 +116,13 @@ def regular(path: Path) -> Path:
     return path
 
 
-def rank_ended(error: BaseException) -> RankError:
-    """The error for a rank that ended and stopped the others, from an exception of ``torch.multiprocessing``."""
+def rank_ended(error: BaseException) -> str:
+    """What ended a rank, which stopped the others, by an exception of ``torch.multiprocessing``; and the remedy."""
     rank, signal = getattr(error, "error_index", 0), getattr(error, "signal_name", None)
     last = (str(error).strip().splitlines() or [""])[-1]
     if last.startswith(__name__ + "."):
-        return RankError(f"rank {rank}: {last.partition(': ')[2]}")  # our own errors already name the remedy
-    return RankError(
+        return f"rank {rank}: {last.partition(': ')[2]}"  # our own errors already name the remedy
+    return (
         f"rank {rank} ended ({f'killed by {signal}' if signal else last}) and stopped the others; resume from the "
         "newest checkpoint with --load-dir, on fewer GPUs with a smaller --machine.num-devices"
     )
@@ -152,29 +142,24 @@ def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError
 
 
 def show_in_one_line() -> None:
-    """In an ``ns-*`` command, print an uncaught :class:`SundaeError` as one line, and end Ctrl-C with code 130.
-
-    Other errors stay as they are; all do when ``SUNDAE_TRACEBACK`` is set.
-    """
+    """In an ``ns-*`` command without ``SUNDAE_TRACEBACK``, print our errors in one line and end Ctrl-C with 130."""
     if not Path(sys.argv[0]).name.startswith("ns-") or os.environ.get("SUNDAE_TRACEBACK"):
         return
     before = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         of_rank = kind.__name__ in ("ProcessExitedException", "ProcessRaisedException")
-        code = getattr(error, "exit_code", None)
+        code, signal = getattr(error, "exit_code", None), getattr(error, "signal_name", None)
         if issubclass(kind, KeyboardInterrupt):
             print("\nStopped.", file=sys.stderr)
             raise SystemExit(130)
         if code in STOPPED:  # the rank that ended first has printed the rest
             raise SystemExit(code)
-        stopped = getattr(error, "signal_name", None) in (None, "SIGINT", "SIGTERM")
-        if kind.__name__ == "ProcessExitedException" and passed_on and stopped:
+        if code is not None and passed_on and signal in (None, "SIGINT", "SIGTERM"):
             print(f"\n{NOTHING_SAVED}", file=sys.stderr)
             raise SystemExit(128 + passed_on[0])
-        shown = rank_ended(error) if of_rank else error
-        if isinstance(shown, SundaeError):
-            print(f"sundae: {shown}", file=sys.stderr)
+        if isinstance(error, SundaeError) or of_rank:
+            print(f"sundae: {rank_ended(error) if of_rank else error}", file=sys.stderr)
         else:
             before(kind, error, trace)
 

@@ -37,15 +37,8 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
     """Yield a path to write to; after the block, flush that file to disk and rename it to ``path``.
 
     After a kill or a power cut, ``path`` is either the earlier file or the complete new one. If the block raises, its
-    file is removed and ``path`` is unchanged.
-
-    Args:
-        path: the file to write; a missing folder is made.
-        partial: temporary file in the same folder. By default named after this process, and those of killed processes
-            are removed.
-
-    Raises:
-        StorageError: the disk is full or not writable.
+    file is removed and ``path`` is unchanged. A missing folder is made. ``partial`` is the temporary file; by default
+    one named after this process, and those of killed processes are removed. ``StorageError`` if nothing can be written.
     """
     owned = partial is None and not _WINDOWS
     partial = partial or path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")

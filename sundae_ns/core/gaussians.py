@@ -25,6 +25,9 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from sundae_ns.core.errors import DataError
+from sundae_ns.core.values import floats
+
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 
 Encoding = Literal["harmonics", "logits"]
@@ -57,15 +60,14 @@ def sh_degree_of(coefficients: int) -> int | None:
 
 
 def odd_shapes(params: Mapping[str, Tensor]) -> list[str]:
-    """Descriptions of the parameters with a wrong shape, for an error message; N is the length of ``means``.
-
-    ``params`` has all of :data:`SPLAT_NAMES`; ``features`` are not checked.
-    """
+    """Descriptions of the parameters with a wrong shape, for an error message; N is the length of ``means``."""
     n = params["means"].shape[0] if params["means"].ndim else 0
     rest = params["features_rest"].shape
     known = len(rest) > 1 and sh_degree_of(rest[1]) is not None
     wanted: dict[str, tuple[int | str, ...]] = {name: (n, columns) for name, columns in _COLUMNS.items()}
     wanted["features_rest"] = (n, rest[1] if known else "(degree + 1)^2 - 1", 3)
+    if FEATURES in params:
+        wanted[FEATURES] = (n, params[FEATURES].shape[-1] if params[FEATURES].ndim else "F")
     return [
         f"{name} has shape {list(params[name].shape)}; it must be [{', '.join(map(str, shape))}]"
         for name, shape in wanted.items()
@@ -74,7 +76,7 @@ def odd_shapes(params: Mapping[str, Tensor]) -> list[str]:
 
 
 def rgb_to_sh(rgb: Tensor) -> Tensor:
-    """SH coefficient of degree 0 ``[..., 3]`` whose colour is ``rgb`` ``[..., 3]`` in [0, 1]."""
+    """SH coefficient of degree 0 ``[..., 3]`` of a colour in [0, 1]."""
     return (rgb - 0.5) / SH_C0
 
 
@@ -90,11 +92,8 @@ def rgb_to_logit(rgb: Tensor) -> Tensor:
 
 def finite_mask(params: Mapping[str, Tensor]) -> Tensor:
     """True where every parameter of a Gaussian is finite: bool ``[N]``."""
-    n = num_gaussians(params)
-    mask = torch.ones(n, dtype=torch.bool, device=params["means"].device)
-    for value in params.values():
-        mask &= torch.isfinite(value.detach().flatten(1)).all(dim=1)
-    return mask
+    rows = [value.detach().flatten(1).isfinite().all(dim=1) for value in params.values()]
+    return torch.stack(rows).all(dim=0)
 
 
 class Gaussians(UserDict[str, Any]):
@@ -102,10 +101,6 @@ class Gaussians(UserDict[str, Any]):
 
     Wraps the given mapping without a copy: surgery that replaces a parameter here replaces it there too. ``len`` counts
     parameters, :attr:`num_gaussians` counts Gaussians.
-
-    Args:
-        params: tensors, or ``Parameter``s in training.
-        encoding: how colours are stored.
     """
 
     def __init__(self, params: MutableMapping[str, Any], encoding: Encoding = "harmonics") -> None:
@@ -148,6 +143,30 @@ def as_gaussians(params: Mapping[str, Any]) -> Gaussians:
     return params if isinstance(params, Gaussians) else Gaussians(dict(params))
 
 
+def checked(params: Mapping[str, Any]) -> Gaussians:
+    """Parameters of a caller, lists and arrays too, as float32 tensors; the Gaussians themselves if they are such.
+
+    Raises:
+        DataError: a name, a shape, a type or a device is wrong, or a Gaussian has values without a meaning.
+    """
+    names = params.keys() if isinstance(params, Mapping) else set()
+    if odd := sorted(str(name) for name in (names ^ set(SPLAT_NAMES)) - {FEATURES}):
+        raise DataError(f"missing or unknown: {', '.join(odd)}; Gaussians map {', '.join(SPLAT_NAMES)} to tensors")
+    gaussians = as_gaussians(params)
+    values = {name: floats(value, name) for name, value in gaussians.items()}
+    if faults := odd_shapes(values):
+        raise DataError(faults[0])
+    if not num_gaussians(values):
+        raise DataError("there are no Gaussians; give at least one")
+    if len(devices := {str(value.device) for value in values.values()}) > 1:
+        raise DataError(f"the Gaussians are on {' and '.join(sorted(devices))}; move them to one device")
+    limits = [limit for value in values.values() if value.numel() for limit in value.detach().aminmax()]
+    if not values["means"].is_meta and not bool(torch.stack(limits).isfinite().all()):
+        if wrong := sanitise(values).dropped:
+            raise DataError(f"{wrong:,} of {num_gaussians(values):,} Gaussians are NaN or infinite; remove these rows")
+    return gaussians if all(values[name] is value for name, value in gaussians.items()) else gaussians.replaced(values)
+
+
 class Sanitised(NamedTuple):
     """Gaussians whose values are finite, and what was changed."""
 
@@ -185,8 +204,7 @@ def sanitise(params: Mapping[str, Any]) -> Sanitised:
 
     - A logit of plus or minus infinity is an opacity of 1 or 0, and becomes plus or minus :data:`LARGEST_LOGIT`.
     - A log-scale of minus infinity is a width of 0, and becomes the least scale within :data:`LEAST_SCALES`.
-    - An all-zero quaternion does not rotate, as in the renderers of 3DGS, and becomes the identity. One that is too
-      short or too long to be normalised in float32 is rescaled.
+    - An all-zero quaternion becomes the identity; one that cannot be normalised in float32 is rescaled.
     - A Gaussian with any other value that is NaN or infinite is dropped.
     """
     gaussians = as_gaussians(params)
@@ -203,7 +221,6 @@ def sanitise(params: Mapping[str, Any]) -> Sanitised:
         values["scales"] = torch.where(narrow, narrowest, scales)
     if n:
         largest = quats.abs().amax(dim=1)
-        # Quaternions outside of this range cannot be normalised in float32.
         odd = ((largest < 1e-6) | (largest > 1e18)) & largest.isfinite()
         if bool(odd.any()):
             unrotated = largest == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 import torch
@@ -22,13 +23,11 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     - centre and covariance are those of the mixture: ``m = sum w_i m_i``, ``S = sum w_i (S_i + (m_i - m)(m_i - m)^T)``;
     - SH coefficients and features are ``sum w_i c_i``;
     - opacity follows from ``t A = sum t_i A_i``, with optical depth ``t = -log(1 - alpha)`` and mean projected area A:
-      a wall of many small Gaussians absorbs as much light from afar as before. Limited to ``MAX_OPACITY``. Volumes in
-      place of areas would suit fog, but Gaussians are flat.
+      a wall of many small Gaussians absorbs as much light from afar as before. Limited to ``MAX_OPACITY``.
 
     Args:
         params: finite parameters of N Gaussians.
-        label: index of the Gaussian that each one is merged into, int64 ``[N]``: its own index for a Gaussian that
-            stays, -1 for one that is dropped, else the index of one that stays.
+        label: index of the Gaussian that each one is merged into ``[N]``: its own if it stays, -1 if it is dropped.
         weight: weight of each Gaussian in its group, not negative ``[N]``.
 
     Returns:
@@ -114,6 +113,5 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
 
 def _logit_of_depth(depth: Tensor) -> Tensor:
     """Logit of the opacity ``1 - exp(-depth)``, which is ``log(exp(depth) - 1)``; opacity at most ``MAX_OPACITY``."""
-    max_depth = -torch.log1p(torch.tensor(-MAX_OPACITY, dtype=depth.dtype))
-    depth = depth.clamp(torch.finfo(depth.dtype).tiny, float(max_depth))
+    depth = depth.clamp(torch.finfo(depth.dtype).tiny, -math.log1p(-MAX_OPACITY))
     return depth + torch.log(-torch.expm1(-depth))

@@ -34,18 +34,13 @@ def check_pair(pred: Tensor, target: Tensor) -> None:
     """Raise DataError unless both are images ``[H, W, 3]`` of one size."""
     if pred.shape != target.shape or pred.dim() != 3 or pred.shape[-1] != 3:
         shapes = f"{list(pred.shape)} and {list(target.shape)}"
-        raise DataError(f"Images have shapes {shapes}; give two of one size, [H, W, 3].")
+        raise DataError(f"images have shapes {shapes}; give two of one size, [H, W, 3]")
 
 
 def psnr(pred: Tensor, target: Tensor) -> Tensor:
     """Peak signal-to-noise ratio ``-10 log10(MSE)``, in dB, a differentiable scalar; infinite for equal images.
 
-    Args:
-        pred: ``[H, W, 3]``, nominally in [0, 1]; not clamped here.
-        target: ``[H, W, 3]`` in [0, 1].
-
-    Raises:
-        DataError: the shapes differ, or are not ``[H, W, 3]``.
+    Images ``[H, W, 3]`` in [0, 1] are not clamped. ``DataError`` if their shapes differ.
     """
     check_pair(pred, target)
     return -10 * torch.log10(torch.mean((pred - target) ** 2))
@@ -56,10 +51,7 @@ def fitted_psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Ten
     """PSNR after the affine map of colours (12 numbers) that brings an image nearest to its target.
 
     It leaves out differences in light and exposure. Images and errors as for :func:`psnr`; ``mask`` has the pixels that
-    count, bool ``[H, W]``.
-
-    Returns:
-        A float64 scalar on the inputs' device, dB, at most :data:`MOST_PSNR`; NaN if the image is not finite.
+    count, bool ``[H, W]``. A float64 scalar, dB, at most :data:`MOST_PSNR`; NaN if the image is not finite.
     """
     check_pair(pred, target)
     chosen = ... if mask is None else mask
@@ -93,8 +85,8 @@ def flip_available() -> bool:
 def flip(pred: Tensor, target: Tensor) -> Tensor | None:
     """Mean FLIP error (Andersson et al. 2020) of two sRGB images ``[H, W, 3]``, in [0, 1]; lower is better.
 
-    The authors' package computes it on the CPU, at 67 pixels per degree, from images clamped to [0, 1]. A float32
-    scalar on the inputs' device; None if the package is not installed. Raises as :func:`psnr`.
+    The authors' package computes it on the CPU, at 67 pixels per degree, from images clamped to [0, 1]. None if the
+    package is not installed. Raises as :func:`psnr`.
     """
     check_pair(pred, target)
     if not flip_available():
@@ -129,32 +121,28 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
-        """Distance of two images ``[H, W, 3]``, clamped to [0, 1], a float32 scalar; lower is better. Raises as `psnr`.
+        """Distance of two images ``[H, W, 3]``, clamped to [0, 1]; lower is better. Raises as :func:`psnr`.
 
-        None if a side is shorter than 32 pixels, which a backbone pools to nothing, or if the weights are missing; the
-        first such call logs a warning.
+        None if a side is shorter than 32 pixels, which a backbone pools to nothing; without weights, with a warning.
         """
         check_pair(pred, target)
         if self._failed or min(pred.shape[:2]) < 32:
             return None
-        try:
-            self._metric = self._built() if self._metric is None else self._metric
-        except Exception as error:  # network, disk or a damaged file: a missing metric must not end a run
-            self._failed = True
+        if self._metric is None:
             url, path = lpips_weights(self.net)
-            cause = f"its {self.net} weights are missing ({one_line(error)})"
-            logger.warning("LPIPS is left out because %s; put %s into %s.", cause, url, path.parent)
-            return None
+            try:
+                if not path.is_file():  # torch.hub downloads without a time limit: ask first whether the server answers
+                    urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=5).close()
+                from torchmetrics.image import LearnedPerceptualImagePatchSimilarity
+
+                self._metric = LearnedPerceptualImagePatchSimilarity(net_type=self.net, normalize=True)
+            except Exception as error:  # network, disk or a damaged file: a missing metric must not end a run
+                self._failed = True
+                cause = f"its {self.net} weights are missing ({one_line(error)})"
+                logger.warning("LPIPS is left out because %s; put %s into %s.", cause, url, path.parent)
+                return None
         # Calling the metric returns the value of this pair alone; earlier calls do not count.
         return self._metric.to(pred.device)(*(x.float().clamp(0, 1).permute(2, 0, 1)[None] for x in (pred, target)))
-
-    def _built(self) -> Any:
-        url, path = lpips_weights(self.net)
-        if not path.is_file():  # torch.hub downloads without a time limit: ask first whether the server answers
-            urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=5).close()
-        from torchmetrics.image import LearnedPerceptualImagePatchSimilarity
-
-        return LearnedPerceptualImagePatchSimilarity(net_type=self.net, normalize=True)
 
 
 @dataclass(frozen=True)
@@ -202,11 +190,8 @@ class ViewQuality:
 def quality_of(
     image: Tensor, truth: Tensor, lpips: Callable[[Tensor, Tensor], Any] | None = None, *, visible: bool = True
 ) -> ViewQuality:
-    """Every metric of a rendered image ``[H, W, 3]`` against its truth.
-
-    ``lpips`` may be left out, and so may FLIP, which takes a second for an image, by ``visible``.
-    """
-    metrics: dict[str, Any] = {"psnr": psnr(image, truth), "psnr_fitted": fitted_psnr(image, truth)}
-    metrics |= {"ssim": ssim(image, truth), "lpips": None if lpips is None else lpips(image, truth)}
-    metrics |= {"flip": flip(image, truth)} if visible else {}
-    return ViewQuality(**{name: float(value) for name, value in metrics.items() if value is not None})
+    """Every metric of an image ``[H, W, 3]`` against its truth; FLIP, which takes a second, only if ``visible``."""
+    metrics: dict[str, Any] = {"psnr": psnr, "psnr_fitted": fitted_psnr, "ssim": ssim, "lpips": lpips}
+    metrics |= {"flip": flip} if visible else {}
+    values = {name: metric(image, truth) for name, metric in metrics.items() if metric is not None}
+    return ViewQuality(**{name: float(value) for name, value in values.items() if value is not None})

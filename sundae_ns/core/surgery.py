@@ -13,16 +13,14 @@ from torch.optim import Optimizer
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import num_gaussians
 
-Change = Callable[[Tensor], Tensor]
+Params = MutableMapping[str, Parameter]
+Optimizers = Mapping[str, Optimizer]
 Snapshot = dict[str, dict[str, Tensor]]
 """By parameter: its ``value`` and the tensors of its optimizer state, all on the CPU."""
 
 
-def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> None:
-    """Raise ``DataError`` unless parameters have one length and the optimizers of their names hold these tensors.
-
-    Parameters without an optimizer and optimizers of other names, such as a network's, are allowed.
-    """
+def check_wiring(params: Mapping[str, Tensor], optimizers: Optimizers) -> None:
+    """Raise ``DataError`` unless parameters have one length and the optimizers of their names, if any, hold them."""
     n = num_gaussians(params)
     for name, value in params.items():
         if not per_gaussian(value, n):
@@ -40,16 +38,9 @@ def per_gaussian(value: Any, n: int) -> bool:
 
 
 def replace_parameter(
-    params: MutableMapping[str, Parameter],
-    optimizers: Mapping[str, Optimizer],
-    name: str,
-    value: Tensor,
-    state: Mapping[str, Any],
+    params: Params, optimizers: Optimizers, name: str, value: Tensor, state: Mapping[str, Any]
 ) -> None:
-    """Replace one parameter, and in its optimizer if it has one; ``requires_grad`` stays.
-
-    ``state`` is the optimizer state of the new parameter; empty resets it.
-    """
+    """Replace a parameter, and in its optimizer if it has one, with a new ``state`` there; ``requires_grad`` stays."""
     new = Parameter(value, requires_grad=params[name].requires_grad)
     optimizer = optimizers.get(name)
     if optimizer is not None:
@@ -60,15 +51,13 @@ def replace_parameter(
     params[name] = new
 
 
-def moments_of(optimizers: Mapping[str, Optimizer], name: str, value: Tensor) -> dict[str, Tensor]:
+def moments_of(optimizers: Optimizers, name: str, value: Tensor) -> dict[str, Tensor]:
     """Optimizer state of a parameter that has its shape: the moments of Adam, without the step count."""
     state = optimizers[name].state.get(value, {}) if name in optimizers else {}
     return {key: held for key, held in state.items() if isinstance(held, Tensor) and held.shape == value.shape}
 
 
-def change_parameter(
-    params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], name: str, change: Change
-) -> None:
+def change_parameter(params: Params, optimizers: Optimizers, name: str, change: Callable[[Tensor], Tensor]) -> None:
     """Replace a parameter ``[N, ...]`` and its moments by a function of them; other optimizer state stays."""
     old = params[name]
     state = optimizers[name].state.get(old, {}) if name in optimizers else {}
@@ -77,22 +66,13 @@ def change_parameter(
 
 
 @torch.no_grad()
-def keep(
-    params: MutableMapping[str, Parameter],
-    optimizers: Mapping[str, Optimizer],
-    states: Iterable[MutableMapping[str, Any]],
-    mask: Tensor,
-) -> None:
+def keep(params: Params, optimizers: Optimizers, states: Iterable[MutableMapping[str, Any]], mask: Tensor) -> None:
     """Keep the Gaussians under a mask, bool ``[N]`` on any device, and remove all others, in place on the mappings.
 
-    Replaces every parameter by a new, shorter ``Parameter`` with the same ``requires_grad`` and without a gradient. The
-    optimizer of the same name holds the new one, with Adam's moments sliced and the step count kept. New objects are
-    needed: after resizing through ``.data``, the backward pass of a live graph fails on the old shape. The caller must
-    refresh other holders of the old objects, such as nerfstudio's ``Optimizers.parameters``.
-
-    Args:
-        optimizers: with one parameter each; names that are not in ``params`` are ignored.
-        states: running states; their tensors with first dimension N are sliced, all else stays.
+    Replaces every parameter, also in the optimizer of its name, with Adam's moments sliced and the step count kept, and
+    slices the tensors of running ``states`` that have first dimension N. New objects are needed: after resizing through
+    ``.data``, the backward pass of a live graph fails on the old shape. The caller must refresh other holders of the
+    old objects, such as nerfstudio's ``Optimizers.parameters``.
 
     Raises:
         DataError: the mask has a wrong shape or dtype or keeps nothing, or the optimizers do not hold the parameters.
@@ -115,15 +95,12 @@ def keep(
 
 
 @torch.no_grad()
-def rewrite(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], values: Mapping[str, Tensor]) -> None:
-    """Overwrite parameters in place with values of the same shapes.
+def rewrite(params: Mapping[str, Tensor], optimizers: Optimizers, values: Mapping[str, Tensor]) -> None:
+    """Overwrite parameters in place with values of the same shapes; ``DataError`` for other names and shapes.
 
     Where a value changes, Adam's first moment becomes 0, because it averages gradients at the old value. The second
     moment stays: if it were 0, the next step would be over three times the learning rate in every direction, for any
-    gradient (``0.1 g / sqrt(0.001 g^2)``). Unchanged values keep both moments.
-
-    Raises:
-        DataError: a name is unknown, a shape differs, or the optimizers do not hold the parameters.
+    gradient (``0.1 g / sqrt(0.001 g^2)``).
     """
     check_wiring(params, optimizers)
     for name, value in values.items():
@@ -138,7 +115,7 @@ def rewrite(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], v
         parameter.copy_(value)
 
 
-def snapshot(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> Snapshot:
+def snapshot(params: Mapping[str, Tensor], optimizers: Optimizers) -> Snapshot:
     """Copy parameters and the tensors of their optimizers, by name; a parameter may have no optimizer."""
     saved = {}
     for name, value in params.items():
@@ -149,20 +126,12 @@ def snapshot(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) 
 
 
 @torch.no_grad()
-def restore(
-    params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], saved: Mapping[str, dict[str, Tensor]]
-) -> None:
+def restore(params: Params, optimizers: Optimizers, saved: Snapshot) -> None:
     """Restore a snapshot with any number of Gaussians; replaces parameters as :func:`keep` does."""
     for name, entries in saved.items():
         value = entries["value"].to(params[name].device, copy=True)
         state = _state(entries, value, optimizers[name]) if name in optimizers else {}
         replace_parameter(params, optimizers, name, value, state)
-
-
-@torch.no_grad()
-def narrow(params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], name: str, width: int) -> None:
-    """Keep the first ``width`` columns of one parameter ``[N, C, ...]`` and of its moments."""
-    change_parameter(params, optimizers, name, lambda value: value[:, :width].clone())
 
 
 def module_snapshot(parameters: Iterable[Tensor], optimizer: Optimizer) -> Snapshot:
@@ -172,7 +141,7 @@ def module_snapshot(parameters: Iterable[Tensor], optimizer: Optimizer) -> Snaps
 
 
 @torch.no_grad()
-def restore_module(parameters: Iterable[Tensor], optimizer: Optimizer, saved: Mapping[str, dict[str, Tensor]]) -> None:
+def restore_module(parameters: Iterable[Tensor], optimizer: Optimizer, saved: Snapshot) -> None:
     """Restore a :func:`module_snapshot` in place; keeps the parameter objects."""
     for i, value in enumerate(parameters):
         entries = saved[str(i)]
@@ -191,9 +160,7 @@ def _state(entries: Mapping[str, Tensor], value: Tensor, optimizer: Optimizer) -
 
 
 @torch.no_grad()
-def grow(
-    params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], count: int, min_opacity: float
-) -> None:
+def grow(params: Params, optimizers: Optimizers, count: int, min_opacity: float) -> None:
     """Add ``count`` Gaussians: the most opaque ones become two at one position, which render alike.
 
     Opacities ``o' = 1 - sqrt(1 - o)``, at least ``min_opacity``, preserve the opacity at the centre. Scales

@@ -41,10 +41,10 @@ from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerCon
 from sundae_ns.plugin.dataparsers import check_capture
 from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import is_number, unit
+from sundae_ns.scene.cameras import is_number
 from sundae_ns.scene.load_save import load, scene_of_checkpoint
 from sundae_ns.scene.packing import refusal
-from sundae_ns.scene.scene import Scene
+from sundae_ns.scene.scene import Scene, unit
 from sundae_ns.train.pruning import PruningConfig
 
 _PARSERS: dict[str, type[DataParserConfig]] = {

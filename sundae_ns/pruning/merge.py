@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from sundae_ns.core.covariance import chunks, covariances_of, lower_entries, outer_entries, overlap, pair_overlap
+from sundae_ns.core.covariance import chunks, entries_of, outer_entries, overlap
 from sundae_ns.core.gaussians import as_gaussians, rgb_to_logit, sh_to_rgb
 from sundae_ns.core.merging import merge
 from sundae_ns.graph.graph import NeighborGraph, build_graph
@@ -55,7 +55,8 @@ def gaussian_graph(params: Mapping[str, Tensor], rule: PruneRule) -> NeighborGra
         return graph
     # In place: of a large field, each value per edge takes gigabytes.
     weights = graph.weights.mul_(_color_affinity(sh_to_rgb(params["features_dc"].detach()), graph))
-    weights *= overlap(means, covariances_of(params), graph.indices, least_width=LEAST_WIDTH * graph.sigma)
+    rows = torch.arange(len(means), device=means.device)[:, None]
+    weights *= overlap(means, entries_of(params), rows, graph.indices, (LEAST_WIDTH * graph.sigma) ** 2)
     return replace(graph, weights=weights, dw=weights.sum(dim=1))
 
 
@@ -138,14 +139,13 @@ class _Groups:
         means = gaussians["means"].detach().to(device).double()
         self.weight = weight
         self.mean = means - means.median(dim=0).values
-        scales, quats = (gaussians[name].detach().to(device).double() for name in ("scales", "quats"))
-        self.entries = lower_entries(scales.exp(), quats)
+        self.entries = entries_of(gaussians).to(device)
         self.entries[:, :3] += WIDTH * self.entries[:, :3].sum(dim=1, keepdim=True)
         self.color = sh_to_rgb(gaussians["features_dc"].detach().to(device).double()).clamp(0, 1)
 
     def cost(self, first: Tensor, second: Tensor) -> Tensor:
         """Cost of the merge of each pair ``[P]``."""
-        unlike = 1 - pair_overlap(self.mean, self.entries, first, second)
+        unlike = 1 - overlap(self.mean, self.entries, first, second)
         unlike += (self.color[first] - self.color[second]).square().sum(dim=1)
         # Of equal pairs, as in a grid of equal points, a random one is the cheapest; else a round would merge few.
         unlike += 1e-9 * ((first * 2_654_435_761 + second * 40_503) % 1_000_003).float() / 1_000_003

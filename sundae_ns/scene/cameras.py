@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from itertools import permutations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,10 +19,11 @@ from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.data.capture import finite, matrix, read_json, rigid, side
 from sundae_ns.data.colmap import read_images
 from sundae_ns.data.lenses import kind_of_frame, with_focal_lengths
-from sundae_ns.scene.scene import Scene
+from sundae_ns.scene.scene import Scene, unit
 from sundae_ns.scene.virtual_cameras import FOV, middle_and_reach, usable, virtual_cameras
 
-Direction = tuple[float, float, float]
+MOST_FRAMES = 36_000  # of a film: 25 minutes
+MOST_CAMERAS = 10_000  # of a file
 
 
 class CameraFile(NamedTuple):
@@ -79,6 +80,7 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
+    _check_number(frames, path.name)
     content = with_focal_lengths(content, path.parent)
     transform, scale = _to_model(scene, content, path.name)
     cameras = []
@@ -106,8 +108,9 @@ def _moved(
 def _of_colmap(model: Path, scene: Scene | None) -> list[Camera]:
     """Cameras of a COLMAP model, in its own coordinates or in those of a run trained on it."""
     transform, scale = _to_model(scene, {}, model.name)
-    cameras = []
-    for image in read_images(model).values():
+    cameras, images = [], read_images(model)
+    _check_number(images, model.name)
+    for image in images.values():
         quaternion, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
         rotation = rotation_matrices(quaternion[None])[0].T
         pose = torch.cat([rotation * rotation.new_tensor(OPENGL_TO_OPENCV), -(rotation @ translation)[:, None]], dim=1)
@@ -117,14 +120,11 @@ def _of_colmap(model: Path, scene: Scene | None) -> list[Camera]:
 
 
 def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple[np.ndarray, float]:
-    """Transform ``[4, 4]`` and then scale, from the coordinates of a ``transforms.json`` to those of a scene.
-
-    A run states both relative to the capture before its ``applied_transform``.
-    """
+    """Transform ``[4, 4]`` and then scale, from the coordinates of a ``transforms.json`` to those of a scene."""
     frame = scene.meta.get("frame") if scene is not None else None
     if frame is None:
         return np.eye(4), 1.0
-    transform, applied = np.eye(4), np.eye(4)
+    transform, applied = np.eye(4), np.eye(4)  # a run states its transform for the capture before the applied one
     transform[:3] = np.asarray(frame["transform"], np.float64)[:3]
     if "applied_transform" in content:
         applied[:3] = matrix(content["applied_transform"], (3,), "applied_transform", where)
@@ -132,11 +132,17 @@ def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple
     return transform @ np.linalg.inv(applied), scale
 
 
+def _check_number(cameras: Sized, where: str) -> None:
+    if len(cameras) > MOST_CAMERAS:
+        raise DataError(f"{where} has {len(cameras):,} cameras; give at most {MOST_CAMERAS:,}")
+
+
 def _camera_path(content: dict[str, Any], where: str) -> list[Camera]:
     """Cameras of a path of nerfstudio's viewer, in the coordinates of the model."""
     entries = content["camera_path"]
     if not isinstance(entries, list) or not entries:
         raise DataError(f"{where} has an empty camera_path; add keyframes in the viewer, and export it again")
+    _check_number(entries, where)
     if content.get("camera_type", "perspective") != "perspective":
         raise DataError(f"{where} has cameras of type {content['camera_type']!r}; use perspective ones")
     width, height = (side(content.get(f"render_{name}"), f"render_{name}", where) for name in ("width", "height"))
@@ -155,10 +161,12 @@ def _camera_path(content: dict[str, Any], where: str) -> list[Camera]:
 
 def is_frame(stated: Any) -> bool:
     """Whether a value states a transform ``[3 or 4, 4]`` and a scale, from a capture's coordinates to a model's."""
-    rows = stated.get("transform") if isinstance(stated, dict) and is_number(stated.get("scale")) else None
-    if not isinstance(rows, list) or len(rows) not in (3, 4):
+    try:
+        matrix(stated["transform"], (3, 4), "transform", "frame")
+        finite(stated["scale"], "scale", "frame", positive=True)
+    except (DataError, KeyError, TypeError):
         return False
-    return all(isinstance(row, list) and len(row) == 4 and all(map(is_number, row)) for row in rows)
+    return True
 
 
 def is_number(value: Any) -> bool:
@@ -169,25 +177,11 @@ def is_number(value: Any) -> bool:
         return False
 
 
-def unit(direction: Sequence[float]) -> Direction:
-    """A direction scaled to unit length; ``ConfigError`` for one without a direction."""
-    if len(direction) != 3 or not all(map(is_number, direction)):
-        raise ConfigError("the up axis is not three finite numbers; give 0 0 1 for z")
-    x, y, z = map(float, direction)
-    length = math.hypot(x, y, z)
-    if not 0 < length < math.inf:
-        raise ConfigError("the up axis has no direction; give 0 0 1 for z")
-    return x / length, y / length, z / length
-
-
 def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None) -> Scene:
     """The scene with another start view or up axis, as a user names them; None keeps that of the scene.
 
     ``start_view`` is the index of a stored camera, or a file whose first camera it is (:func:`sundae_ns.cameras_of`).
-
-    Raises:
-        ConfigError: there is no such view, or the direction is zero.
-        DataError: the file holds no cameras.
+    ``ConfigError`` if there is no such camera or direction, ``DataError`` if the file holds none.
     """
     if up is not None:
         scene = dataclasses.replace(scene, up=unit(up))
@@ -195,15 +189,12 @@ def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None)
         return scene
     if not start_view.lstrip("-").isdigit():
         return dataclasses.replace(scene, start=read_cameras(Path(start_view), scene).cameras[0])
-    count = len(scene.cameras)
-    if not count:
-        raise ConfigError("the scene has no stored cameras; give --start-view a camera file")
-    if not 0 <= int(start_view) < count:
-        raise ConfigError(f"there is no camera {start_view}; give --start-view 0 to {count - 1}, or a camera file")
+    if not 0 <= int(start_view) < len(scene.cameras):
+        stored = f"--start-view 0 to {len(scene.cameras) - 1}, or a camera file" if scene.cameras else "a camera file"
+        raise ConfigError(f"there is no camera {start_view} in the scene; give {stored}")
     return dataclasses.replace(scene, start=scene.cameras[int(start_view)])
 
 
-MOST_FRAMES = 36_000  # of a film: 25 minutes
 _STEEP = 0.95  # largest sine of a camera's pitch; steeper ones have no upright image
 Array = NDArray[np.float64]
 
@@ -222,10 +213,8 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     """
     count = round(seconds * frames_per_second) if math.isfinite(seconds * frames_per_second) else 0
     if not (1 <= count <= MOST_FRAMES and seconds > 0):
-        raise ConfigError(
-            f"a film of {seconds:g} s and {frames_per_second:g} frames a second is impossible; "
-            f"give 1 to {MOST_FRAMES:,} frames"
-        )
+        length = f"{seconds:g} s and {frames_per_second:g} frames a second"
+        raise ConfigError(f"a film of {length} is impossible; give 1 to {MOST_FRAMES:,} frames")
     up = _up_of(scene)
     cameras = [camera for camera in (scene.start, *scene.cameras) if camera is not None]
     lens = cameras[0] if cameras else Camera.from_fov(torch.eye(4), FOV, 1280, 720)

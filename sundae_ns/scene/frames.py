@@ -1,8 +1,7 @@
 """Images of finished scenes for viewers: outputs that are computed on first access, and frames as recorded CUDA graphs.
 
-A frame is many small kernels, each launched from Python. A CUDA graph launches them together. It reads its inputs
-where they were when it was recorded: the Gaussians, which may be trained meanwhile, the head's weights, and the three
-tensors that hold camera and background.
+A graph launches the many small kernels of a frame together. It reads its inputs where they were when it was recorded:
+the Gaussians, which may be trained meanwhile, the head's weights, and the tensors that hold camera and background.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections import UserDict
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, DataError
@@ -51,8 +52,7 @@ class Later:
 class LazyOutputs(UserDict[str, Any]):
     """Named outputs. One that is :class:`Later` is computed on first access, without gradients, and then kept.
 
-    nerfstudio's commands read one or two outputs of a frame; the others cost nothing. No ``dict``, because
-    ``dict(outputs)`` and ``{**outputs}`` would then skip the computation.
+    No ``dict``, because ``dict(outputs)`` and ``{**outputs}`` would then skip the computation.
     """
 
     def __getitem__(self, name: str) -> Any:
@@ -71,18 +71,15 @@ class ShownResponse:
         self._last: tuple[GaussiansKey | None, Tensor | None] = (None, None)
 
     def values(self, gaussians: Gaussians, key: GaussiansKey | None, rule: PruneRule) -> Tensor | None:
-        """Values in [0, 1] ``[N]``; None without a response, as for a single Gaussian.
+        """Values in [0, 1] ``[N]``; None without a response, as for a single Gaussian, or without a ``key``.
 
-        ``key`` is the state of the Gaussians; None while they grow, when their response is not shown.
+        ``key`` is the state of the Gaussians; None while they grow.
         """
-        if key is None:
-            return None
         of, values = self._last
         if of != key:
-            try:
-                values = response_values(response(gaussians, rule))
-            except DataError:
-                values = None
+            values = None
+            with suppress(DataError):
+                values = response_values(response(gaussians, rule)) if key is not None else None
             self._last = (key, values)
         return values
 
@@ -101,9 +98,8 @@ def late_outputs(
     ``features`` shows principal components as colours, ``response`` the response of the visible Gaussians.
 
     Args:
-        images: ``rgb``, ``base_rgb`` and ``accumulation`` of the Gaussians ``drawn``.
+        images: ``rgb``, ``base_rgb`` and ``accumulation`` of the Gaussians ``drawn``, those under ``mask``.
         gaussians: all Gaussians. Both are kept, so their mappings must not change.
-        mask: the Gaussians that were drawn, bool ``[N]``; None for all.
         settings: without a head, the image of features is black.
         values: gives the response of all Gaussians, in [0, 1] ``[N]``, or None.
     """
@@ -123,12 +119,10 @@ def late_outputs(
     def response_image() -> Tensor:
         shown = values()
         if shown is None:
-            return gaussians["means"].new_zeros(camera.height, camera.width, 1)
-        visible = gaussians if mask is None else gaussians.rows(mask)
-        return splat(visible, camera, (shown if mask is None else shown[mask])[:, None], settings).colors
+            return torch.zeros_like(alpha)
+        return splat(drawn, camera, (shown if mask is None else shown[mask])[:, None], settings).colors
 
-    late = {"depth": Later(depth), "features": Later(features), "response": Later(response_image)}
-    outputs = {**images, **late}
+    outputs = {**images, "depth": Later(depth), "features": Later(features), "response": Later(response_image)}
     return LazyOutputs({name: outputs[name] for name in OUTPUTS})
 
 
@@ -152,23 +146,15 @@ def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     mean = features.mean(dim=0)
     centred = features - mean
-    covariance = centred.T @ centred / max(len(features), 1)
-    variances, directions = torch.linalg.eigh(covariance)
-    k = min(3, features.shape[1])
-    directions = directions[:, -k:].flip(-1)
+    variances, directions = torch.linalg.eigh(centred.T @ centred / max(len(features), 1))
+    missing = (0, max(3 - features.shape[1], 0))
+    directions = directions[:, -3:].flip(-1)
     signs = torch.where(directions.sum(dim=0) < 0, -1.0, 1.0)
-    basis = features.new_zeros(features.shape[1], 3)
-    basis[:, :k] = directions * signs
-    deviations = features.new_zeros(3)
-    deviations[:k] = variances[-k:].flip(-1).clamp_min(0).sqrt()
-    return mean, basis, deviations
+    return mean, pad(directions * signs, missing), pad(variances[-3:].flip(-1).clamp_min(0).sqrt(), missing)
 
 
 def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Tensor, alpha: Tensor) -> Tensor:
-    """Rendered features ``[H, W, F]``, weighted by ``alpha``, as colours ``[H, W, 3]``; black where ``alpha`` is 0.
-
-    [0, 1] spans three standard deviations to each side of the mean; see :func:`principal_components`.
-    """
+    """Rendered features ``[H, W, F]``, weighted by ``alpha``, as colours; [0, 1] are six deviations."""
     components = (features - alpha * mean) @ basis
     scaled = components / (6 * deviations.clamp_min(1e-8)) + 0.5 * alpha
     return scaled.clamp(0, 1)
@@ -215,15 +201,14 @@ class FrameReplay:
         if self._can_record and _recordable(source, settings):
             with self._lock:
                 try:
-                    images = self._replayed(source, camera, background, settings)
+                    if (replayed := self._replayed(source, camera, background, settings)) is not None:
+                        return replayed
                 # No compiler, no memory, or any failure of a driver to record.
                 except (BackendError, RuntimeError) as error:
                     _log.warning("frames cannot be recorded and are rendered kernel by kernel: %s", error)
                     _log.debug("", exc_info=True)
                     self._frames.clear()
-                    self._can_record, images = False, None
-            if images is not None:
-                return images
+                    self._can_record = False
         images = render_view(source, camera, background, settings, depth=False)[0]
         return {name: images[name] for name in REPLAYED}
 

@@ -31,12 +31,8 @@ def from_points(
 ) -> dict[str, Tensor]:
     """Parameters of one Gaussian for each point, float32, on the device of ``points`` ``[N, 3]``; ``rgb`` is in [0, 1].
 
-    The standard deviation is the mean distance to the three nearest neighbours (3DGS, Kerbl et al. 2023). Coincident
-    points get the smallest positive one, where 3DGS would take the logarithm of zero. Points that are not finite, in
-    position or colour, are dropped.
-
-    Raises:
-        DataError: no point is finite.
+    The standard deviation is the mean distance to the three nearest neighbours (3DGS, Kerbl et al. 2023); of coincident
+    points the smallest positive one. Points or colours that are not finite are dropped; ``DataError`` if all are.
     """
     finite = torch.isfinite(points).all(dim=1) & torch.isfinite(rgb).all(dim=1)
     points, rgb = points[finite].float(), rgb[finite].float()

@@ -30,8 +30,8 @@ FRAME_FILE = "dataparser_transforms.json"  # of nerfstudio, in the folder of a r
 def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     """Open a finished scene. Nothing in its files is executed, and nerfstudio is not needed.
 
-    Opacities of 0 or 1 and widths of 0, which files store as infinite, become finite. Other Gaussians that are NaN or
-    infinite are dropped. A warning says how many.
+    Opacities of 0 or 1 and widths of 0 become finite. Other Gaussians that are NaN or infinite are dropped. A warning
+    says how many.
 
     Args:
         path: a ``.ply``, also a compressed one, a ``.spz``, ``.sog``, ``.glb``, ``.splat`` or ``.ksplat`` of any
@@ -68,7 +68,7 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
     facts: dict[str, Any] = {"antialiased": marks.antialiased, "in_model_frame": marks.in_model_frame, "up": up}
     if rows := [[*(float(i == j) for j in range(3)), -value] for i, value in enumerate(marks.offset or ())]:
         facts["meta"] = {"frame": {"transform": rows, "scale": 1.0}}
-    return Scene(sanitised.gaussians.to(device), **facts), sanitised.mask
+    return Scene(sanitised.gaussians, **facts).to(device), sanitised.mask
 
 
 def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
@@ -142,10 +142,7 @@ def _of_run(path: Path) -> Scene:
 
 
 def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -> Scene:
-    """The scene of a checkpoint ``source`` with the contents ``loaded``, in a run with a ``config.yml``; on the CPU.
-
-    ``CheckpointError`` if the run is of another method, or its parts do not fit together.
-    """
+    """The scene of a checkpoint with the contents ``loaded``, on the CPU; ``CheckpointError`` if they do not fit."""
     options = model_options(config)
     gaussians, state = checkpoint.gaussians_of(loaded, source), checkpoint.model_state(loaded)
     extra = state.get(checkpoint.EXTRA_STATE)

@@ -1,9 +1,7 @@
 """A packed scene as a web page that decodes and renders it, head included, alone or in a notebook.
 
 ``page.html`` is built from the TypeScript in ``web/`` by ``make web``. It contacts no host: a scene is either in the
-page or in a file beside it. In a notebook it stands in a frame, which needs no server: this works in trusted notebooks
-of JupyterLab 4.6. VS Code and Colab were not tried; VS Code's setting ``notebook.experimental.enableCsp`` would refuse
-the worker in which the page decodes.
+page or in a file beside it. In a notebook it stands in a frame, which works in trusted notebooks of JupyterLab 4.6.
 """
 
 from __future__ import annotations
@@ -19,8 +17,9 @@ from pathlib import Path
 
 from PIL import Image
 
-from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, writing
+from sundae_ns.core.errors import MemoryExhaustedError, writing
 from sundae_ns.core.files import write_bytes, write_text
+from sundae_ns.core.values import whole
 from sundae_ns.scene.cameras import camera_in_front
 from sundae_ns.scene.scene import Scene, image_of, render
 
@@ -35,10 +34,9 @@ def page_of(scene: Scene, packed: bytes, *, title: str) -> str:
 
 
 def write_page(path: Path, scene: Scene, packed: bytes, *, title: str) -> int:
-    """Write the page of a scene as one file, or as a folder with ``index.html`` and ``scene.sundae`` for a web server.
+    """Write the page of a scene as one file, or without a suffix as a folder for a web server; returns the bytes.
 
-    ``path`` with a suffix is a file, without one a folder. ``scene`` gives the first image, ``packed`` is its packed
-    file. Returns the bytes of all files.
+    ``scene`` gives the first image, ``packed`` is its packed file.
     """
     if path.suffix:
         write_text(path, page_of(scene, packed, title=title))
@@ -108,7 +106,7 @@ def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
         title: of the page, for screen readers too.
 
     Raises:
-        ConfigError: the height is not a positive number of pixels.
+        ConfigError: the height is no whole number of pixels.
         PackError: the format cannot store the scene.
 
     >>> import torch, sundae_ns as sn
@@ -116,8 +114,7 @@ def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
     >>> sn.show(scene, height=300)
     Embedded(title='Scene', height=300)
     """
-    if isinstance(height, bool) or not isinstance(height, int) or height < 1:
-        raise ConfigError(f"the height of a frame is {height!r}; give a positive number of pixels")
+    height = whole(height, "height")
     from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other pages do not
 
     page = page_of(scene, packed_bytes(scene), title=title)

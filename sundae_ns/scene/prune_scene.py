@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -16,29 +17,26 @@ from torch import Tensor
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import Gaussians, sanitise
+from sundae_ns.core.values import AnyArray, numbers, whole
 from sundae_ns.graph.neighbors import knn
 from sundae_ns.pruning.decision import prune_gaussians
 from sundae_ns.pruning.rule import PruneRule, kept_count
 from sundae_ns.rasterize.interface import rasterize_cameras
 from sundae_ns.scene.optimise import optimise
 from sundae_ns.scene.render import GaussianSource, RenderSettings, TrainingCamera, contribution, pass_inputs
-from sundae_ns.scene.scene import Scene, measure
+from sundae_ns.scene.scene import Scene, measure, usable_cameras
 from sundae_ns.scene.virtual_cameras import by_device, of_unit_size, resized, size_of, split, virtual_cameras
 
 REFIT_STEPS, REFIT_VIEWS = {"cpu": 64, "cuda": 128}, 4  # steps of a refit by the device, and the images of each
-REFIT_PIXELS = 512 * 512  # most pixels of an image of a refit
-DEFAULT_RULE = PruneRule(selection="pairs")
-"""Merges the pairs whose images differ least. Without training it loses less than the draws of ``ns-train sundae``."""
+REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 23  # most pixels of an image of a refit, and of one that tells what is seen
 
 
 class PrunedScene(NamedTuple):
     """A pruned scene, and what it keeps."""
 
     scene: Scene
-    mask: Tensor
-    """True for kept Gaussians of the scene before the prune, bool ``[N]``."""
-    seen: float | None = None
-    """Share of the finite Gaussians that the cameras see; None if none was asked."""
+    mask: Tensor  # True for kept Gaussians of the scene before the prune, bool [N]
+    seen: float | None = None  # share of the finite Gaussians that the cameras see; None if none was asked
 
 
 def prune(
@@ -46,7 +44,7 @@ def prune(
     *,
     keep: float | None = None,
     count: int | None = None,
-    cameras: Sequence[Camera] | None = None,
+    cameras: Camera | Iterable[Camera] | None = None,
     rule: PruneRule | None = None,
     progress: bool = False,
 ) -> Scene:
@@ -61,7 +59,7 @@ def prune(
         count: number of Gaussians to keep, in place of a share; at least 1.
         cameras: cameras whose images the prune preserves; by default those stored with the scene, else
             :func:`sundae_ns.virtual_cameras`.
-        rule: score, selection and merge; by default :data:`DEFAULT_RULE`.
+        rule: score, selection and merge; by default ``PruneRule()``.
         progress: show a progress bar on stderr.
 
     Returns:
@@ -77,6 +75,9 @@ def prune(
     >>> sn.prune(scene, keep=0.1, cameras=sn.virtual_cameras(scene, 4, size=32)).num_gaussians
     20
     """
+    if not isinstance(rule, PruneRule | None):
+        raise ConfigError(f"the rule is {rule!r}; give a PruneRule, such as PruneRule(selection='pairs')")
+    cameras = None if cameras is None else usable_cameras(cameras)
     return prune_with_mask(scene, keep, count, cameras, rule, progress=progress).scene
 
 
@@ -84,10 +85,10 @@ def check_amount(keep: float | None, count: int | None) -> None:
     """Raise ``ConfigError`` unless one of the two is given, and is in its range."""
     if (keep is None) == (count is None):
         raise ConfigError("prune needs either keep (a share) or count (a number of Gaussians); give one of them")
-    if keep is not None and not 0 < keep <= 1:
+    if keep is not None and not 0 < float(numbers(keep, "keep", ())) <= 1:
         raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
-    if count is not None and count < 1:
-        raise ConfigError(f"count is {count}; give 1 or more Gaussians")
+    if count is not None:
+        whole(count, "count")
 
 
 @torch.no_grad()
@@ -101,12 +102,9 @@ def prune_with_mask(
     progress: bool = False,
     fit: bool = True,
 ) -> PrunedScene:
-    """As :func:`prune`, with the mask of the kept Gaussians.
-
-    Without ``fit``, merged Gaussians are not fitted; a training that follows learns more from those.
-    """
+    """As :func:`prune`, with the mask of the kept Gaussians; without ``fit``, a training that follows fits them."""
     check_amount(keep, count)
-    rule, sanitised = rule or DEFAULT_RULE, sanitise(scene.gaussians)
+    rule, sanitised = rule or PruneRule(), sanitise(scene.gaussians)
     n = sanitised.gaussians.num_gaussians
     if keep is not None:
         count = kept_count(keep, n)
@@ -130,15 +128,19 @@ def prune_with_mask(
     return PrunedScene(small, mask, None if weights is None else float((weights > 0).float().mean()))
 
 
+def at_most(camera: Camera, pixels: int) -> Camera:
+    """The camera, zoomed out if its image has more pixels."""
+    return camera.zoomed(min(1.0, math.sqrt(pixels / (camera.width * camera.height))))
+
+
 def weights_in(
     scene: Scene, cameras: Sequence[Camera], count: int | None = None, console: Console | None = None
 ) -> Tensor:
-    """Blending weight of each Gaussian of a finite scene, summed over the pixels of cameras ``[N]``.
+    """Blending weight of each Gaussian of a finite scene over the pixels of cameras ``[N]``; see :func:`.contribution`.
 
-    With ``count``, pixels are weighted by the detail that ``count`` Gaussians cannot show. Raises ``DataError`` if the
-    cameras see none.
+    ``DataError`` if the cameras see none.
     """
-    sized, scaled = of_unit_size(scene, cameras)
+    sized, scaled = of_unit_size(scene, [at_most(camera, MOST_PIXELS) for camera in cameras])
     views = [TrainingCamera(camera.to(scene.device), None) for camera in scaled]
     source, settings = GaussianSource(sized.gaussians), scene.settings(head=False)
     weights = contribution(source, views, scene.background, settings, count, console=console)
@@ -162,15 +164,11 @@ def refit(
 ) -> Gaussians:
     """Fit centres, shapes, opacities and base colours of Gaussians to the images of more Gaussians, ``full``.
 
-    A merge keeps moments, not images: groups overlap, and hide what was behind them. Adam's steps (Kingma and Ba, 2015)
-    lower the squared error of the blended colours and of the accumulation, over a few images each, as in training. At
-    most :data:`REFIT_STEPS` times :data:`REFIT_VIEWS` cameras are used; ``seed`` orders them.
-
-    Returns:
-        As many Gaussians; ``small`` itself if the refit matches no better.
+    A merge keeps moments, not images. Adam's steps (Kingma and Ba, 2015) lower the squared error of the blended colours
+    and of the accumulation, over a few images each, in an order by ``seed``. Returns ``small`` if it matches no worse.
     """
     device = small["means"].device
-    cameras = [camera.zoomed(min(1.0, math.sqrt(REFIT_PIXELS / (camera.width * camera.height)))) for camera in cameras]
+    cameras = [at_most(camera, REFIT_PIXELS) for camera in cameras]
     order = torch.randperm(len(cameras), generator=torch.Generator().manual_seed(seed)).tolist()
     # Eight cameras that no step uses judge, if there are twice as many.
     judges, trained = (order[:8], order[8:]) if len(order) >= 16 else (order, order)
@@ -206,11 +204,8 @@ def refit(
     steps = by_device(REFIT_STEPS, device)
     with Progress(transient=True, console=console, disable=console is None) as progress:
         task = progress.add_task("Refit of Gaussians", total=steps)
-
-        def show(done: int) -> None:
-            progress.update(task, completed=done)
-
-        optimise(step, {"field": optimizer}, steps, lambda _, i: 1 - i / steps, on_step=show)
+        show = partial(progress.advance, task)
+        optimise(step, {"field": optimizer}, steps, lambda _, i: 1 - i / steps, on_step=lambda _: show())
     gaussians = fitted()
     before, after = (error(each, judges) for each in (small, gaussians))
     return gaussians if bool(after < before) else small  # small too if the fitted ones are not finite
@@ -237,8 +232,7 @@ def count_for_drop(
     """The fewest Gaussians whose images lose at most ``drop`` dB, with the PSNR (dB) by counts that it follows from.
 
     The scene is pruned to a half, a quarter and so on, until every eighth camera, held out, sees too much difference.
-    The error adds to that of the full scene against photographs, which is taken to be that of 30 dB. Raises
-    ``ConfigError`` for an impossible ``drop`` or fewer than two cameras.
+    The error adds to that of the full scene against photographs, which is taken to be that of 30 dB.
     """
     if not 0 < drop < 100:
         raise ConfigError(f"target-drop is {drop}; give a positive number of dB, 0.5 for half a decibel")
@@ -266,7 +260,7 @@ def count_for_drop(
 REACH = 3.0  # Gaussians touch if they are nearer than this many times the sum of their largest standard deviations
 
 
-def crop(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Scene:
+def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
     """The Gaussians whose centres are in a box, its faces included; everything else of the scene stays.
 
     Args:
@@ -285,10 +279,8 @@ def crop(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Scene:
     return kept(scene, crop_mask(scene, low, high))
 
 
-def remove_floaters(scene: Scene, *, cameras: Sequence[Camera] | None = None) -> Scene:
-    """The scene without Gaussians that no surface supports.
-
-    These are small groups that touch no other Gaussian, and what no camera sees. Floaters that touch a surface stay.
+def remove_floaters(scene: Scene, *, cameras: Camera | Iterable[Camera] | None = None) -> Scene:
+    """The scene without small groups of Gaussians that touch no other, and without what no camera sees.
 
     Args:
         scene: to clean; it does not change.
@@ -304,7 +296,7 @@ def remove_floaters(scene: Scene, *, cameras: Sequence[Camera] | None = None) ->
     >>> sn.remove_floaters(sn.Scene(gaussians)).num_gaussians < 2001
     True
     """
-    return kept(scene, ~floater_mask(scene, scene.cameras if cameras is None else cameras))
+    return kept(scene, ~floater_mask(scene, scene.cameras if cameras is None else usable_cameras(cameras)))
 
 
 def kept(scene: Scene, mask: Tensor) -> Scene:
@@ -321,21 +313,19 @@ def within(mask: Tensor | None, inner: Tensor) -> Tensor:
     return narrowed
 
 
-def crop_mask(scene: Scene, low: Sequence[float], high: Sequence[float]) -> Tensor:
+def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
     """True for the Gaussians in a box, bool ``[N]``; arguments and errors as for :func:`crop`."""
-    if len(low) != 3 or len(high) != 3 or not all(math.isfinite(value) for value in (*low, *high)):
-        raise ConfigError("the box is not six finite numbers; give its lowest x y z, then its highest")
-    if not all(a < b for a, b in zip(low, high, strict=True)):
-        raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
     means = scene.gaussians["means"].detach()
-    lowest, highest = (means.new_tensor(corner, dtype=torch.float64) for corner in (low, high))
+    lowest, highest = (numbers(corner, "a corner of the box", (3,)).to(means.device) for corner in (low, high))
+    if not bool((lowest < highest).all()):
+        raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
     inside = ((means.double() >= lowest) & (means.double() <= highest)).all(dim=1)  # exact in float64
     if not bool(inside.any()):
         finite = means[means.isfinite().all(dim=1)].double().cpu().numpy()
         if not len(finite):
             raise DataError("no Gaussian is in the box, because none is finite; export the scene again")
-        low, high = np.quantile(finite, (0.05, 0.95), axis=0)
-        corners = (" ".join(f"{value:.3g}" for value in corner) for corner in (low, high))
+        quantiles = np.quantile(finite, (0.05, 0.95), axis=0)
+        corners = (" ".join(f"{value:.3g}" for value in corner) for corner in quantiles)
         raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
     return inside
 

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import BackendError, DataError
-from sundae_ns.core.gaussians import Gaussians
+from sundae_ns.core.errors import BackendError, ConfigError, DataError, one_line
+from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians, checked
 from sundae_ns.core.metrics import Quality, evaluate
+from sundae_ns.core.values import AnyArray, floats, numbers, usual_defaults, whole
 from sundae_ns.cuda.kernels import naming_full_memory
+from sundae_ns.data.photos import photo_of, upright
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.rasterize.interface import BackendName, select_backend
 from sundae_ns.scene.initialization import from_points
 from sundae_ns.scene.render import SHOWN_BACKGROUNDS, GaussianSource, RenderSettings, render_view
 
+Direction = tuple[float, float, float]
 Background = Literal["random", "black", "white"]
 """Names of backgrounds; a scene that was trained over ``random`` ones is shown on nerfstudio's grey."""
 
@@ -49,25 +55,47 @@ class Scene:
     meta: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """JSON values that a packed scene carries along: ``frame``, ``capture``, ``source``."""
 
+    def __post_init__(self) -> None:
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        put("gaussians", checked(self.gaussians))
+        features = self.gaussians[FEATURES].shape[1] if FEATURES in self.gaussians else 0
+        if self.head is not None and features != self.head.config.num_features:
+            wanted = self.head.config.num_features
+            raise DataError(f"the head reads {wanted} features and the Gaussians have {features}; leave the head out")
+        if self.background_color not in SHOWN_BACKGROUNDS:
+            raise ConfigError(f"the background is {self.background_color!r}; give {', '.join(SHOWN_BACKGROUNDS)}")
+        put("cameras", usable_cameras(self.cameras))
+        put("start", None if self.start is None else usable_cameras(self.start)[0])
+        put("up", None if self.up is None else unit(self.up))
+
     @classmethod
-    def from_points(cls, points: Tensor, colors: Tensor, *, sh_degree: int = 0) -> Scene:
+    @usual_defaults()
+    def from_points(cls, points: AnyArray, colors: AnyArray, *, sh_degree: int = 0) -> Scene:
         """A scene of one Gaussian for each point, sized by the distance to its neighbours.
 
         Args:
             points: positions ``[N, 3]``, world units.
-            colors: in [0, 1] ``[N, 3]``.
+            colors: uint8, or in [0, 1] ``[N, 3]``.
             sh_degree: degree of the spherical harmonics, 0 to 4.
 
         Raises:
-            DataError: shapes do not fit, or there are no points.
+            DataError: shapes or values do not fit, or there are no points.
 
         >>> import torch, sundae_ns as sn
         >>> sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3)).num_gaussians
         100
         """
+        points, colors = floats(points, "points"), floats(colors, "colors", colors=True)
         if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape or not len(points):
             shapes = f"{list(points.shape)} and {list(colors.shape)}"
             raise DataError(f"points and colours have shapes {shapes}; pass [N, 3] each, N at least 1")
+        if not bool(points.isfinite().all()):
+            raise DataError("some points are NaN or infinite; remove them, and their colours")
+        if whole(sh_degree, "sh_degree", 0) > MAX_SH_DEGREE:
+            raise ConfigError(f"sh_degree is {sh_degree}; give at most {MAX_SH_DEGREE}")
+        colors = colors.to(points.device)
         return cls(Gaussians(from_points(points, colors, sh_degree=sh_degree, num_features=0)))
 
     @property
@@ -86,10 +114,14 @@ class Scene:
         """Colour behind the scene ``[3]``, on the device of the scene."""
         return torch.tensor(SHOWN_BACKGROUNDS[self.background_color], dtype=torch.float32, device=self.device)
 
+    @usual_defaults()
     def to(self, device: torch.device | str) -> Scene:
-        """The scene on another device; stored cameras stay on the CPU."""
-        if torch.device(device) == self.device:
-            return self
+        """The scene on another device; stored cameras stay on the CPU. ``BackendError`` if it is not available."""
+        try:
+            if torch.empty(0, device=device).device == self.device:
+                return self
+        except (RuntimeError, AssertionError, TypeError) as error:
+            raise BackendError(f"the device {device} is not available ({one_line(error)}); give cpu") from error
         head = None
         if self.head is not None:
             # No deep copy: on a GPU the head keeps recorded CUDA graphs, which cannot be copied.
@@ -110,6 +142,28 @@ class Scene:
     def __repr__(self) -> str:
         head = "no head" if self.head is None else f"{self.head.config.size} head"
         return f"Scene({self.num_gaussians:,} Gaussians, SH degree {self.gaussians.sh_degree}, {head}, {self.device})"
+
+
+def unit(direction: AnyArray) -> Direction:
+    """A direction scaled to unit length; ``ConfigError`` for one without a direction."""
+    x, y, z = numbers(direction, "the up axis", (3,)).tolist()
+    length = math.hypot(x, y, z)
+    if not length:
+        raise ConfigError("the up axis has no direction; give 0 0 1 for z")
+    return x / length, y / length, z / length
+
+
+def usable_cameras(cameras: Any) -> tuple[Camera, ...]:
+    """One or several cameras of a caller; ``DataError`` for anything else, and for one that is not finite."""
+    listed = tuple(cameras) if isinstance(cameras, Iterable) and not isinstance(cameras, (Camera, str)) else (cameras,)
+    for camera in listed:
+        if not isinstance(camera, Camera):
+            raise DataError(f"{str(camera)[:80]!r} is no camera; give a Camera, or those of cameras_of(path)")
+        for matrix in camera[:2]:
+            # Not on a GPU, which would be waited for.
+            if not isinstance(matrix, Tensor) or (matrix.device.type == "cpu" and not bool(matrix.isfinite().all())):
+                raise DataError("the matrices of a camera are no finite tensors; make it by Camera.from_pose")
+    return listed
 
 
 class Rendering(NamedTuple):
@@ -151,6 +205,7 @@ def render(scene: Scene, camera: Camera, *, head: bool = True, backend: BackendN
     >>> sn.render(scene, camera).rgb.shape
     torch.Size([48, 64, 3])
     """
+    (camera,) = usable_cameras((camera,))
     settings = scene.settings(backend, head=head)
     wanted = any(value.requires_grad for value in (*scene.gaussians.values(), camera.viewmat, camera.K))
     wanted |= settings.head is not None and settings.head.training
@@ -164,8 +219,8 @@ def render(scene: Scene, camera: Camera, *, head: bool = True, backend: BackendN
 @torch.no_grad()
 def measure(
     scene: Scene,
-    reference: Scene | Sequence[Tensor],
-    cameras: Sequence[Camera] | None = None,
+    reference: Scene | Iterable[Any],
+    cameras: Camera | Iterable[Camera] | None = None,
     *,
     head: bool = True,
     backend: BackendName = "auto",
@@ -174,14 +229,15 @@ def measure(
 
     Args:
         scene: to measure.
-        reference: a scene, whose own images count as true, or an image in [0, 1] ``[H, W, 3]`` for each view. Both
-            scenes are rendered over the background of the reference.
+        reference: a scene, whose own images count as true, or an image for each camera: the path of a photo, an image
+            of PIL, or an array or a tensor ``[H, W, 3]``, uint8 or in [0, 1]. Both scenes are rendered over the
+            background of the reference.
         cameras: the cameras; by default those stored with the reference, or with the scene.
         head: whether the heads of both scenes correct their images.
         backend: the rasteriser.
 
     Raises:
-        DataError: there are no views, or not one image of its size for each view.
+        DataError: there are no cameras, or not one image of its size for each camera.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
@@ -190,15 +246,25 @@ def measure(
     True
     """
     stored = reference.cameras if isinstance(reference, Scene) else ()
-    cameras = tuple(cameras) if cameras is not None else stored or scene.cameras
+    cameras = usable_cameras(cameras) if cameras is not None else stored or scene.cameras
     if not cameras:
         raise DataError("there is no view to measure in; give views, such as sundae_ns.virtual_cameras(scene)")
     targets: Iterable[Tensor]
     if isinstance(reference, Scene):
         scene = dataclasses.replace(scene, background_color=reference.background_color)
         targets = (render(reference, camera, head=head, backend=backend).rgb for camera in cameras)
-    elif len(reference) != len(cameras):
-        raise DataError(f"{len(reference)} images do not fit {len(cameras)} views; give one image for each view")
     else:
-        targets = reference
+        several = isinstance(reference, Iterable) and not isinstance(reference, (str, Path, Rendering))
+        images = list(reference) if several and getattr(reference, "ndim", 4) != 3 else [reference]
+        if len(images) != len(cameras):
+            raise DataError(f"{len(images)} images do not fit {len(cameras)} views; give one image for each view")
+        targets = (_image(image, f"image {i}") for i, image in enumerate(images))
     return evaluate(lambda camera: render(scene, camera, head=head, backend=backend).rgb, cameras, targets)
+
+
+def _image(image: Any, name: str) -> Tensor:
+    """An image of a caller, in [0, 1] ``[H, W, 3]``."""
+    image = upright(photo_of(Path(image))) if isinstance(image, (str, Path)) else image
+    if isinstance(image, Image.Image):
+        image = np.asarray(image if image.mode == "RGBA" else image.convert("RGB"))
+    return floats(image.rgb if isinstance(image, Rendering) else image, name, colors=True)

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera, poses_looking_at, world_to_camera
 from sundae_ns.core.covariance import chunks
-from sundae_ns.core.errors import ConfigError, DataError
+from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import Gaussians, sanitise
+from sundae_ns.core.values import whole
 from sundae_ns.rasterize.interface import rasterize_cameras
 from sundae_ns.scene.render import pass_inputs
 from sundae_ns.scene.scene import Scene
@@ -42,10 +43,9 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
     Gaussians show where the photographs were taken: training splits them until each covers few pixels, so from there
-    all of them look small, and from elsewhere some are blobs. Eyes around the middle of the scene look at random
-    Gaussians; small images judge them by the logarithm of the angle of the Gaussians that they show. Half of the
-    cameras are the best of a few draws and moves by its mean. The others are found by mean and deviation, poor ones
-    start again where others are better, and in the end they look at random Gaussians, to see what is around them.
+    all look small. Eyes around the middle of the scene look at random Gaussians; small images judge them by the
+    logarithm of the angle of the Gaussians that they show. Half of the cameras are the best of a few draws and moves by
+    its mean, the others by mean and deviation; in the end these look at random Gaussians, to see what is around them.
 
     Args:
         scene: its finite Gaussians count.
@@ -54,7 +54,7 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         size: width and height of the images, pixels; by default 512.
 
     Raises:
-        ConfigError: ``n`` or ``size`` is less than 1.
+        ConfigError: ``n`` or ``size`` is no whole number of at least 1.
         DataError: no Gaussian is finite.
 
     >>> import torch, sundae_ns as sn
@@ -62,13 +62,11 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     >>> len(sn.virtual_cameras(scene, 8))
     8
     """
-    n, size = by_device(VIEWS, scene.device) if n is None else n, SIDE if size is None else size
-    if n < 1 or size < 1:
-        raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
+    n, size = whole(by_device(VIEWS, scene.device) if n is None else n, "n"), SIDE if size is None else size
     gaussians = usable(scene)
     means = gaussians["means"]
     middle, reach = middle_and_reach(gaussians)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(whole(seed, "seed", 0))
     probe, sizes = _probe(gaussians, middle, reach, generator)
     judge = dataclasses.replace(scene, gaussians=probe)
 
@@ -115,17 +113,15 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         turns = torch.cat([torch.arange(len(eyes)) * 2, torch.arange(len(even)) * 2 + 1]).argsort()
         eyes = torch.cat([eyes, even])[turns]
         targets = torch.cat([targets, random_targets(len(even))])[turns]
+    up = scene.up or (0.0, 0.0, 1.0)
     return [
-        Camera.look_at(middle + reach * eye, middle + reach * target, fov=FOV, width=size, height=size)
+        Camera.look_at(middle + reach * eye, middle + reach * target, up, fov=FOV, width=size, height=size)
         for eye, target in zip(eyes, targets, strict=True)
     ]
 
 
 def of_unit_size(scene: Scene, cameras: Sequence[Camera]) -> tuple[Scene, list[Camera]]:
-    """A scene of another program and its cameras, scaled to a size of 1; see :func:`size_of`.
-
-    The near plane is at a fixed distance, and would hide a scene of millimetres.
-    """
+    """A scene of another program and its cameras at a size of 1: the near plane would hide a scene of millimetres."""
     cameras, size = list(cameras), size_of(scene)
     if size == 1:
         return scene, cameras
@@ -173,10 +169,7 @@ def usable(scene: Scene) -> Gaussians:
 
 
 def _probe(gaussians: Gaussians, middle: Tensor, reach: float, generator: torch.Generator) -> tuple[Gaussians, Tensor]:
-    """Few Gaussians of unit size around the origin that look alike from afar, and logarithms of their sizes ``[M]``.
-
-    They are drawn by size and opacity, and grow to cover the area of the others; the sizes are those before.
-    """
+    """Few Gaussians of a scene of unit size, grown to cover the others, and logarithms of their own sizes ``[M]``."""
     sizes = gaussians["scales"].double().sort(dim=1).values[:, 1:].mean(dim=1) - math.log(reach)
     kept = gaussians
     if gaussians.num_gaussians > _PROBE_GAUSSIANS:
@@ -202,10 +195,7 @@ def _factor(values: Tensor, count: int) -> Tensor:
 
 @torch.no_grad()
 def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor, evenness: float) -> Tensor:
-    """Mean logarithm of the angle of the Gaussians in the pixels of each camera, at most 0 ``[V]``; lower is finer.
-
-    ``sizes`` are logarithms ``[N]``; ``evenness`` times the standard deviation is added.
-    """
+    """Mean logarithm of the angle of the Gaussians in the pixels, and ``evenness`` times its deviation ``[V]``."""
     means, settings = scene.gaussians["means"], scene.settings(head=False)
     coarseness: list[Tensor] = []
     poses = poses_looking_at(eyes, targets, eyes.new_tensor([0.0, 0.0, 1.0]))

@@ -47,6 +47,8 @@ of :func:`sundae_ns.scene.render.contribution`."""
 class PruningConfig(PruneRule):
     """When to prune and how many Gaussians to keep, beside the rule that says which."""
 
+    selection: Literal["systematic", "pairs", "band"] = "systematic"
+    """How scores select Gaussians: by draws in space (systematic), by least different pairs, or by the paper (band)."""
     score: ScoreName = "detail-contribution"
     """Importance of a Gaussian: its blending weight over the training views, with pixels weighted by the detail that
     the kept Gaussians cannot show (detail-contribution), or its high-pass response (response)."""
@@ -65,11 +67,9 @@ class PruningConfig(PruneRule):
     every: int = 2000
     """Steps from one continuous prune to the next."""
     max_gaussians: int | None = None
-    """Continuous: most Gaussians at any step, densification included; a prune keeps at most this many. One-shot: most
-    Gaussians that the prune keeps."""
+    """Most Gaussians that a one-shot prune keeps, or that there are in continuous pruning, densification included."""
     target_gaussians: int | None = None
-    """Each prune keeps exactly this many, instead of a share or of what trials choose. Continuous: the final field has
-    exactly this many; if densification ends with fewer, Gaussians are added."""
+    """Exactly how many each prune keeps, and how many continuous pruning ends with: Gaussians are added if need be."""
     max_drop: float | None = None
     """One-shot, where trials decide: PSNR in dB that a smaller field may lose against the best one, and SSIM in
     proportion. None for 0.1 dB and 0.003."""

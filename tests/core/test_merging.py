@@ -11,6 +11,7 @@ from torch.nn import Parameter
 
 from sundae_ns.core.covariance import (
     covariances,
+    entries_of,
     mean_projected_area,
     overlap,
     quaternions,
@@ -92,34 +93,19 @@ def test_merging_commutes_with_rotation_scale_and_shift() -> None:
     torch.testing.assert_close(after["opacities"], before["opacities"])
 
 
-def test_groups_without_weight_are_unchanged_and_the_scale_of_weights_is_irrelevant() -> None:
-    params, label = gaussians(), torch.tensor([0] * 6 + [6] * 6)
-    for w in (torch.zeros(12), torch.full((12,), torch.nan)):
-        found = merge(params, label, w)
+def test_only_positive_weights_count_and_their_scale_does_not() -> None:
+    params, label, w = gaussians(), torch.tensor([0] * 6 + [6] * 6), torch.rand(12, dtype=torch.float64)
+    for none in (torch.zeros(12), torch.full((12,), torch.nan)):
+        found = merge(params, label, none)
         assert all(torch.equal(found[name], params[name][[0, 6]]) for name in params)
-    w = torch.rand(12, dtype=torch.float64)
     small, plain = merge(params, label, w * 1e-200), merge(params, label, w)
     assert all(torch.allclose(small[name], plain[name]) for name in params)
-
-
-def test_weights_that_are_nan_infinite_or_negative_count_as_zero() -> None:
-    params, label, w = gaussians(), torch.tensor([0] * 6 + [6] * 6), torch.rand(12, dtype=torch.float64)
     w[[1, 7]] = 0
     expected = merge(params, label, w)
     for odd in (torch.nan, torch.inf, -1.0):
         w[[1, 7]] = odd
         found = merge(params, label, w)
         assert all(torch.equal(found[name], expected[name]) for name in params), odd
-
-
-def test_a_group_with_an_axis_that_overflows_is_unchanged_and_others_are_merged() -> None:
-    params = gaussians()
-    params["scales"][2, 1] = 400.0
-    params["quats"][2] = torch.tensor([1.0, 0, 0, 0]).double()
-    found = merge(params, torch.tensor([0] * 6 + [6] * 6), torch.ones(12))
-    assert all(torch.equal(found[name][0], params[name][0]) for name in params)
-    assert not torch.equal(found["means"][1], params["means"][6])
-    assert all(value.isfinite().all() for value in found.values())
 
 
 def test_extremes_stay_finite() -> None:
@@ -136,7 +122,8 @@ def test_extremes_stay_finite() -> None:
 
 def test_groups_that_overflow_or_vanish_are_unchanged() -> None:
     params = gaussians()
-    params["scales"][0], params["scales"][6] = 500.0, -500.0
+    params["scales"][0], params["scales"][6] = torch.tensor([0.0, 400.0, 0.0]), -500.0
+    params["quats"][0] = torch.tensor([1.0, 0, 0, 0]).double()
     params["scales"][7:] = -500.0
     params["means"][6:] = 0
     found = merge(params, torch.tensor([0] * 3 + [3] * 3 + [6] * 6), torch.ones(12))
@@ -145,52 +132,56 @@ def test_groups_that_overflow_or_vanish_are_unchanged() -> None:
     assert not torch.equal(found["means"][1], params["means"][3])
 
 
-def test_overlap_with_itself_is_one_falls_with_distance_and_is_scale_invariant() -> None:
+def neighbours(params: dict[str, Tensor], indices: list[list[int]] | Tensor, least_variance: float = 0.0) -> Tensor:
+    rows = torch.arange(len(params["means"]))[:, None]
+    return overlap(params["means"], entries_of(params), rows, torch.as_tensor(indices), least_variance)
+
+
+def of_widths(means: list[list[float]], widths: list[list[float]], turn: list[float]) -> dict[str, Tensor]:
+    values = {"means": means, "scales": widths, "quats": [turn] * len(means)}
+    made = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
+    return {**made, "scales": made["scales"].log()}
+
+
+def test_overlap_is_that_of_the_formula_and_1_with_itself() -> None:
     params = gaussians(200)
-    S, means = covariance_of(params), params["means"]
-    indices = torch.stack([torch.arange(200), torch.arange(200).roll(1)], dim=1)
-    found = overlap(means, S, indices, least_width=0.0)
+    S, means, other = covariance_of(params), params["means"], torch.arange(200).roll(1)
+    found = neighbours(params, torch.stack([torch.arange(200), other], dim=1))
     torch.testing.assert_close(found[:, 0], torch.ones(200, dtype=torch.float64))
     assert float(found[:, 1].max()) < 1
-    torch.testing.assert_close(overlap(16 * means, 256 * S, indices, least_width=0.0), found)
-    # Two spheres of width 1 at a distance of 2: exp(-4 / 8).
-    unit = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
-    apart = overlap(torch.tensor([[0.0, 0, 0], [2.0, 0, 0]]).double(), unit, torch.tensor([[1], [0]]), least_width=0.0)
-    assert apart.squeeze(1).tolist() == pytest.approx([math.exp(-0.5)] * 2)
-    flat = torch.diag(torch.tensor([1.0, 1.0, 0.0])).double().expand(2, 3, 3)
-    # Compare with the formula, with determinants and inverses of LAPACK.
+    assert torch.equal(overlap(means, entries_of(params), torch.arange(200), other), found[:, 1])
+    larger = {**params, "means": 16 * means, "scales": params["scales"] + math.log(16)}
+    torch.testing.assert_close(neighbours(larger, other[:, None]), found[:, 1:])
+    # With determinants and inverses of LAPACK.
     S = S + 0.3**2 * torch.eye(3)
-    middle = (S + S.roll(1, dims=0)) / 2
-    offset = means - means.roll(1, dims=0)
+    middle, offset = (S + S[other]) / 2, means - means[other]
     exponent = -torch.einsum("ni,nij,nj->n", offset, torch.linalg.inv(middle), offset) / 8
-    ratio = (S.det() * S.roll(1, dims=0).det()) ** 0.25 / middle.det() ** 0.5
-    found = overlap(means, covariance_of(params), indices, least_width=0.3)
-    torch.testing.assert_close(found[:, 1], exponent.exp() * ratio)
-    assert overlap(torch.zeros(2, 3).double(), flat, torch.tensor([[1], [0]]), least_width=0.0).isfinite().all()
+    ratio = (S.det() * S[other].det()) ** 0.25 / middle.det() ** 0.5
+    torch.testing.assert_close(neighbours(params, other[:, None], 0.3**2)[:, 0], exponent.exp() * ratio)
 
 
-def test_overlap_of_needles_survives_pivots_lost_to_rounding() -> None:
-    # Two crossed needles of 1e6 by 1e-6 with one centre, rotated away from the coordinate axes.
-    turn = rotation_matrices(torch.tensor([[0.3, -0.5, 0.7, 0.2]]).double())
-    crossed = torch.diag_embed(torch.tensor([[1e6, 1e-6, 1e-6], [1e-6, 1e6, 1e-6]]).double().square())
-    found = overlap(
-        torch.zeros(2, 3).double(), turn @ crossed @ turn.mT, torch.tensor([[0, 1], [1, 0]]), least_width=1e-6
-    )
+def test_overlap_of_spheres_of_flat_ones_and_of_needles() -> None:
+    # Two spheres of width 1 at a distance of 2: exp(-4 / 8).
+    spheres = of_widths([[0, 0, 0], [2, 0, 0]], [[1, 1, 1]] * 2, [1, 0, 0, 0])
+    assert neighbours(spheres, [[1], [0]]).flatten().tolist() == pytest.approx([math.exp(-0.5)] * 2)
+    flat = of_widths([[0, 0, 0]] * 2, [[1, 1, 0]] * 2, [1, 0, 0, 0])
+    assert neighbours(flat, [[1], [0]]).isfinite().all()
+    # Pivots of crossed needles, turned away from the axes, are lost to rounding.
+    needles = of_widths([[0, 0, 0]] * 2, [[1e6, 1e-6, 1e-6], [1e-6, 1e6, 1e-6]], [0.3, -0.5, 0.7, 0.2])
+    found = neighbours(needles, [[0, 1], [1, 0]], 1e-12)
     assert found[:, 0].tolist() == [1, 1]
     assert found.isfinite().all()
     assert float(found[:, 1].max()) < 1e-3
 
 
 def test_chunks_of_rows_give_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    params = gaussians(50)
-    indices = torch.randint(50, (50, 4))
-    whole = overlap(params["means"], covariance_of(params), indices, least_width=0.1)
-    label = torch.arange(50) // 5 * 5
-    merged = merge(params, label, torch.rand(50, generator=torch.Generator().manual_seed(0)))
+    params, indices = gaussians(50), torch.randint(50, (50, 4))
+    label, weight = torch.arange(50) // 5 * 5, torch.rand(50)
+    whole, merged = neighbours(params, indices, 0.01), merge(params, label, weight)
     monkeypatch.setattr("sundae_ns.core.covariance.PAIRS", 30)
     monkeypatch.setattr("sundae_ns.core.covariance.ROWS", 7)
-    assert torch.equal(overlap(params["means"], covariance_of(params), indices, least_width=0.1), whole)
-    again = merge(params, label, torch.rand(50, generator=torch.Generator().manual_seed(0)))
+    assert torch.equal(neighbours(params, indices, 0.01), whole)
+    again = merge(params, label, weight)
     assert all(torch.equal(again[name], merged[name]) for name in merged)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -26,7 +27,8 @@ from sundae_ns.pruning.scores import response
 from sundae_ns.train.pruning import PruningConfig
 
 SHARE = 0.2
-DEFAULT = PruneRule()
+draws = partial(PruneRule, selection="systematic")
+DEFAULT = draws()
 
 
 def opacity(params: Mapping[str, Tensor]) -> Tensor:
@@ -251,20 +253,20 @@ def test_any_cells_at_any_scale(
 
 
 def test_the_schedule_that_comes_with_a_rule_is_ignored() -> None:
-    expected = decide_share(gaussians(), PruneRule(), 0.25, torch.ones(60)).mask
+    expected = decide_share(gaussians(), draws(), 0.25, torch.ones(60)).mask
     for config in (PruningConfig(mode="off"), PruningConfig(mode="continuous", target_gaussians=10)):
         assert torch.equal(decide_share(gaussians(), config, 0.25, torch.ones(60)).mask, expected)
 
 
 def test_the_band_rule_is_the_papers() -> None:
-    given = PruneRule(signal="positions", num_neighbors=7, seed=3)
+    given = draws(signal="positions", num_neighbors=7, seed=3)
     paper = replace(given, gamma=0.7, score="response", selection="band", edges="centres", redistribution="none")
     assert band_rule(given, 0.7) == paper
 
 
 @pytest.mark.parametrize("options", [{}, {"score": "response", "selection": "band", "redistribution": "none"}])
 def test_a_given_graph_is_used_and_changes_nothing(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    params, rule, weights = gaussians(), PruneRule(**options), torch.ones(60)
+    params, rule, weights = gaussians(), draws(**options), torch.ones(60)
     params["opacities"][4] = torch.nan
     usable = {name: value[torch.arange(60) != 4] for name, value in params.items()}
     expected, graph = decide_share(params, rule, 0.3, weights), gaussian_graph(usable, rule)
@@ -274,7 +276,7 @@ def test_a_given_graph_is_used_and_changes_nothing(options: dict[str, Any], monk
     for name, value in (expected.values or {}).items():
         assert torch.equal((found.values or {})[name], value)
     # A rule without a graph ignores it.
-    assert decide_share(params, PruneRule(score=opacity, redistribution="none"), graph=graph).tau is None
+    assert decide_share(params, draws(score=opacity, redistribution="none"), graph=graph).tau is None
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
@@ -288,7 +290,7 @@ def test_primitives_that_are_not_finite_are_dropped_and_do_not_count(value: floa
     assert decision.dropped_nonfinite == 2
     assert int(decision.mask.sum()) == decision.kept == 29
     assert not decision.mask[[7, 8]].any()
-    everything = decide_share(params, PruneRule(), 1.0, contribution)
+    everything = decide_share(params, draws(), 1.0, contribution)
     assert everything.mask.nonzero().squeeze(1).tolist() == [i for i in range(60) if i not in (7, 8)]
 
 
@@ -318,17 +320,17 @@ def test_prune_leaves_what_the_decision_says_and_the_field_alone(rule: PruneRule
 
 
 def test_invalid_input_raises_one_line() -> None:
-    params, three = gaussians(), PruneRule(score=lambda _: torch.ones(3))
+    params, three = gaussians(), draws(score=lambda _: torch.ones(3))
     cases: list[tuple[type[SundaeError], str, Any]] = [
         (DataError, "none of 60", lambda: decide_share({k: v * torch.nan for k, v in params.items()}, PAPER)),
         (ConfigError, "training views", lambda: decide_share(params, DEFAULT)),
-        (ConfigError, "set redistribution to none", lambda: decide_share(params, PruneRule(score="response"))),
+        (ConfigError, "set redistribution to none", lambda: decide_share(params, draws(score="response"))),
         (DataError, r"shape \[59\] for 60", lambda: decide_share(params, DEFAULT, 0.1, torch.ones(59))),
         (ConfigError, "keep_ratio", lambda: decide_share(params, DEFAULT, 0.0)),
-        (ConfigError, "gamma", lambda: decide_share(params, PruneRule(gamma=2.0))),
-        (ConfigError, "score is 'opacity': use one of detail-c", lambda: PruneRule(score="opacity").validate()),
+        (ConfigError, "gamma", lambda: decide_share(params, draws(gamma=2.0))),
+        (ConfigError, "score is 'opacity': use one of detail-c", lambda: draws(score="opacity").validate()),
         (DataError, r"score has shape \[3\] for 60", lambda: decide(params, three, 6)),
-        (ConfigError, "num_neighbors is 0: use at least 1", lambda: PruneRule(num_neighbors=0).validate()),
+        (ConfigError, "num_neighbors is 0: use at least 1", lambda: draws(num_neighbors=0).validate()),
     ]
     for error, message, call in cases:
         with pytest.raises(error, match=message) as caught:
@@ -347,7 +349,7 @@ def test_a_field_in_training_loses_what_is_not_finite(bad: list[int]) -> None:
 
 def test_a_cut_leaves_the_field_that_prune_returns() -> None:
     params, statistics = {name: Parameter(value) for name, value in gaussians(20).items()}, {"count": torch.arange(20)}
-    rule, weights = PruneRule(score=opacity, num_neighbors=5), torch.linspace(1, 2, 20)
+    rule, weights = draws(score=opacity, num_neighbors=5), torch.linspace(1, 2, 20)
     expected = prune_gaussians(gaussians(20), rule, 10, weights)
     decision = Pruner(params, {}, [statistics]).cut(rule, 10, weights)
     assert decision.kept == len(params["means"]) == 10

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,8 @@ from sundae_ns.pruning.merge import gaussian_graph, pair_labels, voronoi_labels
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.scene.initialization import from_points
 
-PAIRS = PruneRule(selection="pairs")
+draws = partial(PruneRule, selection="systematic")
+PAIRS = PruneRule()
 
 
 WEIGHTS = torch.linspace(0.1, 1, 300)
@@ -90,7 +92,7 @@ def test_appearance_keeps_labels_on_their_side_of_an_edge() -> None:
     # One kept Gaussian next to the edge on the left, and one far from it on the right.
     mask, wrong = torch.isin(torch.arange(400), torch.tensor([8 * 20 + 10, 19 * 20 + 10])), []
     for edges in ("centres", "appearance"):
-        labels = voronoi_labels(gaussian_graph(params, PruneRule(num_neighbors=8, edges=edges)), mask)
+        labels = voronoi_labels(gaussian_graph(params, draws(num_neighbors=8, edges=edges)), mask)
         wrong.append(int((left[labels] != left).sum()))
     assert wrong[0] > 40
     assert wrong[1] == 0
@@ -99,7 +101,7 @@ def test_appearance_keeps_labels_on_their_side_of_an_edge() -> None:
 @pytest.mark.parametrize("edges", ["centres", "appearance"])
 def test_a_merge_keeps_the_weighted_sum_of_colours(edges: Any) -> None:
     params = gaussians()
-    config = PruneRule(edges=edges)
+    config = draws(edges=edges)
     before = {name: value.clone() for name, value in params.items()}
     decision = decide_share(params, config, 0.1, WEIGHTS)
     assert all(torch.equal(params[name], before[name]) for name in params)
@@ -112,7 +114,7 @@ def test_a_merge_keeps_the_weighted_sum_of_colours(edges: Any) -> None:
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
     # A merge does not change the selection.
     assert torch.equal(
-        decide_share(params, PruneRule(edges=edges, redistribution="none"), 0.1, WEIGHTS).mask, decision.mask
+        decide_share(params, draws(edges=edges, redistribution="none"), 0.1, WEIGHTS).mask, decision.mask
     )
 
 
@@ -123,7 +125,7 @@ def test_logits_are_pruned_as_their_colours(rule: dict[str, Any]) -> None:
     logits["features_dc"] *= 4
     harmonics = {**logits, "features_dc": rgb_to_sh(logits["features_dc"].sigmoid())}
     fields = (Gaussians(logits, "logits"), Gaussians(harmonics))
-    found, expected = (decide_share(each, PruneRule(**rule), 0.3, WEIGHTS) for each in fields)
+    found, expected = (decide_share(each, draws(**rule), 0.3, WEIGHTS) for each in fields)
     assert torch.equal(found.mask, expected.mask)
     assert found.values is not None
     assert expected.values is not None
@@ -138,8 +140,8 @@ def test_logits_are_pruned_as_their_colours(rule: dict[str, Any]) -> None:
 
 @pytest.mark.gpu
 def test_a_merge_on_the_gpu_gives_the_same_values() -> None:
-    on_cpu = prune_gaussians(gaussians(), PruneRule(), 30, WEIGHTS)
-    on_gpu = prune_gaussians({n: value.cuda() for n, value in gaussians().items()}, PruneRule(), 30, WEIGHTS.cuda())
+    on_cpu = prune_gaussians(gaussians(), draws(), 30, WEIGHTS)
+    on_gpu = prune_gaussians({n: value.cuda() for n, value in gaussians().items()}, draws(), 30, WEIGHTS.cuda())
     assert torch.equal(on_gpu.decision.mask.cpu(), on_cpu.decision.mask)
     for name, value in on_cpu.gaussians.items():
         assert on_gpu.gaussians[name].is_cuda
@@ -240,4 +242,4 @@ def test_a_merge_by_pairs_loses_less_than_draws() -> None:
         own = torch.cat([pruned.gaussians["means"], pruned.gaussians["features_dc"]], dim=1).double()
         return float(torch.cdist(values, own).min(dim=1).values.square().mean())
 
-    assert spread(PAIRS) < 0.9 * spread(PruneRule())
+    assert spread(PAIRS) < 0.9 * spread(draws())

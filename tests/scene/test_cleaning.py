@@ -11,7 +11,6 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.scene.prune_scene import crop_mask, floater_mask, within
 
 VIEWS = tuple(sn.Camera.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=96, height=72) for x in (-2.0, 0.0, 2.0))
@@ -72,18 +71,17 @@ def test_what_no_view_sees_goes_and_no_image_changes() -> None:
 
 def test_floaters_are_counted_after_values_without_meaning() -> None:
     whole = scene_of(torch.cat([wall(), planted()]), 0.02)
-    means = whole.gaussians["means"].clone()
-    means[7] = math.nan
-    found = floater_mask(dataclasses.replace(whole, gaussians=whole.gaussians.replaced({"means": means})), VIEWS)
+    whole.gaussians["means"][7] = math.nan
+    found = floater_mask(whole, VIEWS)
     assert bool(found[7])
     assert int(found[:4000].sum()) <= 3
     assert bool(found[4000:].all())
-    nothing = dataclasses.replace(whole, gaussians=whole.gaussians.replaced({"means": means * math.nan}))
-    with pytest.raises(DataError, match="no Gaussian is finite"):
-        sn.remove_floaters(nothing)
     away = [sn.Camera.look_at((0.0, -40.0, 0.0), (0.0, -80.0, 0.0), width=32, height=32)]
     with pytest.raises(DataError, match="1 views see none"):
         sn.remove_floaters(whole, cameras=away)
+    whole.gaussians["means"][:] = math.nan
+    with pytest.raises(DataError, match="no Gaussian is finite"):
+        sn.remove_floaters(whole)
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
@@ -106,23 +104,13 @@ def test_a_box_is_exact_and_keeps_all_else() -> None:
     assert whole.num_gaussians == 5
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "message"),
-    [
-        ((0, 0, 0), (1, 1, 0), "the box is empty"),
-        ((0, 0, 0), (1, 1, math.nan), "not six finite numbers"),
-        ((0, 0), (1, 1), "not six finite numbers"),
-    ],
-)
-def test_impossible_boxes_are_refused(low: tuple[float, ...], high: tuple[float, ...], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        sn.crop(scene_of(wall(10), 0.1), low, high)
-
-
 def test_an_empty_result_says_where_the_scene_is() -> None:
+    broken = scene_of(wall(), 0.1)
     with pytest.raises(DataError, match=r"most of them lie between -1\.\d+ .* and 1\.\d+ "):
-        sn.crop(scene_of(wall(), 0.1), (50, 50, 50), (51, 51, 51))
-    broken = sn.Scene(Gaussians({name: value * math.nan for name, value in scene_of(wall(9), 0.1).gaussians.items()}))
+        sn.crop(broken, (50, 50, 50), (51, 51, 51))
+    with pytest.raises(ConfigError, match="the box is empty"):
+        sn.crop(broken, (0, 0, 0), (1, 1, 0))
+    broken.gaussians["means"][:] = math.nan
     with pytest.raises(DataError, match="no Gaussian is in the box"):
         sn.crop(broken, (0, 0, 0), (1, 1, 1))
 

@@ -24,14 +24,23 @@ ROOT = Path(__file__).parents[2]
 FUNCTIONS = ("crop", "load", "measure", "prune", "remove_floaters", "render", "save", "show", "cameras_of")
 FUNCTIONS += ("virtual_cameras",)
 WITHOUT_NERFSTUDIO = """
-import sys
+import sys, torch
 sys.modules["nerfstudio"] = None
-%s
+torch.set_default_dtype(torch.float64)
+torch.set_default_device("meta")  # whose tensors have no values
 import sundae_ns as sn
 scene = sn.load("headed.sundae")
-sn.render(scene, sn.Camera.look_at((2.0, 2.0, 2.0), (0.5, 0.5, 0.5), width=64, height=48))
+image = sn.render(scene, sn.Camera.look_at((2.0, 2.0, 2.0), (0.5, 0.5, 0.5), width=64, height=48)).rgb
+assert image.dtype == torch.float32 and image.device.type == "cpu"
 assert scene.head and "torch._dynamo" not in sys.modules  # the import of torch's compiler takes most of a second
+points = sn.Scene.from_points([[0.0, 0, 0], [1, 2, 3]], [[0.1, 0.2, 0.3]] * 2)
+for suffix in (".ply", ".spz", ".sog", ".glb"):
+    sn.save(points, "points" + suffix)
+    assert sn.load("points" + suffix).num_gaussians == 2
+assert sn.measure(scene, [image], [sn.Camera.look_at((0, 0, 9), (0, 0, 0), width=64, height=48)]).ssim < 1
+%s
 exec(sys.stdin.read())
+assert (torch.get_default_dtype(), torch.ones(1).device.type) == (torch.float64, "meta")
 assert not any(name.split(".")[0] == "nerfstudio" and module for name, module in sys.modules.items())
 """
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -83,7 +82,6 @@ def test_packed_scenes_are_packed_again(name: str, tmp_path: Path) -> None:
         ("gone", None, CheckpointError, "does not exist"),
         ("a.txt", b"a text", CheckpointError, "is no run"),
         ("a.spz", b"\x1f\x8b\x08\x00", DataError, "is no"),
-        ("a.spz", b"NGSP" + bytes(40), DataError, "states 0 Gaussians"),
         ("a.sog", b"PK\x03\x04", DataError, "is not a complete .sog"),
         ("a.ply", b"ply\nformat ascii 1.0\nend_header\n", DataError, "a.ply"),
     ],
@@ -96,24 +94,6 @@ def test_what_is_no_scene_is_refused_in_one_line(
     with pytest.raises(error, match=message) as caught:
         sn.load(tmp_path / name)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("suffix", [".spz", ".sog"])
-def test_damaged_files_are_refused(suffix: str, tmp_path: Path) -> None:
-    sn.save(scene(), tmp_path / f"a{suffix}")
-    whole = (tmp_path / f"a{suffix}").read_bytes()
-    for length in (10, len(whole) // 2, len(whole) - 1):
-        (tmp_path / f"b{suffix}").write_bytes(whole[:length])
-        with pytest.raises(DataError):
-            sn.load(tmp_path / f"b{suffix}")
-
-
-def test_a_sog_that_would_grow_is_refused(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as bundle:
-        bundle.writestr("meta.json", " " * (1 << 27))
-    assert (tmp_path / "a.sog").stat().st_size < 1 << 18
-    with pytest.raises(DataError, match="inflates to"):
-        sn.load(tmp_path / "a.sog")
 
 
 def test_a_field_without_a_finite_primitive_is_refused(tmp_path: Path) -> None:
@@ -205,10 +185,9 @@ def test_primitives_that_are_not_finite_are_dropped() -> None:
 @pytest.mark.parametrize("kind", [".ply", ".spz", ".sog", ".glb", ".sundae", ".html"])
 def test_a_scene_of_opaque_and_flat_primitives_is_saved_whole(tmp_path: Path, kind: str) -> None:
     """One that was made in memory: files are mended when they are opened."""
-    truth = scene()
+    truth = dataclasses.replace(scene(), cameras=tuple(sn.virtual_cameras(scene(), 2, size=32)))
     truth.gaussians["opacities"][:90], truth.gaussians["scales"][80:, 1] = torch.inf, -torch.inf
     truth.gaussians["means"][5] = torch.nan
-    truth = dataclasses.replace(truth, cameras=tuple(sn.virtual_cameras(truth, 2, size=32)))
     sn.save(truth, tmp_path / f"a{kind}")
     if kind != ".html":
         found = sn.load(tmp_path / f"a{kind}")

@@ -98,26 +98,23 @@ def test_options_name_a_view_or_a_file(tmp_path: Path) -> None:
     assert found.start.center.tolist() == [0, 0, 3]
     assert found.up == (0, 0, -1)
     for start_view, up, message in (
-        ("2", None, "there is no camera 2; give --start-view 0 to 1, or a camera file"),
+        ("2", None, "there is no camera 2 in the scene; give --start-view 0 to 1, or a camera file"),
         ("-1", None, "there is no camera -1"),
         (None, (0, 0, 0), "no direction"),
-        (None, (0, 0, float("nan")), "not three finite numbers"),
-        (None, (1.7e308, 1.7e308, 0), "no direction"),
     ):
         with pytest.raises(ConfigError, match=message):
             with_start(plain, start_view, up)
     with pytest.raises(DataError):
         with_start(plain, str(tmp_path / "none.json"), None)
-    with pytest.raises(ConfigError, match="no stored cameras"):
+    with pytest.raises(ConfigError, match="no camera 0 in the scene; give a camera file"):
         with_start(dataclasses.replace(plain, cameras=()), "0", None)
 
 
 def test_values_that_readers_refuse_are_not_written(tmp_path: Path) -> None:
     far = sn.Camera.look_at((2e9, 0, 0), (0, 0, 0))
-    flat = sn.Camera.from_pose(torch.zeros(3, 4), (1, 1, 1, 1), 9, 9)
-    for wrong in (scene(up=(0.0, 0.0, 0.5)), scene(up=(0.0, 0.0, float("nan"))), scene(start=far), scene(start=flat)):
+    for wrong in (far, far._replace(viewmat=torch.zeros(4, 4)), far.zoomed(1e6)):
         with pytest.raises(ConfigError, match="has values that readers refuse"):
-            sn.save(wrong, tmp_path / "a.sundae")
+            sn.save(scene(start=wrong), tmp_path / "a.sundae")
     assert not list(tmp_path.iterdir())
     assert start_of(stated_start(started()))[0] == pytest.approx(UP)
 

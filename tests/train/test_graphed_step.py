@@ -11,7 +11,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from torch import Tensor
 
-from sundae_ns.core.surgery import narrow
+from sundae_ns.core.surgery import change_parameter
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train import graphed_step as capture
 from sundae_ns.train.graphed_step import Buffers, RecordedStep, StepRecordings, start_moments, trained_parameters
@@ -242,6 +242,6 @@ def test_buffers_are_new_only_when_the_field_does_not_fit(
     assert buffers.hold(state, trained, growing=False)
     assert buffers.capacity == 65
     assert not buffers.hold(state, trained, growing=False)
-    narrow(state.gaussians, state.optimizers, "features_rest", 2)
+    change_parameter(state.gaussians, state.optimizers, "features_rest", lambda value: value[:, :2].clone())
     assert buffers.hold(state, trained, growing=False)
     assert buffers.tensors["features_rest"].shape == buffers.tensors["features_rest.exp_avg"].shape == (65, 2, 3)

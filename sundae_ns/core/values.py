@@ -1,0 +1,79 @@
+"""Numbers, tensors and colours as callers give them: as lists, arrays or tensors; checked, and in one form."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from sundae_ns.core.errors import ConfigError, DataError
+
+AnyArray = ArrayLike | Tensor
+"""Lists, arrays and tensors."""
+_WHITE = {"uint8": 255.0, "uint16": 65535.0}
+"""Types of stored images, and their white."""
+
+
+def numbers(values: Any, name: str, *shapes: tuple[int, ...]) -> Tensor:
+    """Finite numbers of one of the shapes, float64 on the CPU; ``ConfigError`` for anything else."""
+    try:
+        array = np.asarray(values.detach().cpu().double() if isinstance(values, Tensor) else values)
+    except (TypeError, ValueError, OverflowError):
+        array = np.empty(0)
+    if array.shape not in shapes or array.dtype.kind not in "iuf" or not (np.abs(array) < 3e38).all():  # of float32
+        wanted = " or ".join(" x ".join(map(str, shape)) or "1" for shape in shapes)
+        raise ConfigError(f"{name} is not made of {wanted} finite numbers; give a list, an array or a tensor of these")
+    return torch.from_numpy(array.astype(np.float64))
+
+
+def whole(value: Any, name: str, least: int = 1) -> int:
+    """A whole number of at least ``least``; ``ConfigError`` for anything else."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or float(value) % 1 or value < least:
+        raise ConfigError(f"{name} is {value!r}; give a whole number, at least {least}")
+    return int(value)
+
+
+def floats(values: Any, name: str, *, colors: bool = False) -> Tensor:
+    """Real numbers of any shape as a float32 tensor; on the CPU, or where a tensor is.
+
+    With ``colors``, values of 8 or 16 bits become [0, 1] by their type, and others have to be there.
+
+    Raises:
+        DataError: the values are of another type or range.
+    """
+    try:
+        given = values if isinstance(values, Tensor) else np.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{name} is no array of numbers; give a tensor or an array") from error
+    kind = str(given.dtype).removeprefix("torch.") if isinstance(given, Tensor) else given.dtype.name
+    if not kind.startswith(("float", "bfloat", "int", "uint")) or (kind in _WHITE and not colors):
+        raise DataError(f"{name} has values of type {kind}; give floating-point numbers")
+    tensor = given.float() if isinstance(given, Tensor) else torch.from_numpy(given.astype(np.float32))
+    if not colors or not tensor.numel():
+        return tensor
+    if kind in _WHITE:
+        return tensor / _WHITE[kind]
+    low, high = (float(value) for value in tensor.detach().aminmax())
+    if not (low >= -0.1 and high <= 1.1):  # resized images may exceed their range a little
+        raise DataError(f"{name} has values from {low:g} to {high:g}; give uint8, or numbers in [0, 1]")
+    return tensor
+
+
+@contextmanager
+def usual_defaults() -> Iterator[None]:
+    """Make new tensors float32 on the CPU in a block or a decorated function, whatever a caller's defaults are."""
+    given = torch.empty(0)
+    if given.dtype is torch.float32 and given.device.type == "cpu":
+        yield
+        return
+    torch.set_default_dtype(torch.float32)
+    try:
+        with torch.device("cpu"):
+            yield
+    finally:
+        torch.set_default_dtype(given.dtype)

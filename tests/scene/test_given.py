@@ -1,0 +1,175 @@
+"""What callers give: lists, arrays, images and paths for tensors, and what is refused in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from fields import random_field
+from PIL import Image
+from short_prunes import short_prunes  # noqa: F401
+
+import sundae_ns as sn
+from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.scene import cameras as camera_files
+from sundae_ns.scene import prune_scene
+
+POINTS = np.random.default_rng(0).random((100, 3))
+SCENE = sn.Scene.from_points(POINTS, POINTS)
+CAMERA = sn.Camera.look_at((2, 2, 2), (0.5, 0.5, 0.5), width=24, height=20)
+EYE = np.eye(4)
+
+
+def image() -> np.ndarray:
+    return (255 * sn.render(SCENE, CAMERA).rgb.numpy()).round().astype(np.uint8)
+
+
+def scene(**values: Any) -> sn.Scene:
+    return sn.Scene({**random_field(9, degree=1), **values})  # type: ignore[arg-type]
+
+
+def look_at(*points: Any, **options: Any) -> sn.Camera:
+    return sn.Camera.look_at(*points, **options)
+
+
+@pytest.mark.parametrize("scale", ["as they are", "uint8", "uint16", ">f4", "reversed", "list", "tensor"])
+def test_points_and_colours_of_every_type(scale: str) -> None:
+    points, colors = POINTS, POINTS
+    match scale:
+        case "uint8" | "uint16":
+            colors = (POINTS * np.iinfo(scale).max).round().astype(scale)
+        case ">f4":
+            points = colors = POINTS.astype(scale)
+        case "reversed":
+            points = colors = POINTS[:, ::-1].copy()[:, ::-1]
+        case "list":
+            points = colors = POINTS.tolist()
+        case "tensor":
+            points = colors = torch.from_numpy(POINTS)  # type: ignore[assignment]
+    found = sn.Scene.from_points(points, colors)
+    torch.testing.assert_close(found.gaussians["means"], SCENE.gaussians["means"])
+    error = (found.gaussians["features_dc"] - SCENE.gaussians["features_dc"]).abs().max()
+    assert error < (0.5 / 255 / 0.28 + 1e-5 if scale == "uint8" else 1e-4)
+
+
+def test_images_of_every_type(tmp_path: Path) -> None:
+    stored = image()
+    Image.fromarray(stored).save(tmp_path / "a.png")
+    expected = sn.measure(SCENE, [torch.from_numpy(stored / np.float32(255))], [CAMERA])
+    assert 55 < expected.psnr < 75  # the rounding
+    forms = [stored, torch.from_numpy(stored), Image.fromarray(stored), tmp_path / "a.png", str(tmp_path / "a.png")]
+    for form in [*forms, stored[None], (stored.astype(np.uint16) * 257)]:
+        for images in (form, form if np.ndim(form) == 4 else [form]):
+            found = sn.measure(SCENE, images, CAMERA)
+            assert (found.psnr, found.ssim) == pytest.approx((expected.psnr, expected.ssim), abs=1e-3)
+    assert sn.measure(SCENE, [sn.render(SCENE, CAMERA)], [CAMERA]).ssim == 1
+
+
+@pytest.mark.usefixtures("short_prunes")
+def test_cameras_and_numbers_of_every_type() -> None:
+    pose = CAMERA.pose
+    for given in (pose, pose.double(), pose.numpy(), pose.tolist()):
+        camera = sn.Camera.from_pose(given, np.array([20, 20, 12, 10]), np.int32(24), 20.0)  # type: ignore[arg-type]
+        torch.testing.assert_close(camera.viewmat, CAMERA.viewmat)
+        assert (camera.width, camera.height) == (24, 20)
+    assert sn.prune(SCENE, count=np.int64(50), cameras=CAMERA).num_gaussians == 50  # type: ignore[arg-type]
+    assert sn.crop(SCENE, np.zeros(3), torch.ones(3)).num_gaussians == 100
+    arrays = {name: value.double().numpy() for name, value in SCENE.gaussians.items()}
+    made = sn.Scene(arrays, cameras=[CAMERA], up=np.array([0, -2.0, 0]))  # type: ignore[arg-type]
+    assert torch.equal(sn.render(made, CAMERA).rgb, sn.render(SCENE, CAMERA).rgb)
+    assert (made.cameras, made.up) == ((CAMERA,), (0, -1, 0))
+    assert dataclasses.replace(made, antialiased=True).gaussians is made.gaussians
+    opaque = scene(opacities=torch.full((9, 1), torch.inf), scales=torch.full((9, 3), -torch.inf))
+    assert opaque.num_gaussians == 9
+
+
+REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
+    "colours to 255": (lambda: sn.Scene.from_points(POINTS, 255 * POINTS), r"colors has values from .* give uint8"),
+    "words": (lambda: sn.Scene.from_points([["a"] * 3], POINTS), "points has values of type str"),
+    "ragged": (lambda: sn.Scene.from_points([[1, 2], [3]], POINTS), "points is no array"),
+    "flags": (lambda: sn.Scene.from_points(POINTS > 0.5, POINTS), "points has values of type bool"),
+    "shape": (lambda: sn.Scene.from_points(POINTS[:, :2], POINTS), r"\[100, 2\] and \[100, 3\]"),
+    "NaN points": (lambda: sn.Scene.from_points(POINTS * np.nan, POINTS), "some points are NaN"),
+    "NaN colours": (lambda: sn.Scene.from_points(POINTS, POINTS * np.nan), "colors has values from nan"),
+    "degree": (lambda: sn.Scene.from_points(POINTS, POINTS, sh_degree=5), "sh_degree is 5"),
+    "no mapping": (lambda: sn.Scene([POINTS]), "Gaussians map means"),  # type: ignore[arg-type]
+    "names": (lambda: scene(opacity=1), "missing or unknown: opacity"),
+    "rows": (lambda: scene(opacities=torch.zeros(9)), r"opacities has shape \[9\]; it must be \[9, 1\]"),
+    "rank": (lambda: scene(features_rest=torch.zeros(9, 7, 3)), "features_rest has shape"),
+    "features": (lambda: scene(features=torch.zeros(8, 2)), "features has shape"),
+    "bytes": (lambda: scene(features_dc=torch.zeros(9, 3, dtype=torch.uint8)), "features_dc has values of type uint8"),
+    "NaN": (lambda: scene(means=torch.tensor([[torch.nan] * 3, *8 * [[0.0] * 3]])), "1 of 9 Gaussians are NaN"),
+    "infinite": (lambda: scene(scales=torch.full((9, 3), torch.inf)), "9 of 9 Gaussians"),
+    "devices": (lambda: scene(means=torch.zeros(9, 3, device="meta")), "are on cpu and meta"),
+    "nothing": (lambda: sn.Scene({n: v[:0] for n, v in random_field(9).items()}), "no Gaussians"),  # type: ignore[arg-type]
+    "head": (lambda: dataclasses.replace(SCENE, head=CompensationHead(HeadConfig(size="tiny"))), "the head reads"),
+    "background": (lambda: dataclasses.replace(SCENE, background_color="grey"), "the background is 'grey'"),
+    "up": (lambda: dataclasses.replace(SCENE, up=(0, 0, 0)), "no direction"),
+    "up NaN": (lambda: dataclasses.replace(SCENE, up=(0, 0, np.nan)), "the up axis is not made of 3 finite numbers"),
+    "device": (lambda: SCENE.to("gpu"), "the device gpu is not available"),
+    "eye": (lambda: look_at((1, 2, 3), (1, 2, 3)), "one point"),
+    "zero": (lambda: look_at((1, 2, 3), (0, 0, 0), (0, 0, 0)), "no direction"),
+    "far": (lambda: look_at((0, 0, 1e300), (0, 0, 0)), "eye is not made of 3 finite numbers"),
+    "two": (lambda: look_at((0, 0), (0, 0, 0)), "eye is not made of 3 finite numbers"),
+    "size 0": (lambda: look_at((0, 0, 1), (0, 0, 0), width=0), "width is 0"),
+    "size 0.5": (lambda: look_at((0, 0, 1), (0, 0, 0), height=0.5), "height is 0.5"),
+    "size inf": (lambda: look_at((0, 0, 1), (0, 0, 0), width=np.inf), "width is inf"),
+    "fov": (lambda: look_at((0, 0, 1), (0, 0, 0), fov=180), "fov is 180"),
+    "scaled pose": (lambda: sn.Camera.from_pose(2 * EYE, (1, 1, 1, 1), 2, 2), "not a rotation"),
+    "focal": (lambda: sn.Camera.from_pose(EYE, (0, 1, 1, 1), 2, 2), "focal lengths are 0 and 1"),
+    "a matrix": (lambda: sn.render(SCENE, EYE), "is no camera"),  # type: ignore[arg-type]
+    "NaN matrix": (lambda: sn.render(SCENE, CAMERA._replace(K=CAMERA.K * np.nan)), "no finite tensors"),
+    "array": (lambda: sn.render(SCENE, CAMERA._replace(K=np.eye(3))), "no finite tensors"),
+    "path": (lambda: sn.prune(SCENE, keep=0.5, cameras="a.json"), "'a.json' is no camera"),  # type: ignore[arg-type]
+    "share": (lambda: sn.prune(SCENE, keep="0.1"), "keep is not made of 1 finite number"),  # type: ignore[arg-type]
+    "half": (lambda: sn.prune(SCENE, count=0.5), "count is 0.5"),  # type: ignore[arg-type]
+    "rule": (lambda: sn.prune(SCENE, keep=0.5, rule="pairs"), "the rule is 'pairs'"),  # type: ignore[arg-type]
+    "2.5 views": (lambda: sn.virtual_cameras(SCENE, 2.5), "n is 2.5"),  # type: ignore[arg-type]
+    "no views": (lambda: sn.virtual_cameras(SCENE, 0), "n is 0"),
+    "seed": (lambda: sn.virtual_cameras(SCENE, 1, seed="a"), "seed is 'a'"),  # type: ignore[arg-type]
+    "images to 255": (lambda: sn.measure(SCENE, [255.0 * POINTS], [CAMERA]), "image 0 has values from"),
+    "NaN image": (lambda: sn.measure(SCENE, [image() * np.nan], [CAMERA]), "image 0 has values from nan"),
+    "CHW": (lambda: sn.measure(SCENE, [image().transpose(2, 0, 1)], [CAMERA]), r"\[20, 24, 3\] and \[3, 20, 24\]"),
+    "grey": (lambda: sn.measure(SCENE, [image()[..., 0]], [CAMERA]), r"\[20, 24, 3\] and \[20, 24\]"),
+    "no image": (lambda: sn.measure(SCENE, 5, [CAMERA]), "image 0 has values from 5 to 5"),  # type: ignore[arg-type]
+    "gone": (lambda: sn.measure(SCENE, ["gone.png"], [CAMERA]), "gone.png cannot be read"),
+    "few": (lambda: sn.measure(SCENE, [image()] * 2, [CAMERA]), "2 images do not fit 1 views"),
+    "box": (lambda: sn.crop(SCENE, 0, 1), "a corner of the box is not made of 3 finite numbers"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused_in_one_line(name: str) -> None:
+    call, words = REFUSED[name]
+    with pytest.raises(sn.SundaeError, match=words) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+    assert ";" in str(caught.value)
+
+
+def test_the_rule_of_a_prune_is_that_of_the_command() -> None:
+    from sundae_ns.cli.prune import RuleOptions
+
+    assert vars(sn.PruneRule()) == vars(RuleOptions())
+    small, same = (sn.prune(SCENE, keep=0.3, cameras=[CAMERA], rule=rule) for rule in (None, sn.PruneRule()))
+    assert all(torch.equal(small.gaussians[name], value) for name, value in same.gaussians.items())
+
+
+def test_huge_cameras_score_at_a_smaller_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(prune_scene, "MOST_PIXELS", 24 * 20)
+    huge = CAMERA.zoomed(1000)
+    torch.testing.assert_close(prune_scene.weights_in(SCENE, [huge]), prune_scene.weights_in(SCENE, [CAMERA]))
+
+
+def test_a_file_of_too_many_cameras_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(camera_files, "MOST_CAMERAS", 2)
+    for key in ("frames", "camera_path"):
+        (tmp_path / "a.json").write_text(json.dumps({key: 3 * [{}], "render_width": 9, "render_height": 9}))
+        with pytest.raises(sn.SundaeError, match=r"a.json has 3 cameras; give at most 2"):
+            sn.cameras_of(tmp_path / "a.json")
