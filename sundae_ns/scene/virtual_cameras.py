@@ -51,7 +51,7 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         scene: its finite Gaussians count.
         n: number of cameras; by default 128 for a scene on a CPU and 256 for one on a GPU.
         seed: of the random draws, which are the same on every device up to rounding.
-        size: width and height of the images, pixels; by default 512.
+        size: width and height of the images, pixels; by default 512, or ``16 sqrt(N)`` for fewer Gaussians.
 
     Raises:
         ConfigError: ``n`` or ``size`` is no whole number of at least 1.
@@ -62,7 +62,8 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     >>> len(sn.virtual_cameras(scene, 8))
     8
     """
-    n, size = whole(by_device(VIEWS, scene.device) if n is None else n, "n"), SIDE if size is None else size
+    n = whole(by_device(VIEWS, scene.device) if n is None else n, "n")
+    size = min(SIDE, max(64, 16 * math.isqrt(scene.num_gaussians))) if size is None else size
     gaussians = usable(scene)
     means = gaussians["means"]
     middle, reach = middle_and_reach(gaussians)
@@ -77,9 +78,7 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
     def normal(count: int) -> Tensor:
         return torch.randn(count, 3, generator=generator, dtype=torch.float64)
 
-    def climb(n: int, evenness: float) -> tuple[Tensor, Tensor]:
-        """Eyes and targets of n cameras."""
-
+    def climb(n: int, evenness: float) -> tuple[Tensor, Tensor]:  # eyes and targets of n cameras
         def best_of(eyes: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             """The best of the cameras n apart, and their coarseness."""
             coarseness = _coarseness(judge, sizes, eyes, targets, evenness).view(-1, n)
