@@ -34,10 +34,10 @@ from sundae_ns.core.metrics import Lpips, lpips_weights
 from sundae_ns.io.pack.codecs import Codecs
 from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED, PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, write_fitted
-from sundae_ns.plugin.finetune import finetune
 from sundae_ns.plugin.finished_runs import Opened, load_model, load_run, model_of
 from sundae_ns.plugin.model import SundaeModelConfig
 from sundae_ns.plugin.trainer import SundaeTrainerConfig
+from sundae_ns.plugin.tuned_packs import finetune
 from sundae_ns.report.measure import measure_scene
 from sundae_ns.report.measured import Measured
 from sundae_ns.scene.load_save import load

@@ -6,7 +6,6 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, replace
 from functools import cache
 from io import StringIO
 from json import dumps
@@ -29,7 +28,10 @@ from sundae_ns.scene.packing import contents_of
 
 if TYPE_CHECKING:
     from sundae_ns.io.pack.packed_scene import Codecs, PackedScene
-    from sundae_ns.plugin.targets import Judge
+    from sundae_ns.plugin.tuned_packs import Judge
+
+# Their types tell these numbers from equal ones that a user gives.
+DEFAULTS: Any = PackConfig(**{name: type("Default", (type(x),), {})(x) for name, x in vars(PackConfig()).items()})
 
 
 def pack(
@@ -44,7 +46,7 @@ def pack(
     data: Path | None = None,
     json: bool = False,
     overwrite: Overwrite = False,
-    precision: Annotated[PackConfig, tyro.conf.arg(name="")] = PackConfig(),  # noqa: B008
+    precision: Annotated[PackConfig, tyro.conf.arg(name="")] = DEFAULTS,
     cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
 ) -> int:
     """Pack a scene into one file that can be rendered; print the size of each part, and the quality before and after.
@@ -73,21 +75,19 @@ def pack(
             f"--finetune and --target-drop look at photos of the whole scene; leave out {cleaning.chosen}, or cut the "
             "scene by `sundae export` or `sundae prune` afterwards"
         )
-    usual = asdict(PackConfig())
-    given = {name: value for name, value in asdict(precision).items() if value != usual[name]}
-    config = replace(precision, **{**FINETUNED, **given}) if finetune else precision
+    given = {name: value for name, value in vars(precision).items() if type(value) in (int, float)}
+    precision, config = PackConfig(**given), PackConfig(**{**(FINETUNED if finetune else {}), **given})
     config.validate()
     check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
     kind = kind_of_gaussians(run)
     for name, value in (("--finetune", finetune), ("--target-drop", target_drop), ("--data", data)):
         if kind is not None and value:
             raise ConfigError(f"{run} is a {PRIMITIVES[kind]} without photos; leave out {name}, or give a run")
-    tuned = finetune > 0
-    packs: list[tuple[PackedScene, Codecs]] = []
+    tuned, packs = finetune > 0, list[tuple["PackedScene", "Codecs"]]()
 
     @cache
     def judge() -> Judge:
-        from sundae_ns.plugin.targets import Judge
+        from sundae_ns.plugin.tuned_packs import Judge
 
         return Judge(run, data)
 
@@ -96,12 +96,12 @@ def pack(
     with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
         task = bar.add_task("Fine-tuning" if finetune else "Packing", total=2 + finetune)
         if finetune:
-            from sundae_ns.plugin.finetune import finetune as tune
+            from sundae_ns.plugin.tuned_packs import finetune as tune
 
             packs.append(tune(run, source, config, finetune, data=data, progress=lambda _: bar.advance(task)))
         bar.update(task, description="Packing")
         if target_bytes is not None or target_drop is not None:
-            from sundae_ns.plugin.targets import Search, best_pack
+            from sundae_ns.plugin.tuned_packs import Search, best_pack
 
             # Starts from the source, because positions of a fitted pack are rounded.
             searches = [Search(source, precision, judge), *(Search(*each, judge) for each in packs)]
@@ -135,7 +135,7 @@ def pack(
 
 def _measured(judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Codecs]], finetune: int) -> dict[str, Any]:
     """Figures of the run and of the first pack; a second pack is that without the fine-tune."""
-    from sundae_ns.plugin.targets import is_worth
+    from sundae_ns.plugin.tuned_packs import is_worth
 
     try:
         views = judge()

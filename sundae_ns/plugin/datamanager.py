@@ -27,7 +27,7 @@ from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line,
 from sundae_ns.data.images import TURNED, check_image, decoded, exif_orientation, turned, wrong_size
 from sundae_ns.data.layouts import larger_model, unused_masks
 from sundae_ns.plugin.camera_models import check_cameras, warn_of_cloud, warn_of_stray_tests
-from sundae_ns.plugin.dataparsers import check_capture, rebound, set_parser
+from sundae_ns.plugin.dataparsers import check_capture, check_ranges, rebound, set_parser
 from sundae_ns.train.progress import warn
 
 _log = logging.getLogger(__name__)
@@ -73,6 +73,8 @@ class CheckedDataset(InputDataset):
         widths, heights = self.cameras.width.flatten().tolist(), self.cameras.height.flatten().tolist()
         for index, (path, mask, *expected) in enumerate(zip(self.image_filenames, masks, widths, heights)):
             full = check_image(path)
+            if min(expected) < 1:
+                raise DataError(f"{path} has no pixel at the given scale of images; give a larger one")
             if self._scaled(full) != expected:
                 orientation = exif_orientation(path)
                 if orientation not in TURNED or self._scaled(full[::-1]) != expected:
@@ -100,6 +102,22 @@ class CheckedDataset(InputDataset):
         """
         with reading(self.image_filenames[image_idx], "an image that can be decoded", remedy="repair or remove it"):
             return super().get_data(image_idx, image_type)
+
+
+class NoTestViews:
+    """In place of the cameras of a test set without images: what needs test views reads them, and fails in one line."""
+
+    def __init__(self, capture: Path) -> None:
+        self._capture = capture
+
+    def __getattr__(self, name: str) -> Any:
+        raise DataError(
+            f"{self._capture} has no test views to measure or render; give ns-render --pose-source train or --split "
+            "train, or train with a --train-split-fraction below 1"
+        )
+
+    def __len__(self) -> int:
+        return int(self.__getattr__("len"))
 
 
 @dataclass
@@ -137,6 +155,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
                 "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run would "
                 "differ; use random"
             )
+        check_ranges(config)
         set_parser(config.dataparser, config.robust_frame)
         splits = ("train", "val" if test_mode == "val" else "test")
         check_capture(config.dataparser, config.capture, splits, images=test_mode != "inference")
@@ -159,8 +178,11 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     def create_train_dataset(self) -> CheckedDataset:
         """Training set, with the transform from the capture's coordinates to the model's in its metadata."""
         outputs, parser = self.train_dataparser_outputs, cast(Any, self.config.dataparser)
-        if len(outputs.image_filenames) == 0:
-            raise DataError(f"no training images in {parser.data}; check the path and the split")
+        if (count := len(outputs.image_filenames)) < 2:
+            raise DataError(
+                f"{parser.data} has {count or 'no'} training image{'s' * (count != 1)}, and training needs 2 or more; "
+                "check the path and the split (--eval-mode)"
+            )
         points = outputs.metadata.get("points3D_xyz")
         check_cameras(outputs.cameras, outputs.image_filenames, points)
         if points is not None:
@@ -183,6 +205,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         dataset = super().create_eval_dataset()
         if names := dataset.image_filenames:
             warn_of_stray_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names)
+        else:
+            dataset.cameras = cast(Any, NoTestViews(self.config.capture))
         return dataset
 
     @property

@@ -27,7 +27,7 @@ from nerfstudio.utils.io import load_from_json
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.core.errors import DataError
+from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.data.capture import check_first_image, check_transforms, rigid
 from sundae_ns.data.colmap import ColmapImage, check_colmap, read_images, read_points
 from sundae_ns.data.layouts import no_model, no_transforms
@@ -53,6 +53,23 @@ FINE_STEP, COARSE_STEP = 1e-5, 1e-3
 """Steps of float32 at the cameras, as shares of their distances: coordinates are shifted from the first one on, and
 cannot be used from the second one on."""
 
+_RANGES: dict[str, tuple[float, float, str]] = {
+    "downscale_factor": (1, 1e9, "1 or more, 1 for images of full size"),
+    "train_split_fraction": (1e-9, 1, "a share in (0, 1]"),
+    "eval_interval": (2, 1e9, "2 or more"),
+    "scale_factor": (1e-9, 1e9, "a positive number"),
+    "camera_res_scale_factor": (1e-9, 1e9, "a positive number"),
+}
+"""Least and most of options of parsers and datamanager, with which nerfstudio divides by zero or trains on nothing."""
+
+
+def check_ranges(options: Any) -> None:
+    """Raise ``ConfigError`` for the first option that is out of its range."""
+    for name, (least, most, wanted) in _RANGES.items():
+        value = getattr(options, name, None)
+        if value is not None and not least <= value <= most:
+            raise ConfigError(f"--{name.replace('_', '-')} is {value}; give {wanted}")
+
 
 def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, images: bool = True) -> None:
     """Check a capture in nerfstudio's or COLMAP's layout before its parser reads it.
@@ -64,8 +81,10 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
         images: whether the images will be needed; a viewer needs the cameras only.
 
     Raises:
+        ConfigError: an option of the parser is out of its range.
         DataError: the first thing that cannot be used, and where it stands.
     """
+    check_ranges(parser)
     if not data.exists():
         raise DataError(
             f"{data} does not exist; give the folder of the capture with --data, or, for a command of nerfstudio that "
@@ -88,13 +107,7 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
 
 
 def set_parser(config: DataParserConfig, robust: bool) -> None:
-    """Let our parser read a capture in place of nerfstudio's; other parsers stay.
-
-    Args:
-        config: of the parser, changed in place.
-        robust: centre and scale the scene by the cameras that stand near each other, and shift survey coordinates in
-            float64. Otherwise all cameras count, in float32, as in nerfstudio.
-    """
+    """Let our parser read a capture in place of nerfstudio's, ``robust`` as in :class:`SundaeDatamanagerConfig`."""
     target: Any = config._target
     config._target = {Nerfstudio: LightNerfstudioParser, ColmapDataParser: CarefulColmapParser}.get(target, target)
     config.robust = robust  # type: ignore[attr-defined]
@@ -109,7 +122,7 @@ def rebound(method: Any, **names: Any) -> Any:
     return copy
 
 
-def _replaced(module: Any, **names: Any) -> SimpleNamespace:
+def replaced(module: Any, **names: Any) -> SimpleNamespace:
     """The contents of a module, with some of its functions replaced."""
     return SimpleNamespace(**{**vars(module), **names})
 
@@ -173,7 +186,7 @@ class _Placed:
     def _generate(self, method: Any, *arguments: Any, **names: Any) -> DataparserOutputs:
         """Run nerfstudio's method; in its result each camera has its own lens and the scale of the near cameras."""
         self.offset, self.lenses, self._growth = None, {}, 1.0
-        utils = _replaced(camera_utils, auto_orient_and_center_poses=self._oriented)
+        utils = replaced(camera_utils, auto_orient_and_center_poses=self._oriented)
         outputs: DataparserOutputs = rebound(method, camera_utils=utils, **names)(self, *arguments)
         cameras, lenses = outputs.cameras, [self.lenses[path] for path in outputs.image_filenames]
         if lenses:
@@ -224,6 +237,11 @@ class _Placed:
             cloud = self._points()
             return cloud if cloud is None or self.offset is None else cloud - self.offset
 
+        if self.config.auto_scale_poses and (poses[:, :3, 3] == poses[0, :3, 3]).all():
+            raise DataError(
+                f"all cameras of {self.config.data} stand at one place, so nothing says how far things are; correct "
+                "their poses, or, for a panorama, give --auto-scale-poses False"
+            )
         oriented, self._transform = camera_utils.auto_orient_and_center_poses(poses, **methods)
         far = stray_cameras(poses[:, :3, 3].double().numpy(), points) if self._robust else np.zeros(len(poses), bool)
         if far.any():
@@ -335,7 +353,7 @@ class CarefulColmapParser(_Placed, ColmapDataParser):
         read = rebound(
             ColmapDataParser._get_all_images_and_cameras,
             parse_colmap_camera_params=stated,
-            colmap_utils=_replaced(colmap_parsing_utils, **readers),
+            colmap_utils=replaced(colmap_parsing_utils, **readers),
         )
         meta: dict[str, Any] = read(self, recon_dir)
         self._stated: dict[Path, Lens] = {Path(frame["file_path"]): frame.pop("lens") for frame in meta["frames"]}

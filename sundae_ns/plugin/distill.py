@@ -235,10 +235,9 @@ class Distillation:
 
     def load(self, path: Path) -> None:
         """Continue from a file of :meth:`save`; ``CheckpointError`` if it is damaged, or of other options or scene."""
-        state = self.state
-        try:
-            with reading(path, "a checkpoint", CheckpointError):
-                saved = torch.load(path, map_location=state.device, weights_only=True)
+        state, kind = self.state, "a checkpoint of this scene and these options"
+        with reading(path, kind, CheckpointError, remedy="remove it to start anew"):
+            saved = torch.load(path, map_location=state.device, weights_only=True)
             if saved["options"] != self._options():
                 raise ValueError("other options")
             self.step, self.gain = int(saved["step"]), saved["gain"]
@@ -248,10 +247,6 @@ class Distillation:
             for name, optimizer in state.optimizers.items():
                 optimizer.load_state_dict(saved["optimizers"][name])
             self._mean = RunningMean.of(saved["mean"], state.device)
-        except Exception as error:  # torch raises errors of many kinds for a damaged file
-            raise CheckpointError(
-                f"{path} is damaged, or of another scene or other options; remove it to start anew"
-            ) from error
         if state.head is not None:
             state.head_starts_at = -math.inf
 

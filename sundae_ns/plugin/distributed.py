@@ -47,6 +47,7 @@ HEAD = "compensation"  # Name of the head's optimizer: every rank holds a copy o
 
 def check_options(config: Any) -> None:
     """Raise ``ConfigError`` for the first option of a ``SundaeTrainerConfig`` that several ranks cannot use."""
+    check_machine(config.machine.num_devices, config.machine.device_type)
     model, pruning = config.pipeline.model, config.pipeline.model.pruning
     counted = pruning.max_gaussians is not None or pruning.target_gaussians is not None
     for name, given in (
@@ -240,7 +241,6 @@ class Ranks:
         """A copy of a trainer's configuration without the viewer, which could show one shard only."""
         if self.count == 1:
             return config
-        check_options(config)
         config = copy.deepcopy(config)
         viewer_only = config.vis in ("viewer", "viewer_legacy")
         config.vis = "tensorboard" if viewer_only else config.vis.removeprefix("viewer+")

@@ -114,8 +114,6 @@ def load_model(path: Path, data: Path | None = None, *, split: Literal["test", "
         for camera, batch in opened.datamanager.fixed_indices_eval_dataloader:
             opened.cameras.append(camera.to(model.device))
             opened.truths.append(model.truth(batch, {"background": model._get_background_color()}))
-        if not opened.cameras:
-            raise DataError(f"{opened.capture} has no test views, so there is nothing to measure {opened.source} on")
     return opened
 
 

@@ -98,7 +98,6 @@ class SundaeTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Write ``config.yml`` into the run's folder atomically, once several ranks can use these options."""
         if self.machine.num_devices > 1:
-            distributed.check_machine(self.machine.num_devices, self.machine.device_type)
             distributed.check_options(self)
         path = self.get_base_dir() / "config.yml"
         with writing(f"cannot make {path.parent} for --output-dir"):
@@ -285,11 +284,7 @@ class SundaeTrainer(Trainer):
             super()._train_complete_viewer()
 
     def save_checkpoint(self, step: int) -> None:
-        """Save model, optimizers, schedules and random state; only then remove older checkpoints.
-
-        Raises:
-            StorageError: no space or no right to write; older checkpoints stay.
-        """
+        """Save model, optimizers, schedules and random state; only then remove older checkpoints."""
         with self.ranks.whole() as first:
             if not first:
                 return

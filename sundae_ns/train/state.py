@@ -157,7 +157,7 @@ class Photo(NamedTuple):
     mask: Tensor | None  # Pixels that count, bool [H, W]; None for all
 
 
-TrainingRun: TypeAlias = Any  # A plugin.callbacks.NerfstudioRun, which this floor cannot import; callbacks act on it
+TrainingRun: TypeAlias = Any  # A plugin.model.NerfstudioRun, which this floor cannot import; callbacks act on it
 
 
 class Callback:

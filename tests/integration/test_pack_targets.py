@@ -19,9 +19,9 @@ from sundae_ns.io.pack.codecs import Codecs
 from sundae_ns.io.pack.config import FINETUNED, PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes, read_scene
 from sundae_ns.io.pack.quantize import Transform
-from sundae_ns.plugin import targets
+from sundae_ns.plugin import tuned_packs
 from sundae_ns.plugin.finished_runs import load_run
-from sundae_ns.plugin.targets import COARSEST, Candidate, Search, best_pack, scaled
+from sundae_ns.plugin.tuned_packs import COARSEST, Candidate, Search, best_pack, scaled
 from sundae_ns.scene.packing import contents_of
 
 
@@ -199,15 +199,15 @@ def test_targets_that_cannot_be_met(tiny: Any, tmp_path: Path, capsys: pytest.Ca
 
 
 def test_a_pack_is_worth_its_bytes_at_the_price_of_trials() -> None:
-    assert targets.is_worth(30.0, 100, 30.0, 100)
-    assert targets.is_worth(29.7, 50, 30.0, 100)
-    assert not targets.is_worth(29.5, 50, 30.0, 100)  # half of the bytes are worth 0.4 dB
+    assert tuned_packs.is_worth(30.0, 100, 30.0, 100)
+    assert tuned_packs.is_worth(29.7, 50, 30.0, 100)
+    assert not tuned_packs.is_worth(29.5, 50, 30.0, 100)  # half of the bytes are worth 0.4 dB
 
 
 def test_a_fine_tune_that_loses_says_so(
     tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(targets, "is_worth", lambda *_: False)
+    monkeypatch.setattr(tuned_packs, "is_worth", lambda *_: False)
     plain = packed(capsys, tiny.folder, "-o", tmp_path / "plain.sundae")
     words = [tiny.folder, "-o", tmp_path / "a.sundae", "--finetune", 1, "--head-step", "0.021", "--color-step", "1"]
     with pytest.raises(SystemExit, match="0"):

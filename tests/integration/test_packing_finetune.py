@@ -23,9 +23,9 @@ from sundae_ns.io import checkpoint
 from sundae_ns.io.pack.config import FINETUNED, PackConfig
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.io.pack.packed_scene import fit_scene, read_scene, write_fitted
-from sundae_ns.plugin import finetune as packing_finetune
-from sundae_ns.plugin.finetune import RoundedTraining, finetune
+from sundae_ns.plugin import tuned_packs
 from sundae_ns.plugin.finished_runs import load_model, load_run
+from sundae_ns.plugin.tuned_packs import RoundedTraining, finetune
 from sundae_ns.scene.optimise import rate_factor
 from sundae_ns.scene.packing import contents_of
 
@@ -59,7 +59,7 @@ def quality(run: Any, file: Path) -> float:
 
 def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Ten times the rates for a twentieth of the steps.
-    monkeypatch.setattr(packing_finetune, "RATES", {name: 10 * rate for name, rate in packing_finetune.RATES.items()})
+    monkeypatch.setattr(tuned_packs, "RATES", {name: 10 * rate for name, rate in tuned_packs.RATES.items()})
     seen: list[dict[str, Tensor]] = []
     train = RoundedTraining.step
 
@@ -116,7 +116,8 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     shutil.copytree(tiny.folder, run)
     text = (run / "config.yml").read_text()
     (run / "config.yml").write_text(text.replace(f"- {tiny.scene.name}\n", "- elsewhere\n"))
-    words = ["pack", str(run), "-o", str(file), "--finetune", "3", "--feature-step", "0.01"]
+    plain = PackConfig().color_step  # counts although it is that of a pack without a fine-tune
+    words = ["pack", str(run), "-o", str(file), "--finetune", "3", "--feature-step", "0.01", "--color-step", str(plain)]
     with pytest.raises(SystemExit, match="2"):
         main(words)
     assert "elsewhere does not exist" in capsys.readouterr().err
@@ -126,7 +127,7 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     meta = read_header(file).meta
     assert meta["source"]["finetuned"] == 3
     stored = meta["attributes"]
-    config = PackConfig(**{**FINETUNED, "feature_step": 0.01})  # type: ignore[arg-type]
+    config = PackConfig(**{**FINETUNED, "feature_step": 0.01, "color_step": plain})  # type: ignore[arg-type]
     _, codecs = fit_scene(contents_of(load_run(run, data=tiny.scene)), config)
     for name in codecs.gaussians:
         assert stored[name]["step"] == codecs.gaussians[name].step, name  # type: ignore[attr-defined]
@@ -140,7 +141,7 @@ def test_an_interrupt_leaves_nothing(tiny: Any, tmp_path: Path, monkeypatch: pyt
             raise KeyboardInterrupt
         return 1.0
 
-    monkeypatch.setattr(packing_finetune, "rate_factor", interrupted)
+    monkeypatch.setattr(tuned_packs, "rate_factor", interrupted)
     before = digests(tiny.folder)
     with pytest.raises(KeyboardInterrupt):
         pack(tiny.folder, tmp_path / "a.sundae", finetune=5)

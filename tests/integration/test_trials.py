@@ -15,8 +15,8 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.eval_utils import eval_setup
 from trial_runs import LENGTH, PRUNE_AT, records_of, served_views, tidy, tiny_run, tiny_scene, trials_of
 
-from sundae_ns.plugin.callbacks import NerfstudioRun
 from sundae_ns.plugin.finished_runs import load_run
+from sundae_ns.plugin.model import NerfstudioRun
 from sundae_ns.report.measure import sizes
 from sundae_ns.scene.packing import contents_of
 from sundae_ns.train import choice, trials

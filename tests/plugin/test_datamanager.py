@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from PIL import Image
 from small_captures import meta_of
 
@@ -313,9 +315,16 @@ def test_a_question_without_a_terminal(still_life: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     ("edits", "options", "cause"),
     [
-        ({"train_filenames": []}, {}, "no training images"),
+        ({"train_filenames": []}, {}, "has no training images, and training needs 2 or more; check the path and"),
+        ({"train_filenames": ["images/frame_00001.png"]}, {}, "has 1 training image, and training needs 2"),
         ({"fl_x": 1e-5, "fl_y": 1e-5}, {}, "focal length of frame_"),
         ({}, {"manager": {"train_cameras_sampling_strategy": "fps"}}, "fps is not a function of seed and step"),
+        ({}, {"manager": {"camera_res_scale_factor": math.nan}}, "--camera-res-scale-factor is nan; give a positive"),
+        ({}, {"manager": {"camera_res_scale_factor": 0.01}}, "has no pixel at the given scale of images"),
+        ({}, {"downscale_factor": 0}, "--downscale-factor is 0; give 1 or more"),
+        ({}, {"train_split_fraction": 1.5}, r"--train-split-fraction is 1.5; give a share in \(0, 1\]"),
+        ({}, {"colmap": "sparse/0", "eval_interval": 1}, "--eval-interval is 1; give 2 or more"),
+        ({}, {"scale_factor": -1.0}, "--scale-factor is -1.0; give a positive number"),
     ],
 )
 def test_captures_and_options_that_cannot_be_used(
@@ -323,5 +332,35 @@ def test_captures_and_options_that_cannot_be_used(
 ) -> None:
     edit(capture, **edits)
     with pytest.raises((ConfigError, DataError), match=cause) as caught:
-        load(capture, **options)
+        load(capture, **options).next_train(0)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("scaled", [True, False])
+def test_cameras_at_one_place_have_no_scale(
+    capture: Path, load: Load, edit: Edit, caplog: pytest.LogCaptureFixture, scaled: bool
+) -> None:
+    frames = meta_of(capture)["frames"]
+    edit(capture, frames=[{**frame, "transform_matrix": frames[0]["transform_matrix"]} for frame in frames])
+    if scaled:
+        with pytest.raises(DataError, match="stand at one place, .* for a panorama, give --auto-scale-poses False"):
+            load(capture)
+    else:
+        load(capture, auto_scale_poses=False)
+        assert "all cameras stand at one place" in caplog.text
+
+
+def test_what_needs_test_views_says_so(capture: Path, load: Load, edit: Edit) -> None:
+    """ns-eval asks for batches, ns-render for cameras; training and ns-viewer need neither."""
+    edit(capture, val_filenames=[], test_filenames=[])
+    made = load(capture)
+    assert not made.eval_dataset
+    assert made.next_train(0)[1]["image"].shape == (SIDE, SIDE, 3)
+    for needed in (
+        lambda: made.fixed_indices_eval_dataloader,
+        lambda: len(made.eval_dataset.cameras),
+        lambda: made.eval_dataset.cameras.fx[0],
+        lambda: FixedIndicesEvalDataloader(input_dataset=made.eval_dataset, device="cpu"),
+    ):
+        with pytest.raises(DataError, match="has no test views to measure or render; give ns-render --pose-source"):
+            needed()

@@ -98,10 +98,10 @@ def test_a_resumed_training_ends_as_an_uninterrupted_one(
     for name, value in whole.result().gaussians.items():
         assert torch.equal(value, second.result().gaussians[name]), name
     other = Distillation(ball, keep=0.2, cameras=cameras, steps=20, head=head)
-    with pytest.raises(CheckpointError, match="of another scene or other options"):
+    with pytest.raises(CheckpointError, match="of this scene and these options .other options.; remove it"):
         other.load(tmp_path / "partial")
     (tmp_path / "partial").write_bytes(b"nothing")
-    with pytest.raises(CheckpointError, match="partial"):
+    with pytest.raises(CheckpointError, match="partial is not a checkpoint"):
         begun().load(tmp_path / "partial")
 
 

@@ -18,8 +18,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from torch import Tensor
 
 from sundae_ns.head.head import HeadConfig
-from sundae_ns.plugin.callbacks import NerfstudioRun
-from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
+from sundae_ns.plugin.model import NerfstudioRun, SundaeModel, SundaeModelConfig
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.train.pruning import PruningConfig
 
