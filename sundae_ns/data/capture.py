@@ -68,7 +68,9 @@ def rigid(pose: np.ndarray, where: str) -> np.ndarray:
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object of a file; ``DataError`` if it cannot be read or holds none."""
     with reading(path, "JSON", remedy="write it again"):
-        content = json.loads(regular(path).read_bytes())
+        if regular(path).stat().st_size > 32_000_000:  # that of 30,000 images
+            raise DataError(f"{path} has more than 32 MB; split it")
+        content = json.loads(path.read_bytes())
     if not isinstance(content, dict):
         raise DataError(f"{path} does not hold a JSON object; give the transforms.json of a capture")
     return content

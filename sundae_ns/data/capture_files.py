@@ -24,8 +24,7 @@ from sundae_ns.data.photos import LEAST_PHOTOS, Photo, upright, usable
 
 TRANSFORMS = "transforms.json"
 MARKER = ".sundae_scene"  # in a copy of the demo's capture; it permits to replace it
-ARCHIVE = Path(__file__).with_name("demo_capture.zip")
-"""The capture of ``sundae demo``: 48 training and 8 test images of 128 x 128 pixels, and 5,000 points, ray-traced."""
+ARCHIVE = Path(__file__).with_name("demo_capture.zip")  # ray-traced: 48 training, 8 test images, 5,000 points
 CLOUD = "sparse_pc.ply"
 # From COLMAP's coordinates, whose y points down in most captures, to those of the capture, whose z points up.
 APPLIED = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
@@ -92,19 +91,18 @@ def write_images(
     def write(item: tuple[str, Photo]) -> tuple[str, Photo]:
         path, photo = folder / item[0], item[1]
         advance(1)
-        if path.exists():
-            return item
-        with writing(f"cannot write {path}"):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partial = path.with_name(f"{path.name}.partial")
-            image, exif = upright(photo)  # decodes: what is broken is named before the work of hours
-            if photo.as_it_is:
-                shutil.copyfile(photo.path, partial)
-            elif photo.suffix == ".png":
-                image.save(partial, format="PNG", exif=exif)
-            else:
-                image.convert("L" if image.mode == "L" else "RGB").save(partial, format="JPEG", exif=exif, **JPEG)
-            partial.replace(path)
+        if not path.exists():
+            with writing(f"cannot write {path}"):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                partial = path.with_name(f"{path.name}.partial")
+                image, exif = upright(photo)  # decodes: what is broken is named before the work of hours
+                if photo.as_it_is:
+                    shutil.copyfile(photo.path, partial)
+                elif photo.suffix == ".png":
+                    image.save(partial, format="PNG", exif=exif)
+                else:
+                    image.convert("L" if image.mode == "L" else "RGB").save(partial, "JPEG", exif=exif, **JPEG)
+                partial.replace(path)
         return item
 
     return dict(usable(list(zip(names_of(photos), photos, strict=True)), write, warn))

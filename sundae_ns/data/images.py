@@ -26,8 +26,6 @@ REPAIR = "repair it or remove the view"
 # Pillow's types of pixels that are read, and those in which their colours are converted.
 _MODES = {"CMYK": "CMYK", **dict.fromkeys(("1", "L", "LA", "I;16", "I;16B", "I;16L"), "L")}
 _MODES |= dict.fromkeys(("P", "PA", "RGB", "RGBA", "YCbCr"), "RGB")
-_PROFILES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}  # types of pixels by the colour space of an ICC profile
-
 PQ, HLG, ADOBE = 16, 18, -1  # transfers; Adobe RGB (1998) has no number
 HIGH_RANGE = (PQ, HLG)
 BT709, BT2020, P3 = 1, 9, 12
@@ -130,7 +128,7 @@ def _transform(profile: bytes, mode: str) -> Any:
     """The transform from an ICC profile to sRGB; None if it changes no value by more than 1, or cannot be used."""
     try:
         stated = ImageCms.ImageCmsProfile(BytesIO(profile))
-        source = _PROFILES[stated.profile.xcolor_space.strip()]
+        source = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}[stated.profile.xcolor_space.strip()]
         transform = ImageCms.buildTransform(stated, ImageCms.createProfile("sRGB"), source, "RGB")
     except (KeyError, OSError, ImageCms.PyCMSError):
         return None
@@ -201,6 +199,8 @@ def orientation_in(exif: Image.Exif) -> int:
 
 def turned(image: Image.Image, orientation: int) -> Image.Image:
     """Stored pixels upright by their EXIF orientation."""
+    if orientation == 1:
+        return image
     image = image.copy()
     image.getexif()[ExifTags.Base.Orientation] = orientation
     return ImageOps.exif_transpose(image)

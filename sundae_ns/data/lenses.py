@@ -124,8 +124,7 @@ def with_focal_lengths(meta: dict[str, Any], folder: Path) -> dict[str, Any]:
     """A ``transforms.json`` that states angles of view, as Blender and instant-ngp do, with focal lengths in pixels."""
     angles: list[Any] = [meta.get(f"camera_angle_{axis}") for axis in "xy"]
     known = [type(angle) in (int, float) and 0 < angle < math.pi for angle in angles]
-    frames = meta.get("frames")
-    entries = [meta, *(frames if isinstance(frames, list) else [])]
+    entries = [meta, *(meta["frames"] if isinstance(meta.get("frames"), list) else [])]
     if not known[0] or any(isinstance(entry, dict) and "fl_x" in entry for entry in entries):
         return meta
     size: Any = (None, None)

@@ -25,7 +25,6 @@ LEAST_PHOTOS = 3  # with a pose that a scene needs, because nerfstudio holds out
 _COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
 _CONVERTED = ("TIFF", "WEBP", "BMP", "HEIF")
 _MASKS = ("masks", "mask")  # names of folders whose images are masks
-_LEAST_SIDE = 8  # pixels, at the size that COLMAP looks at
 _REPAIR = "repair or remove it"
 
 
@@ -50,8 +49,7 @@ def find_photos(folder: Path, warn: Callable[[str], object] = str) -> list[Photo
     counts = Counter(path.parent for path in paths)
     if len(counts) > 1 and folder not in counts:
         listed = ", ".join(f"{path.relative_to(folder)}: {count:,}" for path, count in list(counts.items())[:3])
-        listed += ", ..." * (len(counts) > 3)
-        where = f"{folder} holds {len(paths):,} photos in {len(counts)} folders ({listed})"
+        where = f"{folder} holds {len(paths):,} photos in {len(counts)} folders ({listed}{', ...' * (len(counts) > 3)})"
         raise DataError(f"{where}; give the folder of one scene, or move its photos into one folder")
     if not reads_heif():
         paths = [path for path in paths if path.suffix.lower() not in HEIF]
@@ -65,14 +63,14 @@ def find_photos(folder: Path, warn: Callable[[str], object] = str) -> list[Photo
 
 
 def usable(items: Sequence[Any], use: Callable[[Any], Any], warn: Callable[[str], object]) -> Iterator[Any]:
-    """Results of ``use``, without those that raise a ``DataError``; it is raised unless half of all are left."""
+    """Results of ``use``, without up to half and 100 that raise a ``DataError``."""
     errors = 0
     for item in items:
         try:
             yield use(item)
         except DataError as error:
             errors += 1
-            if len(items) - errors < max(LEAST_PHOTOS, len(items) / 2):
+            if errors > 100 or len(items) - errors < max(LEAST_PHOTOS, len(items) / 2):
                 raise DataError(f"{error}; {errors} of {len(items):,} photos cannot be used") from error
             warn(f"left out: {error}")
 
@@ -146,8 +144,8 @@ def photo_of(path: Path) -> Photo:
 
 
 def check_shape(path: Path, size: tuple[int, int]) -> None:
-    """Raise ``DataError`` if an image is too narrow for COLMAP, which makes it smaller."""
-    if min(size) * min(1, LONGEST_SIDE / max(size)) < _LEAST_SIDE:
+    """Raise ``DataError`` if an image has less than 8 pixels on a side at the size that COLMAP looks at."""
+    if min(size) * min(1, LONGEST_SIDE / max(size)) < 8:
         raise DataError(f"{path} is {size[0]} x {size[1]} px, too narrow for camera poses; crop it, or remove it")
 
 

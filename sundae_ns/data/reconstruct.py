@@ -213,9 +213,8 @@ def _blocks(items: Sequence[Any], size: int, advance: Advance) -> Iterator[Seque
 
 def _reconstruct(work: Path, images: Path, count: int, advance: Advance) -> list[Any]:
     """Find poses and points, unless they are there; the models (``pycolmap.Reconstruction``), the largest first."""
-    # OPENCV has two focal lengths and four terms of distortion, which diverge where few photos constrain them. If it
-    # leaves out more than a twentieth of the photos, SIMPLE_RADIAL is tried, with one of each; as it fits less well, it
-    # must place a tenth more.
+    # The four terms of distortion of OPENCV diverge where few photos constrain them. If it leaves out more than a
+    # twentieth, SIMPLE_RADIAL is tried, with one; as it fits less well, it must place a tenth more.
     module, folder = pycolmap(), work / "sparse"
     models = _models(folder)
     for attempt in () if models else ("database", "simple_radial"):

@@ -22,7 +22,6 @@ _OPTIONS = {
     "format_whitelist": "mov,matroska,avi,mpeg,mpegvideo,mpegts,h264,hevc,flv,asf,ogg",
     "protocol_whitelist": "file",
 }
-_MOST_PIXELS = 1 << 27
 _CONVERT = "convert it to .mp4 (H.264)"
 # By their numbers in ITU-T H.273: matrices of BT.709, FCC, BT.601 (twice), SMPTE 240M, BT.2020; those of RGB or unknown
 # ones; transfers that no player shows as they are.
@@ -65,17 +64,16 @@ def image_of(frame: Any, path: Path) -> Image.Image:
     Its own matrix and range count; without a matrix BT.709 from 1280 x 577 on and BT.601 below, as in players. A high
     dynamic range is rolled off; other transfers are shown as they are, and so are wide gamuts.
     """
-    matrix, transfer = int(frame.colorspace), int(getattr(frame, "color_trc", 2))
+    matrix, transfer = int(frame.colorspace), int(frame.color_trc)
     if matrix in _UNSTATED:
         matrix = 1 if frame.width >= 1280 or frame.height > 576 else 5
     if matrix not in _MATRICES or transfer in _NOT_SHOWN:
         what = f"{_NOT_SHOWN[transfer]} light" if transfer in _NOT_SHOWN else f"a colour matrix of number {matrix}"
         raise DataError(f"{path} has {what}, which is not read; convert it to BT.709, for example with HandBrake")
-    high = transfer in HIGH_RANGE
-    options = {"src_colorspace": matrix, "src_color_range": int(frame.color_range)}
-    pixels = frame.reformat(format="rgb48le" if high else "rgb24", **options).to_ndarray()
-    if high:
-        pixels = to_srgb_values(pixels, transfer, int(getattr(frame, "color_primaries", 2)))
+    kind = "rgb48le" if transfer in HIGH_RANGE else "rgb24"
+    pixels = frame.reformat(format=kind, src_colorspace=matrix, src_color_range=int(frame.color_range)).to_ndarray()
+    if transfer in HIGH_RANGE:
+        pixels = to_srgb_values(pixels, transfer, int(frame.color_primaries))
     for data in frame.side_data:
         if data.type.name == "DISPLAYMATRIX":  # of points (x, y) as rows, in 65536ths
             a, b, _, c, d = np.sign(np.round(np.frombuffer(bytes(data), np.int32)[:5] / 65536)).astype(int)
@@ -95,7 +93,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
             if video is None:
                 raise DataError(f"{path} has no images; give a video")
             video.thread_type = "AUTO"
-            video.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
+            video.codec_context.options = {"max_pixels": str(1 << 27)}
             yield container, video
     except (av.error.FFmpegError, OSError) as error:
         raise DataError(f"{path} is not a video that FFmpeg decodes ({error.strerror}); {_CONVERT}") from error

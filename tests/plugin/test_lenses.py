@@ -203,7 +203,7 @@ FOUR, TWELVE = [0.1, 0.02, 0.0, 0.0], [0.5] * 12
         ({"distortion_params": TWELVE, "camera_model": "FISHEYE624"}, {}, (0.5,) * 12),
         ({"latlong": True}, {}, "the images are panoramas"),
         ({"equirectangular": True}, {}, "the images are panoramas"),
-        ({"distortion_params": [0.1, 0, 0.001, 0]}, {}, "may be k1, k2, p1, p2 or k1, k2, k3, k4; give them by these"),
+        ({"distortion_params": [0.1, 0, 0.001, 0]}, {}, "may be k1, k2, p1, p2 or k1 to k4; give them by name"),
         ({"distortion_params": TWELVE}, {}, "OPENCV needs distortion_params of 6 numbers"),
         ({"camera_model": "FISHEYE624"}, {}, "FISHEYE624 needs distortion_params of 12 numbers, not 0"),
     ],
@@ -269,7 +269,7 @@ def test_an_angle_of_view_gives_the_focal_length(capture: Path, load: Load, edit
     edit(capture, camera_angle_y=2 * math.atan(12 / 30))
     assert float(load(capture).train_dataset.cameras.fy[0]) == pytest.approx(30.0, rel=1e-6)
     edit(capture, camera_angle_x=50.0)
-    with pytest.raises(DataError, match="camera_angle_x is 50.0; it must be an angle of view in radians"):
+    with pytest.raises(DataError, match="camera_angle_x is 50.0; it must be an angle in radians"):
         load(capture)
 
 
