@@ -86,18 +86,9 @@ def rows_of(opened: Opened, method: str, files: Iterator[Packed], scene: sn.Scen
         # Files for viewers state no background.
         shown = dataclasses.replace(measured, background_color=scene.background_color)
         quality = sn.measure(shown, opened.truths, cameras)
-        return {
-            "capture": opened.scene,
-            "method": method,
-            "format": kind,
-            "program": program,
-            "bytes": count,
-            "psnr": round(quality.psnr, 4),
-            "ssim": round(quality.ssim, 4),
-            "primitives": measured.num_gaussians,
-            "seed": "" if opened.seed is None else opened.seed,
-            "command": command,
-        }
+        figures = (count, round(quality.psnr, 4), round(quality.ssim, 4), measured.num_gaussians)
+        seed = "" if opened.seed is None else opened.seed
+        return dict(zip(COLUMNS, (opened.scene, method, kind, program, *figures, seed, command), strict=True))
 
     stored = bytes_of(scene.gaussians) + (0 if scene.head is None else bytes_of_module(scene.head))
     yield row(scene, "fp32", "", stored, f"ns-train {opened.method}")

@@ -56,20 +56,17 @@ READS = {
 def settings(kind: str, antialiased: bool) -> dict[str, dict[str, Options]]:
     """Settings of each viewer of a file by name, beginning with its own defaults; each contains those before."""
     blur = {"preBlurAmount": 0.0, "blurAmount": 0.3} if antialiased else {"preBlurAmount": 0.3, "blurAmount": 0.0}
+    exact = {"sortRadial": False, "maxStdDev": REACH, "minAlpha": 1 / 255, "accumExtSplats": True}
+    sorted_exactly = {"sphericalHarmonicsDegree": 2, "antialiased": antialiased, "integerBasedSort": False}
     ladders: dict[str, dict[str, Options]] = {
         "spark": {
             "default": {},
             "blur": {"renderer": blur},
-            "full precision": {
-                "renderer": {"sortRadial": False, "maxStdDev": REACH, "minAlpha": 1 / 255, "accumExtSplats": True},
-                "scene": {"extSplats": True},
-            },
+            "full precision": {"renderer": exact, "scene": {"extSplats": True}},
         },
         "gaussianSplats3D": {
             "default": {},
-            "exact order": {
-                "renderer": {"sphericalHarmonicsDegree": 2, "antialiased": antialiased, "integerBasedSort": False}
-            },
+            "exact order": {"renderer": sorted_exactly},
         },
         "three": {"default": {}},
         "playcanvas": {

@@ -55,9 +55,8 @@ def main() -> None:
         sys.exit("no Chromium here; apt-get install chromium")
     chance = random.Random(0)
     with tempfile.TemporaryDirectory() as folder:
-        scene = write_still_life(
-            Path(folder) / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1
-        )
+        size = {"train_views": 8, "test_views": 2, "width": 64, "height": 64, "points": 300}
+        scene = write_still_life(Path(folder) / "scene", **size)
         words = ["ns-train", "sundae-tiny", "--data", scene, "--output-dir", Path(folder) / "out", "--vis", "viewer"]
         words += ["--max-num-iterations", 10_000_000, "--steps-per-save", 10_000_000, "--logging.steps-per-log", 10]
         words += ["--pipeline.model.pruning.prune-at", PRUNE_AT, "--pipeline.model.warmup-length", 5]

@@ -75,12 +75,6 @@ def tracked() -> list[str]:
     return run("git", "ls-files", "--deduplicate", cwd=ROOT).splitlines()
 
 
-def packaged() -> set[str]:
-    """Files of the package, by their names in a wheel."""
-    places = (name.replace("method_configs/", "sundae_ns/method_configs/", 1) for name in tracked())
-    return {name for name in places if name.startswith("sundae_ns/") and not (ROOT / name).is_dir()}
-
-
 def build(folder: Path) -> tuple[Path, Path]:
     """Build an sdist of the tracked files in ``folder``, and a wheel of the sdist: paths of both."""
     # A copy: setuptools leaves a build folder beside its sources.
@@ -99,8 +93,10 @@ def build(folder: Path) -> tuple[Path, Path]:
 
 def missing(wheel: Path) -> list[str]:
     """Files of the package that a wheel lacks."""
+    names = (name.replace("method_configs/", "sundae_ns/method_configs/", 1) for name in tracked())
+    package = {name for name in names if name.startswith("sundae_ns/") and not (ROOT / name).is_dir()}
     with zipfile.ZipFile(wheel) as archive:
-        return sorted(packaged() - set(archive.namelist()))
+        return sorted(package - set(archive.namelist()))
 
 
 def install(wheel: Path, clean: Path) -> None:
@@ -154,13 +150,8 @@ def main() -> None:
             options.keep.mkdir(parents=True, exist_ok=True)
             for path in (sdist, wheel):
                 shutil.copy(path, options.keep)
-        result = {
-            "wheel": wheel.name,
-            "bytes": wheel.stat().st_size,
-            "python": sys.version.split()[0],
-            "methods": len(methods),
-            "demo_steps": options.demo_steps,
-        }
+        about = {"bytes": wheel.stat().st_size, "python": sys.version.split()[0], "methods": len(methods)}
+        result = {"wheel": wheel.name, **about, "demo_steps": options.demo_steps}
     print(json.dumps(result))
 
 

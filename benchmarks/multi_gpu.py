@@ -161,11 +161,8 @@ def main() -> None:
                 continue
             if tiled:
                 gaussians = tile(read_gaussians(options.field or folder / "warm.ckpt")[0], options.primitives)
-                state = {
-                    "step": 0,
-                    "pipeline": {f"_model.gauss_params.{key}": value for key, value in gaussians.items()},
-                }
-                checkpoint.write(state, folder / "tiled.ckpt")
+                state = {f"_model.gauss_params.{key}": value for key, value in gaussians.items()}
+                checkpoint.write({"step": 0, "pipeline": state}, folder / "tiled.ckpt")
                 del gaussians, state
             for ranks in options.gpus:
                 torch.multiprocessing.spawn(measure, (ranks, folder, options, extra, tiled), nprocs=ranks)

@@ -41,9 +41,16 @@ def fixed_shares(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(found, key=lambda row: float(row["share"]))
 
 
+def logarithmic(panel: Any, ticks: list[float]) -> None:
+    panel.set_xscale("log")
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.xaxis.set_minor_formatter(NullFormatter())
+    panel.set_xticks(ticks)
+    panel.grid(alpha=0.3)
+
+
 def plot_curve() -> Any:
-    """PSNR and SSIM of packed scenes against their size: fixed shares as a line, what the default has chosen, and its
-    fine-tuned pack."""
+    """PSNR and SSIM of packed scenes by size: fixed shares, what the default has chosen, and its fine-tuned pack."""
     rows = [row for row in lines_of("curve.csv") if row["seed"] == "42"]
     packs = [row for row in lines_of("formats.csv") if row["format"] == ".sundae"]
     stock = {row["capture"]: row for row in packs if row["method"] == "splatfacto"}
@@ -74,11 +81,7 @@ def plot_curve() -> Any:
             if capture in stock:
                 place = int(stock[capture]["bytes"]) / MB, float(stock[capture][metric])
                 panel.plot(*place, "s", color="gray", label="splatfacto")
-            panel.set_xscale("log")
-            panel.xaxis.set_major_formatter("{x:g}")
-            panel.xaxis.set_minor_formatter(NullFormatter())
-            panel.set_xticks([0.3, 1, 3, 10])
-            panel.grid(alpha=0.3)
+            logarithmic(panel, [0.3, 1, 3, 10])
             panel.margins(y=0.12)
         column[0].set_title(capture, fontsize=10)
         column[1].set_xlabel("MB, packed")
@@ -93,21 +96,13 @@ def plot_rules() -> Any:
     """PSNR of pruning rules against the share they keep, over random Gaussians, a panel for each capture."""
     figure, panels = plt.subplots(1, len(PRUNED), figsize=(5.5 * len(PRUNED), 4), layout="constrained")
     for panel, scene in zip(panels, PRUNED, strict=True):
-        psnr = {
-            (line["rule"], float(line["keep"])): float(line["psnr"])
-            for line in lines_of("rules.csv")
-            if line["scene"] == scene
-        }
+        lines = [line for line in lines_of("rules.csv") if line["scene"] == scene]
+        psnr = {(line["rule"], float(line["keep"])): float(line["psnr"]) for line in lines}
         keeps = sorted({keep for _, keep in psnr})
         for rule, name in KEPT_RULES.items():
+            gains = [psnr[rule, keep] - psnr["random", keep] for keep in keeps]
             width = 2.5 if rule == "detail-merge" else 1.2
-            panel.plot(
-                [f"{keep:.0%}" for keep in keeps],
-                [psnr[rule, keep] - psnr["random", keep] for keep in keeps],
-                "o-",
-                label=name,
-                linewidth=width,
-            )
+            panel.plot([f"{keep:.0%}" for keep in keeps], gains, "o-", label=name, linewidth=width)
         panel.set_title(f"{scene}, 15,000 steps after the prune, no head", fontsize=9)
         panel.set_xlabel("Gaussians kept")
         panel.set_ylabel("test PSNR over random Gaussians, dB")
@@ -130,22 +125,14 @@ def plot_time() -> Any:
             panel.plot(*zip(*points, strict=True), color=ARMS[row["arm"]], label=row["arm"])
             panel.plot(*points[-1], "o", color=ARMS[row["arm"]])
         panel.set_title(capture, fontsize=10)
-        panel.set_xscale("log")
-        panel.set_xticks([3, 10, 30, 100, 300])
-        panel.xaxis.set_major_formatter("{x:g}")
-        panel.xaxis.set_minor_formatter(NullFormatter())
+        logarithmic(panel, [3, 10, 30, 100, 300])
         panel.set_xlabel("seconds of training")
-        panel.grid(alpha=0.3)
     panels[0].set_ylabel("test PSNR, dB")
     figure.legend(*panels[0].get_legend_handles_labels(), fontsize=9, loc="outside lower center", ncols=3)
     return figure
 
 
-PLOTS: dict[str, Callable[[], Any]] = {
-    "curve": plot_curve,
-    "rules": plot_rules,
-    "time": plot_time,
-}
+PLOTS: dict[str, Callable[[], Any]] = {"curve": plot_curve, "rules": plot_rules, "time": plot_time}
 
 
 def main() -> None:

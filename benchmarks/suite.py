@@ -164,13 +164,8 @@ def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping
         # The output of a training that failed ends with the cause.
         lines += [*(f"- {name}: {reason.splitlines()[-1]}" for name, reason in left_out.items()), ""]
     packed, tuned = ([result for result in results if result.get(name)] for name in ("packed", "tuned"))
-    lines += [
-        "## Packing",
-        "",
-        "By the defaults of `sundae pack`; errors on all test views.",
-        "",
-        *_packing(group(packed, arms), "packed"),
-    ]
+    lines += ["## Packing", "", "By the defaults of `sundae pack`; errors on all test views.", ""]
+    lines += _packing(group(packed, arms), "packed")
     if tuned:
         lines += ["", f"With `--finetune {FINETUNE_STEPS}`, as `sundae run` packs on a GPU.", ""]
         lines += _packing(group(tuned, arms), "tuned")

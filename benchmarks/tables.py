@@ -325,18 +325,8 @@ def prune() -> list[str]:
     return table(["capture, kept", *PRUNES.values()], made)
 
 
-TABLES: dict[str, Callable[[], list[str]]] = {
-    "quality": quality,
-    "speed": speed,
-    "training-time": training_time,
-    "packing": packing,
-    "formats": formats,
-    "packed-headline": packed_headline,
-    "equal-quality": equal_quality,
-    "multi-gpu": multi_gpu,
-    "prune": prune,
-    "trials": trials,
-}
+MAKERS = quality, speed, training_time, packing, formats, packed_headline, equal_quality, multi_gpu, prune, trials
+TABLES: dict[str, Callable[[], list[str]]] = {make.__name__.replace("_", "-"): make for make in MAKERS}
 
 
 def with_tables(text: str) -> str:

@@ -40,7 +40,7 @@ def write_results(out: Path, results: Sequence[Result], page: str) -> None:
 
 
 def group(results: Sequence[Result], arms: Sequence[Arm]) -> dict[tuple[str, str, float | None], list[Result]]:
-    """Results by scene, arm and share; in the order of scenes, shares and arms, warm-ups first."""
+    """Results by scene, arm and share, in their order; warm-ups first."""
     groups: dict[tuple[str, str, float | None], list[Result]] = {}
     for result in results:
         job = result["job"]

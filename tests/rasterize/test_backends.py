@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import torch
 from hard_scenes import CASES, NEAR, Scene, scene
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from splat_inputs import blending_weights, geometry, rasterize, rasterize_cameras, several_views
 from torch import Tensor
@@ -193,39 +193,22 @@ def test_absgrad_is_the_sum_of_absolute_pixel_gradients(backend: Any) -> None:
     assert (expected > signed.abs() + 1e-6).any()
 
 
-@pytest.mark.parametrize(
-    ("n", "width", "height", "channels", "options"),
-    [
-        (300, 48, 40, 3, {}),
-        (300, 48, 40, 3, {"antialiased": True}),
-        (300, 33, 9, 16, {"render_depth": False}),
-        (60, 1, 1, 5, {"near_plane": 2.9}),
-        (200, 17, 23, 9, {"far_plane": 3.1}),
-        (0, 20, 20, 3, {}),
-        (1, 20, 20, 4, {}),
-    ],
-)
-def test_the_compiled_loops_match_the_reference_up_to_rounding(
-    n: int, width: int, height: int, channels: int, options: dict[str, Any]
-) -> None:
-    values, camera = scene(n), make_view(width, height)
-    values["colors"] = torch.rand(n, channels)
-    ours, exact = (render(values, camera, F64, backend, **options) for backend in (CPU, REFERENCE))
-    assert torch.equal(ours["radii"], exact["radii"])
-    compare(ours, exact, 1e-12, 1e-10)  # measured: 3.0e-15 and 1.6e-13
-
-
 @given(
     seed=st.integers(0, 2**32),
-    n=st.integers(0, 60),
-    size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
-    channels=st.integers(1, 9),
+    n=st.integers(0, 300),
+    size=st.tuples(st.integers(1, 48), st.integers(1, 40)),
+    channels=st.integers(1, 16),
     log_scale=st.floats(-9.0, 3.0),
     logit=st.floats(-8.0, 8.0),
-    antialiased=st.booleans(),
+    options=st.fixed_dictionaries(
+        {"antialiased": st.booleans(), "render_depth": st.booleans(), "near_plane": st.sampled_from([0.01, 2.9])},
+        optional={"far_plane": st.just(3.1)},
+    ),
 )
+@example(0, 300, (48, 40), 16, -2.5, 0.0, {"render_depth": False})
+@example(0, 0, (20, 20), 3, 0.0, 0.0, {"near_plane": 2.9})
 def test_any_scene(
-    seed: int, n: int, size: tuple[int, int], channels: int, log_scale: float, logit: float, antialiased: bool
+    seed: int, n: int, size: tuple[int, int], channels: int, log_scale: float, logit: float, options: dict[str, Any]
 ) -> None:
     values, camera = scene(n, seed), make_view(*size)
     values["colors"] = torch.rand(n, channels)
@@ -233,9 +216,9 @@ def test_any_scene(
     values["opacities"] += logit
     values["means"][: n // 3, 2] -= 2.5  # near the camera, and behind it
     values["means"][::5, 2] = 3.0  # ties are broken by index
-    ours, exact = (render(values, camera, F64, b, antialiased=antialiased) for b in (CPU, REFERENCE))
+    ours, exact = (render(values, camera, F64, backend, **options) for backend in (CPU, REFERENCE))
     assert torch.equal(ours["radii"], exact["radii"])
-    compare(ours, exact, 1e-9, 1e-7)
+    compare(ours, exact, 1e-9, 1e-7)  # measured of ordinary scenes: 3.0e-15 and 1.6e-13
 
 
 @pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
@@ -263,32 +246,6 @@ def test_gsplat_is_finite_on_hard_scenes(name: str, antialiased: bool) -> None:
     ours = render(make(), camera, F32, gsplat, "cuda", antialiased=antialiased, near_plane=NEAR)
     assert all(value.isfinite().all() for value in ours.values())
     assert 0 <= ours["alpha"].min() <= ours["alpha"].max() <= 1
-
-
-EXTREMES = {
-    "vanishing": {"scales": -70.0},  # squares underflow
-    "transparent": {"opacities": -200.0},
-    "at the camera": {"means": 0.0},
-    "beside": {"means": 1e6},
-    "behind": {"means": -10.0},
-}
-
-
-@each_backend
-@pytest.mark.parametrize("case", [*EXTREMES, "none", "huge at the near plane"])
-def test_extremes_are_finite(backend: Any, case: str) -> None:
-    values = scene(40 if case != "none" else 0)
-    for name, value in EXTREMES.get(case, {}).items():
-        values[name].fill_(value)
-    if case == "huge at the near plane":
-        values["means"][:, 2] = torch.linspace(-0.02, 0.03, 40)
-        values["scales"][::2] = math.log(1e3)
-    for antialiased in (False, True):
-        ours = render(values, make_view(20, 20, turned=False), F32, backend, antialiased=antialiased)
-        assert all(value.isfinite().all() for value in ours.values())
-        if case not in ("vanishing", "huge at the near plane"):
-            assert not ours["image"].any()
-            assert not ours["depth"].any()
 
 
 @pytest.mark.parametrize("dtype", [F32, F64], ids=str)

@@ -73,9 +73,16 @@ def opaque_on_one_pixel() -> Scene:
     return made
 
 
-def behind_the_camera() -> Scene:
+def with_all(name: str, value: float) -> Scene:
     made = scene()
-    made["means"][:, 2] -= 10.0
+    made[name].fill_(value)
+    return made
+
+
+def huge_at_the_near_plane() -> Scene:
+    made = scene(40)
+    made["means"][:, 2] = torch.linspace(-0.02, 0.03, 40)
+    made["scales"][::2] = math.log(1e3)
     return made
 
 
@@ -89,7 +96,13 @@ CASES: dict[str, tuple[Callable[[], Scene], int, float, float]] = {
     "logits of 30": (lambda: with_opacities(30.0), 48, 5e-6, 2e-5),
     "logits of -30": (lambda: with_opacities(-30.0), 48, 5e-6, 2e-5),
     "on and behind the near plane": (around_the_near_plane, 48, 5e-6, 2e-5),
-    "all behind the camera": (behind_the_camera, 48, 0.0, 0.0),
+    "all behind the camera": (lambda: with_all("means", -10.0), 48, 0.0, 0.0),
+    "all at the camera": (lambda: with_all("means", 0.0), 48, 0.0, 0.0),
+    "all beside the image": (lambda: with_all("means", 1e6), 48, 0.0, 0.0),
+    "transparent": (lambda: with_all("opacities", -200.0), 48, 0.0, 0.0),
+    "vanishing": (lambda: with_all("scales", -70.0), 20, 5e-6, 1e-4),  # squares underflow
+    "huge at the near plane": (huge_at_the_near_plane, 20, 5e-5, 1e-3),
+    "none": (lambda: scene(0), 20, 0.0, 0.0),
     "quaternions of zeros": (without_rotations, 48, 5e-6, 2e-5),
     "an image of one pixel": (scene, 1, 5e-6, 1e-4),  # measured 9.9e-7 and 2.0e-5
     "10,000 on one pixel": (on_one_pixel, 16, 5e-6, 2e-5),
