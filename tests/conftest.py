@@ -73,6 +73,7 @@ def pytest_configure() -> None:
     # A test on a busy machine may be slow, so examples have no deadline.
     hypothesis.settings.register_profile("few", max_examples=10, deadline=None)
     hypothesis.settings.register_profile("all", max_examples=200, deadline=None)
+    hypothesis.settings.register_profile("release", max_examples=5000, deadline=None)
     hypothesis.settings.load_profile("all" if ALL_SEEDS else "few")
 
 

@@ -177,7 +177,6 @@ def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any], size: int) -
         codes = centres[..., :3].reshape(-1, coefficients, 3)[label[:, 0] + 256 * label[:, 1]]
         rest = np.asarray(meta["shN"]["codebook"], np.float32)[codes]
     arrays = {
-        "means": np.sign(bent) * np.expm1(np.abs(bent)),
         "scales": np.asarray(meta["scales"]["codebook"], np.float32)[pixels(meta["scales"], 0, 3)],
         "quats": from_smallest_three((turns[:, :3] / 255.0 - 0.5) * math.sqrt(2.0), largest),
         "features_dc": np.asarray(meta["sh0"]["codebook"], np.float32)[color[:, :3]],
@@ -187,6 +186,7 @@ def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any], size: int) -
     if len(bent) != n:
         raise ValueError(f"its images have fewer than {n:,} pixels")
     gaussians = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
+    gaussians["means"] = torch.from_numpy(np.sign(bent) * np.expm1(np.abs(bent)))  # float64, as survey coordinates need
     check_gaussians(gaussians, ValueError)
     return gaussians
 

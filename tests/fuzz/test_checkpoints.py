@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from limits import verdict
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import Optimizers
@@ -94,7 +95,7 @@ def start_warm(path: Path) -> None:
     read_gaussians(path)
 
 
-def test_a_valid_checkpoint_is_read(good: bytes, verdict: Any, tmp_path: Path) -> None:
+def test_a_valid_checkpoint_is_read(good: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     path.write_bytes(good)
     assert verdict(lambda: resume(path), len(good)) is None
@@ -112,9 +113,7 @@ def folder(good: bytes, tmp_path: Path) -> Iterator[Path]:
     made.config.load_dir = made.config.load_step = None
 
 
-def test_training_resumes_from_the_newest_complete_checkpoint(
-    folder: Path, verdict: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_training_resumes_from_the_newest_complete_checkpoint(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = trainer()
     assert verdict(made._load_checkpoint, 10**6) is None
     assert made._start_step == 8
@@ -122,7 +121,7 @@ def test_training_resumes_from_the_newest_complete_checkpoint(
 
 
 @pytest.mark.parametrize("step", [8, 9])
-def test_a_requested_step_is_not_replaced(folder: Path, verdict: Any, step: int) -> None:
+def test_a_requested_step_is_not_replaced(folder: Path, step: int) -> None:
     made = trainer()
     made.config.load_step = step
     error = verdict(made._load_checkpoint, 10**6)
@@ -138,7 +137,7 @@ def rezipped(good: bytes, change: Callable[[str, bytes], bytes]) -> bytes:
     return out.getvalue()
 
 
-def test_tensors_without_their_bytes(good: bytes, verdict: Any, tmp_path: Path) -> None:
+def test_tensors_without_their_bytes(good: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     path.write_bytes(rezipped(good, lambda name, data: b"" if "/data/" in name else data))
     assert verdict(lambda: resume(path), path.stat().st_size) is not None
@@ -198,7 +197,7 @@ ODD: dict[str, Callable[[dict[str, Any]], None]] = {
 
 
 @pytest.mark.parametrize("kind", ODD)
-def test_odd_contents_are_refused(good: bytes, verdict: Any, tmp_path: Path, kind: str) -> None:
+def test_odd_contents_are_refused(good: bytes, tmp_path: Path, kind: str) -> None:
     state = contents(good)
     ODD[kind](state)
     path = tmp_path / "a.ckpt"
@@ -218,7 +217,7 @@ class MakesFolder:
 
 
 @pytest.mark.parametrize("place", ["pipeline", "optimizers", "random", "schedulers", "scalers"])
-def test_nothing_in_a_checkpoint_is_run(good: bytes, verdict: Any, tmp_path: Path, place: str) -> None:
+def test_nothing_in_a_checkpoint_is_run(good: bytes, tmp_path: Path, place: str) -> None:
     folder, path = tmp_path / "folder", tmp_path / "a.ckpt"
     state = contents(good)
     state[place] = {**state[place], "extra": MakesFolder(folder)}

@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 import torch
+from limits import verdict
 
 from sundae_ns.io import checkpoint
 from sundae_ns.io.formats import read_gaussians, write_for_viewers
@@ -121,7 +122,7 @@ CASES: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], Any]]] = {
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("name", CASES)
-def test_nothing_leaves_the_file(tmp_path: Path, name: str, place: str, verdict: Any) -> None:
+def test_nothing_leaves_the_file(tmp_path: Path, name: str, place: str) -> None:
     make, read = CASES[name]
     path = tmp_path / "deep" / "er" / name
     path.parent.mkdir(parents=True)
@@ -141,7 +142,7 @@ def test_members_of_an_exported_archive_are_plain_names(tmp_path: Path) -> None:
     assert all(Path(name).name == name for name in names)
 
 
-def test_reading_a_capture_writes_nothing(tmp_path: Path, verdict: Any) -> None:
+def test_reading_a_capture_writes_nothing(tmp_path: Path) -> None:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
     from harness.still_life import write_still_life

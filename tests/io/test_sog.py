@@ -180,8 +180,18 @@ FORMS: dict[str, Callable[[dict[str, bytes]], bytes]] = {
 def test_other_forms_of_a_bundle(tmp_path: Path, bundled: dict[str, bytes], form: str, suffix: str) -> None:
     (tmp_path / "a.sog").write_bytes(zipped(bundled))
     (tmp_path / f"b{suffix}").write_bytes(FORMS[form](bundled))
-    truth, found = (read_gaussian_file(tmp_path / name).sanitised.gaussians for name in ("a.sog", f"b{suffix}"))
+    truth, found = (read_gaussian_file(tmp_path / name)[0].gaussians for name in ("a.sog", f"b{suffix}"))
     assert all(torch.equal(found[name], truth[name]) for name in truth)
+
+
+def test_survey_coordinates_are_read_in_double(tmp_path: Path, bundled: dict[str, bytes]) -> None:
+    """In float32 they have steps of a quarter there."""
+    low, high = (np.log1p(np.array([end, end, end])).tolist() for end in (4e6, 4e6 + 10))
+    files = ["means_l.webp", "means_u.webp"]
+    (tmp_path / "a.sog").write_bytes(_meta(means={"mins": low, "maxs": high, "files": files})(bundled))
+    means = read_gaussian_file(tmp_path / "a.sog")[0].gaussians["means"]
+    assert len(means[:, 0].unique()) > 140
+    assert np.ptp(means[:, 0].numpy()) == pytest.approx(10, abs=0.01)
 
 
 def webp(width: int, height: int, **options: Any) -> bytes:

@@ -162,3 +162,12 @@ def sealed(meta: dict[str, Any] | bytes, body: bytes) -> bytes:
     """A packed scene with this header and body, and a valid checksum of the header."""
     text = meta if isinstance(meta, bytes) else json.dumps(meta).encode()
     return b"\x89SUNDAE\n" + struct.pack("<II", 3, len(text)) + hashlib.sha256(text).digest() + text + body
+
+
+def resealed(meta: dict[str, Any], body: bytes) -> bytes:
+    """The file with valid checksums of header and sections."""
+    offset = 0
+    for section in meta["sections"]:
+        end = offset + sum(section["parts"])
+        section["sha256"], offset = hashlib.sha256(body[offset:end]).hexdigest(), end
+    return sealed(meta, body)
