@@ -1,10 +1,23 @@
-"""What Windows needs, as far as Linux can tell: no module needs what only POSIX has."""
+"""Elsewhere: Windows, as far as Linux can tell, and a folder in which an editor looks at a user's program."""
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
+import venv
+import zipfile
+from pathlib import Path
 
+ROOT = Path(__file__).parents[1]
+BUILD = "import sys; from setuptools import build_meta; build_meta.build_editable(sys.argv[1])"
+PROGRAM = """import sundae_ns as sn
+
+scene = sn.load("garden.ply")
+small = sn.prune(scene, keep=0.1, cameras=sn.virtual_cameras(scene, n=16))
+image = sn.render(small, sn.Camera.look_at((0, -3, 1), (0, 0, 0), width=64)).rgb
+sn.save(small, "small.sundae", {})
+"""
 POSIX_MODULES = ("fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty")
 IMPORTER = """
 import importlib, os, pkgutil, signal, sys, sundae_ns
@@ -35,3 +48,21 @@ def test_every_module_is_imported_without_what_only_posix_has() -> None:
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout.split()[-1]) > 100
+
+
+def test_an_editor_finds_the_types_of_an_editable_install(tmp_path: Path) -> None:
+    source, out = tmp_path / "source", tmp_path / "program.py"
+    for name in ("sundae_ns", "method_configs"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md"):
+        shutil.copy(ROOT / name, source)
+    subprocess.run([sys.executable, "-c", BUILD, tmp_path], cwd=source, capture_output=True, check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    venv.create(tmp_path / "venv")
+    (packages,) = tmp_path.glob("venv/lib/*/site-packages")
+    zipfile.ZipFile(wheel).extractall(packages)
+    check = [sys.executable, "-m", "mypy", "--strict", "--python-executable", tmp_path / "venv" / "bin" / "python", out]
+    for option, words in (("upright=True", "Success"), ("uprigth=True", 'Unexpected keyword argument "uprigth"')):
+        out.write_text(PROGRAM.format(option))
+        done = subprocess.run(check, cwd=tmp_path, env={}, capture_output=True, text=True, check=False)
+        assert words in done.stdout, done.stdout + done.stderr

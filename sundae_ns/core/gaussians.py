@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.values import floats
+from sundae_ns.core.values import floats, positions
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 
@@ -38,10 +38,8 @@ SPLAT_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opac
 _COLUMNS = {"means": 3, "scales": 3, "quats": 4, "features_dc": 3, "opacities": 1}
 MAX_SH_DEGREE = 4
 FEATURES = "features"  # name of the parameter that SUNDAE adds to each Gaussian
-LARGEST_LOGIT = 16.0
-"""Logit for opacities of 0 and 1. Its float32 opacity is the last below 1, so that its logarithms stay finite."""
-LEAST_SCALES = (-80.0, -43.0)
-"""Limits of the log-scale for widths of 0; the square of the larger one is a normal float32."""
+LARGEST_LOGIT = 16.0  # for opacities of 0 and 1; its float32 opacity is the last below 1
+LEAST_SCALES = (-80.0, -43.0)  # limits of the log-scale for widths of 0; squares of the larger one are normal float32
 
 
 def num_gaussians(params: Mapping[str, Tensor]) -> int:
@@ -153,7 +151,7 @@ def checked(params: Mapping[str, Any]) -> Gaussians:
     if odd := sorted(str(name) for name in (names ^ set(SPLAT_NAMES)) - {FEATURES}):
         raise DataError(f"missing or unknown: {', '.join(odd)}; Gaussians map {', '.join(SPLAT_NAMES)} to tensors")
     gaussians = as_gaussians(params)
-    values = {name: floats(value, name) for name, value in gaussians.items()}
+    values = {name: (positions if name == "means" else floats)(value, name) for name, value in gaussians.items()}
     if faults := odd_shapes(values):
         raise DataError(faults[0])
     if not num_gaussians(values):
@@ -170,10 +168,8 @@ def checked(params: Mapping[str, Any]) -> Gaussians:
 class Sanitised(NamedTuple):
     """Gaussians whose values are finite, and what was changed."""
 
-    gaussians: Gaussians
-    """The valid Gaussians ``[M, ...]``; the tensors of the source if nothing changed."""
-    mask: Tensor
-    """True for these Gaussians of the source, bool ``[N]``."""
+    gaussians: Gaussians  # the valid ones [M, ...]; the tensors of the source if nothing changed
+    mask: Tensor  # True for these Gaussians of the source, bool [N]
     limits: int  # number of them with an opacity of exactly 0 or 1, which was clamped
     flat: int  # with a width of 0, which was clamped
     unrotated: int  # with an all-zero quaternion, which became the identity

@@ -31,9 +31,8 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
         weight: weight of each Gaussian in its group, not negative ``[N]``.
 
     Returns:
-        Parameters ``[M, ...]`` of the Gaussians that stay, in order, with dtype and device of ``params``; computed in
-        float64 in a fixed order. A Gaussian that is alone in its group, has no weight or overflows is unchanged, bit
-        for bit.
+        Parameters ``[M, ...]`` of the Gaussians that stay, in order; computed in float64 in a fixed order. A Gaussian
+        that is alone in its group, has no weight or overflows is unchanged, bit for bit.
     """
     source = {name: value.detach() for name, value in params.items()}
     device = source["means"].device

@@ -1,8 +1,7 @@
 """Image metrics, each in one named variant.
 
 PSNR is over all pixels and channels, with a peak of 1. SSIM is pytorch_msssim's, as in splatfacto: an 11 x 11 Gaussian
-window with sigma 1.5, no padding ("valid"), averaged over pixels and colour channels. Other libraries pad or normalise
-the variance differently; their values differ in the fourth digit. FLIP needs the optional package of its authors.
+window with sigma 1.5, no padding ("valid"), averaged over pixels and colour channels.
 """
 
 from __future__ import annotations
@@ -110,8 +109,8 @@ def lpips_weights(net: Net = "alex") -> tuple[str, Path]:
 class Lpips:
     """Learned perceptual image patch similarity (Zhang et al. 2018), built at its first use, which downloads weights.
 
-    torchmetrics' variant with ``normalize=True``, for images in [0, 1]. Values of different nets do not compare: most
-    papers report VGG, splatfacto and gsplat report AlexNet. No ``nn.Module``, so that checkpoints do not hold the net.
+    torchmetrics' variant with ``normalize=True``. Values of different nets do not compare: most papers report VGG,
+    splatfacto and gsplat report AlexNet. No ``nn.Module``, so that checkpoints do not hold the net.
     """
 
     def __init__(self, net: Net = "alex") -> None:

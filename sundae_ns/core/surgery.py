@@ -15,8 +15,7 @@ from sundae_ns.core.gaussians import num_gaussians
 
 Params = MutableMapping[str, Parameter]
 Optimizers = Mapping[str, Optimizer]
-Snapshot = dict[str, dict[str, Tensor]]
-"""By parameter: its ``value`` and the tensors of its optimizer state, all on the CPU."""
+Snapshot = dict[str, dict[str, Tensor]]  # by parameter: its value and its optimizer state, all on the CPU
 
 
 def check_wiring(params: Mapping[str, Tensor], optimizers: Optimizers) -> None:
@@ -33,7 +32,7 @@ def check_wiring(params: Mapping[str, Tensor], optimizers: Optimizers) -> None:
 
 
 def per_gaussian(value: Any, n: int) -> bool:
-    """Return whether a value is a tensor with a row for each of ``n`` Gaussians."""
+    """Whether a value is a tensor with a row for each of ``n`` Gaussians."""
     return isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] == n
 
 
@@ -42,8 +41,7 @@ def replace_parameter(
 ) -> None:
     """Replace a parameter, and in its optimizer if it has one, with a new ``state`` there; ``requires_grad`` stays."""
     new = Parameter(value, requires_grad=params[name].requires_grad)
-    optimizer = optimizers.get(name)
-    if optimizer is not None:
+    if (optimizer := optimizers.get(name)) is not None:
         optimizer.state.pop(params[name], None)
         if state:
             optimizer.state[new] = dict(state)

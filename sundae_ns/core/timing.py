@@ -23,10 +23,7 @@ def now(device: torch.device | str) -> float:
 
 
 def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: int = 5, repeats: int = 20) -> float:
-    """Median milliseconds of a function on a device, from its call until the device is idle again.
-
-    ``warmup`` untimed calls come before the ``repeats`` timed ones; ``ConfigError`` if it is not at least one.
-    """
+    """Median milliseconds of ``repeats`` calls of a function, until the device is idle again, after ``warmup`` ones."""
     if warmup < 0 or repeats < 1:
         raise ConfigError(f"{warmup} warm-up calls and {repeats} timed calls; give at least 0 and 1.")
     for _ in range(warmup):

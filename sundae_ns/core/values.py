@@ -64,6 +64,17 @@ def floats(values: Any, name: str, *, colors: bool = False) -> Tensor:
     return tensor
 
 
+def positions(values: Any, name: str) -> Tensor:
+    """As :func:`floats`; ``DataError`` too if float32 moves positions by 1e-4 of their extent, as those of surveys."""
+    tensor = floats(values, name)
+    if tensor is values or not tensor.numel():
+        return tensor
+    exact = values.double() if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values).astype(np.float64))
+    if (exact - tensor).abs().max() > 1e-4 * (tensor.amax(dim=0) - tensor.amin(dim=0)).max():
+        raise DataError(f"{name} is too far from zero for float32; subtract its median, and add it to what you export")
+    return tensor
+
+
 @contextmanager
 def usual_defaults() -> Iterator[None]:
     """Make new tensors float32 on the CPU in a block or a decorated function, whatever a caller's defaults are."""

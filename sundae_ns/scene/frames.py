@@ -33,12 +33,9 @@ _log = logging.getLogger(__name__)
 
 OUTPUTS = ("rgb", "base_rgb", "depth", "accumulation", "features", "response")
 """Outputs beside the background, in the order in which viewers list them."""
-GaussiansKey = tuple[int, int]
-"""Identifies a state of the Gaussians: their number, and the number of prunes."""
-SPARE_CAPACITY = 1.5
-"""Capacity for tile and Gaussian pairs, as a multiple of those of the recorded view. Another view may have more."""
-REPLAYED = ("rgb", "base_rgb", "accumulation")
-"""Images of a recorded frame."""
+GaussiansKey = tuple[int, int]  # a state of the Gaussians: their number, and the number of prunes
+SPARE_CAPACITY = 1.5  # for tile and Gaussian pairs, as a multiple of the recorded view's: another view may have more
+REPLAYED = ("rgb", "base_rgb", "accumulation")  # images of a recorded frame
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, one_line
 from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians, checked
 from sundae_ns.core.metrics import Quality, evaluate
-from sundae_ns.core.values import AnyArray, floats, numbers, usual_defaults, whole
+from sundae_ns.core.values import AnyArray, floats, numbers, positions, usual_defaults, whole
 from sundae_ns.cuda.kernels import naming_full_memory
+from sundae_ns.data.images import to_srgb
 from sundae_ns.data.photos import photo_of, upright
 from sundae_ns.head.head import CompensationHead
 from sundae_ns.rasterize.interface import BackendName, select_backend
@@ -87,7 +88,7 @@ class Scene:
         >>> sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3)).num_gaussians
         100
         """
-        points, colors = floats(points, "points"), floats(colors, "colors", colors=True)
+        points, colors = positions(points, "points"), floats(colors, "colors", colors=True)
         if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape or not len(points):
             shapes = f"{list(points.shape)} and {list(colors.shape)}"
             raise DataError(f"points and colours have shapes {shapes}; pass [N, 3] each, N at least 1")
@@ -264,7 +265,7 @@ def measure(
 
 def _image(image: Any, name: str) -> Tensor:
     """An image of a caller, in [0, 1] ``[H, W, 3]``."""
-    image = upright(photo_of(Path(image))) if isinstance(image, (str, Path)) else image
+    image = upright(photo_of(Path(image)))[0] if isinstance(image, (str, Path)) else image
     if isinstance(image, Image.Image):
-        image = np.asarray(image if image.mode == "RGBA" else image.convert("RGB"))
+        image = np.asarray(image if image.mode == "RGBA" else to_srgb(image).convert("RGB"))
     return floats(image.rgb if isinstance(image, Rendering) else image, name, colors=True)

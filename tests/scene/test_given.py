@@ -97,6 +97,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "shape": (lambda: sn.Scene.from_points(POINTS[:, :2], POINTS), r"\[100, 2\] and \[100, 3\]"),
     "NaN points": (lambda: sn.Scene.from_points(POINTS * np.nan, POINTS), "some points are NaN"),
     "NaN colours": (lambda: sn.Scene.from_points(POINTS, POINTS * np.nan), "colors has values from nan"),
+    "a survey": (lambda: sn.Scene.from_points(POINTS + 5e6, POINTS), "points is too far from zero"),
     "degree": (lambda: sn.Scene.from_points(POINTS, POINTS, sh_degree=5), "sh_degree is 5"),
     "no mapping": (lambda: sn.Scene([POINTS]), "Gaussians map means"),  # type: ignore[arg-type]
     "names": (lambda: scene(opacity=1), "missing or unknown: opacity"),
@@ -138,7 +139,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "CHW": (lambda: sn.measure(SCENE, [image().transpose(2, 0, 1)], [CAMERA]), r"\[20, 24, 3\] and \[3, 20, 24\]"),
     "grey": (lambda: sn.measure(SCENE, [image()[..., 0]], [CAMERA]), r"\[20, 24, 3\] and \[20, 24\]"),
     "no image": (lambda: sn.measure(SCENE, 5, [CAMERA]), "image 0 has values from 5 to 5"),  # type: ignore[arg-type]
-    "gone": (lambda: sn.measure(SCENE, ["gone.png"], [CAMERA]), "gone.png cannot be read"),
+    "gone": (lambda: sn.measure(SCENE, ["gone.png"], [CAMERA]), "gone.png"),
     "few": (lambda: sn.measure(SCENE, [image()] * 2, [CAMERA]), "2 images do not fit 1 views"),
     "box": (lambda: sn.crop(SCENE, 0, 1), "a corner of the box is not made of 3 finite numbers"),
 }
