@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import chain
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +17,7 @@ def bytes_of(params: Mapping[str, Tensor]) -> int:
 
 def bytes_of_module(module: nn.Module) -> int:
     """Bytes of a module's parameters and buffers, each in its own dtype; a shared tensor counts once."""
-    return sum(tensor.numel() * tensor.element_size() for tensor in chain(module.parameters(), module.buffers()))
+    return sum(tensor.numel() * tensor.element_size() for tensor in [*module.parameters(), *module.buffers()])
 
 
 def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:

@@ -106,10 +106,10 @@ def read_gaussian_file(path: Path) -> tuple[Sanitised, Marks]:
         DataError: the file is missing, damaged, of another kind, or has no finite Gaussian.
     """
     kind = kind_of_gaussians(path)
-    read = _READERS[kind](path) if kind in _READERS else (read_ply(path), *ply_marks(path))
+    read = _READERS[kind](path) if kind in _READERS else (read_ply(path), ply_marks(path))
     params, *stated = read if isinstance(read, tuple) else (read,)
     params["means"], offset = recentred(params["means"])
-    marks = Marks(*stated)
+    marks = stated[0] if stated and isinstance(stated[0], Marks) else Marks(*stated)
     if offset is not None:
         _log.warning("%s lies where float32 is too coarse; its coordinates are less %.10g %.10g %.10g", path, *offset)
         x, y, z = map(sum, zip(offset, marks.offset or (0.0, 0.0, 0.0), strict=True))
@@ -214,6 +214,8 @@ def write_for_viewers(
     gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
     if kind == ".glb":
         write_glb(path, gaussians, antialiased=marks.antialiased, in_model_frame=marks.in_model_frame)
+    elif kind == ".sog":
+        write_sog(path, gaussians, antialiased=marks.antialiased, up=marks.up or ())
     else:
-        (write_spz if kind == ".spz" else write_sog)(path, gaussians, antialiased=marks.antialiased)
+        write_spz(path, gaussians, antialiased=marks.antialiased)
     return gaussians

@@ -2,7 +2,7 @@
 
 Written from the format's public description, because no maintained Python package writes it:
 
-    meta.json                  {"version": 2, "count", "antialias", "means", "scales", "quats", "sh0", "shN"}
+    meta.json                  {"version": 2, "count", "antialias", "up", "means", "scales", "quats", "sh0", "shN"}
     means_l, means_u .webp     low and high bytes of 65,536 levels per axis, after sign(x) log(1 + |x|)
     scales.webp                log-scales, indices in a codebook of 256 numbers
     quats.webp                 the three smallest components, 8 bits each; alpha is 252 + the index of the largest
@@ -20,7 +20,7 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -35,7 +35,7 @@ from sundae_ns.core.errors import DataError, reading, regular
 from sundae_ns.core.files import replacing
 from sundae_ns.io.budget import afford, afford_gaussians, parsed_json, read_exactly
 from sundae_ns.io.coordinates import scene_order
-from sundae_ns.io.ply import check_gaussians, checked, from_smallest_three
+from sundae_ns.io.ply import Marks, check_gaussians, checked, from_smallest_three, vector
 
 META, STREAMED = METAS = ("meta.json", "lod-meta.json")
 _LEVELS_OF_DETAIL = "it is streamed SOG; give the meta.json of one of its folders, or the file that it was made of"
@@ -46,7 +46,7 @@ _LEVELS = 65535  # highest level of a position, in two bytes
 _FIRST_MODE = 252  # alpha of a rotation without its first component; the next values stand for the other components
 
 
-def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
+def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False, up: Sequence[float] = ()) -> None:
     """Write the base colours of Gaussians that ``ply.checked`` accepts as a .sog, atomically, in another order."""
     from PIL import Image
 
@@ -74,6 +74,7 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
         "count": n,
         "antialias": antialiased,
         **({"model": "antialiased"} if antialiased else {}),  # what splat-transform reads
+        **({"up": list(up)} if up else {}),  # which only this program reads
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_values.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
@@ -100,11 +101,11 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
             bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), image.getvalue())
 
 
-def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
+def read_sog(path: Path) -> tuple[dict[str, Tensor], Marks]:
     """Read a bundled .sog, a .zip of one or of its folder, or a folder of images or the ``meta.json`` in it.
 
-    Returns Gaussians as of ``ply.read_ply``, and whether they are marked as antialiased. Raises ``DataError`` if a file
-    is missing, damaged, lossy, streamed, or of another version than 2.
+    Returns Gaussians as of ``ply.read_ply``, and what it states of them. Raises ``DataError`` if a file is missing,
+    damaged, lossy, streamed, or of another version than 2.
     """
     with reading(path, "a complete .sog"), ExitStack() as stack:
         if path.is_dir() or path.name in METAS:
@@ -119,8 +120,9 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
         meta = parsed_json(entry(META))
         if (version := meta.get("version", 1)) != 2:
             raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
-        gaussians = _decoded(entry, meta, size)
-    return gaussians, bool(meta.get("antialias")) or meta.get("model") == "antialiased"
+        antialiased = bool(meta.get("antialias")) or meta.get("model") == "antialiased"
+        marks = Marks(antialiased, up=vector(" ".join(map(str, meta.get("up", ())))))
+        return _decoded(entry, meta, size), marks
 
 
 def _file_entry(folder: Path, name: str) -> bytes:

@@ -169,7 +169,7 @@ def test_up_is_stated_else_by_convention_and_kept(tmp_path: Path, caplog: pytest
     stated = sn.load(tmp_path / "a.ply")
     assert stated.up == (0.6, 0.0, 0.8)
     assert not caplog.messages
-    for kind in (".ply", ".sundae"):
+    for kind in (".ply", ".sog", ".sundae"):
         sn.save(stated, tmp_path / f"b{kind}")
         assert sn.load(tmp_path / f"b{kind}").up == (0.6, 0.0, 0.8)
     write_ply(tmp_path / "c.ply", small_field())
