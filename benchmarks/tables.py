@@ -42,7 +42,7 @@ METHODS = {
 """Arms of runs.csv in the order of a table, by the names that readers see."""
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
-LEFT_OUT = ("splatfacto-7k", "sundae-warm-up", "sundae-with-head", "sundae-no-head-bytes", "band")
+LEFT_OUT = ("splatfacto-7k", "sundae-warm-up", "sundae-with-head", "sundae-no-head", "sundae-no-head-bytes", "band")
 """Methods of runs.csv that the table of quality leaves out; the text gives what they show."""
 SHARE = 0.1
 """Share that ``sundae`` keeps."""
@@ -103,11 +103,9 @@ def quality() -> list[str]:
     rows, found = [], runs()
     usual = {(row["scene"], row["variant"]) for row in found if row["keep_ratio"] == SHARE}
     compared = {row["scene"] for row in found if row["variant"] in ("sundae", "sundae-auto")}
-    headless = {row["scene"] for row in found if row["variant"] == "sundae" and not row["bytes_head"]}
     for row in found:
         other_share = row["keep_ratio"] != SHARE and (row["scene"], row["variant"]) in usual
-        again = row["variant"] == "sundae-no-head" and row["scene"] in headless  # the same run but for chance
-        if other_share or again or row["variant"] in LEFT_OUT or row["scene"] not in compared:
+        if other_share or row["variant"] in LEFT_OUT or row["scene"] not in compared:
             continue
         capture = f"{row['scene']}, {row['resolution'].replace('x', ' x ')}"
         keep = "" if row["keep_ratio"] is None else f"{row['keep_ratio']:.0%}"
