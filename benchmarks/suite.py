@@ -84,7 +84,7 @@ def run_suite(options: SuiteOptions, runner: Runner | None = None, console: Cons
     defaults = (PAPER_ARMS, PAPER_RATIOS) if options.paper else (ARMS, (0.1,))
     options = replace(options, arms=options.arms or defaults[0], keep_ratios=options.keep_ratios or defaults[1])
     arms = choose_arms(options.arms, options.method, options.steps_scale, from_scratch=not options.paper)
-    check_out(options.out, reads=[options.folder])
+    check_out(options.out, reads=[path for path, _ in find_captures(options)] if options.paper else [options.folder])
     plan, left_out = plan_suite(options, arms)
     for scene, reason in left_out.items():
         console.print(f"[yellow]Left out: {escape(f'{scene}: {reason}')}", highlight=False, soft_wrap=True)
