@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from harness.still_life import write_still_life
 from sundae_ns.core.errors import ConfigError, DataError, StorageError
 from sundae_ns.data import reconstruct
 from sundae_ns.data.capture import check_transforms
+from sundae_ns.data.capture_files import Placed
 from sundae_ns.data.reconstruct import Request, check_installed, find_poses, pycolmap, threads
 from sundae_ns.io import run_folder
 from sundae_ns.io.ply import read_point_cloud
@@ -41,37 +43,33 @@ def colmap(monkeypatch: pytest.MonkeyPatch) -> FakeColmap:
 
 @pytest.fixture
 def photos(tmp_path: Path) -> Path:
-    folder = tmp_path / "-my $(photos)"
+    folder = tmp_path / "-my \udcff$(photos)"
     folder.mkdir()
     for index in range(PHOTOS):
         Image.new("RGB", (16, 12), (20 * index, 90, 90)).save(folder / f"{index}.JPG")
     return folder
 
 
-class Log:
-    """Stages with their progress."""
-
-    def __init__(self) -> None:
-        self.stages: dict[str, list[int]] = {}
+def find(photos: Path, warn: Callable[[str], object] = str, **changes: Any) -> tuple[Placed, dict[str, list[int]]]:
+    """What is placed, and for each stage the number of its parts and how many were done."""
+    stages: dict[str, list[int]] = {}
 
     @contextmanager
-    def __call__(self, stage: str, total: int) -> Iterator[Callable[[int], None]]:
-        self.stages[stage] = [total, 0]
+    def report(stage: str, total: int) -> Iterator[Callable[[int], None]]:
+        stages[stage] = [total, 0]
 
         def advance(count: int) -> None:
-            self.stages[stage][1] += count
+            stages[stage][1] += count
 
         yield advance
 
-
-def request(photos: Path, **changes: object) -> Request:
     out = photos.parent / "capture"
-    return Request(**{"photos": photos, "capture": out, "matching": "auto", "frames": 20, "masks": None, **changes})  # type: ignore[arg-type]
+    options: dict[str, Any] = {"capture": out, "matching": "auto", "frames": 20, "masks": None, **changes}
+    return find_poses(Request(photos, **options), report, warn), stages
 
 
 def test_photos_become_a_capture(colmap: FakeColmap, photos: Path) -> None:
-    log = Log()
-    found = find_poses(request(photos), log)
+    found, stages = find(photos)
     assert len(found.placed) == PHOTOS
     assert (found.cameras, found.error, found.models, found.masks) == (1, 0.5, (PHOTOS,), None)
     capture = photos.parent / "capture"
@@ -80,9 +78,9 @@ def test_photos_become_a_capture(colmap: FakeColmap, photos: Path) -> None:
     assert len(list((capture / "images").iterdir())) == PHOTOS
     assert read_point_cloud(capture / "sparse_pc.ply")[0].tolist() == [[1.0, 3.0, -2.0]]
     assert (capture / "colmap" / "sparse" / "0" / "images.json").is_file()
-    assert sorted(path.name for path in photos.parent.iterdir()) == ["-my $(photos)", "capture"]
+    assert sorted(path.name for path in photos.parent.iterdir()) == [photos.name, "capture"]
     for stage, parts in (("images", 8), ("features", 8), ("matches of pairs", 28), ("capture", 8)):
-        assert log.stages[stage] == [parts, parts]
+        assert stages[stage] == [parts, parts]
     assert colmap.calls["models"] == ["OPENCV"]
 
 
@@ -91,12 +89,11 @@ def test_a_stage_continues(colmap: FakeColmap, photos: Path, stage: str, monkeyp
     monkeypatch.setattr(reconstruct, "_PAIRS_AT_ONCE", 5)
     colmap.fails = stage
     with pytest.raises(RuntimeError, match="ended early"):
-        find_poses(request(photos), Log())
+        find(photos)
     assert not (photos.parent / "capture").exists()
     run_folder._held.clear()  # the process has ended
-    log = Log()
-    assert len(find_poses(request(photos), log).placed) == PHOTOS
-    assert log.stages["features"] == [PHOTOS, PHOTOS]
+    found, stages = find(photos)
+    assert (len(found.placed), stages["features"]) == (PHOTOS, [PHOTOS, PHOTOS])
     for name, times in (("import", PHOTOS * (1 + (stage == "import"))), ("features", PHOTOS), ("pairs", 28)):
         assert len(colmap.calls[name]) == times, "nothing is done twice"
     assert len(colmap.calls["models"]) == 1 + (stage == "models")
@@ -106,66 +103,73 @@ def test_a_stage_continues(colmap: FakeColmap, photos: Path, stage: str, monkeyp
 def test_other_photos_or_options_start_anew(colmap: FakeColmap, photos: Path, change: str) -> None:
     colmap.fails = "models"
     with pytest.raises(RuntimeError):
-        find_poses(request(photos), Log())
+        find(photos)
     run_folder._held.clear()
     if change == "a photo more":
         shutil.copy(photos / "0.JPG", photos / "9.JPG")
     elif change == "another photo":
         Image.new("RGB", (16, 12), "red").save(photos / "0.JPG")
-    find_poses(request(photos, matching="similar" if change == "another way" else "auto"), Log())
+    find(photos, matching="similar" if change == "another way" else "auto")
     assert colmap.calls["features"].count("c1/frame_00001.jpg") == 2
 
 
-def test_the_largest_model_is_taken(colmap: FakeColmap, photos: Path) -> None:
-    colmap.models = [3, 6, 4, 2]
-    found = find_poses(request(photos), Log())
-    assert found.models == (6, 4, 3)
-    assert found.left_out == ("6.JPG", "7.JPG")
-    assert len(list((photos.parent / "capture" / "images").iterdir())) == 6
-
-
-@pytest.mark.parametrize(("simple", "count"), [([PHOTOS], PHOTOS), ([6, 2], 6), ([5], 5), ([], 5)])
-def test_simple_cameras_are_tried_while_photos_are_left_out(
-    colmap: FakeColmap, photos: Path, simple: list[int], count: int
+@pytest.mark.parametrize(
+    ("models", "simple", "placed", "tried"),
+    [
+        ([3, 8, 4, 2], None, (8, 4, 3), 1),
+        ([5], [PHOTOS], (PHOTOS,), 2),
+        ([5], [6, 2], (6,), 2),
+        ([5], [5], (5,), 2),
+        ([5], [], (5,), 2),
+        ([], [], (), 2),
+    ],
+)
+def test_the_largest_model_is_taken_and_simple_cameras_are_tried_while_photos_are_left_out(
+    colmap: FakeColmap, photos: Path, models: list[int], simple: list[int] | None, placed: tuple[int, ...], tried: int
 ) -> None:
-    colmap.models, colmap.simple = [5], simple
-    assert len(find_poses(request(photos), Log()).placed) == count
-    assert colmap.calls["models"] == ["OPENCV", "SIMPLE_RADIAL"]
+    colmap.models, colmap.simple = models, simple
+    if placed:
+        found, _ = find(photos)
+        assert found.models == placed
+        assert found.left_out == tuple(f"{index}.JPG" for index in range(placed[0], PHOTOS))
+        assert len(list((photos.parent / "capture" / "images").iterdir())) == placed[0]
+    else:
+        with pytest.raises(DataError, match="no photos could be placed"):
+            find(photos)
+    assert colmap.calls["models"] == ["OPENCV", "SIMPLE_RADIAL"][:tried]
 
 
 def test_images_that_see_hardly_a_point_have_no_pose(colmap: FakeColmap, photos: Path) -> None:
     colmap.blind = ("c1/frame_00002.jpg",)
-    assert find_poses(request(photos), Log()).left_out == ("1.JPG",)
+    assert find(photos)[0].left_out == ("1.JPG",)
     capture = photos.parent / "capture"
     assert not (capture / "images" / "frame_00002.jpg").exists()
     assert "frame_00002" not in (capture / "colmap" / "sparse" / "0" / "images.json").read_text()
 
 
-def test_no_model(colmap: FakeColmap, photos: Path) -> None:
-    colmap.models = []
-    with pytest.raises(DataError, match="no photos could be placed"):
-        find_poses(request(photos), Log())
-
-
 def test_frames_of_a_video(colmap: FakeColmap, tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", 90)
-    log = Log()
-    assert find_poses(request(tmp_path / "a.mp4", frames=40), log).total == 40
-    assert log.stages["frames"] == [40, 40]
+    found, stages = find(tmp_path / "a.mp4", frames=40)
+    assert (found.total, stages["frames"]) == (40, [40, 40])
 
 
-def test_masks_reach_the_capture(colmap: FakeColmap, photos: Path, tmp_path: Path) -> None:
+def test_masks_reach_the_capture_beside_a_broken_photo(colmap: FakeColmap, photos: Path, tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     for index in range(PHOTOS):
         mask = Image.new("L", (16, 12), 255)
         mask.putpixel((index, 0), 0)
         mask.save(tmp_path / "masks" / f"{index}.png")
-    colmap.models = [6]
-    assert find_poses(request(photos, masks=tmp_path / "masks"), Log()).masks == "6 of 6"
+    content = (photos / "1.JPG").read_bytes()
+    (photos / "1.JPG").write_bytes(content[: content.index(b"\xff\xda") + 14])
+    colmap.models, said = [6], []
+    found, _ = find(photos, said.append, masks=tmp_path / "masks")
+    assert (found.masks, found.left_out) == ("6 of 6", ("7.JPG",))
+    assert "1.JPG cannot be read" in said[0]
     frames = check_transforms(tmp_path / "capture" / "transforms.json")["frames"]
-    assert frames[2]["mask_path"] == "masks/frame_00003.png"
+    assert frames[1]["mask_path"] == "masks/frame_00003.png"
     with Image.open(tmp_path / "capture" / "masks" / "frame_00003.png") as stored:
         assert (stored.getpixel((2, 0)), stored.getpixel((3, 0))) == (0, 255)
+    assert len([*(tmp_path / "capture").glob("masks_[248]/*.png")]) == 18
 
 
 def test_one_process_works_on_a_capture(colmap: FakeColmap, photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,7 +177,7 @@ def test_one_process_works_on_a_capture(colmap: FakeColmap, photos: Path, monkey
     held = dict(run_folder._held)
     monkeypatch.setattr(run_folder, "_held", {})
     with pytest.raises(StorageError, match="works in .*partial; wait for it, or choose another folder"):
-        find_poses(request(photos), Log())
+        find(photos)
     del held
 
 
@@ -218,14 +222,9 @@ def test_pairs_of_a_walk(tmp_path: Path, walk: list[str], monkeypatch: pytest.Mo
     assert len(similar) < 60 * 13
 
 
-def test_its_log_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake = FakeColmap()
-    monkeypatch.setitem(sys.modules, "pycolmap", fake)  # type: ignore[arg-type]
-    assert pycolmap() is fake
-    assert fake.logging.minloglevel == 3
-
-
 def test_a_missing_package_and_a_broken_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
+    assert pycolmap().logging.minloglevel == 3, "its log is silent"
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     for load in (check_installed, pycolmap):
         with pytest.raises(ConfigError, match=r"need pycolmap; install it with pip install \"sundae_ns\[photos\]\""):
@@ -265,7 +264,7 @@ def test_poses_of_a_still_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     scene = write_still_life(
         tmp_path / "scene", train_views=55, test_views=1, width=128, height=128, points=10, samples=1
     )
-    found = find_poses(request(scene / "images"), Log())
+    found, _ = find(scene / "images")
     assert len(found.placed) >= 45
     assert found.error < 1
     truth = {frame["file_path"]: frame for frame in json.loads((scene / "transforms.json").read_text())["frames"]}

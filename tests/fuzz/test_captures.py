@@ -25,7 +25,7 @@ from icc_profiles import judged, profile
 from limits import verdict
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from PIL import Image
-from small_captures import HEIGHT, SIZE, VIEWS, WIDTH, bytes_of, load, meta_of, write_text_model
+from small_captures import HEIGHT, SIZE, VIEWS, WIDTH, bytes_of, load, manager, meta_of, write_text_model
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.data.colmap import check_colmap
@@ -253,6 +253,10 @@ MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a NaN position": (_patch("images.bin", 8 + 36, "<d", float("nan")), "image 1: the pose is nan"),
     "a missing camera": (_patch("images.bin", 8 + 60, "<i", 9), "camera 9 is not in the model"),
     "a name for a shell": (_patch("images.bin", 8 + 64, "15s", b"$(reboot).png!!"), "has quotes, .*rename it"),
+    "a name above": (_patch("images.bin", 8 + 64, "15s", b"../../a.png.png"), "leads out of the folder of images"),
+    "an absolute name": (_patch("images.bin", 8 + 64, "15s", b"/etc/passwd.png"), "leads out of the folder of images"),
+    "a name of two lines": (_patch("images.bin", 8 + 64, "15s", b"a\nb.png.png.png"), "has quotes, .*rename it"),
+    "one image": (lambda model: _text(model, "1 1 0 0 0 0 0 3 1 a.png"), "has 1 image; training needs 2"),
     "an endless name": (_patch("images.bin", 8 + 64, "10000s", b"a" * 10**4), "is not a complete images.bin"),
     "no images": (_patch("images.bin", 0, "<Q", 0), "has no images"),
     "no points": (_patch("points3D.bin", 0, "<Q", 0), "has no points"),
@@ -413,6 +417,16 @@ def test_unusual_captures_train(compiled: None, capture: Path, kind: str, folder
     data = capture.rename(capture.with_name(folder))
     FINE[kind](data)
     assert verdict(lambda: train_a_step(data), bytes_of(data)) is None
+
+
+@pytest.mark.parametrize(("made", "factors"), [((), "1"), (("images_2", "images_8"), "1, 2, 8")])
+def test_a_missing_size_is_named_with_what_makes_it(capture: Path, made: tuple[str, ...], factors: str) -> None:
+    for name in made:
+        (capture / name).mkdir()
+    with pytest.raises(DataError) as error:
+        manager(capture, downscale_factor=3)
+    make = f"`mkdir images_3 && magick mogrify -path images_3 -resize {WIDTH // 3}x{HEIGHT // 3}! images/*`"
+    assert f"give another --downscale-factor ({factors}), or make it with {make}" in str(error.value)
 
 
 def test_training_sees_srgb(capture: Path) -> None:

@@ -28,8 +28,8 @@ def write_text_model(folder: Path, names: list[str]) -> None:
         (folder / f"{file}.txt").write_text(text, encoding="utf-8")
 
 
-def manager(data: Path, *, colmap: bool = False) -> SundaeDatamanager:
-    parser: Any = NerfstudioDataParserConfig(load_3D_points=True)
+def manager(data: Path, *, colmap: bool = False, downscale_factor: int | None = None) -> SundaeDatamanager:
+    parser: Any = NerfstudioDataParserConfig(load_3D_points=True, downscale_factor=downscale_factor)
     if colmap:
         parser = ColmapDataParserConfig(colmap_path=Path("sparse/0"), eval_mode="all")
     return SundaeDatamanagerConfig(data=data, dataparser=parser, cache_images_type="uint8").setup(
