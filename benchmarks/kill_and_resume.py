@@ -44,7 +44,7 @@ from harness.killing import Bench, command_here, train_here
 from harness.still_life import write_still_life
 from sundae_ns.core.errors import CheckpointError
 from sundae_ns.io import checkpoint
-from sundae_ns.plugin.camera_models import camera_of
+from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.finished_runs import load_model
 
 SPREAD = 3.0

@@ -33,7 +33,7 @@ from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import SundaeError
-from sundae_ns.plugin.camera_models import camera_of
+from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.finished_runs import load_model
 
 COLUMNS = (

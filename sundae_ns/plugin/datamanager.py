@@ -26,8 +26,15 @@ from torch import Tensor
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line, reading
 from sundae_ns.data.images import TURNED, check_image, decoded, exif_orientation, turned, wrong_size
 from sundae_ns.data.layouts import larger_model, unused_masks
-from sundae_ns.plugin.camera_models import check_cameras, warn_of_cloud, warn_of_stray_tests
-from sundae_ns.plugin.dataparsers import check_capture, check_ranges, rebound, set_parser
+from sundae_ns.plugin.dataparsers import (
+    check_cameras,
+    check_capture,
+    check_ranges,
+    rebound,
+    set_parser,
+    warn_of_cloud,
+    warn_of_stray_tests,
+)
 from sundae_ns.train.progress import warn
 
 _log = logging.getLogger(__name__)

@@ -20,6 +20,7 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import CheckpointError, ConfigError, reading
 from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import FEATURES, Gaussians, sanitise
+from sundae_ns.core.values import usual_defaults
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.accounting import stored_bytes
@@ -49,6 +50,7 @@ class Distillation:
     ``progress`` says whether the prune shows a progress bar.
     """
 
+    @usual_defaults()
     def __init__(
         self,
         teacher: Scene,
@@ -119,6 +121,7 @@ class Distillation:
             trained_focal=(min(focals), max(focals)),
         )
 
+    @usual_defaults()
     def train(self, after_step: Callable[[int, int], bool]) -> bool:
         """Decide on the head, if that is due, and train the steps that are left; whether all steps were trained.
 

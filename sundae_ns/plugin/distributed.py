@@ -102,12 +102,8 @@ def may_be_seen(means: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, siz
     has rows of length ``f / z * sqrt(1 + k^2)``, and k is clamped to the image and a margin. So the radius is at most
     ``3 s C / z`` with one C per camera, plus the blur; multiplied by z, the test is linear in position and s.
 
-    Args:
-        means: centres, world units ``[N, 3]``.
-        scales: logarithms of the standard deviations ``[N, 3]``.
-        viewmats: world-to-camera ``[R, 4, 4]``.
-        Ks: intrinsics in pixels ``[R, 3, 3]``.
-        sizes: width and height in pixels ``[R, 2]``.
+    Takes centres and logarithms of standard deviations ``[N, 3]``, world-to-camera transforms ``[R, 4, 4]``, and
+    intrinsics ``[R, 3, 3]`` and sizes ``[R, 2]`` in pixels.
     """
     off_axis = Ks[:, :2, 2] - sizes / 2
     limit = off_axis.abs() + (0.5 + 0.5 * FOV_MARGIN) * sizes
@@ -226,12 +222,7 @@ class BatchOptimizers(Optimizers):
 
 
 class Ranks:
-    """The processes that train one scene. For a single one, every method leaves things as they are.
-
-    Args:
-        rank: of this process.
-        count: number of ranks, of the default process group.
-    """
+    """The processes, of the default group, that train one scene. For a single one, all methods leave things alone."""
 
     def __init__(self, rank: int = 0, count: int = 1) -> None:
         self.rank, self.count = rank, count

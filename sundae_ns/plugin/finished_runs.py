@@ -31,14 +31,14 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, PackError
+from sundae_ns.core.values import usual_defaults
 from sundae_ns.head.head import HeadConfig
 from sundae_ns.io import checkpoint
 from sundae_ns.io.config_file import check_run, config_of, load_config
 from sundae_ns.io.formats import kind_of, refuse, unread
 from sundae_ns.io.run_folder import prunes_of
-from sundae_ns.plugin.camera_models import camera_of
 from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
-from sundae_ns.plugin.dataparsers import check_capture
+from sundae_ns.plugin.dataparsers import camera_of, check_capture
 from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.cameras import is_number
@@ -84,6 +84,7 @@ class Opened:
         return (self.capture.parent if self.capture.suffix == ".json" else self.capture).resolve().name
 
 
+@usual_defaults()
 def load_model(path: Path, data: Path | None = None, *, split: Literal["test", "val"] = "test") -> Opened:
     """Open a finished scene as a model, with its test views. No code in its files runs, and they are only read.
 
@@ -197,13 +198,9 @@ def model_of(scene: Scene) -> SundaeModel:
     """The model of a scene in evaluation mode, on the CPU, with all SH degrees and the head enabled."""
     degree = 0 if scene.gaussians.encoding == "logits" else max(scene.gaussians.sh_degree, 1)
     head = HeadConfig(mode="off") if scene.head is None else dataclasses.replace(scene.head.config, start_at=0)
-    config = SundaeModelConfig(
-        sh_degree=degree,
-        sh_degree_interval=1,
-        rasterize_mode="antialiased" if scene.antialiased else "classic",
-        background_color=scene.background_color,
-        head=head,
-    )
+    look: Any = {"rasterize_mode": "antialiased" if scene.antialiased else "classic"}
+    look |= {"background_color": scene.background_color, "sh_degree": degree, "sh_degree_interval": 1}
+    config = SundaeModelConfig(head=head, **look)
     config.camera_optimizer.mode = "off"
     # Two points; without any, the model would start from tens of thousands of random points.
     seeds = (torch.eye(3)[:2], torch.zeros(2, 3))
@@ -231,17 +228,11 @@ def place(model: SundaeModel, gaussians: Mapping[str, Tensor]) -> None:
         value.data = new
 
 
+@usual_defaults()
 def load_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> Scene:
-    """The scene of a finished run with some of its training cameras, and what says how its capture is read.
+    """The scene of a finished run with at most ``max_cameras`` training cameras, and how its capture is read.
 
-    Args:
-        run: folder of a run of sundae or splatfacto, or its ``config.yml``, which is not run.
-        max_cameras: highest number of training cameras, evenly chosen; with 0 the capture is not needed.
-        data: the capture, if it has moved.
-
-    Raises:
-        CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
-        DataError: its capture is gone, or cannot be used.
+    Arguments and errors are those of :func:`load_model`; with 0 cameras the capture is not needed.
     """
     check_run(run)
     path = config_of(run)
@@ -250,17 +241,15 @@ def load_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> 
     manager.data = data or manager.data or config.data
     source = {"method": config.method_name, **scene.meta["source"]}
     meta = {**scene.meta, "source": source, "capture": describe_capture(manager)}
-    cameras, up = _training_views(manager, max_cameras) if max_cameras > 0 else (), scene.up
+    cameras, up = tuple[Camera, ...](), scene.up
+    if max_cameras > 0:
+        views: Cameras = manager.setup(device="cpu", test_mode="test").train_dataset.cameras
+        chosen = torch.linspace(0, len(views) - 1, min(max_cameras, len(views))).round().long().tolist()
+        cameras = tuple(camera_of(views[i : i + 1], "cpu") for i in chosen)
     if up is None and cameras:
         with suppress(ConfigError):  # cameras that look all around have none
             up = unit(torch.stack([camera.pose[:, 1] for camera in cameras]).double().mean(dim=0).tolist())
     return dataclasses.replace(scene, cameras=cameras, up=up, meta=meta)
-
-
-def _training_views(manager: SundaeDatamanagerConfig, most: int) -> tuple[Camera, ...]:
-    cameras: Cameras = manager.setup(device="cpu", test_mode="test").train_dataset.cameras
-    chosen = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()
-    return tuple(camera_of(cameras[i : i + 1], "cpu") for i in chosen)
 
 
 def describe_capture(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
@@ -294,13 +283,8 @@ def datamanager_of(scene: Scene, data: Path) -> SundaeDatamanagerConfig:
     stated: Any = scene.meta.get("capture")
     parser, scale = stated_capture(stated)
     check_capture(parser, data, ("train", "test"))
-    return SundaeDatamanagerConfig(
-        dataparser=parser,
-        camera_res_scale_factor=scale,
-        data=data.resolve(),
-        cache_images_type="uint8",
-        robust_frame=stated.get("robust_frame") is True,
-    )
+    shape: Any = {"camera_res_scale_factor": scale, "robust_frame": stated.get("robust_frame") is True}
+    return SundaeDatamanagerConfig(dataparser=parser, data=data.resolve(), cache_images_type="uint8", **shape)
 
 
 def stated_capture(stated: Any) -> tuple[DataParserConfig, float]:

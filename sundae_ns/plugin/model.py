@@ -31,8 +31,8 @@ from sundae_ns.io import checkpoint
 from sundae_ns.io.accounting import bytes_of, bytes_of_module
 from sundae_ns.io.config_file import find_config
 from sundae_ns.io.run_folder import take_records
-from sundae_ns.plugin.camera_models import camera_of, check_projection
 from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanager, view_index
+from sundae_ns.plugin.dataparsers import camera_of, check_projection
 from sundae_ns.plugin.distributed import Ranks
 from sundae_ns.plugin.viewer import ViewerControls, in_viewer
 from sundae_ns.rasterize.interface import select_backend

@@ -86,10 +86,8 @@ class PruneAwareDecay(Scheduler):
         """A ``LambdaLR`` whose state holds Python numbers only."""
         config = self.config
         restart = None if config.lr_restart is None else config.lr_restart / lr_init
-        hold, rise = config.hold_until_prune, config.warmup_steps
-        return LambdaLR(
-            optimizer, Decay(config.lr_final / lr_init, config.max_steps, restart, hold, rise, config.shape)
-        )
+        shape = config.hold_until_prune, config.warmup_steps, config.shape
+        return LambdaLR(optimizer, Decay(config.lr_final / lr_init, config.max_steps, restart, *shape))
 
 
 class ProgressWriter(LocalWriter):
@@ -104,11 +102,7 @@ class ProgressWriter(LocalWriter):
         self._time_left = TimeLeft()
 
     def write_stats_log(self, step: int) -> None:
-        """Print a line if it is due.
-
-        Args:
-            step: ignored; it belongs to nerfstudio's first event, which is the configuration after a start.
-        """
+        """Print a line if it is due; ``step`` belongs to nerfstudio's first event, the configuration after a start."""
         events = {event["name"]: event for event in EVENT_STORAGE}
         # nerfstudio measures every few steps only, and ten steps after a prune may take a minute on a CPU.
         if METRICS_EVENT in events:

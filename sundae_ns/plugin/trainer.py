@@ -24,14 +24,14 @@ from rich.table import Table
 
 from sundae_ns.core.errors import NOTHING_SAVED, CheckpointError, SundaeError, one_line
 from sundae_ns.core.files import write_text, writing
+from sundae_ns.core.values import usual_defaults
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io import checkpoint, run_folder
 from sundae_ns.io.checkpoint import random_state, set_random_state
 from sundae_ns.io.config_file import find_capture
 from sundae_ns.plugin import distributed
-from sundae_ns.plugin.camera_models import warn_of_other_frame
 from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
-from sundae_ns.plugin.dataparsers import check_capture
+from sundae_ns.plugin.dataparsers import check_capture, warn_of_other_frame
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.plugin.viewer import stop_rendering
@@ -125,6 +125,7 @@ class SundaeTrainer(Trainer):
         self._stopped_by = 0  # the signal that ends this training after the step; 0 for none
         self._interruption = Interruption(self._stop, quiet=local_rank != 0)
 
+    @usual_defaults()
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Load the capture and, if a run is resumed, its checkpoint."""
         try:
@@ -164,6 +165,7 @@ class SundaeTrainer(Trainer):
                 if first:
                     super().eval_iteration(step)
 
+    @usual_defaults()
     def train(self) -> None:
         """Train; errors of a full disk or a full GPU say so in one line."""
         with (

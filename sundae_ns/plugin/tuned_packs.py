@@ -23,6 +23,7 @@ from torch import Tensor
 
 from sundae_ns.core.errors import CheckpointError, ConfigError, PackError, SundaeError
 from sundae_ns.core.metrics import Quality, evaluate
+from sundae_ns.core.values import usual_defaults
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.pack.codecs import Codecs, estimated_bits
 from sundae_ns.io.pack.config import STEPS, PackConfig
@@ -45,6 +46,7 @@ RATE = 0.025  # Loss for each bit per stored number: about what a bit less costs
 FINEST, COARSEST = -3.0, 4.0  # Ends of the search: powers of two of the factor
 
 
+@usual_defaults()
 def finetune(
     run: Path,
     scene: PackedScene,

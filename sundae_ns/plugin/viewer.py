@@ -123,12 +123,9 @@ class ViewerControls(torch.nn.Module):
         self.expected.value = f"{count:,} Gaussians{figures}"
 
     def visible(self, source: GaussianSource, crop: Tensor | None, *, compensate: bool) -> Visible | None:
-        """What the next image shows; None if it shows no Gaussian.
+        """What the next image of a ``source`` shows; None if it shows no Gaussian.
 
-        Args:
-            source: of all Gaussians.
-            crop: Gaussians in the crop box, bool ``[N]``; None for no box.
-            compensate: whether images outside of a viewer get the head's correction.
+        ``crop`` are the Gaussians in the crop box, bool ``[N]``; ``compensate`` counts outside of a viewer.
         """
         preview = self.preview()
         if preview is not None:

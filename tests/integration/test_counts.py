@@ -135,7 +135,7 @@ def test_trials_choose_the_count_and_leave_nothing_else_behind(make: Make, judge
     assert (prune["before"], prune["after"], prune["step"]) == (full, chosen, record["step"])
 
 
-@pytest.mark.parametrize(("gain", "decision"), [(4.0, "head"), (0.2, "plain"), (-0.3, "plain")])
+@pytest.mark.parametrize(("gain", "decision"), [(4.0, "head"), (0.2, "plain")])
 def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make: Make, judge: Any, gain: float, decision: str) -> None:
     """If it gains enough for its bytes, which are several times those of this field."""
     judge(LEVEL, gain)
@@ -195,16 +195,11 @@ def test_a_head_in_any_case_rests_during_the_trials_and_counts_its_own_steps(mak
     assert not model.state.provisional
 
 
-@pytest.mark.parametrize(
-    ("pruning", "kept"),
-    [({"max_gaussians": 9}, 9), ({"max_bytes": 1}, 1), ({"max_drop": 20.0}, 5)],  # 5: 2.5% of 200
-)
-def test_a_budget_works_on_the_same_curve(make: Make, judge: Any, pruning: dict[str, Any], kept: int) -> None:
+def test_a_budget_works_on_the_same_curve(make: Make, judge: Any) -> None:
     judge(LEVEL)
-    trainer = make(pruning=pruning)
+    trainer = make(pruning={"max_gaussians": 9})
     trainer.train()
-    assert trainer.pipeline.model.num_points == record_of(trainer)["chosen"]  # type: ignore[union-attr]
-    assert abs(record_of(trainer)["chosen"] - kept) <= (1 if pruning.get("max_drop") else 0)
+    assert trainer.pipeline.model.num_points == record_of(trainer)["chosen"] == 9  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
@@ -223,11 +218,4 @@ def test_where_trials_cannot_decide_a_tenth_stays_and_one_line_says_so(
     assert trainer.pipeline.model.num_points == 20  # type: ignore[union-attr]
     said = " ".join(capsys.readouterr().out.split())
     assert said.count(f"pruning keeps 10% of the Gaussians: {reason}") == 1
-    assert "count" not in records_of(trainer)
-
-
-def test_a_number_that_the_user_gives_is_kept_exactly(make: Make) -> None:
-    trainer = make(pruning={"target_gaussians": 33})
-    trainer.train()
-    assert trainer.pipeline.model.num_points == 33  # type: ignore[union-attr]
     assert "count" not in records_of(trainer)

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import sundae_ns as sn
-from sundae_ns.plugin.camera_models import camera_of
+from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.finished_runs import load_model
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "bench_formats.py"

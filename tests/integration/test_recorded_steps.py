@@ -102,12 +102,23 @@ def test_training_goes_on_where_a_recording_fails(
     assert "without recordings, slower: no memory for a recording" in " ".join(capsys.readouterr().out.split())
 
 
-def test_what_cannot_be_recorded_runs_as_before(trainer_of: MakeTrainer) -> None:
+def test_what_cannot_be_recorded_runs_as_before_under_every_default_dtype(trainer_of: MakeTrainer) -> None:
     """On a CPU there is nothing to record; on a GPU, options decide."""
 
     def change(config: Any) -> None:
-        config.max_num_iterations = 1
+        config.max_num_iterations = 2
 
-    trainer: Any = trainer_of(change)
-    assert trainer._recorded is None
-    assert not trainer._recordable()
+    fields = []
+    for dtype in (torch.float32, torch.float64):
+        torch.manual_seed(0)
+        torch.set_default_dtype(dtype)
+        try:
+            trainer: Any = trainer_of(change)
+            trainer.train()
+            assert torch.get_default_dtype() == dtype
+        finally:
+            torch.set_default_dtype(torch.float32)
+        assert trainer._recorded is None
+        assert not trainer._recordable()
+        fields.append(dict(trainer.model.gauss_params))
+    assert all(torch.equal(value, fields[1][name]) for name, value in fields[0].items())

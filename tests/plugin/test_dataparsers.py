@@ -19,8 +19,8 @@ from plyfile import PlyData, PlyElement
 from small_captures import meta_of
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.plugin.camera_models import warn_of_other_frame
 from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanagerConfig
+from sundae_ns.plugin.dataparsers import warn_of_other_frame
 from sundae_ns.plugin.finished_runs import datamanager_of, describe_capture
 from sundae_ns.scene.cameras import cameras_of
 from sundae_ns.scene.scene import Scene

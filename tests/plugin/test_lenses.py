@@ -19,7 +19,7 @@ from small_captures import meta_of
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.data.lenses import COLMAP_LENSES, lens_of
-from sundae_ns.plugin.camera_models import check_projection
+from sundae_ns.plugin.dataparsers import check_projection
 from sundae_ns.scene.cameras import cameras_of
 
 Load = Callable[..., Any]

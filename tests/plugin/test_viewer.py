@@ -9,75 +9,45 @@ from typing import Any, get_args
 
 import pytest
 import torch
-from models import as_the_viewer
-from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from models import FakeDatamanager, Training, _build, _camera, _perturb, as_the_viewer
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.scene_box import OrientedBox, SceneBox
-from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from torch import Tensor
 
 import sundae_ns.plugin.viewer
 import sundae_ns.pruning.decision
-from sundae_ns.head.head import HeadConfig
-from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
-from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
+from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.plugin.viewer import RuleName, ViewerControls, previewed_rule
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import response
 from sundae_ns.scene.render import GaussianSource, render_view
 from sundae_ns.train.curve import CurvePoint, expected_change
-from sundae_ns.train.pruning import UNPRUNED, PruningConfig, prune_when_due
+from sundae_ns.train.pruning import UNPRUNED, prune_when_due
 
 N = 90
 RULES: tuple[RuleName, ...] = get_args(RuleName)
 
 
 def camera(shift: float = 0.0) -> Cameras:
-    pose = torch.eye(4)[None, :3].clone()
-    pose[0, :, 3] = torch.tensor([shift, 0.1, 3.0])
-    return Cameras(pose, fx=30.0, fy=30.0, cx=16.0, cy=12.0, width=32, height=24)
+    return _camera(32, 24, shift)
 
 
-class Views:
-    """A datamanager with two training cameras, which counts how often they are asked for."""
+class Views(FakeDatamanager):
+    """Counts how often its cameras are asked for."""
 
-    eval_dataset = None
-    place = (0, 1)
-    train_indices = (0, 1)
-    holdout_indices: tuple[int, ...] = ()
     asked = 0
 
-    def training_views(self) -> Iterator[tuple[Cameras, None]]:
+    def training_views(self) -> Iterator[tuple[Cameras, Tensor | None]]:
         self.asked += 1
-        yield from ((camera(-0.5), None), (camera(0.5), None))
+        return super().training_views()
 
 
 def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:
     """A model whose head takes part, as a viewer has set it up."""
-    generator = torch.Generator().manual_seed(1)
-    xyz = torch.randn(n, 3, generator=generator) * 0.5
-    rgb = torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
-    config = SundaeModelConfig(
-        pruning=PruningConfig(**{"prune_at": 3, "keep_ratio": 0.5, **pruning}),
-        head=HeadConfig(mode="residual", size="tiny", num_features=5, pixel_unshuffle=1),
-        camera_optimizer=CameraOptimizerConfig(mode="off"),
-        sh_degree=1,
-        num_downscales=0,
-        background_color="black",
-        dense_start_views=0,
-    )
-    box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
-    model = config.setup(scene_box=box, num_train_data=2, metadata={}, seed_points=(xyz, rgb))
-    assert model.head is not None
-    with torch.no_grad():
-        for value in model.head.parameters():
-            value += 0.05 * torch.randn(value.shape, generator=generator)
-    model.step = 10
-    cameras = Views()
+    model, cameras = _perturb(_build(n=n, pruning=pruning, background_color="black")), Views()
     pipeline = SimpleNamespace(model=model, datamanager=cameras)
     model.viewer_controls.control._setup(SimpleNamespace(pipeline=pipeline, viser_server=None))  # type: ignore[arg-type]
     return model.eval(), cameras
@@ -284,27 +254,10 @@ def test_a_changed_field_is_scored_anew(calls: list[int]) -> None:
 
 
 def test_a_prune_in_training_is_seen_and_a_step_is_not(calls: list[int]) -> None:
-    model, cameras = build()
-    model.step = 0
-    groups = model.get_param_groups()
-    configs = {name: {"optimizer": FusedAdamConfig(lr=5e-3), "scheduler": None} for name in groups}
-    optimizers = Optimizers(configs, groups)
-    pipeline = SimpleNamespace(datamanager=cameras, model=model)
-    callbacks = model.get_training_callbacks(
-        TrainingCallbackAttributes(optimizers, None, pipeline, None)  # type: ignore[arg-type]
-    )
-    truth = {"image": torch.zeros(24, 32, 3, dtype=torch.uint8)}
-    model.viewer_controls.rule.value, model.viewer_controls.keep_ratio.value = "band: both", 0.2
-    kept = []
+    model, _ = build()
+    model.step, training, kept = 0, Training(model), []
     for step in range(5):
-        model.train()
-        for callback in callbacks:
-            callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        outputs = model(camera())
-        sum(model.get_loss_dict(outputs, truth).values()).backward()  # type: ignore[union-attr]
-        optimizers.optimizer_step_all()
-        for callback in callbacks:
-            callback.run_callback_at_location(step, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        training.step(step)
         model.eval()
         kept.append(int(shown(model, "band: both", 0.2).sum()))  # type: ignore[union-attr]
     after = model.num_points

@@ -367,7 +367,7 @@ def test_one_process_is_left_as_it_is() -> None:
         assert first
 
 
-def test_an_error_of_sundae_in_a_rank_keeps_its_message(tmp_path: Path) -> None:
+def test_an_error_of_sundae_in_a_rank_keeps_its_message() -> None:
     class Raised(Exception):
         error_index = 1
 
@@ -375,19 +375,6 @@ def test_an_error_of_sundae_in_a_rank_keeps_its_message(tmp_path: Path) -> None:
     text += "Traceback ...\nsundae_ns.core.errors.DataError: cause; mend\n"
     assert str(rank_ended(Raised(text))) == "rank 1: cause; mend"
     assert "rank 1 ended (ValueError: odd)" in str(rank_ended(Raised("Traceback ...\nValueError: odd")))
-    code = """
-import sys
-sys.argv = ["/usr/bin/ns-train"]
-from torch.multiprocessing.spawn import ProcessExitedException
-from sundae_ns.core.errors import show_in_one_line
-show_in_one_line()
-raise ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -9, "SIGKILL")
-"""
-    (tmp_path / "program").write_text(code)
-    found, printed = forked.run(tmp_path / "program")
-    assert found == 1
-    (line,) = printed.splitlines()
-    assert line.startswith("sundae: rank 1 ended (killed by SIGKILL)")
 
 
 @pytest.mark.gpu

@@ -13,7 +13,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.core.covariance import rotation_matrices
-from sundae_ns.plugin.camera_models import camera_of
+from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.scene.render import StepResolution
 
