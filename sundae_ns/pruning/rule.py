@@ -68,11 +68,7 @@ class PruneRule:
         return self.selection == "pairs" and self.redistribution == "merge"
 
     def validate(self) -> None:
-        """Check every option.
-
-        Raises:
-            ConfigError: names the first invalid option and its valid values.
-        """
+        """Raise a ConfigError that names the first invalid option and its valid values."""
         for name, hint in get_type_hints(type(self)).items():
             value, kinds = getattr(self, name), (hint, *get_args(hint))
             choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]

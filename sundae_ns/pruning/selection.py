@@ -124,11 +124,7 @@ def _systematic_sample(probabilities: Tensor, count: int, start: float) -> Tenso
 
 
 def as_scores(score: Tensor, count: int) -> Tensor:
-    """Scores as float64 on the CPU ``[N]``.
-
-    Raises:
-        DataError: they have another shape, or ``count`` is not in 1 to N.
-    """
+    """Scores as float64 on the CPU ``[N]``; DataError if they have another shape or ``count`` is not in 1 to N."""
     if score.ndim != 1:
         raise DataError(f"scores have shape {list(score.shape)}: pass one number per Gaussian, [N]")
     if not 1 <= count <= len(score):

@@ -18,13 +18,12 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 log = logging.getLogger(__name__)
 
 AVERAGED_EVERY = 10  # Steps between two weights that count: neighbours differ by little
-NamedTensors = Mapping[str, Tensor]
 
 
 class RunningMean:
     """The mean of ``count`` weights so far, by name; they are counted in one after another."""
 
-    def __init__(self, values: NamedTensors | None = None, count: int = 0) -> None:
+    def __init__(self, values: Mapping[str, Tensor] | None = None, count: int = 0) -> None:
         self.values, self.count = dict(values or {}), count
 
     @classmethod
@@ -38,7 +37,7 @@ class RunningMean:
         return {"mean": self.values, "count": self.count}
 
     @torch.no_grad()
-    def count_in(self, weights: NamedTensors) -> None:
+    def count_in(self, weights: Mapping[str, Tensor]) -> None:
         """Count weights in; those of other shapes begin a new mean."""
         if not self.fits(weights):
             self.values, self.count = {name: value.clone() for name, value in weights.items()}, 0
@@ -48,7 +47,7 @@ class RunningMean:
         torch._foreach_lerp_([self.values[name] for name in weights], list(weights.values()), 1 / self.count)
 
     @torch.no_grad()
-    def replace(self, weights: NamedTensors) -> dict[str, Tensor]:
+    def replace(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Put the mean, if one fits, in the place of weights; returns their copies, which are empty without a mean."""
         copies = {name: value.clone() for name, value in weights.items()} if self.fits(weights) else {}
         for name in copies:
@@ -56,7 +55,7 @@ class RunningMean:
         return copies
 
     @contextmanager
-    def shown(self, weights: NamedTensors) -> Iterator[None]:
+    def shown(self, weights: Mapping[str, Tensor]) -> Iterator[None]:
         """Put the mean, if one fits, in the place of weights for the length of a block."""
         copies = self.replace(weights)
         try:
@@ -64,7 +63,7 @@ class RunningMean:
         finally:
             RunningMean(copies, len(copies)).replace(weights)
 
-    def fits(self, weights: NamedTensors) -> bool:
+    def fits(self, weights: Mapping[str, Tensor]) -> bool:
         """Whether there is a mean, and of weights of these names and shapes."""
         same_names = self.count > 0 and self.values.keys() == weights.keys()
         return same_names and all(value.shape == self.values[name].shape for name, value in weights.items())
@@ -89,8 +88,7 @@ class Averaging(Callback):
     name = "averaging"
 
     def __init__(self, share: float, settled_at: float) -> None:
-        self.share = share
-        self.settled_at = settled_at
+        self.share, self.settled_at = share, settled_at
         self._mean = RunningMean()
         self._restored = 0  # Returns to a snapshot that the field had made when the mean began
         self._replaced: dict[str, Tensor] = {}  # Weights of the last step, from which a longer training goes on

@@ -61,10 +61,9 @@ def build(
     strategy, num_features = make_strategy(options, num_images), 0 if head.mode == "off" else head.num_features
     params, start = initial_gaussians(options, points, frame, num_features=num_features, cap=strategy.cap)
     gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
-    networks = torch.nn.ModuleDict({} if head.mode == "off" else {"head": CompensationHead(head)})
     state = TrainingState(
         gaussians=Gaussians(cast(Any, gauss_params), "logits" if options.sh_degree == 0 else "harmonics"),
-        networks=networks,
+        networks=torch.nn.ModuleDict({} if head.mode == "off" else {"head": CompensationHead(head)}),
         offset=pruning.prune_at if warm else 0,
         densify_until=strategy.refine_stop_iter,
         head_starts_at=pruning.settled_at if head.start_at is None else head.start_at,

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from sundae_ns.train.curve import CurvePoint
 
-HEADS = ("plain", "head", "features")
-"""Heads in the order of their trials: none, the head as configured, one of more features. Each takes more bytes."""
+HEADS = ("plain", "head", "features")  # In the order of their trials: none, as configured, with more features
 PSNR_WEIGHTS, SSIM_WEIGHTS = (0.75, 0.1), (0.75, 0.003)
 """Weight of PSNR (SSIM) at the end of a trial, and dB (SSIM) that each halving of the count gains after it."""
 HEAD_PSNR, HEAD_SSIM = (3.0, 0.4), (2.0, 1.0)
@@ -105,9 +104,8 @@ def best_head(tried: Sequence[Tried], folds: int) -> str:
     for first in range(0, len(tried) - folds + 1, folds):
         rows = list(tried[first : first + folds])
         if best:
-            (psnr, ssim), (better, closer) = (
-                mean_quality([view for row in candidate for view in row.qualities]) for candidate in (best, rows)
-            )
+            views = [[view for row in candidate for view in row.qualities] for candidate in (best, rows)]
+            (psnr, ssim), (better, closer) = map(mean_quality, views)
             doublings = math.log2(sum(rows[0].bytes or [1]) / sum(best[0].bytes or [1]))
             if not is_enough(better - psnr, closer - ssim, doublings):
                 continue

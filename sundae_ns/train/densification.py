@@ -77,11 +77,6 @@ class CappedStrategy(DefaultStrategy):
 
     cap: int | None = None  # Highest number of Gaussians; None for no cap
 
-    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """State of gsplat's strategy, and the peak."""
-        return {**super().initialize_state(scene_scale), "peak": 0}
-
-    @torch.no_grad()
     def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
         """Add the statistics of a step, unless they have been added."""
         if not info.get(COUNTED):
@@ -109,7 +104,7 @@ class Densification(Callback):
     def initialize(self, state: TrainingState) -> None:
         """Start the running state anew, as for a field that has not been trained."""
         state.densification.clear()
-        state.densification.update(self.strategy.initialize_state(scene_scale=1.0))
+        state.densification.update(self.strategy.initialize_state(scene_scale=1.0), peak=0)
 
     def before_backward(self, state: TrainingState) -> None:
         """Keep the gradients that densification reads."""

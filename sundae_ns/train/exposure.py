@@ -124,8 +124,7 @@ class ExposureCompensation(Callback):
         """Log the largest difference."""
         if self._smoother is None or not self._divides:
             return
-        exposure = self._gains.double().cpu().log().mean(dim=1)
-        most = float(exposure.abs().max().exp()) - 1
+        most = float(self._gains.double().cpu().log().mean(dim=1).abs().max().exp()) - 1
         changed = f"up to {most:.0%} brighter or darker than those beside them; training has taken that out"
         log.info(f"photos are {changed if most > 0 else 'as bright as those beside them; none was changed'}")
 
@@ -143,8 +142,7 @@ class ExposureCompensation(Callback):
         ready = self._state.step + 1 >= FIRST_STEPS and self._counts[rows].mean() >= FIRST_MEASUREMENTS
         if self._divides is None and ready:
             self._divides = bool(np.median(np.sqrt(np.square(response).mean(axis=1))) > NOTICED)
-            if not self._divides:
-                self._smoother = None
+            self._smoother = self._smoother if self._divides else None
         if not self._divides:
             return
         # The positive-part estimator of James and Stein; it is 0 up to the size of the noise.

@@ -270,8 +270,7 @@ class RecordedStep:
     """Training steps of one set of Gaussians; without ``record`` kernel by kernel, as a test does on a CPU."""
 
     def __init__(self, losses: StepLosses, *, record: bool = True) -> None:
-        self._losses = losses
-        self._buffers = Buffers()
+        self._losses, self._buffers = losses, Buffers()
         self._held: _Held | None = None
         self._recordings = StepRecordings(record=record)
 
@@ -287,21 +286,14 @@ class RecordedStep:
         held = self._held
         if held is None or not held.unchanged(state, settings):
             held = self._held = self._hold(state, settings)
+        values = [*(float(group["lr"]) for _, _, group in held.groups), float(state.gaussians.num_gaussians)]
         # Pinned: copying from other memory would wait until the GPU has finished the last step.
-        numbers = torch.tensor(
-            [*(float(group["lr"]) for _, _, group in held.groups), float(state.gaussians.num_gaussians)],
-            dtype=torch.float32,
-            pin_memory=state.device.type == "cuda",
-        ).to(state.device, non_blocking=True)
+        pinned = torch.tensor(values, dtype=torch.float32, pin_memory=state.device.type == "cuda")
+        numbers = pinned.to(state.device, non_blocking=True)
         # The prior of a field that grows is a mean over fewer rows than the buffers have.
         count = numbers[-1] if state.densifying and self._losses.prior_weight(state) > 0 else None
-        result = self._recordings.run(
-            partial(self._step, state, held),
-            replace(inputs, rates=numbers[:-1], count=count),
-            settings,
-            kind=_kind(state, inputs, settings),
-            addresses=held.addresses,
-        )
+        inputs, kind = replace(inputs, rates=numbers[:-1], count=count), _kind(state, inputs, settings)
+        result = self._recordings.run(partial(self._step, state, held), inputs, settings, kind, held.addresses)
         if result is not None:
             state.info = {COUNTED: True}
         return result

@@ -110,16 +110,14 @@ def _warm_gaussians(options: Any, source: Path, frame: Frame | None, num_feature
     if options.warm_start_frame != "auto":
         in_model_frame = options.warm_start_frame == "model"
     elif kind_of(source) == "gsplat":
-        raise CheckpointError(
-            f"{source} does not state its coordinates, and gsplat turns and scales a capture unless it trains with "
-            "--no-normalize-world-space; if it did, give --pipeline.model.warm-start-frame capture"
-        )
+        turned = f"{source} does not state its coordinates, which gsplat changes without --no-normalize-world-space"
+        raise CheckpointError(f"{turned}; if it had that, give --pipeline.model.warm-start-frame capture")
     if not in_model_frame:
         if frame is None:
-            raise CheckpointError(
-                "the warm start is in the capture's coordinates, and only sundae's datamanager knows their transform; "
-                "train with it, or give --pipeline.model.warm-start-frame model"
+            unknown = (
+                "the warm start is in the capture's coordinates, and only sundae's datamanager knows their transform"
             )
+            raise CheckpointError(f"{unknown}; train with it, or give --pipeline.model.warm-start-frame model")
         params = similarity(params, *frame)
         params["means"] = params["means"].float()  # survey coordinates are float64 until here
     columns = (options.sh_degree + 1) ** 2 - 1
@@ -173,7 +171,5 @@ class DenseStart(Callback):
         params, _ = initial_gaussians(self._options, points, None, num_features=self._num_features, cap=self._cap)
         for name, value in params.items():  # without moments
             replace_parameter(state.gaussians.data, state.optimizers, name, value.to(state.device), {})
-        log.info(
-            f"{len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones "
-            "(--pipeline.model.dense-start-views 0 leaves them out)"
-        )
+        without = "--pipeline.model.dense-start-views 0 leaves them out"
+        log.info(f"{len(xyz):,} points by a plane sweep beside {len(sparse):,} sparse ones ({without})")

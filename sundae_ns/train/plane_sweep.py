@@ -148,10 +148,8 @@ def _reduced(photo: Photo, longest: int) -> _Reduced:
     mask = torch.ones_like(image[:, :1]) if photo.mask is None else photo.mask[None, None].to(image)
     if longest < max(camera.width, camera.height):
         camera = camera.zoomed(longest / max(camera.width, camera.height))
-        image, mask = (
-            interpolate(value, (camera.height, camera.width), mode="bilinear", antialias=True)
-            for value in (image, mask)
-        )
+        size = (camera.height, camera.width)
+        image, mask = (interpolate(value, size, mode="bilinear", antialias=True) for value in (image, mask))
     grey = image.mean(dim=1, keepdim=True)
     patches = _patches(grey)
     usable = (patches.deviation > CONTRAST) & (_box(mask)[0, 0] / patches.size > 0.99)

@@ -88,13 +88,10 @@ def long_on_cpu(seconds: float, left: int) -> str | None:
 
     The seconds are of one of the first steps, which use smaller images and fewer Gaussians than the ``left`` ones.
     """
-    if seconds * left <= LONG:
-        return None
-    return (
-        f"this training runs on a CPU and takes at least {duration(seconds * left)} more ({1000 * seconds:.0f} ms a "
-        "step). sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and smaller images "
-        "are faster: end the command with nerfstudio-data --downscale-factor 4"
-    )
+    least = f"this training runs on a CPU and takes at least {duration(seconds * left)} more"
+    smaller = "smaller images are faster: end the command with nerfstudio-data --downscale-factor 4"
+    ways = f"sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and {smaller}"
+    return None if seconds * left <= LONG else f"{least} ({1000 * seconds:.0f} ms a step). {ways}"
 
 
 COMMANDS = ("ns-eval", "ns-render", "ns-export", "ns-viewer")  # They only read the run of --load-config

@@ -32,12 +32,11 @@ log = logging.getLogger(__name__)
 
 USUAL_SHARE = 0.1  # Share that a prune keeps unless it is told otherwise; also where trials cannot decide
 NEVER = -1  # Value of state["pruned_at"] before the first prune
-UNPRUNED = {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}
-"""Running state at the start: step of the last prune, number of prunes, peak number of Gaussians."""
+UNPRUNED = {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}  # Running state at the start; the peak is of Gaussians
 COUNT = "count"  # Key of the running state with the number that trials have chosen; 0 for the usual share
-LEAST_OPACITY = 0.005
-"""Lowest opacity of Gaussians that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
+LEAST_OPACITY = 0.005  # Of Gaussians that share the appearance of one; 3DGS-MCMC counts lower ones as dead
 
+Running = MutableMapping[str, Any]
 Contribute = Callable[[int | None], Tensor]
 """Renders the training views and returns the contribution of the pruner's Gaussians ``[N]``; the argument is ``count``
 of :func:`sundae_ns.scene.render.contribution`."""
@@ -158,11 +157,7 @@ def write_record(run: TrainingRun, name: str, record: Any) -> None:
 
 
 def prune_when_due(
-    config: PruningConfig,
-    pruner: Pruner,
-    state: MutableMapping[str, Any],
-    step: int,
-    contribute: Contribute | None = None,
+    config: PruningConfig, pruner: Pruner, state: Running, step: int, contribute: Contribute
 ) -> dict[str, Any] | None:
     """Prune if it is due; add Gaussians that lack to the target. Call it after optimizers and densification.
 
@@ -182,12 +177,7 @@ def prune_when_due(
 
 
 def prune_to(
-    target: Callable[[int], int],
-    rule: PruneRule,
-    pruner: Pruner,
-    state: MutableMapping[str, Any],
-    step: int,
-    contribute: Contribute | None,
+    target: Callable[[int], int], rule: PruneRule, pruner: Pruner, state: Running, step: int, contribute: Contribute
 ) -> dict[str, Any]:
     """Prune in training: drop what is not finite, decide the count, render, cut, and record the step.
 
@@ -205,14 +195,13 @@ def prune_to(
         threshold on squared distances, ``sigma``, the width of the edge weights, and the number of ``isolated``.
 
     Raises:
-        ConfigError: the rule needs a contribution and there is none.
         DataError: the field cannot be pruned, see :func:`sundae_ns.pruning.decision.decide`.
     """
     device = pruner.params["means"].device
     before, started = pruner.total, now(device)
     dropped = pruner.drop_nonfinite()
     count, weights = target(pruner.total), None
-    if contribute is not None and rule.uses_contribution and count < pruner.total:
+    if rule.uses_contribution and count < pruner.total:
         weights = contribute(count if rule.uses_detail else None)
     decision = pruner.cut(rule, count, weights)
     state.update(pruned_at=step, num_prunes=state["num_prunes"] + 1)

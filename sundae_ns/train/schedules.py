@@ -94,25 +94,20 @@ def network_groups(
     return [{"params": values, "lr": rate, "weight_decay": decay} for (rate, decay), values in groups.items()]
 
 
-def sparse_factor(num_gaussians: int) -> float:
-    """Factor on the learning rate of the centres after a prune."""
-    return min(max(1.0, math.sqrt(SPARSE / max(num_gaussians, 1))), MOST_FACTOR)
+def sparse_factor(count: int) -> float:
+    """Factor on the learning rate of the centres after a prune to this number of Gaussians."""
+    return min(max(1.0, math.sqrt(SPARSE / max(count, 1))), MOST_FACTOR)
 
 
 def notify_pruned(
-    schedulers: Mapping[str, LRScheduler],
-    step: int,
-    num_gaussians: int,
-    *,
-    last: bool = True,
-    ends_at: int | None = None,
+    schedulers: Mapping[str, LRScheduler], step: int, count: int, *, last: bool = True, ends_at: int | None = None
 ) -> None:
     """Restart every :class:`Decay` among ``schedulers`` at ``step``; later calls change nothing.
 
     Args:
         schedulers: by name.
         step: training step of the prune.
-        num_gaussians: number that was kept. With fewer than :data:`SPARSE` centres move faster.
+        count: number of Gaussians that were kept. With fewer than :data:`SPARSE` centres move faster.
         last: False while pruning goes on or the head is still disabled; rates that hold until then are left alone.
         ends_at: training step at which they reach their final value, as for a trial; None for that of the run.
     """
@@ -120,7 +115,7 @@ def notify_pruned(
         if decay.pruned_at is None and (last or not decay.hold_until_prune):
             decay.pruned_at, decay.ends_at = step, ends_at
             if name == "means":
-                decay.after_prune = sparse_factor(num_gaussians)
+                decay.after_prune = sparse_factor(count)
             _apply(scheduler)
 
 
@@ -300,10 +295,9 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
     Raises:
         ConfigError: an option would change shapes or schedulers of the checkpoint.
     """
-    config.optimizers = deepcopy(config.optimizers)
+    config.optimizers, differing = deepcopy(config.optimizers), []
     names = [*step_options(usual), *_leaves(usual.pipeline.model, "pipeline.model")]
     free = set(_free(config, usual, given, names))
-    differing = []
     for name in dict.fromkeys(names):
         value = option(run, name)
         if name in free:

@@ -95,9 +95,8 @@ class TrainingState:
         if FEATURES in self.gaussians:
             features = self.gaussians[FEATURES]
             features.data, features.grad = features.data[:, :0], None
-        for name in ("compensation", FEATURES):
-            if name in self.optimizers:
-                self.optimizers[name].state.clear()
+        for name in {"compensation", FEATURES} & self.optimizers.keys():
+            self.optimizers[name].state.clear()
 
     def widen_head(self, num_features: int) -> bool:
         """Give the head this width of features, with fresh weights; returns whether it had another."""

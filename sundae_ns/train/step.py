@@ -104,8 +104,7 @@ def image_losses(
     root = ((image - target).square().mean() + LEAST_SQUARE).sqrt() if squares else None
     windows = weight > 0 and min(target.shape[:2]) >= SSIM_WINDOW
     single = all(value.dtype == torch.float32 for value in (image, target, base) if value is not None)
-    slower = "SSIM runs as slower convolutions"
-    if windows and single and kernels_where_possible(loss_kernels, image.device, slower):
+    if windows and single and kernels_where_possible(loss_kernels, image.device, "SSIM runs as slower convolutions"):
         loss, of_base = fused_loss(image, target, weight, base, l1_weight=0.0 if squares else 1 - weight)
         return loss if root is None else (1 - weight) * root + loss, of_base
     of_base = None if base is None else (base - target).abs().mean()

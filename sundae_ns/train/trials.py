@@ -79,10 +79,10 @@ def measure_heldout(run: TrainingRun, *, with_fitted: bool = False) -> list[Held
     """Quality of the held-out views, with the head if it is enabled; fully masked views are left out."""
     qualities = []
     for camera, target, mask in run.heldout_views():
-        images, _ = render_view(run.source, camera, run.background, run.settings, depth=False)
-        quality = view_quality(images["rgb"], target, mask)
+        image = render_view(run.source, camera, run.background, run.settings, depth=False)[0]["rgb"]
+        quality = view_quality(image, target, mask)
         if quality.pixels:
-            fitted = float(fitted_psnr(images["rgb"], target, mask)) if with_fitted else math.nan
+            fitted = float(fitted_psnr(image, target, mask)) if with_fitted else math.nan
             qualities.append(quality._replace(fitted=fitted))
     return qualities
 
@@ -94,11 +94,9 @@ def view_quality(image: Tensor, target: Tensor, mask: Tensor | None) -> HeldOutQ
         return HeldOutQuality(0, 0.0, 0.0)
     # Outside of the mask the compared image is exact, so all of its error belongs to the pixels that count.
     compared = image if mask is None else torch.where(mask[..., None], image, target)
-    share = pixels / target[..., 0].numel()
+    share, large = pixels / target[..., 0].numel(), min(target.shape[:2]) >= SSIM_WINDOW
     decibels = float(psnr(compared, target)) + 10 * math.log10(share)
-    similarity = 0.0
-    if min(target.shape[:2]) >= SSIM_WINDOW:
-        similarity = 1 - (1 - float(ssim(compared, target))) / share
+    similarity = 1 - (1 - float(ssim(compared, target))) / share if large else 0.0
     return HeldOutQuality(pixels, min(decibels, MOST_PSNR), similarity)
 
 
@@ -655,9 +653,8 @@ def _figures(tried: list[Tried]) -> dict[str, dict[str, Any]]:
     for head in dict.fromkeys(row.head for row in tried):
         rows = [row for row in tried if row.head == head]
         views = [view for row in rows for view in row.qualities]
-        mean = dict(zip(("psnr", "ssim"), mean_quality(views), strict=True))
-        size = sum(rows[0].bytes) if rows[0].bytes else None
-        figures[head] = {**mean, "bytes": size, "views": [view._asdict() for view in views]}
+        (psnr, ssim), size = mean_quality(views), sum(rows[0].bytes) if rows[0].bytes else None
+        figures[head] = {"psnr": psnr, "ssim": ssim, "bytes": size, "views": [view._asdict() for view in views]}
     return figures
 
 
