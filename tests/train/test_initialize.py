@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,8 +27,12 @@ Build = Callable[..., SundaeModel]
 Points = Callable[[], tuple[Tensor, Tensor]]
 MakeCamera = Callable[..., Cameras]
 TrainingOf = Callable[[SundaeModel], Any]
-N = 60
-"""Gaussians of a model that is built without a count."""
+Capsys = pytest.CaptureFixture[str]
+N = 60  # Gaussians of a model that is built without a count
+
+
+def said(capsys: Capsys) -> str:
+    return " ".join(capsys.readouterr().out.split())
 
 
 def colors_of(model: SundaeModel, camera: Cameras) -> Tensor:
@@ -38,27 +43,26 @@ def colors_of(model: SundaeModel, camera: Cameras) -> Tensor:
 
 @pytest.mark.parametrize("seed_points", [None, (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))])
 def test_without_a_sparse_cloud_points_are_random(
-    build: Build, training_of: TrainingOf, seed_points: Any, capsys: pytest.CaptureFixture[str]
+    build: Build, training_of: TrainingOf, seed_points: Any, capsys: Capsys
 ) -> None:
     model = build(seed_points=seed_points, num_random=40, random_scale=2.0)
     assert model.num_points == 40
     assert model.means.abs().max() <= 1
     training_of(model)
-    assert "no sparse point cloud" in " ".join(capsys.readouterr().out.split())
+    assert "no sparse point cloud" in said(capsys)
 
 
 @pytest.mark.parametrize(("n", "warned"), [(FEWEST_POINTS - 1, True), (FEWEST_POINTS, False)])
 def test_who_has_hardly_any_points_hears_that_photos_do_not_overlap(
-    build: Build, training_of: TrainingOf, n: int, warned: bool, capsys: pytest.CaptureFixture[str]
+    build: Build, training_of: TrainingOf, n: int, warned: bool, capsys: Capsys
 ) -> None:
     model = build(seed_points=(torch.rand(n, 3), torch.full((n, 3), 99, dtype=torch.uint8)))
     training_of(model)
-    said = " ".join(capsys.readouterr().out.split())
-    assert (f"only {n} sparse points" in said) == warned
+    assert (f"only {n} sparse points" in said(capsys)) == warned
 
 
 def test_a_finished_run_is_not_warned_of_what_it_did_not_start_from(
-    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+    build: Build, training_of: TrainingOf, capsys: Capsys
 ) -> None:
     """Nor is training that goes on from a checkpoint: its field takes the place of the points."""
     model = build(seed_points=None, num_random=40)
@@ -68,12 +72,12 @@ def test_a_finished_run_is_not_warned_of_what_it_did_not_start_from(
 
 
 def test_a_cloud_above_the_cap_is_cut_before_the_first_step(
-    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+    build: Build, training_of: TrainingOf, capsys: Capsys
 ) -> None:
     model = build(pruning={"mode": "continuous", "max_gaussians": 25})
     assert model.num_points == 25
     training_of(model)
-    assert "starting from 25 of them" in " ".join(capsys.readouterr().out.split())
+    assert "starting from 25 of them" in said(capsys)
 
 
 def _ply(build: Build, path: Path, degree: int = 1, **options: Any) -> dict[str, Tensor]:
@@ -182,17 +186,14 @@ def test_a_warm_start_prunes_at_its_first_step(build: Build, training_of: Traini
     assert training.model.num_points == N // 2
 
 
-TrainingOf = Callable[..., Any]
 FOUND = 40
 
 
 class FakeSweep:
     """Finds points at a known place, of a known colour."""
 
-    longest = 0
-    wanted = 0
+    longest, wanted, most = 0, 0, FOUND
     seen: Tensor
-    most = FOUND
 
     def __init__(self, photos: Iterable[Any], sparse: Tensor, longest: int) -> None:
         self.photos, self.swept = list(photos), set[int]()
@@ -219,7 +220,7 @@ def few(build: Build, **options: Any) -> SundaeModel:
 
 
 def test_the_field_starts_from_both_clouds(
-    build: Build, training_of: TrainingOf, points: Callable[..., Any], capsys: pytest.CaptureFixture[str]
+    build: Build, training_of: TrainingOf, points: Callable[..., Any], capsys: Capsys
 ) -> None:
     model = few(build, sh_degree=1)
     alone = model.scales.detach().clone()
@@ -233,7 +234,7 @@ def test_the_field_starts_from_both_clouds(
     assert torch.allclose(colours, torch.tensor([0.2, 0.4, 0.6]).expand(FOUND, 3), atol=1e-5)
     # Widths follow the neighbours in both clouds: those of the dense one are a twentieth of the distances of the other.
     assert float(model.scales[60:].detach().max()) < float(alone.median())
-    assert "40 points by a plane sweep beside 60 sparse ones" in " ".join(capsys.readouterr().out.split())
+    assert "40 points by a plane sweep beside 60 sparse ones" in said(capsys)
     assert training.live()
     training.step(0)
     assert training.live()
@@ -250,18 +251,15 @@ def test_the_field_starts_from_both_clouds(
 )
 def test_other_fields_stay_as_they_are(build: Build, training_of: TrainingOf, options: dict[str, Any]) -> None:
     model = few(build, **options)
-    before = {name: value.detach().clone() for name, value in model.gauss_params.items()}
+    before = model.means.detach().clone()
     training_of(model)
-    assert all(torch.equal(before[name], value) for name, value in model.gauss_params.items())
+    assert torch.equal(before, model.means)
 
 
 def test_a_resumed_run_goes_on_with_its_own_field(build: Build, training_of: TrainingOf) -> None:
     training = training_of(few(build))
     training.step(0)
-    saved = {
-        name: value.clone() if isinstance(value, Tensor) else value
-        for name, value in training.model.state_dict().items()
-    }
+    saved = deepcopy(training.model.state_dict())
     model = few(build)
     model.load_state_dict(saved)
     training_of(model)
@@ -282,41 +280,26 @@ def test_more_points_than_wanted_are_thinned_evenly(
     assert torch.histc(added, bins=9, min=5, max=8).tolist() == pytest.approx([10] * 9, abs=1)
 
 
-def test_a_cloud_that_is_not_sparse_stays_as_it_is(
-    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(initialize.FILLED, "cpu", 60)
-    monkeypatch.setattr(initialize, "Sweep", None)
-    model = few(build)
-    training_of(model)
-    assert model.num_points == 60
-
-
-@pytest.mark.parametrize(("most", "swept"), [(2, False), (3, True)])
-def test_a_cpu_sweeps_few_views(
-    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch, most: int, swept: bool
+@pytest.mark.parametrize(("filled", "most", "swept"), [(60, 3, False), (61, 2, False), (100, 3, True)])
+def test_a_cpu_sweeps_few_views_of_a_sparse_cloud(
+    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch, filled: int, most: int, swept: bool
 ) -> None:
     monkeypatch.setattr(initialize, "MOST_ON_CPU", most)
+    monkeypatch.setitem(initialize.FILLED, "cpu", filled)
     model = few(build)
     training_of(model)
     assert model.num_points == 60 + swept * FOUND
 
 
-def test_photos_are_the_training_images_with_their_views(build: Build, training_of: TrainingOf) -> None:
-    training = training_of(build())
-    run = training.callbacks[0].func.__self__
+def test_photos_are_the_training_images_with_their_views_and_masks(
+    build: Build, training_of: TrainingOf, batch: Callable[..., dict[str, Tensor]], camera: Callable[..., Any]
+) -> None:
+    """Transparent pixels are masked too."""
+    run = training_of(build()).callbacks[0].func.__self__
     photos = list(run.photos())
     assert [float(photo.camera.center[0]) for photo in photos] == pytest.approx([-0.5, 0.0, 0.5])
     assert [photo.mask for photo in photos] == [None] * 3
-    (_, batch), *_ = run._datamanager.cameras([0])
-    assert torch.allclose(photos[0].target, batch["image"].float() / 255)
-
-
-def test_transparent_and_masked_pixels_are_masked(
-    build: Build, training_of: TrainingOf, batch: Callable[..., dict[str, Tensor]], camera: Callable[..., Any]
-) -> None:
-    training = training_of(build())
-    run = training.callbacks[0].func.__self__
+    assert torch.allclose(photos[0].target, batch()["image"].float() / 255)
     image = {**batch(channels=4), "mask": torch.ones(32, 40, 1, dtype=torch.bool)}
     image["mask"][:4] = False
     image["image"][..., 3] = 255
