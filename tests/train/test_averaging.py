@@ -125,8 +125,17 @@ def test_ranks_do_not_save_the_mean_of_their_shard(state: Any) -> None:
     assert not mean.state_dict()
 
 
-def test_a_share_that_cannot_be(build: Callable[..., Any]) -> None:
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("average_share", 1.5, "average-share is 1.5; give a share"),
+        ("base_loss_weight", -1.0, "base-loss-weight is -1.0; give 0 or more"),
+        ("prior_after_prune", float("nan"), "prior-after-prune is nan"),
+        ("use_bilateral_grid", True, "no bilateral grid"),
+    ],
+)
+def test_options_that_cannot_be(build: Callable[..., Any], option: str, value: float, words: str) -> None:
     config = build(n=5).config
-    config.average_share = 1.5
-    with pytest.raises(ConfigError, match="average-share is 1.5"):
+    setattr(config, option, value)
+    with pytest.raises(ConfigError, match=words):
         check(config)

@@ -30,11 +30,10 @@ def test_the_highest_gradients_grow() -> None:
     assert (state["radii"] <= 0.05).all()
 
 
-@pytest.mark.parametrize("room", [4, 100])
-def test_room_enough_changes_nothing(room: int) -> None:
+def test_room_enough_changes_nothing() -> None:
     gradients = torch.tensor([0.9, 0.1, 0.8, 0.7, 0.0, 0.6])
     state = {"grad2d": gradients.clone(), "count": torch.ones(6), "radii": None}
-    limit_growth(state, torch.arange(6) % 2 == 0, room, threshold=0.5, radius=0.05)
+    limit_growth(state, torch.arange(6) % 2 == 0, 4, threshold=0.5, radius=0.05)
     assert torch.equal(state["grad2d"], gradients)
 
 
@@ -92,7 +91,7 @@ def test_statistics_are_those_of_gsplat(absgrad: bool) -> None:
         torch.testing.assert_close(ours[name], theirs[name])
 
 
-def test_statistics_ofis_gsplat_1_5() -> None:
+def test_statistics_of_radii_by_axis() -> None:
     running = {"grad2d": torch.zeros(3), "count": torch.zeros(3), "radii": torch.zeros(3)}
     count_view(running, torch.ones(3, 2), torch.tensor([[4, 8], [0, 8], [2, 2]]), 80, 40)
     assert running["count"].tolist() == [1, 0, 1]

@@ -29,9 +29,12 @@ def found(gains: ExposureCompensation) -> Tensor:
     return torch.stack([(1 / gains.balanced(white, batch_of(index)))[0, 0] for index in range(COUNT)])
 
 
+def random_gains(spread: float, seed: int) -> Tensor:
+    return torch.exp(spread * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(seed)))
+
+
 def test_photos_that_differ_from_their_neighbours_are_evened_out() -> None:
-    true = torch.exp(0.2 * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0)))
-    gains, run = begin()
+    true, (gains, run) = random_gains(0.2, 0), begin()
     measure(gains, run, lambda index: image_of(index) * true[index])
     left = true.log() - found(gains).log()
     assert left.std() < 0.4 * true.log().std(), "what neighbours have in common stays in the photos"
@@ -47,7 +50,7 @@ def test_light_that_changes_with_the_place_stays_in_the_photos() -> None:
 
 def test_differences_no_larger_than_a_fields_own_errors_stay_in_the_photos() -> None:
     """So a capture whose light does not change is trained as without gains, to the bit."""
-    true = torch.exp(0.8 * exposure.NOISE * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0)))
+    true = random_gains(0.8 * exposure.NOISE, 0)
     gains, run = begin()
     measure(gains, run, lambda index: image_of(index) * true[index])
     assert torch.equal(found(gains), torch.ones(COUNT, 3))
@@ -55,7 +58,7 @@ def test_differences_no_larger_than_a_fields_own_errors_stay_in_the_photos() -> 
 
 def test_gains_settle_whatever_they_were_at_first() -> None:
     """They are measured against photos that were divided by them: an error must not feed itself."""
-    true = torch.exp(0.2 * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(1)))
+    true = random_gains(0.2, 1)
     ends = []
     for first in (1.0, 1.5):
         gains, run = begin()
@@ -93,8 +96,7 @@ def test_a_photo_that_says_nothing_has_no_gain(spoilt: Tensor) -> None:
 def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alone(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    photo = image_of(0)
-    gains, run = begin()
+    photo, (gains, run) = image_of(0), begin()
     measure(gains, run, lambda index: image_of(index) * (1 + index % 2))
     assert gains.balanced(photo, batch_of(0)) is not photo
     assert gains.balanced(photo, batch_of(0, channels=4)) is photo
@@ -102,11 +104,8 @@ def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alo
     before = gains.state_dict()
     gains.observe(photo, photo, None, batch_of(0, channels=4))
     assert torch.equal(gains.state_dict()["sums"], before["sums"])
-    for few in (
-        ExposureCompensation(LEAST_PHOTOS - 1, "on"),
-        ExposureCompensation(LEAST_PHOTOS - 1, "auto"),
-        ExposureCompensation(9, "off"),
-    ):
+    for mode in ("on", "auto", "off"):
+        few = ExposureCompensation(LEAST_PHOTOS - 1, mode)  # type: ignore[arg-type]
         few.before_training(run_of(ring(LEAST_PHOTOS - 1)))
         few.observe(photo, few.balanced(photo * 2, batch_of(0)), None, batch_of(0))
         update(few, run)
@@ -117,7 +116,7 @@ def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alo
 
 
 def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
-    true = torch.exp(0.2 * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(2)))
+    true = random_gains(0.2, 2)
 
     def photos(index: int) -> Tensor:
         return image_of(index) * true[index]
@@ -181,7 +180,7 @@ def test_training_compares_with_the_balanced_photo_and_evaluation_with_the_true_
 
 
 def test_auto_divides_photos_of_changing_light_from_the_decision_on() -> None:
-    true = torch.exp(0.15 * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(3)))
+    true = random_gains(0.15, 3)
 
     def photos(index: int) -> Tensor:
         return image_of(index) * true[index]
@@ -206,9 +205,8 @@ def test_auto_divides_photos_of_changing_light_from_the_decision_on() -> None:
 @pytest.mark.parametrize("differences", ["even light", "three photos", "the place"])
 def test_auto_leaves_a_capture_of_even_light_alone_and_measures_no_more(differences: str) -> None:
     """So it is trained as without gains, to the bit. A few photos in other light are no change of exposure."""
-    noise = 0.8 * exposure.NOISE * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(0))
     true = {
-        "even light": torch.exp(noise),
+        "even light": random_gains(0.8 * exposure.NOISE, 0),
         "three photos": torch.where(torch.arange(COUNT) < 3, 2.5, 1.0)[:, None].expand(-1, 3),
         "the place": torch.exp(0.2 * torch.sin(ANGLES))[:, None].expand(-1, 3),
     }[differences]

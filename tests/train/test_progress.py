@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import subprocess
 import sys
@@ -50,11 +51,7 @@ def test_the_time_left_does_not_jump() -> None:
     while done < total:
         steps = round(10 / (0.016 if len(found) % 2 else 0.124))
         done, now = min(done + steps, total), now + 10
-        left = watch.update(done, total, now)
-        if left is not None:
-            found.append((left, now))
-        else:
-            found.append((float("nan"), now))
+        found.append((watch.update(done, total, now) or math.nan, now))
     later = [left for left, _ in found[10:-6]]
     assert all(1 / 1.5 < after / before < 1.5 for before, after in zip(later, later[1:]))
     half = len(found) // 2
@@ -133,43 +130,33 @@ def test_a_second_one_leaves_at_once() -> None:
 @pytest.mark.parametrize(
     ("started", "expected"),
     [
-        ("sundae --data a --max-num-iterations 9", "sundae --load-dir run --data a"),
-        ("sundae --max-num-iterations=9 --vis viewer", "sundae --load-dir run --vis viewer"),
-        (
-            "sundae-1 --load-dir old --load-step 4 --data a colmap --colmap-path s",
-            "sundae-1 --load-dir run --data a colmap --colmap-path s",
-        ),
+        ("sundae --data a --max-num-iterations 9", "sundae --load-dir 'a run' --data a"),
+        ("sundae --max-num-iterations=9 --vis viewer", "sundae --load-dir 'a run' --vis viewer"),
+        ("sundae-1 --load-dir old --load-step 4 colmap --a s", "sundae-1 --load-dir 'a run' colmap --a s"),
+        ("", "sundae --data data --load-dir 'a run'"),  # by another program
     ],
 )
 def test_the_command_that_resumes(started: str, expected: str) -> None:
-    program = ["/usr/bin/ns-train", *started.split()]
-    assert resume_command(program, Path("run"), "sundae", "data") == f"ns-train {expected}"
-
-
-def test_the_command_that_resumes_what_another_program_started() -> None:
-    found = resume_command(["pytest", "--load-dir", "x"], Path("a run"), "sundae-1", Path("data"))
-    assert found == "ns-train sundae-1 --data data --load-dir 'a run'"
+    program = ["/usr/bin/ns-train", *started.split()] if started else ["pytest", "--load-dir", "x"]
+    assert resume_command(program, Path("a run"), "sundae", "data") == f"ns-train {expected}"
 
 
 @pytest.mark.parametrize(
-    "words",
-    [["--load-config", "{}"], ["--load_config", "{}"], ["--load-config={}"], ["camera-path", "--load-config={}"]],
+    ("command", "opens"),
+    [
+        ("ns-eval --load-config {}", True),
+        ("/usr/bin/ns-render camera-path --load-config={}", True),
+        ("ns-viewer --load_config {}", True),
+        ("ns-export gaussian-splat --load-config={}", True),
+        ("ns-train sundae --load-config {}", False),
+        ("sundae report {}", False),
+        ("ns-eval --load-config", False),
+        ("ns-eval --output-path {}", False),
+        ("", False),
+    ],
 )
-@pytest.mark.parametrize("program", ["ns-eval", "/usr/bin/ns-render", "ns-viewer", "ns-export"])
-def test_the_folder_of_the_config(tmp_path: Path, program: str, words: list[str]) -> None:
-    path = tmp_path / "run" / "config.yml"
-    words = [word.format(path) for word in words]
-    assert loaded_run([program, *words]) is None, "there is no such file"
-    path.parent.mkdir()
-    path.touch()
-    assert loaded_run([program, *words]) == path.parent
-
-
-def test_a_training_writes_where_it_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "config.yml"
-    path.touch()
-    assert loaded_run(["ns-train", "sundae", "--load-config", str(path)]) is None
-    assert loaded_run(["sundae", "report", str(path)]) is None
-    assert loaded_run(["ns-eval", "--load-config"]) is None
-    assert loaded_run(["ns-eval", "--output-path", str(path)]) is None
-    assert loaded_run([]) is None
+def test_the_folder_of_the_run_that_a_command_opens(tmp_path: Path, command: str, opens: bool) -> None:
+    words = command.format(tmp_path / "config.yml").split()
+    assert loaded_run(words) is None, "there is no such file"
+    (tmp_path / "config.yml").touch()
+    assert loaded_run(words) == (tmp_path if opens else None)
