@@ -17,7 +17,7 @@ import random
 import re
 import zipfile
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from encodings import normalize_encoding
 from encodings.aliases import aliases
 from numbers import Integral
@@ -97,13 +97,9 @@ def read(path: Path) -> dict[str, Any]:
     """A checkpoint of nerfstudio's trainer, on the CPU. No code in it runs; ``CheckpointError`` if it is bad."""
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist; give a .ckpt file, or the folder of them")
-    with _naming(path), path.open("rb") as file:
+    with reading(path, "a nerfstudio checkpoint", CheckpointError, remedy="give another file"), path.open("rb") as file:
         check_whole(file)
         return _loaded(file)
-
-
-def _naming(path: Path) -> AbstractContextManager[None]:
-    return reading(path, "a nerfstudio checkpoint", CheckpointError, remedy="give another file")
 
 
 def _loaded(file: BinaryIO) -> dict[str, Any]:
@@ -126,7 +122,7 @@ def newest_whole(folder: Path) -> tuple[Path, list[str]]:
 def read_newest(folder: Path) -> tuple[Path, dict[str, Any]]:
     """The newest whole checkpoint of a folder or a run, and its contents, also while a training replaces it."""
     path, file, _ = _open_newest(folder)
-    with file, _naming(path):
+    with file, reading(path, "a nerfstudio checkpoint", CheckpointError, remedy="give another file"):
         return path, _loaded(file)
 
 
@@ -278,7 +274,15 @@ def load_tensors(file: BinaryIO) -> Any:
 
 
 def _check_pickle(pickled: bytes) -> None:
+    ranks: dict[Any, int] = {}  # of tuples, by their place in the memo: up to so many hold each other twice
+    rank, is_tuple = 0, False
     for operation, argument, _ in pickletools.genops(pickled):
+        rank = max(rank, ranks.get(argument, 0)) if "GET" in operation.name else rank
+        if is_tuple and "PUT" in operation.name:
+            ranks[argument] = rank + 1
+        is_tuple = "TUPLE" in operation.name
+        if rank > 20:  # the hash of a tuple visits each as often as it is held
+            raise ValueError("it holds tuples in tuples without end")
         if operation.name == "GLOBAL" and not _MADE.fullmatch(str(argument)):
             raise ValueError(f"it holds more than tensors and plain values ({argument})")
         if isinstance(argument, str):

@@ -125,10 +125,9 @@ def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tu
 
 
 def read_glb(path: Path) -> tuple[dict[str, Tensor], bool, bool]:
-    """Read the Gaussians of a .glb of any program; meshes and cameras beside them are left out. No code in it runs.
+    """The Gaussians of a .glb of any program, without meshes and cameras beside them. No code in it runs.
 
-    Returns Gaussians on the CPU, float32 but for means in float64, because nodes may move them far; and the marks of
-    :func:`write_glb`, antialiased and in the model's frame. Raises ``DataError`` for any other form.
+    Their means are float64, because nodes may move them far. Then the marks of :func:`write_glb`, as its options.
     """
     with reading(path, "a complete .glb with Gaussians", remedy="export it again, or as .ply"):
         try:
@@ -261,8 +260,7 @@ def _read_primitive(
 
     means = values("POSITION")
     degree = max((d for d in range(MAX_SH_DEGREE + 1) if set(semantics(d)) <= attributes.keys()), default=0)
-    # Accessors may share their bytes; else each number has one.
-    afford_gaussians(len(means), (degree + 1) ** 2 - 1, len(binary) // 8)
+    afford_gaussians(len(means), (degree + 1) ** 2 - 1, len(binary) // 8)  # accessors may share their bytes
     rest = [values(name) for name in semantics(degree)]
     params = {
         "means": means,

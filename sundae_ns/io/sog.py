@@ -104,8 +104,7 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
 def read_sog(path: Path) -> tuple[dict[str, Tensor], Marks]:
     """Read a bundled .sog, a .zip of one or of its folder, or a folder of images or the ``meta.json`` in it.
 
-    Returns Gaussians as of ``ply.read_ply``, and what it states of them. Raises ``DataError`` if a file is missing,
-    damaged, lossy, streamed, or of another version than 2.
+    Returns Gaussians as of ``ply.read_ply``, their means in float64, and what it states of them.
     """
     with reading(path, "a complete .sog"), ExitStack() as stack:
         if path.is_dir() or path.name in METAS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 import zipfile
 from collections.abc import Callable
@@ -252,7 +253,18 @@ def _call(name: bytes, arguments: bytes) -> bytes:
 _GIGABYTES = b"(\x8a\x05\x00\x00\x00\x00\x01t"  # the tuple of 2^32
 _TEXT = b"X\x04\x00\x00\x00abcd"
 _HEX = b"X\x03\x00\x00\x00hex"
+
+
+def _key(levels: int) -> bytes:
+    """Operations for a dictionary whose key has so many levels: its hash visits the lowest 2^levels times."""
+    key: tuple[Any, ...] = (1,)
+    for _ in range(levels):
+        key = (key, key)
+    return b"}" + pickle.dumps(key, 2)[2:-1] + b"K\x01s"
+
+
 WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
+    "tuples that hold each other": (_pickled(_key(60)), "tuples in tuples"),
     "lists that hold themselves": (_laugh, "holds no Gaussians"),
     "four gigabytes of bytes": (_pickled(_call(b"builtins\nbytearray", _GIGABYTES)), "more than tensors .*bytearray"),
     "four gigabytes of numbers": (_pickled(_call(b"torch\nFloatTensor", _GIGABYTES)), "more than .*FloatTensor"),

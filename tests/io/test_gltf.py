@@ -145,19 +145,12 @@ def test_integers_are_normalised(tmp_path: Path) -> None:
     opacities = gaussians["opacities"].sigmoid()[:, 0].numpy()
     turns = np.roll(torch.nn.functional.normalize(gaussians["quats"]).numpy(), -1, axis=1)
     turns = np.stack([-turns[:, 1], turns[:, 0], turns[:, 3], -turns[:, 2]], axis=1)  # after half a turn about z
-    added = np.rint(65535 * opacities).astype("<u2").tobytes()
-    for name, data, kind, component in (
-        (f"{EXTENSION}:OPACITY", added, "SCALAR", 5123),
-        (f"{EXTENSION}:ROTATION", np.rint(32767 * turns).astype("<i2").tobytes(), "VEC4", 5122),
+    for name, values, component in (
+        (f"{EXTENSION}:OPACITY", np.rint(65535 * opacities[:, None]).astype("<u2"), 5123),
+        (f"{EXTENSION}:ROTATION", np.rint(32767 * turns).astype("<i2"), 5122),
     ):
-        document["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
-        document["accessors"].append(
-            {"bufferView": len(document["bufferViews"]) - 1, "count": 4, "type": kind, "componentType": component}
-        )
-        document["accessors"][-1]["normalized"] = True
+        binary = added(document, binary, values, component, normalized=True)
         attributes[name] = len(document["accessors"]) - 1
-        binary += data
-    document["buffers"][0]["byteLength"] = len(binary)
     put(tmp_path / "b.glb", document, binary)
     close(read_glb(tmp_path / "b.glb")[0], read_glb(tmp_path / "a.glb")[0], 2e-4)
 
@@ -184,19 +177,16 @@ def _no_scenes(document: Document) -> None:
     document["nodes"] = [{"mesh": 0}, {"children": [0], "translation": [0, 5, 0]}]
 
 
+def _twice(document: Document) -> None:
+    document.update(nodes=[{"mesh": 0}, {"mesh": 0, "translation": [1, 0, 0]}], scenes=[{"nodes": [0, 1]}])
+
+
+FAR = [5e5 + 1 / 8, 30, -4e6 + 1 / 16]
 UNUSUAL: dict[str, tuple[Callable[[Document], object], list[list[float]]]] = {
     "no scenes: all nodes that are no child": (_no_scenes, [[0, 5, 0]]),
     "a hidden node, whose children are hidden": (_hidden, [[0, 0, 0]]),
-    "survey coordinates": (
-        _in("nodes", translation=[5e5 + 1 / 8, 30, -4e6 + 1 / 16]),
-        [[5e5 + 1 / 8, 30, -4e6 + 1 / 16]],
-    ),
-    "one mesh twice": (
-        lambda document: document.update(
-            nodes=[{"mesh": 0}, {"mesh": 0, "translation": [1, 0, 0]}], scenes=[{"nodes": [0, 1]}]
-        ),
-        [[0, 0, 0], [1, 0, 0]],
-    ),
+    "survey coordinates": (_in("nodes", translation=FAR), [FAR]),
+    "one mesh twice": (_twice, [[0, 0, 0], [1, 0, 0]]),
 }
 
 
@@ -207,11 +197,20 @@ def test_places_of_unusual_scenes(tmp_path: Path, kind: str) -> None:
     plain = read_glb(tmp_path / "a.glb")[0]["means"]
     UNUSUAL[kind][0](document)
     put(tmp_path / "a.glb", document, binary)
-    found = read_glb(tmp_path / "a.glb")[0]["means"]
     moves = torch.tensor(UNUSUAL[kind][1], dtype=torch.float64) * torch.tensor([-1.0, -1.0, 1.0])
-    expected = torch.cat([plain + move for move in moves.flip(0)])
-    assert len(found) == len(expected)
-    assert min((found - other).abs().max() for other in (expected, torch.cat([plain + move for move in moves]))) < 1e-9
+    expected = torch.cat([plain + move for move in moves])
+    torch.testing.assert_close(read_glb(tmp_path / "a.glb")[0]["means"], expected, rtol=0, atol=1e-9)
+
+
+def added(document: Document, binary: bytes, values: np.ndarray, component: int, **accessor: object) -> bytes:
+    """The buffer with values ``[N, C]``, of which the last accessor tells."""
+    kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
+    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes}
+    document["bufferViews"].append(view)
+    about = {"bufferView": len(document["bufferViews"]) - 1, "count": len(values), "componentType": component}
+    document["accessors"].append({**about, "type": kind, **accessor})
+    document["buffers"][0]["byteLength"] = len(binary) + values.nbytes
+    return binary + values.tobytes()
 
 
 def test_instances_are_nodes_of_their_own(tmp_path: Path) -> None:
@@ -219,27 +218,19 @@ def test_instances_are_nodes_of_their_own(tmp_path: Path) -> None:
     write_glb(tmp_path / "a.glb", small_field(20, 2))
     document, binary = parts(tmp_path / "a.glb")
     half = math.sqrt(0.5)
-    trs = {
+    turns = [[0, half, 0, half], [0, 0, 0, 1], [half, half, 0, 0]]
+    placed = {
         "TRANSLATION": [[1, 2, 3], [0, 0, 0], [4, 0, 0]],
-        "ROTATION": [[0, half, 0, half], [0, 0, 0, 1], [half, half, 0, 0]],
-        "SCALE": [[2, 2, 2], [1, 1, -1], [0.5] * 3],
+        "ROTATION": turns,
+        "SCALE": [[2] * 3, [1, 1, -1], [0.5] * 3],
     }
     outer = {"rotation": [half, 0, 0, half], "translation": [0, 7, 0]}
-    nodes = [{name.lower(): trs[name][i] for name in trs} | {"mesh": 0} for i in range(3)]
+    nodes = [{name.lower(): placed[name][i] for name in placed} | {"mesh": 0} for i in range(3)]
     put(tmp_path / "b.glb", {**document, "nodes": [{**outer, "children": [1, 2, 3]}, *nodes]}, binary)
-    for values in trs.values():
-        data = np.array(values, "<f4").tobytes()
-        document["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
-        document["accessors"].append(
-            {
-                "bufferView": len(document["bufferViews"]) - 1,
-                "count": 3,
-                "componentType": 5126,
-                "type": f"VEC{len(values[0])}",
-            }
-        )
-        binary += data
-    instancing = {"attributes": {name: len(document["accessors"]) - 3 + i for i, name in enumerate(trs)}}
+    for values in placed.values():
+        binary = added(document, binary, np.array(values, "<f4"), 5126)
+    first = len(document["accessors"]) - 3
+    instancing = {"attributes": {name: first + i for i, name in enumerate(placed)}}
     document["nodes"] = [{**outer, "mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": instancing}}]
     document["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
     put(tmp_path / "a.glb", document, binary)

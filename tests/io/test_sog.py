@@ -211,65 +211,49 @@ def _lie(content: bytes, name: bytes, size: int) -> bytes:
     return bytes(data)
 
 
-def _meta(**changes: Any) -> Callable[[dict[str, bytes]], bytes]:
-    return lambda files: zipped(
-        {**files, "meta.json": json.dumps({**json.loads(files["meta.json"]), **changes}).encode()}
-    )
+Make = Callable[[dict[str, bytes]], bytes]
 
 
-def _bomb(method: int) -> Callable[[dict[str, bytes]], bytes]:
+def _meta(**changes: Any) -> Make:
+    return lambda files: zipped(files | {"meta.json": json.dumps(json.loads(files["meta.json"]) | changes).encode()})
+
+
+def _with(name: str, content: bytes) -> Make:
+    return lambda files: zipped(files | {name: content})
+
+
+def _bomb(method: int) -> Make:
     return lambda files: _lie(zipped({**files, "means_l.webp": bytes(1 << 28)}, method), b"means_l.webp", 1000)
 
 
-def _all(image: bytes) -> dict[str, bytes]:
-    return dict.fromkeys(("means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp"), image)
+def _all(side: int, **changes: Any) -> Make:
+    """All images but those of harmonics are equal ones of these sides."""
+    names = ("means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp")
+    return lambda files: _meta(**changes)(files | dict.fromkeys(names, webp(side, side, lossless=True)))
 
 
-HOSTILE: dict[str, tuple[Callable[[dict[str, bytes]], bytes], str]] = {
-    "a lossy image": (lambda files: zipped({**files, "means_l.webp": webp(13, 13, quality=80)}), "no lossless WebP"),
-    "a lossy image with alpha": (
-        lambda files: zipped({**files, "sh0.webp": webp(13, 13, quality=80, alpha_quality=50)}),
-        "lossless",
-    ),
-    "no image": (lambda files: zipped({**files, "means_l.webp": b"RIFF"}), "no lossless WebP"),
-    "an image beyond its Gaussians": (
-        lambda files: zipped({**files, **_all(webp(9000, 9000, lossless=True))}),
-        "9000 x 9000 pixels for 150",
-    ),
-    "as many Gaussians as pixels": (
-        lambda files: _meta(count=81_000_000)({**files, **_all(webp(9000, 9000, lossless=True))}),
-        "would unpack to",
-    ),
+SCALES, MEANS = ["scales.webp"], ["means_l.webp", "means_u.webp"]
+HOSTILE: dict[str, tuple[Make, str]] = {
+    "a lossy image": (_with("means_l.webp", webp(13, 13, quality=80)), "no lossless WebP"),
+    "lossy colours beside alphas": (_with("sh0.webp", webp(13, 13, quality=80, alpha_quality=50)), "no lossless WebP"),
+    "no image": (_with("means_l.webp", b"RIFF"), "no lossless WebP"),
+    "an image beyond its Gaussians": (_all(9000), "9000 x 9000 pixels for 150"),
+    "as many Gaussians as pixels": (_all(9000, count=81_000_000), "would unpack to"),
+    "more Gaussians than pixels": (_all(9), "fewer than 150 pixels"),
     "bz2": (_bomb(zipfile.ZIP_BZIP2), "compressed by method 12"),
     "lzma": (_bomb(zipfile.ZIP_LZMA), "compressed by method 14"),
     "deflate": (_bomb(zipfile.ZIP_DEFLATED), "CRC-32"),
     "a size beyond the file": (lambda files: _lie(zipped(files), b"means_l.webp", 2**32 - 2), "would unpack to"),
-    "a bundle in a bundle in a bundle": (
-        lambda files: zipped({"a.sog": zipped({"b.sog": zipped(files)})}),
-        "0 meta.json and 1 .sog",
-    ),
-    "two scenes": (lambda files: zipped({"a.sog": zipped(files), "b.sog": zipped(files)}), "0 meta.json and 2 .sog"),
-    "streamed": (
-        lambda files: zipped({"lod-meta.json": b"{}", "0_0/meta.json": b"{}"}),
-        "streamed SOG; give the meta.json",
-    ),
-    "deep JSON": (lambda files: zipped({**files, "meta.json": b"[" * 999_999}), "recursion"),
+    "three levels": (lambda files: zipped({"a.sog": zipped({"b.sog": zipped(files)})}), "0 meta.json and 1 .sog"),
+    "two scenes": (lambda files: zipped({"a.sog": zipped(files), "b.sog": b""}), "0 meta.json and 2 .sog"),
+    "streamed": (lambda _: zipped({"lod-meta.json": b"{}", "0/meta.json": b"{}"}), "streamed SOG; give the meta.json"),
+    "deep JSON": (_with("meta.json", b"[" * 999_999), "recursion"),
     "fewer than no Gaussians": (_meta(count=-5), "it states -5 Gaussians"),
     "endless Gaussians": (_meta(count=math.inf), "infinity"),
-    "more Gaussians than pixels": (
-        lambda files: zipped({**files, **_all(webp(9, 9, lossless=True))}),
-        "fewer than 150 pixels",
-    ),
     "an outside file": (_meta(quats={"files": ["../../etc/passwd"]}), "no item named"),
-    "a short codebook": (_meta(scales={"codebook": [0.0], "files": ["scales.webp"]}), "out of bounds"),
-    "a codebook of pairs": (
-        _meta(scales={"codebook": [[0.0, 1.0]] * 256, "files": ["scales.webp"]}),
-        "scales has shape",
-    ),
-    "NaN for a bound": (
-        _meta(means={"mins": [math.nan] * 3, "maxs": [1] * 3, "files": ["means_l.webp", "means_u.webp"]}),
-        "none is finite",
-    ),
+    "a short codebook": (_meta(scales={"codebook": [0.0], "files": SCALES}), "out of bounds"),
+    "a codebook of pairs": (_meta(scales={"codebook": [[0.0, 1.0]] * 256, "files": SCALES}), "scales has shape"),
+    "NaN for a bound": (_meta(means={"mins": [math.nan] * 3, "maxs": [1] * 3, "files": MEANS}), "none is finite"),
     "no SH degree": (_meta(shN={"bands": 9, "codebook": [0], "files": []}), "99 SH coefficients"),
 }
 

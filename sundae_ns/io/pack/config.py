@@ -50,8 +50,7 @@ FINETUNED: dict[str, int | float] = {
     "harmonics_step": 0.06,
     "feature_step": 0.2,
     "head_step": 0.14,
-}
-"""Coarser options for scenes that were fine-tuned with them (``sundae_ns.plugin.tuned_packs``)."""
+}  # coarser options for scenes that were fine-tuned with them (``sundae_ns.plugin.tuned_packs``)
 FINETUNE_STEPS = 1500  # that make up for them: packs lose at most about 0.1 dB more (``curve.csv``)
 LEAST_LENGTHS = 20  # of a run, in fine-tunes, whose last steps are one: measured with a twentieth
 FINETUNED_SIZE = 0.6  # bytes of such a pack as a share of one without: 0.58 to 0.61 on six captures
