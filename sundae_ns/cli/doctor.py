@@ -65,10 +65,9 @@ def parts(compile_kernels: bool = False) -> list[Part]:
         "apt-get install nvidia-driver (Ubuntu: ubuntu-drivers install), reboot, and look at nvidia-smi. This torch "
         f"needs driver {driver} or newer; for an older one, pip install -c constraints-cuda12.txt -e ."
     )
-    home = f"/usr/local/cuda-{cuda}"
     fix_nvcc = (
-        f"apt-get install cuda-toolkit-{cuda.replace('.', '-')} from NVIDIA's repository (Ubuntu 24.04's own "
-        f"nvidia-cuda-toolkit is 12.0), then export CUDA_HOME={home} PATH={home}/bin:$PATH"
+        f"apt-get install cuda-toolkit-{cuda.replace('.', '-')} from NVIDIA's repository (Ubuntu 24.04's own is 12.0), "
+        f"then export CUDA_HOME=/usr/local/cuda-{cuda} PATH=/usr/local/cuda-{cuda}/bin:$PATH"
     )
     fix_weights = f"curl --location --create-dirs --output {shlex.quote(str(weights))} {url}"
     fix_photos, library = 'pip install "sundae_ns[photos]"', ctypes.util.find_library

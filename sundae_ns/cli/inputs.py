@@ -18,7 +18,7 @@ from sundae_ns.cli.options import Flag
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import DataError
 from sundae_ns.io.config_file import check_run, find_config
-from sundae_ns.io.formats import kind_of, kind_of_gaussians
+from sundae_ns.io.formats import kind_of
 from sundae_ns.io.ply import has_own_columns
 from sundae_ns.scene.cameras import cameras_of
 from sundae_ns.scene.load_save import load, packed_file
@@ -75,12 +75,16 @@ def open_run(run: Path, **options: Any) -> Scene:
 
 def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     """A scene, and the packed file that holds it; a run, whose capture may have moved, is packed in memory."""
-    if kind_of(path) == "packed" or kind_of_gaussians(path) is not None or path.suffix == ".sundae":
+    if not _is_run(path):
         return packed_file(path)
     scene = open_run(path, data=data)
     from sundae_ns.scene.packing import packed_bytes
 
     return scene, packed_bytes(scene)
+
+
+def _is_run(path: Path) -> bool:
+    return (path.is_dir() or path.name == "config.yml") and find_config(path) is not None
 
 
 def chosen_cameras(scene: Scene, cameras: Path | None, most: int | None) -> Sequence[Camera]:
@@ -89,7 +93,7 @@ def chosen_cameras(scene: Scene, cameras: Path | None, most: int | None) -> Sequ
         return scene.cameras
     if kind_of(cameras) == "packed":
         return load(cameras).cameras
-    if (cameras.is_dir() or cameras.name == "config.yml") and find_config(cameras) is not None:
+    if _is_run(cameras):
         return open_run(cameras, max_cameras=most or VIEWS["cpu"]).cameras
     return cameras_of(cameras, scene)
 

@@ -69,16 +69,15 @@ def exit_with(command: Callable[[], int], name: str) -> NoReturn:
     """Run a command and exit with its code; 2 after the one line of a :class:`SundaeError`, 130 for an interrupt."""
     for variable, value in ENVIRONMENT.items():
         os.environ.setdefault(variable, value)
-    early = f"{name} ended early"
     try:
         # Commands name the file that they cannot write; this covers others, such as a full disk behind stdout.
-        with writing(early):
+        with writing(f"{name} ended early"):
             code = command()
             sys.stdout.flush()
     except SundaeError as error:
         if os.environ.get("SUNDAE_TRACEBACK"):
             raise
-        file = getattr(error.__cause__, "filename", None) if str(error).startswith(early) else None
+        file = getattr(error.__cause__, "filename", None) if " ended early: " in str(error) else None
         print(f"sundae: {f'{file}: ' if file else ''}{error}", file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:  # the reader of stdout has left, as head does

@@ -21,7 +21,7 @@ from sundae_ns.cli.process import quoted, run_command, word
 from sundae_ns.cli.train import FINETUNE_WORDS, TrainOptions, has_gpu, pack_run
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 from sundae_ns.core.files import put_aside, write_text
-from sundae_ns.data.capture_files import placed_in
+from sundae_ns.data.capture_files import Placed, placed_in
 from sundae_ns.data.layouts import is_model, is_posed, no_transforms, posed_layout
 from sundae_ns.io.config_file import schedule_length
 from sundae_ns.io.pack import container
@@ -38,7 +38,7 @@ class Step(NamedTuple):
 
     name: str
     run: Callable[[], int]  # Returns the exit code of its commands
-    done: Callable[[], bool]
+    check: Callable[[], object]  # Raises an error, or returns False, unless the result is whole
     result: Path | None = None  # Out of date once an earlier step has run again
 
 
@@ -115,24 +115,23 @@ class Project:
         export = ["sundae", "export", word(packed), "-o", word(page)]
         steps = [
             Step("train", self._train, self._trained),
-            Step("pack", lambda: self._pack(packed), lambda: _passes(lambda: _check_pack(packed)), packed),
-            Step("report", lambda: run_command(measure), lambda: _passes(lambda: _check_report(report)), report),
-            Step("web page", lambda: run_command(export), lambda: _passes(lambda: _check_page(page)), page),
+            Step("pack", lambda: self._pack(packed), lambda: _check_pack(packed), packed),
+            Step("report", lambda: run_command(measure), lambda: _check_report(report), report),
+            Step("web page", lambda: run_command(export), lambda: _check_page(page), page),
         ]
         return steps if self.posed else [Step("camera poses", self._find_poses, self.placed), *steps]
 
     def _find_poses(self) -> int:
-        with writing(f"cannot replace {self.capture}"):
-            put_aside(self.capture)  # damaged
+        put_aside(self.capture)  # damaged
         return run_command(["sundae", "poses", word(self.photos), "-o", word(self.capture), *self.poses.words()])
 
-    def placed(self) -> bool:
-        """Whether the capture is whole."""
-        return _passes(lambda: placed_in(self.capture))
+    def placed(self) -> Placed:
+        """Which photos have a pose in the capture; an error unless it is whole."""
+        return placed_in(self.capture)
 
     def _train(self) -> int:
         """Train, or resume a training; ``DataError`` if too few photos have a pose."""
-        if not self.posed and not (placed := placed_in(self.capture)).enough:
+        if not self.posed and not (placed := self.placed()).enough:
             raise DataError(
                 f"COLMAP placed {len(placed.placed)} of {placed.total} photos; {placed.again}, and start in another "
                 f"folder, or train on these with `sundae run {quoted(self.capture)} -o OTHER`"
@@ -147,8 +146,7 @@ class Project:
             options = replace(options, steps=None)
         else:
             if any(saved.glob("*.ckpt")):
-                with writing(f"cannot replace {self.run}"):
-                    put_aside(self.run)
+                put_aside(self.run)
             if self.quality == "draft":
                 options = replace(options, steps=DRAFT_STEPS)
             if self.quality == "best":
@@ -205,13 +203,13 @@ def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
     """
     out, poses = project.out, project.poses
     project.check()
-    if not project.posed and not project.placed():
+    if not project.posed and not _passes(project.placed):
         check_poses(project.photos, poses.frames, poses.masks, remarks=False)  # sundae poses prints them
     project.claim()
     plan = project.plan()
     for number, step in enumerate(plan, start=1):
         heading = f"# step {number} of {len(plan)}, {step.name}"
-        if step.done():
+        if _passes(step.check):
             print(f"{heading}: done", flush=True)
             continue
         for later in plan[number - 1 :]:
@@ -227,7 +225,7 @@ def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
                 said = f"{step.name} was killed by signal {code - 128}; the same command tries it again"
             print(f"sundae: {said}", file=sys.stderr)
             return code
-        if not step.done():
+        if not _passes(step.check):
             raise SundaeError(f"{step.name} ended without its result; the output above says why")
     print(f"# packed scene: {out / 'scene.sundae'}; report: {out / 'report' / 'report.html'}")
     print(f"# to look at the scene: open {out / 'scene.html'} in a browser, or")
@@ -240,28 +238,24 @@ def _bytes(megabytes: float) -> int:
 
 
 def _passes(check: Callable[[], object]) -> bool:
-    """Whether a check of a result raises no error, of ours or for files that are not what they should be."""
+    """Whether a check of a result is true, and raises no error of ours or of files with other contents."""
     try:
-        check()
+        return check() is not False
     except (SundaeError, OSError, ValueError, TypeError, KeyError, AttributeError):
         return False
-    return True
 
 
 def _check_pack(path: Path) -> None:
     container.read_sections(path, container.read_header(path))  # checks the checksums
 
 
-def _check_report(page: Path) -> None:
-    """A report has figures and a page; figures that could not be measured are null."""
+def _check_report(page: Path) -> bool:
+    """Whether a report has figures and a page; figures that could not be measured are null."""
     runs = json.loads(page.with_suffix(".json").read_bytes())
     figures = [value for run in runs for way in run["configurations"] for value in way["mean"].values()]
-    if not figures or not all(value is None or math.isfinite(value) for value in figures):
-        raise ValueError("not measured")
-    _check_page(page)
+    return _check_page(page) and bool(figures) and all(value is None or math.isfinite(value) for value in figures)
 
 
-def _check_page(path: Path) -> None:
-    """A web page has its end; a full disk or a copy may have cut it off."""
-    if not path.read_bytes()[-16:].rstrip().endswith((b"</html>", b"-->")):
-        raise ValueError("cut off")
+def _check_page(path: Path) -> bool:
+    """Whether a web page has its end; a full disk or a copy may have cut it off."""
+    return path.read_bytes()[-16:].rstrip().endswith((b"</html>", b"-->"))

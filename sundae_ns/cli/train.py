@@ -15,7 +15,7 @@ import tyro
 from sundae_ns.cli.options import Flag, Out, Share, Source, check_folder, check_least
 from sundae_ns.cli.process import run_command, word
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError
-from sundae_ns.data.layouts import posed_layout
+from sundae_ns.data.layouts import is_posed, no_transforms, posed_layout
 from sundae_ns.io.pack.config import FINETUNE_STEPS
 from sundae_ns.io.run_folder import new_name, unfinished_run
 
@@ -85,6 +85,8 @@ def train(
     if resume and options.steps is not None:
         raise ConfigError("a resumed run trains its remaining steps; leave out --steps or --resume")
     options.check(capture)
+    if not is_posed(capture) and capture.suffix != ".json" and not any(map(_is_parser, further)):
+        raise no_transforms(capture)
     check_folder(out, reads=[], overwrite=True)
     (old, step, length), more = unfinished_run(out, options.method, capture) or (None, 0, 0), list(further)
     if resume and old is None:

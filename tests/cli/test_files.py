@@ -208,7 +208,7 @@ def test_files_are_exported_pruned_and_refused_without_nerfstudio(tmp_path: Path
         ["export", "head.sundae", "-o", "head.html"],
         ["pack", "a.ply", "-o", "packed.sundae"],
     ]
-    refused = dict.fromkeys(("pack gone -o x", "export gone -o x.html"), "give the folder of a")
+    refused = {"pack gone -o x": "give the folder of a", "export gone -o x.html": "gone does not exist; give a run"}
     codes, errors = without("nerfstudio", [*commands, *(command.split() for command in refused)], tmp_path)
     assert codes == [0] * len(commands) + [2] * len(refused), errors
     for words in commands:

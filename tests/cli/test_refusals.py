@@ -38,12 +38,12 @@ REFUSALS = {
     "prune in.ply -o a.ply --keep 0.1 --target-drop 1": "--keep and --target-drop exclude",
     "prune in.ply -o a.ply --target-drop 0": "target-drop is 0.0; give a positive number of dB",
     "prune in.ply -o a.ply --target-drop 1 --num-cameras 1": "a target needs two",
-    "prune in.ply -o a.ply --count 0": "count is 0; give 1 or more",
+    "prune in.ply -o a.ply --count 0": "count is 0; give a whole number, at least 1",
     "prune none.ply -o a.ply": "none.ply has 5 Gaussians, and none is finite; export it again",
     "prune empty.ply -o a.ply": "empty.ply has 0 Gaussians, and none is finite; export it again",
     "prune in.ply -o in.bin/a.ply": "in.bin is no folder",
     "prune in.ply -o /proc/a.ply": "cannot write to /proc (",
-    "prune a.ksplat -o a.ply": "a.ksplat is not a complete .ksplat (33 bytes are",
+    "prune a.ksplat -o a.ply": "a.ksplat is not a complete .ksplat (",
     "prune trained -o a.ply": "trained is a folder of 3DGS; give trained/point_cloud/iter",
     "distill in.ply -o b.ply": "b.ply cannot hold a head; name it .sundae, or leave the head out with --no-head",
     "distill in.ply -o b.txt": "b.txt has no supported suffix",
@@ -54,7 +54,7 @@ REFUSALS = {
     "export in.ply -o in.bin/new/a.sog": "in.bin is no folder",
     "export in.ply -o a.ply": "in.ply is a .ply already; give an output name that ends in .spz or",
     "export in.ply -o a.sog --upright": "not in nerfstudio's coordinates",
-    "export in.bin -o a.ply": "in.bin is no .spz; give a .ply",
+    "export in.bin -o a.ply": "in.bin is not a complete .spz (",
     "export nothing.sundae -o a.ply": "nothing.sundae cannot be read",
     "export a.glb -o a.ply": "a.glb is not a complete .glb with Gaussians",
     "pack in.sundae -o a.sundae": "in.sundae is a packed scene; give the run that was packed",
@@ -76,7 +76,9 @@ REFUSALS = {
     "report in.ply -o out": "in.ply is a .ply file; it comes without test views",
     "report in.ply -o used": "--overwrite",
     "report in.ply -o . --overwrite": "holds what the command reads",
-    "view a.splat": "a.splat is not a complete .splat (33 bytes are no whole number of Gaussians",
+    "view damaged.json": "damaged.json is no run; give a run, its config.yml, or a .sundae",
+    "export trained/point_cloud -o a.html": "trained/point_cloud is no run; give a run",
+    "view a.splat": "a.splat is not a complete .splat (",
     "render a.pth -o a.png": "a.pth is a checkpoint of another trainer; give its .ply",
     "render in.sundae -o a.png": "there are 2 cameras; choose one with --view 0 to 1, or write an .mp4",
     "render in.sundae -o a.png --view 2": "there is no camera 2; give --view 0 to 1",
@@ -100,6 +102,8 @@ REFUSALS = {
     "train scene --steps 0": "steps is 0",
     "train scene --method splatfacto": "splatfacto is no method of sundae; use one of sundae, ",
     "train gone": "gone does not exist",
+    "train empty": "empty has no transforms.json; ",
+    "train text.mp4": "text.mp4 is a file, not a capture; sundae poses makes a capture of a video",
     "train scene -o /proc/runs": "cannot write to /proc (",
     "train scene photos": "photos is no option; options of ns-train follow a --",
     "train scene --resume --steps 5": "leave out --steps or --resume",
@@ -166,6 +170,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_video(folder / "walk.mp4", 9)
     (folder / "text.mp4").write_text("not a video")
     cloud = "trained/point_cloud/iteration_7/point_cloud.ply"
+    (folder / "scene/transforms.json").touch()
     for name in (cloud, "model/sparse/0/cameras.bin", "blender/transforms_train.json", "used/thesis.txt"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).touch()

@@ -47,6 +47,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Commands:
     """The commands, in a folder with an empty capture, ``scene``, on a machine without a GPU."""
     made = Commands()
     (tmp_path / "scene").mkdir()
+    (tmp_path / "scene/transforms.json").touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sundae_ns.cli.train.run_command", made)
     monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: False)
@@ -102,6 +103,7 @@ def test_what_is_not_given_is_the_method_s_own(commands: Commands) -> None:
 
 
 def test_further_options_and_the_parser_of_a_capture(commands: Commands) -> None:
+    Path("scene/transforms.json").unlink()
     Path("scene/images").mkdir()
     Image.new("RGB", (20, 16), "grey").save("scene/images/0.png")
     write_model(Path("scene/sparse/0"), ["0.png"], (20, 16))
@@ -116,6 +118,7 @@ def test_further_options_and_the_parser_of_a_capture(commands: Commands) -> None
 
 
 def test_a_capture_of_blender_is_read_over_white(commands: Commands) -> None:
+    Path("scene/transforms.json").unlink()
     for split in ("train", "val", "test"):
         Path(f"scene/transforms_{split}.json").write_text(json.dumps({"frames": [{"file_path": "./0"}]}))
     Image.new("RGBA", (20, 16)).save("scene/0.png")
@@ -134,6 +137,7 @@ def test_an_unfinished_run_is_named_and_resumed(commands: Commands, capsys: pyte
     commands.elsewhere = True
     for name in ("my scene", "other"):
         Path(name).mkdir()
+        Path(name, "transforms.json").touch()
     run_of(Path("outputs/my scene/sundae/first"), Path("my scene"), 1999)
     run_of(Path("outputs/my scene/sundae/whole"), Path("my scene"), 29999)
     run_of(Path("outputs/other/sundae/first"), Path("other"), 2999)
