@@ -1,24 +1,43 @@
-"""Cameras of files, and virtual ones."""
+"""Cameras: of nerfstudio, of files, virtual ones; windows of their images, start view and up axis of a scene."""
 
 from __future__ import annotations
 
+import base64
+import dataclasses
 import json
 import math
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from colmap_models import write_model
+from command_line import run
 from fields import random_field
+from hypothesis import given
+from hypothesis import strategies as st
+from nerfstudio.cameras.cameras import Cameras
 from short_prunes import short_prunes  # noqa: F401
+from torch import Tensor
 
 import sundae_ns as sn
-from sundae_ns.core.errors import DataError
+from sundae_ns.core.covariance import rotation_matrices
+from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import Gaussians
+from sundae_ns.io.pack import container
+from sundae_ns.plugin.dataparsers import camera_of
+from sundae_ns.plugin.distill import distill
+from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.scene import virtual_cameras as virtual
-from sundae_ns.scene.cameras import is_frame, read_cameras
+from sundae_ns.scene.cameras import camera_in_front, is_frame, read_cameras, with_start
+from sundae_ns.scene.packing import start_of, stated_start
+from sundae_ns.scene.page import render_first
 from sundae_ns.scene.prune_scene import prune_with_mask
+from sundae_ns.scene.render import StepResolution
+from sundae_ns.scene.scene import image_of
 
 FRAME = {"transform_matrix": [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]}
 LENS = {"fl_x": 50, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48}
@@ -259,3 +278,251 @@ EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 )
 def test_a_frame_is_a_transform_and_a_scale(frame: Any, valid: bool) -> None:
     assert is_frame(frame) == valid
+
+
+Build = Callable[..., SundaeModel]
+Perturb = Callable[[SundaeModel], SundaeModel]
+MakeCamera = Callable[..., Cameras]
+MakeBatch = Callable[..., dict[str, Tensor]]
+TrainingOf = Callable[[SundaeModel], Any]
+
+
+@torch.no_grad()
+def test_a_primitive_lands_where_the_pinhole_says(build: Build, camera: MakeCamera) -> None:
+    xyz = torch.tensor([[0.55, 0.35, 0.0]])
+    model = build(seed_points=(xyz, torch.zeros(1, 3, dtype=torch.uint8))).eval()
+    model.gauss_params["scales"].data.fill_(-5)
+    alpha = model.get_outputs_for_camera(camera())["accumulation"][..., 0]
+    row, column = divmod(int(alpha.argmax()), 40)
+    # In front of the camera by 3; x to the right, y up, pixel centres at one half.
+    assert (column, row) == (int(20 + 30 * 0.55 / 3), int(16 - 30 * 0.25 / 3))
+
+
+@pytest.mark.parametrize(("step", "mirrored"), [(10, True), (11, False)])
+def test_a_window_is_a_part_of_the_whole_picture(
+    build: Build,
+    perturb: Perturb,
+    camera: MakeCamera,
+    batch: MakeBatch,
+    monkeypatch: pytest.MonkeyPatch,
+    step: int,
+    mirrored: bool,
+) -> None:
+    """Pictures, truth and mask of a window are what the whole picture shows there, or its mirror image."""
+    whole, cut = (perturb(build(head={"max_train_pixels": limit}, background_color="black")) for limit in (0, 600))
+    with torch.no_grad():
+        # Rasterisers clamp how they linearise large Gaussians far outside of the picture, and a window is a picture.
+        whole.gauss_params["scales"] -= 2
+    cut.load_state_dict(whole.state_dict())
+    masked = {**batch(), "mask": torch.rand(32, 40, 1, generator=torch.Generator().manual_seed(4)) > 0.5}
+    for model in (whole, cut):
+        model.train()
+        model.step = step
+    monkeypatch.setattr(whole, "resolution", lambda step: StepResolution(step, 1, 0))
+    outputs = {model: model.get_outputs(camera()) for model in (whole, cut)}
+    crop = outputs[cut]["window"]
+    assert outputs[whole]["window"] is None
+    assert crop.width * crop.height <= 600
+    assert crop.mirrored == mirrored
+
+    def part(image: Tensor) -> Tensor:
+        seen = image[crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
+        return seen.flip(1) if mirrored else seen
+
+    for name in ("base_rgb", "accumulation"):
+        torch.testing.assert_close(outputs[cut][name], part(outputs[whole][name]), atol=1e-5, rtol=0)
+    truth = part(whole.truth(masked, outputs[whole]))
+    assert torch.equal(cut.truth(masked, outputs[cut]), truth)
+    losses = cut.get_loss_dict(outputs[cut], masked, {})
+    expected = ((outputs[cut]["base_rgb"] - truth).abs() * part(masked["mask"])).mean()
+    torch.testing.assert_close(losses["base_loss"], cut.config.base_loss_weight * expected)
+
+
+def test_windows_wait_for_the_head_and_for_densification(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = build(head={"max_train_pixels": 600})
+    assert not model.state.head_enabled
+    assert model.resolution(0) == StepResolution(0, 1, 0)
+    perturb(model)
+    assert model.resolution(0) == StepResolution(0, 1, 600, mirror=True)
+    assert model.eval().get_outputs(camera())["rgb"].shape == (32, 40, 3)  # what is shown is whole
+    early = perturb(
+        build(head={"max_train_pixels": 600, "start_at": 0}, pruning={"mode": "continuous", "start": 5, "stop": 50})
+    )
+    assert early.state.head_enabled
+    assert early.resolution(0) == StepResolution(0, 1, 0)  # densification takes its statistics from whole pictures
+    paper = perturb(build(head={"mode": "features"}))
+    assert not paper.resolution(0).mirror
+
+
+def made(seed: int, count: int = 3) -> Cameras:
+    generator = torch.Generator().manual_seed(seed)
+    poses = torch.cat(
+        [
+            rotation_matrices(torch.randn(count, 4, generator=generator)),
+            10 * torch.randn(count, 3, 1, generator=generator),
+        ],
+        dim=2,
+    )
+    focal = 50 + 100 * torch.rand(count, 2, 1, generator=generator)
+    width, height = torch.randint(1, 5000, (2, count, 1), generator=generator)
+    return Cameras(poses, focal[:, 0], focal[:, 1], width / 2 + 3, height / 2 - 5, width=width, height=height)
+
+
+@given(seed=st.integers(0, 10**6), downscale=st.integers(1, 4), index=st.integers(0, 2))
+def test_a_view_is_what_the_matrices_say(seed: int, downscale: int, index: int) -> None:
+    """World-to-camera is the inverse of the pose with y and z turned; intrinsics shrink with the picture."""
+    cameras = made(seed)
+    camera = cameras[index : index + 1]
+    cam = camera_of(camera, "cpu", downscale=downscale)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3] = cameras.camera_to_worlds[index].double() * torch.tensor([1.0, -1.0, -1.0, 1.0])
+    torch.testing.assert_close(cam.viewmat.double(), torch.linalg.inv(pose), rtol=1e-5, atol=1e-5)
+    K = cameras.get_intrinsics_matrices()[index].clone()
+    K[:2] /= downscale
+    torch.testing.assert_close(cam.K, K, rtol=1e-6, atol=0)
+    assert (cam.width, cam.height) == (
+        int(cameras.width[index]) // downscale,
+        int(cameras.height[index]) // downscale,
+    )
+    torch.testing.assert_close(torch.tensor(cam.focal), K[[0, 1], [0, 1]].mean(), rtol=1e-6, atol=0)
+    for name in ("camera_to_worlds", "fx", "cy", "width"):
+        assert torch.equal(getattr(cameras, name), getattr(made(seed), name)), "the camera does not change"
+    assert cam.viewmat.is_contiguous()
+    assert cam.K.is_contiguous()
+    before = cam.viewmat.clone()
+    cameras.camera_to_worlds.mul_(2)
+    assert torch.equal(cam.viewmat, before), "the view keeps no hold of its camera"
+
+
+def test_a_pose_that_learns_gives_the_same_view_and_a_gradient() -> None:
+    camera = made(0)[1:2]
+    pose = camera.camera_to_worlds.clone().requires_grad_()
+    plain, learned = camera_of(camera, "cpu"), camera_of(camera, "cpu", pose=pose)
+    torch.testing.assert_close(plain.viewmat, learned.viewmat.detach(), rtol=1e-6, atol=1e-5)
+    assert torch.equal(plain.K, learned.K)
+    assert plain[2:] == learned[2:]
+    learned.viewmat[:3].sum().backward()  # type: ignore[no-untyped-call]
+    assert pose.grad is not None
+    assert (pose.grad != 0).any()
+
+
+UP = (0.6, 0.0, -0.8)
+
+
+def two_seen(**options: Any) -> sn.Scene:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(80, 3, generator=generator)
+    cameras = tuple(sn.Camera.look_at((0.5 + dx, -2.0, 0.5), (0.5, 0.5, 0.5), width=40, height=30) for dx in (0.0, 0.8))
+    return dataclasses.replace(sn.Scene.from_points(points, points), cameras=cameras, **options)
+
+
+def started() -> sn.Scene:
+    return two_seen(up=UP, start=sn.Camera.look_at((3, 0.5, 0.5), (0.5, 0.5, 0.5), UP, fov=70, width=64, height=48))
+
+
+def same(one: sn.Scene, other: sn.Scene) -> bool:
+    assert one.start is not None
+    assert other.start is not None
+    alike = all(torch.allclose(a, b, atol=1e-6) for a, b in zip(one.start[:2], other.start[:2], strict=True))
+    return alike and one.start[2:] == pytest.approx(other.start[2:]) and one.up == pytest.approx(other.up)
+
+
+@pytest.mark.usefixtures("short_prunes")
+def test_files_and_scenes_made_of_a_scene_keep_both(tmp_path: Path) -> None:
+    truth = started()
+    sn.save(truth, tmp_path / "a.sundae")
+    found = sn.load(tmp_path / "a.sundae")
+    assert same(found, truth)
+    assert same(sn.prune(found, keep=0.5), truth)
+    assert same(distill(found, keep=0.5, steps=1, head=False, size=16), truth)
+    assert run("prune", tmp_path / "a.sundae", "-o", tmp_path / "b.sundae") == 0
+    assert same(sn.load(tmp_path / "b.sundae"), truth)
+
+
+def test_a_file_without_them_is_read_and_adds_nothing(tmp_path: Path) -> None:
+    sn.save(two_seen(), tmp_path / "a.sundae")
+    header = container.read_header(tmp_path / "a.sundae")
+    assert header.meta.keys().isdisjoint({"up", "start"})
+    found = sn.load(tmp_path / "a.sundae")
+    assert (found.up, found.start) == (None, None)
+
+
+def test_the_first_image_is_that_of_the_start_view() -> None:
+    shown = started()
+    assert shown.start is not None
+    expected = image_of(sn.render(shown, shown.start).rgb)
+    assert np.array_equal(np.asarray(render_first(shown)), np.asarray(expected))
+    assert np.asarray(render_first(two_seen())).shape == (30, 40, 3)
+
+
+@pytest.mark.parametrize("up", [None, UP, (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-0.95, 0.3122499, 0.0)])
+def test_the_camera_in_front_stands_upright(up: Any) -> None:
+    camera = camera_in_front(two_seen(up=up))
+    wanted = torch.tensor(up or (0.0, 0.0, 1.0))
+    assert torch.allclose(camera.pose[:, 1], wanted, atol=1e-5)
+    if up is None:
+        assert torch.allclose(camera.pose[:, 2], torch.tensor([0.0, -1.0, 0.0]), atol=1e-6)
+
+
+def test_options_name_a_view_or_a_file(tmp_path: Path) -> None:
+    plain = two_seen()
+    assert with_start(plain, None, None) is plain
+    assert with_start(plain, "1", None).start is plain.cameras[1]
+    found = with_start(plain, str(written(tmp_path, {**LENS, "frames": [FRAME]})), (0, 0, -5))
+    assert found.start is not None
+    assert found.start.center.tolist() == [0, 0, 3]
+    assert found.up == (0, 0, -1)
+    for start_view, up, message in (
+        ("2", None, "there is no camera 2 in the scene; give --start-view 0 to 1, or a camera file"),
+        ("-1", None, "there is no camera -1"),
+        (None, (0, 0, 0), "no direction"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            with_start(plain, start_view, up)
+    with pytest.raises(DataError):
+        with_start(plain, str(tmp_path / "none.json"), None)
+    with pytest.raises(ConfigError, match="no camera 0 in the scene; give a camera file"):
+        with_start(dataclasses.replace(plain, cameras=()), "0", None)
+
+
+def test_values_that_readers_refuse_are_not_written(tmp_path: Path) -> None:
+    far = sn.Camera.look_at((2e9, 0, 0), (0, 0, 0))
+    for wrong in (far, far._replace(viewmat=torch.zeros(4, 4)), far.zoomed(1e6)):
+        with pytest.raises(ConfigError, match="has values that readers refuse"):
+            sn.save(two_seen(start=wrong), tmp_path / "a.sundae")
+    assert not list(tmp_path.iterdir())
+    assert start_of(stated_start(started()))[0] == pytest.approx(UP)
+
+
+def test_commands_state_them_without_coding_the_scene_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sn.save(two_seen(), tmp_path / "a.sundae")
+    words = ("--start-view", 1, "--up", 0, -2, 0)
+    assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "site", *words) == 0
+    before, after = (tmp_path / name for name in ("a.sundae", "site/scene.sundae"))
+    found = sn.load(after)
+    assert found.up == (0, -1, 0)
+    assert found.start is not None
+    assert torch.allclose(found.start.viewmat, two_seen().cameras[1].viewmat, atol=1e-6)
+    one, other = (container.read_sections(path, container.read_header(path)) for path in (before, after))
+    assert all(np.array_equal(one[name], other[name]) for name in (*one, *other))
+    assert run("export", after, "-o", tmp_path / "a.html") == 0
+    (code,) = re.findall(r'id="scene"[^>]*>([^<]*)</script>', (tmp_path / "a.html").read_text())
+    assert base64.b64decode(code) == after.read_bytes()
+    sn.save(two_seen(), tmp_path / "a.ply")
+    camera = written(tmp_path, {**LENS, "frames": [FRAME]})
+    packed = tmp_path / "b.sundae"
+    assert run("pack", tmp_path / "a.ply", "-o", packed, "--start-view", camera, "--up", 0, -1, 0) == 0
+    found = sn.load(packed)
+    assert found.up == (0, -1, 0)
+    assert found.start is not None
+    assert found.start.center.tolist() == [0, 0, 3]
+    capsys.readouterr()
+    for words in (
+        ("export", tmp_path / "a.sundae", "-o", tmp_path / "b.spz", "--up", 0, 0, 1),
+        ("export", tmp_path / "a.sundae", "-o", tmp_path / "b.html", "--start-view", 7),
+        ("pack", tmp_path / "a.ply", "-o", tmp_path / "c.sundae", "--start-view", 0),
+    ):
+        assert run(*words) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert line.startswith("sundae: ")
+    assert not {"b.spz", "b.html", "c.sundae"} & {path.name for path in tmp_path.iterdir()}

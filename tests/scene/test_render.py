@@ -1,9 +1,16 @@
-"""Pictures of the model: every output, with the head and without, crops, other scales, and a device without room."""
+"""Images of the model: its outputs, made when they are read, crops, other scales, full memory, and recorded frames."""
 
 from __future__ import annotations
 
-import os
+import copy
+import logging
+import sys
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from threading import Barrier
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,22 +20,28 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.utils import colormaps
 from torch import Tensor
 
-from sundae_ns.core.camera import Crop, crop_image
-from sundae_ns.core.errors import MemoryExhaustedError
+from sundae_ns.core.camera import Camera
+from sundae_ns.core.errors import BackendError, MemoryExhaustedError
 from sundae_ns.core.gaussians import Gaussians
+from sundae_ns.cuda.cuda_graphs import RECORD_AT
 from sundae_ns.head.head import resize
-from sundae_ns.method_configs import sundae
 from sundae_ns.plugin.model import SundaeModel
-from sundae_ns.scene.render import GaussianSource, render_view
+from sundae_ns.scene import frames
+from sundae_ns.scene.frames import FrameReplay, Later, LazyOutputs
+from sundae_ns.scene.render import GaussianSource, RenderSettings, render_view
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
 MakeCamera = Callable[..., Cameras]
 TrainingOf = Callable[[SundaeModel], Any]
-
 N = 60
 """Gaussians of a model that is built without a count."""
 VIEWER_KEYS = {"rgb": 3, "base_rgb": 3, "depth": 1, "accumulation": 1, "features": 3, "response": 1, "background": 3}
+
+
+@pytest.fixture
+def model(build: Build, perturb: Perturb) -> SundaeModel:
+    return perturb(build()).eval()
 
 
 @pytest.mark.parametrize("size", [(30, 30), (31, 47), (97, 33)])
@@ -39,8 +52,8 @@ def test_every_output_can_be_shown(
 ) -> None:
     model = perturb(build(head={"mode": mode})).eval()
     outputs = model.get_outputs_for_camera(camera(*size))
-    assert {name: value.shape for name, value in outputs.items()} == {
-        name: (size[1], size[0], channels) for name, channels in VIEWER_KEYS.items()
+    assert {name: (*size[::-1], count) for name, count in VIEWER_KEYS.items()} == {
+        k: v.shape for k, v in outputs.items()
     }
     for name, value in outputs.items():
         assert value.dtype == torch.float32, name
@@ -81,13 +94,11 @@ def test_depth_is_splatted_when_it_is_looked_at(
 
 
 @torch.no_grad()
-def test_a_crop_without_primitives_has_the_same_keys(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
-    model = perturb(build()).eval()
+def test_a_crop_without_primitives_has_the_same_keys(model: SundaeModel, camera: MakeCamera) -> None:
     whole = model.get_outputs_for_camera(camera())
     far = OrientedBox.from_params((50.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     empty = model.get_outputs_for_camera(camera(), obb_box=far)
-    assert list(empty) == list(whole)
-    assert {name: value.shape for name, value in empty.items()} == {n: v.shape for n, v in whole.items()}
+    assert [(name, value.shape) for name, value in empty.items()] == [(n, v.shape) for n, v in whole.items()]
     assert torch.equal(empty["rgb"], empty["background"])
     assert not empty["accumulation"].any()
     half = OrientedBox.from_params((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (2.0, 9.0, 9.0))
@@ -97,8 +108,7 @@ def test_a_crop_without_primitives_has_the_same_keys(build: Build, perturb: Pert
 
 
 @torch.no_grad()
-def test_without_the_head_the_picture_is_the_base_exactly(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
-    model = perturb(build()).eval()
+def test_without_the_head_the_picture_is_the_base_exactly(model: SundaeModel, camera: MakeCamera) -> None:
     on = model.get_outputs_for_camera(camera())
     assert (on["rgb"] - on["base_rgb"]).abs().max() > 1e-3
     settings = model.render_settings(training=False).without_head()
@@ -109,34 +119,6 @@ def test_without_the_head_the_picture_is_the_base_exactly(build: Build, perturb:
     model.step = 3
     before = model.get_outputs_for_camera(camera())
     assert torch.equal(before["rgb"], before["base_rgb"])
-
-
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-@torch.no_grad()
-def test_a_mirrored_window_shows_the_mirror_image(
-    build: Build, perturb: Perturb, camera: MakeCamera, backend: str
-) -> None:
-    """Camera and truth agree: off-centre, without symmetry, at an odd width."""
-    model = perturb(build(rasterizer=backend)).eval()
-    model.step = 10
-    cam = model.camera_of(camera(47, 31))
-    cam.K[0, 2] += 2.5
-    part = Crop(5, 3, 33, 20)
-    settings = model.render_settings(training=False).without_head()
-    for crop in (Crop(0, 0, 47, 31), part):
-        plain, mirrored = (
-            render_view(model.source, cam.cut(crop._replace(mirrored=one)), torch.zeros(3), settings)[0]
-            for one in (False, True)
-        )
-        for name in ("rgb", "depth", "accumulation"):
-            assert plain[name].std() > 1e-3
-            error = (mirrored[name] - plain[name].flip(1)).abs()
-            # Other roundings may skip a splat that is just visible, or keep it.
-            assert error.max() < 0.02 * plain[name].max()
-            assert (error > 2e-5).float().mean() < 0.005
-    image = torch.rand(31, 47, 3)
-    assert torch.equal(crop_image(image, part._replace(mirrored=True)), crop_image(image, part).flip(1))
-    assert torch.equal(crop_image(image, part), image[3:23, 5:38])
 
 
 @torch.no_grad()
@@ -174,12 +156,11 @@ def test_what_features_make_lies_over_the_background(build: Build, perturb: Pert
     model = perturb(build(head={"mode": "features"})).eval()
     model.step = 10_000
     model.gauss_params["opacities"].data -= 3.0
-    pictures = []
+    images = []
     for value in (0.25, 0.75):
         model.set_background(torch.full((3,), value))
-        outputs = model.get_outputs_for_camera(camera())
-        pictures.append((outputs["rgb"], outputs["accumulation"]))
-    (dark, alpha), (light, _) = pictures
+        images.append(model.get_outputs_for_camera(camera()))
+    dark, light, alpha = images[0]["rgb"], images[1]["rgb"], images[0]["accumulation"]
     inside = ((dark > 0) & (light < 1)).all(dim=-1, keepdim=True) & (alpha > 0.01) & (alpha < 0.99)
     assert inside.sum() > 50
     torch.testing.assert_close((light - dark)[inside[..., 0]], (0.5 * (1 - alpha))[inside].expand(3, -1).T)
@@ -230,10 +211,7 @@ class FullBackend:
     name = "full"
 
     def rasterize(self, *_: Any, **__: Any) -> Any:
-        raise torch.cuda.OutOfMemoryError(
-            "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total capacity of 79.10 GiB of which 1 MiB is "
-            "free."
-        )
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total ...")
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         return torch.zeros_like(directions)
@@ -243,27 +221,291 @@ class FullBackend:
 def test_full_memory_says_how_much_and_what_to_try(build: Build, camera: MakeCamera, training: bool) -> None:
     model = build().train(training)
     model.backend = FullBackend()  # type: ignore[assignment]
-    with pytest.raises(
-        MemoryExhaustedError, match=rf"cannot allocate 2\.50 GiB more with {N} Gaussians; try"
-    ) as caught:
+    options = f"cache-images cpu .*camera-res-scale-factor .*max-gaussians {N // 2}"
+    with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 2\.50 GiB more with {N} Gaussians; .*{options}"):
         model.get_outputs_for_camera(camera())
-    text = str(caught.value)
-    assert "\n" not in text
-    for option in ("cache-images cpu", "camera-res-scale-factor", f"max-gaussians {N // 2}"):
-        assert option in text
 
 
-@pytest.mark.parametrize("mode", ["residual", "features"])
-def test_a_model_trained_ten_times_too_fast_may_be_bad_but_not_broken(
-    build: Build, camera: MakeCamera, training_of: TrainingOf, mode: str
+def test_outputs_that_nobody_asks_for_cost_nothing(
+    model: SundaeModel, camera: MakeCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Field and head together, each by ten times its rate in the method."""
-    model = build(head={"mode": mode, "start_at": 0}, pruning={"prune_at": 10})
-    training = training_of(model)
-    for name, optimizer in training.optimizers.optimizers.items():
-        optimizer.param_groups[0]["lr"] = 10 * sundae.config.optimizers[name]["optimizer"].lr
-    for step in range(1000 if os.environ.get("SUNDAE_ALL_SEEDS") == "1" else 100):
-        training.step(step)
-    outputs = model.eval().get_outputs_for_camera(camera())
-    assert all(torch.isfinite(outputs[name]).all() for name in ("rgb", "base_rgb", "accumulation"))
-    assert all(torch.isfinite(value).all() for value in model.parameters())
+    splatted: list[int] = []
+    rendering = sys.modules["sundae_ns.scene.render"]  # its name is also that of a function
+    rasterize = rendering.rasterize
+    monkeypatch.setattr(rendering, "rasterize", lambda *a, **kwargs: splatted.append(1) or rasterize(*a, **kwargs))
+    outputs = model.get_outputs_for_camera(camera())
+    assert outputs["rgb"].shape == outputs["base_rgb"].shape
+    assert (len(splatted), model._response._last[0]) == (1, None)
+    assert outputs["response"].max() > 0
+    assert len(splatted) == 2
+
+
+def test_outputs_belong_to_the_field_that_was_rendered(model: SundaeModel, camera: MakeCamera) -> None:
+    before = {name: value.clone() for name, value in model.get_outputs_for_camera(camera()).items()}
+    outputs = model.get_outputs_for_camera(camera())
+    with torch.no_grad():  # a prune, while another thread still shows the picture
+        for name, value in model.gauss_params.items():
+            model.gauss_params[name] = torch.nn.Parameter(value[::2].clone())
+        model.state.pruning["num_prunes"] += 1
+    assert {name for name, value in outputs.items() if not torch.equal(value, before[name])} == set()
+    after = model.get_outputs_for_camera(camera())
+    assert not torch.equal(after["response"], before["response"])
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("n", [1, 5])
+def test_one_primitive_has_no_response_to_show_and_few_have_one(build: Build, camera: MakeCamera, n: int) -> None:
+    picture = build(n=n).eval().get_outputs_for_camera(camera())["response"]
+    assert picture.isfinite().all()
+    assert bool(picture.any()) == (n > 1)
+
+
+def test_an_output_is_made_once_by_every_way_to_it_and_without_gradients() -> None:
+    calls, weight = [], torch.ones(1, requires_grad=True)
+
+    def make(name: str) -> Tensor:
+        calls.append(name)
+        return 2 * weight
+
+    outputs = LazyOutputs(rgb="RGB", depth=Later(lambda: make("depth")), features=Later(lambda: make("features")))
+    for look in (dict, lambda o: {**o}, lambda o: dict(o.items()), lambda o: dict(zip(o, o.values(), strict=True))):
+        assert look(copy.copy(outputs)) == {"rgb": "RGB", "depth": 2, "features": 2}
+    assert isinstance(outputs.data["depth"], Later)
+    calls.clear()
+    assert not any(value.requires_grad for value in (outputs["depth"], outputs["depth"], outputs.get("depth")))
+    assert calls == ["depth"]
+    assert outputs.pop("depth") == 2
+    assert list(outputs) == ["rgb", "features"]
+
+
+def test_two_threads_get_values() -> None:
+    barrier = Barrier(2, timeout=10)  # both are in it before either has its value
+    outputs = LazyOutputs(x=Later(lambda: barrier.wait() >= 0))
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(lambda _: outputs["x"], range(2))) == [True, True]
+
+
+class Recorder:
+    """In place of the GPU's: what it plays is rendered anew, and it notes what it was asked for."""
+
+    def __init__(self) -> None:
+        self.recorded: list[int | None] = []
+        self.played = 0
+        self.needed = 100
+        self.fails: Exception | None = None
+
+    def record(self, source: Any, _: Any, __: Any, settings: RenderSettings, capacity: int | None = None) -> Any:
+        if self.fails is not None:
+            raise self.fails
+        self.recorded.append(capacity)
+
+        def show(camera: Camera, background: Tensor) -> dict[str, Tensor]:
+            shown = render_view(source, camera, background, settings, depth=False)[0]
+            return {name: shown[name] for name in frames.REPLAYED}
+
+        return SimpleNamespace(show=show, capacity=capacity or 120)
+
+    def play(self, recording: Any, camera: Camera, background: Tensor) -> tuple[dict[str, Tensor], int]:
+        self.played += 1
+        return recording.show(camera, background), self.needed
+
+
+@pytest.fixture
+def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    found = Recorder()
+    monkeypatch.setattr(frames, "_record", found.record)
+    monkeypatch.setattr(frames, "_replay", found.play)
+    monkeypatch.setattr(frames, "_recordable", lambda source, settings: source.replayable)
+    return found
+
+
+def test_a_size_that_stays_is_recorded_and_played_back(
+    build: Build, perturb: Perturb, camera: MakeCamera, recorder: Recorder
+) -> None:
+    model = perturb(build(background_color="black")).eval()
+    shown = [model.get_outputs_for_camera(camera(shift=0.1 * i))["rgb"] for i in range(RECORD_AT + 2)]
+    assert (len(recorder.recorded), recorder.played) == (1, 3)
+    model._replay = FrameReplay()
+    for i, picture in enumerate(shown):
+        assert torch.equal(picture, model.get_outputs_for_camera(camera(shift=0.1 * i))["rgb"])
+        model.get_outputs_for_camera(camera(width=20 + i))
+
+
+def test_what_a_recording_has_fixed_makes_another_one(
+    model: SundaeModel, camera: MakeCamera, recorder: Recorder
+) -> None:
+    def show(**options: Any) -> int:
+        for _ in range(RECORD_AT):
+            model.get_outputs_for_camera(camera(**options))
+        return len(recorder.recorded)
+
+    assert show() == 1
+    assert show(width=41) == 2
+    assert show(height=33) == 3
+    model.compensated = False
+    assert show() == 4
+    model.compensated = True
+    assert model.head is not None
+    model.head.config = replace(model.head.config, precision="fp32")
+    assert show() == 5
+    model.state.trained_focal = (10.0, 10.0)  # the camera's is 30: the head runs at another scale
+    assert show() == 6
+    with torch.no_grad():
+        model.gauss_params["means"] = torch.nn.Parameter(model.gauss_params["means"].clone())
+    assert show() == 7
+    assert len(model._replay._frames) == 1
+    model.step = 0  # fewer bands of the harmonics take part
+    assert show() == 8
+    model.config.rasterize_mode = "antialiased"
+    assert show() == 9
+    model.step = 10
+    assert show() == 10  # those of a field that is gone hold memory for nothing
+
+
+def test_a_view_of_more_pairs_than_there_is_room_for_is_recorded_again(
+    model: SundaeModel, camera: MakeCamera, recorder: Recorder
+) -> None:
+    for _ in range(RECORD_AT):
+        model.get_outputs_for_camera(camera())
+    recorder.needed = 121
+    outputs = model.get_outputs_for_camera(camera())
+    assert recorder.recorded == [None, int(frames.SPARE_CAPACITY * 121)]
+    assert outputs["rgb"].shape == (32, 40, 3)
+    recorder.needed = 150
+    model.get_outputs_for_camera(camera())
+    assert len(recorder.recorded) == 2
+
+
+def test_one_thread_plays_at_a_time(
+    model: SundaeModel, camera: MakeCamera, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inside, most, play = [0], [0], recorder.play
+
+    def slowly(*arguments: Any) -> Any:
+        inside[0] += 1
+        most[0] = max(most[0], inside[0])
+        time.sleep(0.02)
+        made = play(*arguments)
+        inside[0] -= 1
+        return made
+
+    monkeypatch.setattr(frames, "_replay", slowly)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: model.get_outputs_for_camera(camera())["rgb"], range(12)))
+    assert (most[0], recorder.played) == (1, 10)
+
+
+@pytest.mark.parametrize("error", [BackendError("no compiler: install one"), torch.cuda.OutOfMemoryError("full")])
+def test_what_cannot_be_recorded_is_rendered_and_said_once(
+    model: SundaeModel, camera: MakeCamera, recorder: Recorder, caplog: pytest.LogCaptureFixture, error: Exception
+) -> None:
+    recorder.fails = error
+    with caplog.at_level(logging.WARNING):
+        shown = [model.get_outputs_for_camera(camera())["rgb"] for _ in range(2 * RECORD_AT)]
+    assert caplog.text.count("cannot be recorded") == 1
+    assert all(torch.equal(picture, shown[0]) for picture in shown)
+
+
+def test_a_part_of_a_field_is_never_recorded(
+    model: SundaeModel, camera: MakeCamera, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its tensors are gone with the frame."""
+    box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    for _ in range(2 * RECORD_AT):
+        cropped = model.get_outputs_for_camera(camera(), obb_box=box)["rgb"]
+    mask = torch.arange(60) % 2 == 0
+    half = SimpleNamespace(gaussians=model.state.gaussians.rows(mask), decision=SimpleNamespace(mask=mask))
+    monkeypatch.setattr(model.viewer_controls, "preview", lambda: half)
+    for _ in range(2 * RECORD_AT):
+        previewed = model.get_outputs_for_camera(camera())["rgb"]
+    assert recorder.recorded == []
+    monkeypatch.undo()
+    whole = model.get_outputs_for_camera(camera())["rgb"]
+    assert not torch.equal(cropped, whole)
+    assert not torch.equal(previewed, whole)
+
+
+def test_nothing_is_recorded_on_a_cpu_or_in_training(
+    model: SundaeModel, camera: MakeCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(frames, "_record")
+    for _ in range(2 * RECORD_AT):
+        model.get_outputs_for_camera(camera())
+    source, empty = (GaussianSource(Gaussians({"means": torch.zeros(n, 3)})) for n in (1, 0))
+    settings = model.render_settings(training=False)
+    settings = replace(settings, backend=SimpleNamespace(name="gsplat"))  # type: ignore[arg-type]
+    with torch.no_grad():
+        assert frames._recordable(source, settings)
+        assert not frames._recordable(empty, settings)
+        assert not frames._recordable(source, replace(settings, training=True))
+        assert not frames._recordable(GaussianSource(source.gaussians, whole=False), settings)
+    assert not frames._recordable(source, settings)  # with gradients
+
+
+def eager(model: SundaeModel, camera: Cameras) -> dict[str, Tensor]:
+    model._replay = FrameReplay()
+    outputs = model.get_outputs_for_camera(camera)
+    assert len(model._replay._frames) == 0
+    return {name: outputs[name] for name in frames.REPLAYED}
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("head", [{}, {"precision": "fp32"}, {"mode": "features"}, {"mode": "off"}])
+@pytest.mark.parametrize("focal", [None, 12.0])
+def test_what_is_played_back_is_what_would_be_rendered(
+    build: Build, perturb: Perturb, camera: MakeCamera, head: dict[str, Any], focal: float | None
+) -> None:
+    model = perturb(build(n=2000, sh_degree=3, head=head, background_color="white")).cuda().eval()
+    model.step = 10_000
+    if focal is not None:
+        model.state.trained_focal = (focal, focal)
+    cameras = [camera(width=150, height=101, shift=shift) for shift in (0.0, 0.3, -0.6, 0.1)]
+    expected = [eager(model, cam) for cam in cameras]
+    replayed = model._replay = FrameReplay()
+    for _ in range(RECORD_AT):
+        model.get_outputs_for_camera(cameras[0])
+    shown = [model.get_outputs_for_camera(cam) for cam in cameras]
+    assert len(replayed._frames) == 1
+    assert replayed._can_record
+    for found, truth in zip(shown, expected, strict=True):
+        for name, picture in truth.items():
+            torch.testing.assert_close(found[name], picture, rtol=0, atol=2e-3 if name == "rgb" else 1e-6)
+    assert not torch.equal(shown[0]["rgb"], shown[1]["rgb"])
+    assert shown[1]["depth"].isfinite().all()
+    assert bool(shown[1]["features"].any()) == (head.get("mode") != "off")
+
+
+@pytest.mark.gpu
+def test_what_is_trained_meanwhile_is_seen(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = perturb(build(n=500)).cuda().eval()
+    before = [model.get_outputs_for_camera(camera())["rgb"] for _ in range(RECORD_AT + 1)][-1]
+    with torch.no_grad():
+        model.gauss_params["features_dc"] += 0.5
+        for value in model.head.parameters():  # type: ignore[union-attr]
+            value += 0.02
+    after = model.get_outputs_for_camera(camera())["rgb"]
+    assert len(model._replay._frames) == 1
+    assert not torch.equal(after, before)
+    torch.testing.assert_close(after, eager(model, camera())["rgb"], rtol=0, atol=2e-3)
+    with torch.no_grad():  # a prune
+        for name, value in list(model.gauss_params.items()):
+            model.gauss_params[name] = torch.nn.Parameter(value[::2].clone())
+    for _ in range(RECORD_AT):
+        pruned = model.get_outputs_for_camera(camera())["rgb"]
+    torch.testing.assert_close(pruned, eager(model, camera())["rgb"], rtol=0, atol=2e-3)
+
+
+@pytest.mark.gpu
+def test_a_view_of_many_more_pairs(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = perturb(build(n=3000)).cuda().eval()
+    far, near = camera(width=640, height=480, shift=300.0), camera(width=640, height=480)
+    expected = eager(model, near)["base_rgb"]
+    model._replay = FrameReplay()
+    for _ in range(RECORD_AT):
+        model.get_outputs_for_camera(far)
+    (small,) = model._replay._frames._graphs.values()
+    found = model.get_outputs_for_camera(near)["base_rgb"]
+    (large,) = model._replay._frames._graphs.values()
+    assert large.capacity > small.capacity
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    assert model._replay._can_record
