@@ -58,7 +58,7 @@ def pack(
         target_bytes: find the finest steps whose file has at most this many bytes.
         target_drop: find the coarsest steps that lose at most this PSNR on some test views, dB.
         finetune: training steps with quantisation in the loop before packing, for example 1000; the run is not changed.
-            Bits and steps at their defaults are then coarser, for a smaller file.
+            Bits and steps that are not given are then coarser, for a smaller file.
         max_cameras: maximum number of training cameras to store for viewers; with 0, the capture is not needed.
         start_view: what a page of the scene opens with: index of a stored camera, or a camera file as sundae render
             reads it; by default the first camera.
