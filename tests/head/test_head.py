@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 import torch
@@ -111,20 +109,6 @@ def test_wild_inputs_give_finite_images(mode: str, kind: str) -> None:
     out.square().mean().backward()
     assert torch.isfinite(out).all()
     assert torch.isfinite(splatted.grad).all()
-
-
-@pytest.mark.parametrize("mode", ["residual", "features"])
-def test_training_with_ten_times_the_rate_stays_finite(mode: str) -> None:
-    torch.manual_seed(0)
-    module = head(mode=mode, pixel_unshuffle=2)
-    optimizer = torch.optim.Adam(module.parameters(), lr=1e-2)  # the methods have 1e-3 at most
-    images = [inputs(16, 16) for _ in range(4)]
-    truths = [torch.rand(16, 16, 3) for _ in images]
-    for step in range(1000 if os.environ.get("SUNDAE_ALL_SEEDS") == "1" else 200):
-        optimizer.zero_grad()
-        (module(*images[step % 4]) - truths[step % 4]).abs().mean().backward()
-        optimizer.step()
-    assert all(torch.isfinite(module(*image)).all() for image in images)
 
 
 @pytest.mark.gpu

@@ -337,23 +337,6 @@ def test_same_steps_as_nerfstudios_adam() -> None:
     assert len(optimizer.param_groups[0]["params"]) == 2
 
 
-def step_at_a_long_gradient(config: AdamOptimizerConfig) -> float:
-    """How far a weight moves, in rates, by the first long gradient after thousands of short ones."""
-    value = torch.nn.Parameter(torch.zeros(1))
-    optimizer = config.setup([value])
-    for step in range(5000):
-        value.grad = torch.full((1,), 1e-4 * (-1) ** step)
-        optimizer.step()
-    before, value.grad = value.item(), torch.ones(1)
-    optimizer.step()
-    return abs(value.item() - before) / config.lr
-
-
-def test_a_long_gradient_moves_a_networks_weights_by_less_than_the_rate() -> None:
-    assert step_at_a_long_gradient(FusedAdamConfig(lr=1e-3)) > 3
-    assert step_at_a_long_gradient(NetworkAdamConfig(lr=1e-3)) < 0.5
-
-
 def test_weights_of_many_inputs_have_smaller_rates() -> None:
     head = CompensationHead(HeadConfig(size="regular", pixel_unshuffle=1))
     optimizer = NetworkAdamConfig(lr=1e-3, full_rate_inputs=1152).setup(head.parameters())
@@ -383,31 +366,6 @@ def test_a_networks_weights_decay_by_a_share_of_the_rate_and_biases_do_not() -> 
     optimizer.step()
     torch.testing.assert_close(net.weight.detach(), 0.95 * before[0])
     assert torch.equal(net.bias.detach(), before[1])
-
-
-def test_rates_of_all_layers_decay_alike_and_come_back_from_a_checkpoint() -> None:
-    def made() -> tuple[torch.optim.Optimizer, Any]:
-        head = CompensationHead(HeadConfig(size="regular"))
-        optimizer = NetworkAdamConfig(lr=1e-3).setup(head.parameters())
-        config = PruneAwareDecayConfig(lr_final=1e-5, max_steps=100, lr_restart=1e-3, hold_until_prune=True)
-        return optimizer, config.setup().get_scheduler(optimizer, 1e-3)
-
-    optimizer, scheduler = made()
-    highest = [group["lr"] for group in optimizer.param_groups]
-    assert len(highest) > 1
-    notify_pruned({"compensation": scheduler}, 0, 100)
-    for _ in range(50):
-        optimizer.step()
-        scheduler.step()
-    rates = [group["lr"] for group in optimizer.param_groups]
-    assert rates == pytest.approx([0.1 * rate for rate in highest])
-    again, schedule = made()
-    again.load_state_dict(optimizer.state_dict())
-    schedule.load_state_dict(scheduler.state_dict())
-    for each in (optimizer, scheduler, again, schedule):
-        each.step()
-    assert [group["lr"] for group in again.param_groups] == [group["lr"] for group in optimizer.param_groups]
-    assert optimizer.param_groups[0]["lr"] < rates[0]
 
 
 @pytest.mark.gpu

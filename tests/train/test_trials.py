@@ -162,20 +162,17 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun, monkeypatch: 
     assert (height(run), other.taken_back) == (0.0, 6)
 
 
-def test_the_mode_auto_adds_a_trial_and_the_others_do_not(build: Build) -> None:
-    assert "trials" in {callback.name for callback in build(head={"mode": "auto"}).train_callbacks}
-    for mode in ("residual", "features", "off"):
-        assert "trials" not in {callback.name for callback in build(head={"mode": mode}).train_callbacks}
-    names = [callback.name for callback in build(head={"mode": "off"}, pruning={"keep_ratio": None}).train_callbacks]
-    assert names.index("trials") < names.index("pruning") < names.index("after-prune")
-
-
-def test_an_undecided_head_is_residual_and_disabled(build: Build) -> None:
+def test_trials_are_there_for_an_undecided_head_which_is_disabled_or_an_undecided_count(build: Build) -> None:
     model = build(head={"mode": "auto"})
     model.step = 10**6
     assert model.head is not None
     assert model.head.config.mode == "residual"
     assert not model.state.head_enabled
+    for mode in ("residual", "features", "off"):
+        assert "trials" not in {callback.name for callback in build(head={"mode": mode}).train_callbacks}
+    for undecided in (model, build(head={"mode": "off"}, pruning={"keep_ratio": None})):
+        names = [callback.name for callback in undecided.train_callbacks]
+        assert names.index("trials") < names.index("pruning") < names.index("after-prune")
 
 
 def test_a_removed_head_leaves_no_values_and_no_moments(build: Build) -> None:
