@@ -45,7 +45,7 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
 
     >>> import pathlib, tempfile, torch, sundae_ns as sn
-    >>> path = pathlib.Path(tempfile.mkdtemp(), "cloud.ply")
+    >>> path = pathlib.Path(tempfile.mkdtemp(), "cloud.glb")
     >>> sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), path)
     >>> sn.load(path)
     Scene(50 Gaussians, SH degree 0, no head, cpu)

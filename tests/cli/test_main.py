@@ -67,14 +67,14 @@ def test_torch_is_not_loaded_before_a_command_starts() -> None:
 
 def test_the_installed_command_takes_any_name_and_no_warning_for_an_error(tmp_path: Path) -> None:
     """Names of files may hold bytes that are no text."""
-    sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), tmp_path / "a.ply")
+    sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), tmp_path / "a.glb")
     environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"}
 
     def started(*words: str | bytes) -> tuple[int, bytes, bytes]:
         done = subprocess.run([SUNDAE, *words], cwd=tmp_path, env=environment, capture_output=True, check=False)
         return done.returncode, done.stdout, done.stderr
 
-    code, out, errors = started("export", "a.ply", "-o", b"\xff.html")
+    code, out, errors = started("export", "a.glb", "-o", b"\xff.html")
     assert (code, errors) == (0, b"")
     assert out.startswith(b"\\udcff.html: ")
     assert (tmp_path / os.fsdecode(b"\xff.html")).stat().st_size > 1000

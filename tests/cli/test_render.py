@@ -64,9 +64,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     generator = torch.Generator().manual_seed(0)
     points, colors = torch.rand(100, 3, generator=generator), torch.rand(100, 3, generator=generator)
     scene = sundae_ns.Scene.from_points(points, colors)
-    sundae_ns.save(scene, folder / "cloud.ply")
-    scene = dataclasses.replace(scene, cameras=tuple(VIEWS))
-    sundae_ns.save(scene, folder / "packed.sundae")
+    sundae_ns.save(dataclasses.replace(scene, up=(0.0, 0.0, 1.0)), folder / "cloud.ply")
+    sundae_ns.save(dataclasses.replace(scene, cameras=tuple(VIEWS)), folder / "packed.sundae")
     return folder
 
 
