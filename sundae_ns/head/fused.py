@@ -41,9 +41,7 @@ def compensated(net: UNet, residual: bool, base: Tensor, splatted: Tensor, alpha
         BackendError: the kernels cannot be compiled or loaded.
     """
     launches = head_kernels(base.device, dtype, head_options(net, residual))
-    height, width = base.shape[:2]
-    folded = folded_input(net, height, width, base, dtype)
-    fold_pixels(splatted, alpha, net.pixel_unshuffle, residual, folded, launches)
+    folded = fold_pixels(net, residual, splatted, alpha, dtype, launches)
     last = network(net, cast_weights(net, dtype), folded, launches).last
     return unfold_pixels(net, last, base, alpha, launches)
 
@@ -65,11 +63,9 @@ class _Correction(torch.autograd.Function):
         ctx: Any, splatted: Tensor, alpha: Tensor, net: UNet, residual: bool, dtype: torch.dtype, *_: Tensor
     ) -> Tensor:
         height, width, ctx.channels = splatted.shape
-        ctx.net, ctx.residual = net, residual
+        ctx.net, ctx.residual, ctx.weights = net, residual, cast_weights(net, dtype)
         ctx.launches = head_kernels(splatted.device, dtype, head_options(net, residual))
-        ctx.weights = cast_weights(net, dtype)
-        folded = folded_input(net, height, width, splatted, dtype)
-        fold_pixels(splatted, alpha, net.pixel_unshuffle, residual, folded, ctx.launches)
+        folded = fold_pixels(net, residual, splatted, alpha, dtype, ctx.launches)
         ctx.tape = network(net, ctx.weights, folded, ctx.launches)
         ctx.save_for_backward(alpha)
         return unfold_pixels(net, ctx.tape.last, splatted.new_zeros(height, width, 3), alpha, ctx.launches)
@@ -94,14 +90,8 @@ class _Correction(torch.autograd.Function):
 def head_options(net: UNet, residual: bool) -> tuple[str, ...]:
     """Compiler options for a network: its fold, its widths, and whether it corrects an image."""
     widths = [layer.out_channels for layer in net.modules() if isinstance(layer, nn.Conv2d)]
-    return (
-        f"-DMOST_CHANNELS={max(widths)}",
-        f"-DR={net.pixel_unshuffle}",
-        f"-DWIDTH={net.out.in_channels}",
-        f"-DPACK={PACK}",
-        f"-DSLOPE={SLOPE}f",
-        f"-DRESIDUAL={int(residual)}",
-    )
+    sizes = (f"-DMOST_CHANNELS={max(widths)}", f"-DR={net.pixel_unshuffle}", f"-DWIDTH={net.out.in_channels}")
+    return *sizes, f"-DPACK={PACK}", f"-DSLOPE={SLOPE}f", f"-DRESIDUAL={int(residual)}"
 
 
 def head_kernels(device: torch.device, dtype: torch.dtype, options: tuple[str, ...]) -> Launches:
@@ -140,18 +130,23 @@ def padded_channels(channels: int, fold: int) -> int:
     return -(-channels // per_pack) * per_pack
 
 
-def fold_pixels(splatted: Tensor, alpha: Tensor, size: int, residual: bool, folded: Tensor, launches: Launches) -> None:
-    """Write splatted values to the network's input ``folded``, ``size`` x ``size`` pixels in the channels of one.
+def fold_pixels(
+    net: UNet, residual: bool, splatted: Tensor, alpha: Tensor, dtype: torch.dtype, launches: Launches
+) -> Tensor:
+    """Splatted values as the network's input ``[1, C, h, w]``, a square of pixels in the channels of one.
 
     Splatted values ``[H, W, 3 + F]`` and accumulation ``[H, W, 1]`` are float32; their pixels may have a stride, their
     rows must be adjacent. Only a residual network sees colours and accumulation.
     """
-    height, width = splatted.shape[:2]
-    rows, columns = folded.shape[-2:]
-    padded = folded.shape[1] // size**2
+    height, width, channels = splatted.shape
+    size, stride = net.pixel_unshuffle, 2 ** (len(net.encoder) - 1)
+    rows, columns = (-(-side // (size * stride)) * stride for side in (height, width))
+    padded = padded_channels(convolutions(net)[0].in_channels // size**2, size)
+    folded = image_like(splatted, padded * size**2, rows, columns, dtype)
     images: list[Argument] = [splatted, pixel_stride(splatted), alpha, pixel_stride(alpha)]
-    sizes = [4 if residual else 0, splatted.shape[2] - 3, padded, height, width, rows, columns]
+    sizes = [4 if residual else 0, channels - 3, padded, height, width, rows, columns]
     launches["fold"](rows * columns * padded, [*images, *sizes, folded])
+    return folded
 
 
 def network(net: UNet, weights: list[Tensor], folded: Tensor, launches: Launches) -> Tape:
@@ -205,15 +200,6 @@ def unfold_pixels(net: UNet, raw: Tensor, base: Tensor, alpha: Tensor, launches:
     images: list[Argument] = [base, alpha, pixel_stride(alpha), height, width, out]
     launches["unfold"](rows * columns, [*layers, *images])
     return out
-
-
-def folded_input(net: UNet, height: int, width: int, like: Tensor, dtype: torch.dtype) -> Tensor:
-    """An uninitialised input of the network for an image size, ``[1, C, h, w]`` channels last."""
-    size = net.pixel_unshuffle
-    stride = 2 ** (len(net.encoder) - 1)
-    rows, columns = (-(-side // (size * stride)) * stride for side in (height, width))
-    channels = padded_channels(convolutions(net)[0].in_channels // size**2, size) * size**2
-    return image_like(like, channels, rows, columns, dtype)
 
 
 def convolutions(net: UNet) -> list[nn.Conv2d]:
@@ -276,10 +262,8 @@ def network_backward(
         )
         channels = convolutions(net)[number].in_channels
         # The memory format of the weights, so that autograd need not copy the gradient.
-        gradients[number] = (
-            grad_weight[:, :channels].float().contiguous(memory_format=torch.channels_last),
-            grad_biases[number],
-        )
+        grad_weight = grad_weight[:, :channels].float().contiguous(memory_format=torch.channels_last)
+        gradients[number] = grad_weight, grad_biases[number]
         return cast("Tensor", grad_x).contiguous(memory_format=torch.channels_last)
 
     def double(block: int, grad_raw: Tensor) -> Tensor:
@@ -298,19 +282,16 @@ def network_backward(
         # The second convolution of the coarser block precedes those of this block.
         bias = bias_of(convolutions(net)[2 * (levels + step) - 1])
         gradient = torch.empty_like(coarse)
-        launches["upsample_backward"](
-            coarse.numel() // PACK,
-            [grad_skip, grad_skip.shape[1], coarse, bias, channels, rows, columns, gradient],
-        )
+        arguments: list[Argument] = [grad_skip, grad_skip.shape[1], coarse, bias, channels, rows, columns, gradient]
+        launches["upsample_backward"](coarse.numel() // PACK, arguments)
     gradient = double(levels - 1, gradient)
     for level in reversed(range(levels - 1)):
         grad_skip, skip = grad_skips[level], tape.inputs[2 * (2 * levels - 2 - level)]
         rows, columns = skip.shape[-2:]
         channels = gradient.shape[1]
         grad_raw = image_like(gradient, channels, rows, columns)
-        launches["pool_backward"](
-            grad_raw.numel() // PACK, [grad_skip, skip, skip.shape[1], gradient, channels, rows, columns, grad_raw]
-        )
+        arguments = [grad_skip, skip, skip.shape[1], gradient, channels, rows, columns, grad_raw]
+        launches["pool_backward"](grad_raw.numel() // PACK, arguments)
         gradient = double(level, grad_raw)
     return gradient, [tensor for number in range(len(gradients)) for tensor in gradients[number]]
 
