@@ -18,16 +18,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sundae_ns.core.errors import DataError
+from sundae_ns.data import capture_files
 from sundae_ns.data.capture import check_transforms
-from sundae_ns.data.capture_files import (
-    APPLIED,
-    Placed,
-    names_of,
-    placed_in,
-    transforms_of,
-    write_images,
-    write_smaller,
-)
+from sundae_ns.data.capture_files import APPLIED, Placed, names_of, placed_in, write_images, write_smaller
 from sundae_ns.data.images import reads_heif
 from sundae_ns.data.photos import find_photos
 from sundae_ns.scene.cameras import cameras_of
@@ -41,20 +34,19 @@ def model(cameras: int = 1) -> Any:
     images = []
     for i, number in enumerate((5, 4, 3, 2, 9)):
         pose = np.column_stack([Rotation.random(random_state=i).as_matrix(), np.random.default_rng(i).normal(size=3)])
+        camera, stated = 1 + i % cameras, SimpleNamespace(matrix=lambda pose=pose: pose)
+        name = f"c{camera}/frame_{number:05d}.jpg"
         images.append(
-            SimpleNamespace(
-                name=f"c{1 + i % cameras}/frame_{number:05d}.jpg",
-                camera_id=1 + i % cameras,
-                has_pose=number != 9,
-                cam_from_world=lambda pose=pose: SimpleNamespace(matrix=lambda: pose),
-            )
+            SimpleNamespace(name=name, camera_id=camera, has_pose=number != 9, cam_from_world=lambda s=stated: s)
         )
     stated = [SimpleNamespace(width=40 + i, height=30, params=np.array(PARAMETERS)) for i in range(cameras)]
     return SimpleNamespace(images=dict(enumerate(images)), cameras=dict(enumerate(stated, start=1)))
 
 
 def transforms(made: Any) -> dict[str, Any]:
-    return transforms_of(made, {image.name: f"IMG {image.name[-9:-4]}.HEIC" for image in made.images.values()})
+    return capture_files.transforms_of(
+        made, {image.name: f"IMG {image.name[-9:-4]}.HEIC" for image in made.images.values()}
+    )
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
@@ -75,7 +67,7 @@ def test_our_cameras_see_what_colmap_sees(tmp_path: Path, cameras: int) -> None:
         assert (float(camera.K[0, 0]), float(camera.K[1, 2])) == (PARAMETERS[0], PARAMETERS[3])
 
 
-def test_frames_name_their_photos_in_order() -> None:
+def test_frames_name_their_photos_in_order(tmp_path: Path) -> None:
     meta = transforms(model())
     assert [frame["file_path"] for frame in meta["frames"]] == [f"images/frame_{i:05d}.jpg" for i in (2, 3, 4, 5)]
     assert meta["frames"][0]["original"] == "IMG 00002.HEIC"
@@ -84,9 +76,6 @@ def test_frames_name_their_photos_in_order() -> None:
     made.cameras[1].params = np.array([50.0, 20.0, 15.0, 0.01])  # a simple camera is a special case
     meta = transforms(made)
     assert [meta[name] for name in ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1")] == [50, 50, 20, 15, 0.01, 0, 0]
-
-
-def test_photos_of_a_capture(tmp_path: Path) -> None:
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps({"frames": [{"original": "b"}, {"file_path": "images/c"}], "left_out": ["a"]}))
     assert placed_in(tmp_path) == Placed(("b", "images/c"), ("a",))
@@ -138,14 +127,17 @@ def written(folder: Path, out: Path) -> list[Path]:
 
 
 def test_photos_of_one_camera_share_a_folder(tmp_path: Path) -> None:
-    save(tmp_path / "a.jpg", model="Phone", focal=4.2)
-    save(tmp_path / "b.jpg", model="Phone", focal=9.0)
-    save(tmp_path / "c.jpg", gradient(24, 40), model="Phone", focal=4.2)
-    save(tmp_path / "d.jpg", gradient(24, 40), model="Phone", focal=4.2, orientation=6)  # turned, it is as the first
-    save(tmp_path / "e.png", model="Other")
-    names = names_of(find_photos(tmp_path))
-    assert [name[:2] for name in names] == ["c1", "c2", "c3", "c1", "c4"]
-    assert names[3:] == ["c1/frame_00004.jpg", "c4/frame_00005.png"]
+    tall = gradient(24, 40)
+    for name, image, entries in (
+        ("a.jpg", None, {"model": "Phone", "focal": 4.2}),
+        ("b.jpg", None, {"model": "Phone", "focal": 9.0}),
+        ("c.jpg", tall, {"model": "Phone", "focal": 4.2}),
+        ("d.jpg", tall, {"model": "Phone", "focal": 4.2, "orientation": 6}),  # turned, it is as the first
+        ("e.png", None, {"model": "Other"}),
+    ):
+        save(tmp_path / name, image, **entries)
+    names = [f"c{camera}/frame_{number:05d}" for number, camera in enumerate((1, 2, 3, 1, 4), start=1)]
+    assert names_of(find_photos(tmp_path)) == [*(f"{name}.jpg" for name in names[:4]), f"{names[4]}.png"]
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

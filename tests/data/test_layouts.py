@@ -12,17 +12,10 @@ from colmap_models import write_model
 from PIL import Image
 
 from sundae_ns.core.errors import DataError
+from sundae_ns.data import layouts
 from sundae_ns.data.capture import beside
 from sundae_ns.data.colmap import check_colmap
-from sundae_ns.data.layouts import (
-    is_posed,
-    larger_model,
-    models_in,
-    no_model,
-    no_transforms,
-    posed_layout,
-    unused_masks,
-)
+from sundae_ns.data.layouts import is_posed, no_model, no_transforms, posed_layout, unused_masks
 
 
 def photos(folder: Path, count: int = 3, size: tuple[int, int] = (20, 16)) -> list[str]:
@@ -93,12 +86,9 @@ def test_a_capture_of_blender(tmp_path: Path) -> None:
         (data / missing).unlink()
         with pytest.raises(DataError, match=missing):
             posed_layout(data)
-
-
-@pytest.mark.parametrize("frames", [[], 3, [{}], ["r_0"]])
-def test_a_capture_of_blender_without_frames_is_refused(tmp_path: Path, frames: object) -> None:
-    with pytest.raises(DataError, match=r"transforms_train\.json lists no frames with a file_path"):
-        posed_layout(blender(tmp_path / "lego", frames=frames))
+    for number, frames in enumerate(([], 3, [{}], ["r_0"])):
+        with pytest.raises(DataError, match=r"transforms_train\.json lists no frames with a file_path"):
+            posed_layout(blender(tmp_path / str(number), frames=frames))
 
 
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
@@ -151,11 +141,11 @@ def test_a_larger_model_is_named(tmp_path: Path) -> None:
     assert "(usually sparse/0)" in str(no_model(tmp_path, Path("colmap/sparse/0")))
     _several(tmp_path)
     (tmp_path / "sparse" / "10" / "images.bin").write_bytes(b"\0")
-    assert models_in(tmp_path) == {"sparse/0": 3, "sparse/1": 20, "sparse/10": 0}
-    remark = larger_model(tmp_path, Path("sparse/0"))
+    assert layouts.models_in(tmp_path) == {"sparse/0": 3, "sparse/1": 20, "sparse/10": 0}
+    remark = layouts.larger_model(tmp_path, Path("sparse/0"))
     assert remark == "sparse/0 has 3 images and sparse/1 has 20; to train on those, give --colmap-path sparse/1"
-    assert larger_model(tmp_path, Path("sparse/1")) is None
-    assert larger_model(tmp_path, Path("elsewhere")) is None
+    assert layouts.larger_model(tmp_path, Path("sparse/1")) is None
+    assert layouts.larger_model(tmp_path, Path("elsewhere")) is None
     assert "give `colmap --colmap-path sparse/1`" in str(no_model(tmp_path, Path("colmap/sparse/0")))
 
 
@@ -174,13 +164,10 @@ def test_the_file_beside_a_missing_one(tmp_path: Path, wanted: str, present: lis
     for name in present:
         (tmp_path / name).touch()
     assert beside(tmp_path / wanted) == ("" if named is None else f" (there is {named})")
-
-
-def test_masks_that_are_not_used(tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     assert unused_masks(tmp_path) is None
-    (tmp_path / "masks" / "0.jpg.png").touch()
-    assert unused_masks(tmp_path) == "masks"
+    (tmp_path / "masks" / wanted).touch()
+    assert unused_masks(tmp_path) == ("masks" if wanted.lower().endswith("g") else None)
 
 
 @pytest.mark.parametrize(("name", "fits"), [("my photos (2)", True), ("-a;b&c", True), ("a$(touch P)", False)])

@@ -18,6 +18,7 @@ import pytest
 from fake_colmap import FakeColmap
 from PIL import Image
 from run_commands import write_video
+from scipy.spatial.transform import Rotation
 
 from harness.still_life import write_still_life
 from sundae_ns.core.errors import ConfigError, DataError, StorageError
@@ -261,24 +262,19 @@ def test_poses_of_a_still_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     pytest.importorskip("pycolmap")
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setattr(run_folder, "_held", {})
-    scene = write_still_life(
-        tmp_path / "scene", train_views=55, test_views=1, width=128, height=128, points=10, samples=1
-    )
+    sizes = {"train_views": 55, "test_views": 1, "width": 128, "height": 128, "points": 10, "samples": 1}
+    scene = write_still_life(tmp_path / "scene", **sizes)
     found, _ = find(scene / "images")
     assert len(found.placed) >= 45
     assert found.error < 1
     truth = {frame["file_path"]: frame for frame in json.loads((scene / "transforms.json").read_text())["frames"]}
-    meta = check_transforms(tmp_path / "scene" / "capture" / "transforms.json")
-    ours = np.array([frame["transform_matrix"] for frame in meta["frames"]])
-    theirs = np.array([truth[f"images/{frame['original']}"]["transform_matrix"] for frame in meta["frames"]])
-    a, b = ours[:, :3, 3], theirs[:, :3, 3]
-    centred, target = a - a.mean(axis=0), b - b.mean(axis=0)
-    u, values, v = np.linalg.svd(target.T @ centred)
-    signs = np.diag([1, 1, np.sign(np.linalg.det(u @ v))])
-    rotation = u @ signs @ v
-    scale = (values * np.diag(signs)).sum() / (centred**2).sum()
-    away = np.linalg.norm(target - scale * centred @ rotation.T, axis=1)
+    frames = check_transforms(tmp_path / "scene" / "capture" / "transforms.json")["frames"]
+    ours = np.array([frame["transform_matrix"] for frame in frames])
+    theirs = np.array([truth[f"images/{frame['original']}"]["transform_matrix"] for frame in frames])
+    centred, target = (poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0) for poses in (ours, theirs))
+    turn, _ = Rotation.align_vectors(target, centred)
+    moved = turn.apply(centred)
+    away = np.linalg.norm(target - (moved * target).sum() / (moved**2).sum() * moved, axis=1)
     assert away.max() < 0.05 * np.linalg.norm(target, axis=1).max()  # measured: 0.022
-    turned = np.einsum("ij,njk,nlk->nil", rotation, ours[:, :3, :3], theirs[:, :3, :3])
-    angles = np.degrees(np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    assert angles.max() < 3
+    between = turn * Rotation.from_matrix(ours[:, :3, :3]) * Rotation.from_matrix(theirs[:, :3, :3]).inv()
+    assert np.degrees(between.magnitude()).max() < 3

@@ -38,9 +38,7 @@ def ours() -> dict[str, MethodSpecification]:
 def test_every_method_is_registered_under_its_own_name() -> None:
     from nerfstudio.configs.method_configs import all_descriptions, all_methods
 
-    assert set(ours()) == set(METHODS)
-    assert set(METHODS) <= set(all_methods)
-    assert set(METHODS) <= set(all_descriptions)
+    assert set(ours()) == set(METHODS) == set(METHODS) & set(all_methods) & set(all_descriptions)
 
 
 RULE = ("score", "selection", "redistribution", "edges", "signal")
@@ -75,27 +73,13 @@ def test_configuration(name: str) -> None:
 
 
 def test_methods_share_no_objects() -> None:
-    def parts(value: Any, seen: set[int]) -> set[int]:
-        if hasattr(value, "__dataclass_fields__") and not isinstance(value, type) and id(value) not in seen:
-            seen.add(id(value))
-            for inner in vars(value).values():
-                parts(inner, seen)
-        elif isinstance(value, dict):
-            for inner in value.values():
-                parts(inner, seen)
-        return seen
+    def parts(value: Any) -> set[int]:
+        inner = vars(value) if hasattr(value, "__dataclass_fields__") and not isinstance(value, type) else value
+        own = set() if inner is value else {id(value)}
+        return own.union(*map(parts, inner.values())) if isinstance(inner, dict) else own
 
-    found = [parts(specification.config, set()) for specification in ours().values()]
-    assert len(set().union(*found)) == sum(len(one) for one in found)
-
-
-def test_help_of_ns_train(call_here: Any) -> None:
-    text = call_here("ns-train", "sundae", "--help")
-    for option in ("keep-ratio", "gamma", "score", "selection", "signal", "mode", "prune-at"):
-        assert f"--pipeline.model.pruning.{option}" in text
-    for option in ("head.mode", "head.size", "head.num-features", "warm-start", "rasterizer"):
-        assert f"--pipeline.model.{option}" in text
-    assert "Share of the N Gaussians that one prune keeps" in " ".join(text.split())
+    found = [parts(specification.config) for specification in ours().values()]
+    assert len(set().union(*found)) == sum(map(len, found)) > 100
 
 
 def test_import_is_light_and_errors_of_ns_train_are_one_line() -> None:
