@@ -20,13 +20,10 @@ from sundae_ns.train.pruning import PruningConfig
 
 
 def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
-    """Optimizers for a run: splatfacto's rates, and rates of features and head.
+    """Optimizers for a run of ``steps``: splatfacto's rates, and rates of features and head.
 
-    Right after the prune the rate of the centres restarts, so that kept Gaussians can fill the gaps.
-
-    Args:
-        steps: length of the run, at which decaying rates reach their final value.
-        plain: leave out what is not in the paper: this restart, and weight decay of the head.
+    Right after the prune the rate of the centres restarts, so that kept Gaussians can fill the gaps. ``plain`` leaves
+    out what is not in the paper: this restart, and weight decay of the head.
     """
     rates = {**configs.RATES, "camera_opt": 1e-4}
     groups: dict[str, Any] = {

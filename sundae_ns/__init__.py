@@ -69,8 +69,7 @@ __all__ = [*_HOMES]  # noqa: PLE0604
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    # Do not look for garbage among the objects that the first import of torch leaves: they live as long as the process.
-    # If torch is there already, so may be tensors of the caller, which would never be freed if they were frozen.
+    # The objects that the first import of torch leaves live as long as the process: do not look for garbage there.
     first = "torch" not in sys.modules and gc.isenabled()
     if first:
         gc.disable()

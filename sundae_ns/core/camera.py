@@ -1,7 +1,6 @@
-"""Cameras in the rasteriser's form, from poses in nerfstudio's convention.
+"""Cameras with world-to-camera matrices and OpenCV axes (x right, y down, view along z), as the rasteriser takes them.
 
-nerfstudio stores camera-to-world with OpenGL axes (x right, y up, view along -z). The rasteriser takes world-to-camera
-with OpenCV axes (x right, y down, view along z).
+Poses are camera-to-world with OpenGL axes (x right, y up, view along -z), as nerfstudio stores them.
 """
 
 from __future__ import annotations
@@ -147,8 +146,7 @@ class Camera(NamedTuple):
     def zoomed(self, factor: float) -> Camera:
         """The camera with the same field of view and sides ``factor`` times as long."""
         width, height = (max(round(side * factor), 1) for side in (self.width, self.height))
-        # Scale by the rounded sizes, so that the edges of both images agree. Row by row, because a tensor of numbers
-        # would be copied to the device.
+        # By the rounded sizes, so that edges agree; row by row, because a tensor of numbers is copied to the device.
         K = torch.stack([self.K[0] * (width / self.width), self.K[1] * (height / self.height), self.K[2]])
         return Camera(self.viewmat, K, width, height, self.focal * factor)
 

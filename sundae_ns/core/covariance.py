@@ -48,10 +48,7 @@ def chunks(n: int, size: int | None = None) -> Iterator[slice]:
 
 
 def quaternions(matrices: Tensor) -> Tensor:
-    """Unit wxyz quaternions ``[N, 4]`` of rotation matrices ``[N, 3, 3]``.
-
-    The diagonal gives the largest of the four components, which is at least one half; the others are divided by it.
-    """
+    """Unit wxyz quaternions ``[N, 4]`` of rotation matrices ``[N, 3, 3]``."""
     m = matrices
     xx, yy, zz = m.diagonal(dim1=1, dim2=2).unbind(dim=1)
     squares = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], dim=1)
@@ -61,7 +58,7 @@ def quaternions(matrices: Tensor) -> Tensor:
     # Row i is 4 q_i q.
     rows = (w, wx, wy, wz), (wx, x, xy, xz), (wy, xy, y, yz), (wz, xz, yz, z)
     products = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
-    largest = squares.argmax(dim=1)
+    largest = squares.argmax(dim=1)  # at least one half; the others are divided by it
     chosen = products[torch.arange(len(m), device=m.device), largest]
     return chosen / torch.linalg.vector_norm(chosen, dim=1, keepdim=True)
 
@@ -95,8 +92,7 @@ def scales_and_quaternions(matrices: Tensor) -> tuple[Tensor, Tensor]:
 def mean_projected_area(scales: Tensor) -> Tensor:
     """Mean projected area of ellipsoids with half axes ``[N, 3]`` over all directions, divided by pi ``[N]``.
 
-    It is a quarter of the surface area (Cauchy), by Thomsen's formula, which is exact to 1.1%. The volume does not
-    measure how much of an image a Gaussian covers, because most Gaussians are flat.
+    It is a quarter of the surface area (Cauchy), by Thomsen's formula, which is exact to 1.1%.
     """
     exponent = 1.6075
     a, b, c = (scales / scales.amax(dim=1, keepdim=True)).pow(exponent).unbind(dim=1)
@@ -109,11 +105,10 @@ def overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor, least
     ``exp(-(d^T S^-1 d) / 8) (|A| |B|)^(1/4) / |S|^(1/2)`` with ``S = (A + B) / 2`` (Bhattacharyya, 1943).
 
     Args:
-        means: world units ``[N, 3]``; the result has their dtype.
+        means: ``[N, 3]``; the result has their dtype.
         entries: of the covariances, by :func:`entries_of` ``[N, 6]``.
         first, second: indices ``[P]``, or of a Gaussian ``[P, 1]`` and of its neighbours ``[P, K]``; as the result.
-        least_variance: added to all axes, squared world units; without it, parallel flat Gaussians would not overlap
-            however close they are.
+        least_variance: added to all axes; without it, parallel flat Gaussians would not overlap however close they are.
     """
     first, second = first.to(means.device), second.to(means.device)
     entries = entries + least_variance * entries.new_tensor([1, 1, 1, 0, 0, 0])
@@ -139,11 +134,9 @@ def outer_entries(vectors: Tensor) -> Tensor:
 
 
 def _cholesky(entries: Tensor, least_variance: float) -> tuple[Tensor, ...]:
-    """Cholesky factors ``[...]`` of symmetric matrices with entries ``[..., 6]``, both in the order of ``_LOWER``.
-
-    Written out, because the batched function calls LAPACK once per matrix. A pivot is never below the least eigenvalue,
-    so clamping at a lower bound of it repairs pivots of needles that rounding made too small.
-    """
+    """Cholesky factors ``[...]`` of symmetric matrices with entries ``[..., 6]``, both in the order of ``_LOWER``."""
+    # Written out, because the batched function calls LAPACK once per matrix. A pivot is never below the least
+    # eigenvalue, so clamping at a lower bound of it repairs pivots of needles that rounding made too small.
     xx, yy, zz, yx, zx, zy = entries.unbind(dim=-1)
     a = xx.clamp_min(least_variance).sqrt()
     ba, ca = yx / a, zx / a

@@ -90,10 +90,7 @@ def reading(
     remedy: str = "export it again",
     missing: str = "check the path",
 ) -> Iterator[None]:
-    """Turn every error of reading an untrusted file into a ``failure``; decoders raise errors of many kinds.
-
-    ``kind`` is what the file should be, ``remedy`` is for a damaged file, ``missing`` for one that cannot be opened.
-    """
+    """Turn every error of reading an untrusted file of a ``kind`` into a ``failure``; decoders raise many kinds."""
     try:
         yield
     except SundaeError:

@@ -22,10 +22,7 @@ _WINDOWS = os.name == "nt"  # renames no open file, opens no folder, and flushes
 
 
 def locked(file: IO[Any]) -> bool | None:
-    """Whether this process gets the lock of an open file, without waiting; None if the file system has no locks.
-
-    The system drops the lock when the last process that has the file open ends.
-    """
+    """Whether this process gets the lock of an open file until it ends; None if the file system has no locks."""
     try:
         return lock_descriptor(file.fileno(), blocking=False)
     except OSError:

@@ -142,11 +142,7 @@ def as_gaussians(params: Mapping[str, Any]) -> Gaussians:
 
 
 def checked(params: Mapping[str, Any]) -> Gaussians:
-    """Parameters of a caller, lists and arrays too, as float32 tensors; the Gaussians themselves if they are such.
-
-    Raises:
-        DataError: a name, a shape, a type or a device is wrong, or a Gaussian has values without a meaning.
-    """
+    """Parameters of a caller, lists and arrays too, as float32 tensors; ``DataError`` for all that is no Gaussian."""
     names = params.keys() if isinstance(params, Mapping) else set()
     if odd := sorted(str(name) for name in (names ^ set(SPLAT_NAMES)) - {FEATURES}):
         raise DataError(f"missing or unknown: {', '.join(odd)}; Gaussians map {', '.join(SPLAT_NAMES)} to tensors")

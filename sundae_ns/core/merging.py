@@ -28,11 +28,11 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     Args:
         params: finite parameters of N Gaussians.
         label: index of the Gaussian that each one is merged into ``[N]``: its own if it stays, -1 if it is dropped.
-        weight: weight of each Gaussian in its group, not negative ``[N]``.
+        weight: of each Gaussian in its group, not negative ``[N]``.
 
     Returns:
-        Parameters ``[M, ...]`` of the Gaussians that stay, in order; computed in float64 in a fixed order. A Gaussian
-        that is alone in its group, has no weight or overflows is unchanged, bit for bit.
+        The Gaussians that stay, in order, computed in float64. One that is alone, has no weight or overflows is
+        unchanged, bit for bit.
     """
     source = {name: value.detach() for name, value in params.items()}
     device = source["means"].device

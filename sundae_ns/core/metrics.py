@@ -65,10 +65,7 @@ def fitted_psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Ten
 
 
 def ssim(pred: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity (Wang et al. 2004); takes, returns and raises the same as :func:`psnr`.
-
-    NaN if a side is shorter than the window: pytorch_msssim would not smooth along it and return another quantity.
-    """
+    """Structural similarity (Wang et al. 2004), as :func:`psnr`; NaN if a side is shorter than the window."""
     check_pair(pred, target)
     if min(pred.shape[:2]) < SSIM_WINDOW:
         return pred.new_full((), float("nan"))
@@ -84,8 +81,7 @@ def flip_available() -> bool:
 def flip(pred: Tensor, target: Tensor) -> Tensor | None:
     """Mean FLIP error (Andersson et al. 2020) of two sRGB images ``[H, W, 3]``, in [0, 1]; lower is better.
 
-    The authors' package computes it on the CPU, at 67 pixels per degree, from images clamped to [0, 1]. None if the
-    package is not installed. Raises as :func:`psnr`.
+    By the authors' package, on the CPU and at 67 pixels per degree; None if it is not installed.
     """
     check_pair(pred, target)
     if not flip_available():
@@ -120,10 +116,7 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
-        """Distance of two images ``[H, W, 3]``, clamped to [0, 1]; lower is better. Raises as :func:`psnr`.
-
-        None if a side is shorter than 32 pixels, which a backbone pools to nothing; without weights, with a warning.
-        """
+        """Distance of two images ``[H, W, 3]``; None if a side is shorter than 32 pixels, or without weights."""
         check_pair(pred, target)
         if self._failed or min(pred.shape[:2]) < 32:
             return None

@@ -70,11 +70,7 @@ def keep(params: Params, optimizers: Optimizers, states: Iterable[MutableMapping
     Replaces every parameter, also in the optimizer of its name, with Adam's moments sliced and the step count kept, and
     slices the tensors of running ``states`` that have first dimension N. New objects are needed: after resizing through
     ``.data``, the backward pass of a live graph fails on the old shape. The caller must refresh other holders of the
-    old objects, such as nerfstudio's ``Optimizers.parameters``.
-
-    Raises:
-        DataError: the mask has a wrong shape or dtype or keeps nothing, or the optimizers do not hold the parameters.
-            All arguments are unchanged then.
+    old objects. ``DataError`` for a wrong mask or other optimizers; all arguments are unchanged then.
     """
     n = num_gaussians(params)
     if mask.dtype != torch.bool or mask.shape != (n,):
@@ -97,8 +93,7 @@ def rewrite(params: Mapping[str, Tensor], optimizers: Optimizers, values: Mappin
     """Overwrite parameters in place with values of the same shapes; ``DataError`` for other names and shapes.
 
     Where a value changes, Adam's first moment becomes 0, because it averages gradients at the old value. The second
-    moment stays: if it were 0, the next step would be over three times the learning rate in every direction, for any
-    gradient (``0.1 g / sqrt(0.001 g^2)``).
+    moment stays: if it were 0, the next step would be ``0.1 g / sqrt(0.001 g^2)``, three times the learning rate.
     """
     check_wiring(params, optimizers)
     for name, value in values.items():

@@ -203,13 +203,9 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     """Cameras of a film, one a frame, along a closed and smooth path at an even speed; upright, without roll.
 
     The path leads through up to eight stored cameras, from the start view, else the first, on the shortest way, and
-    looks where they look. A scene with fewer than three cameras is seen from a circle around its middle. The speed is
-    that of motion and turning together. The scene's up axis, else the mean of its cameras', else z, is upwards. Lens
-    and shape of the images are those of the first camera, with at most 1,280 pixels a side.
-
-    Raises:
-        ConfigError: there is not even one frame, or there are more than :data:`MOST_FRAMES`.
-        DataError: the scene has no finite Gaussian.
+    looks where they look; with fewer than three cameras, on a circle around the middle. The speed is that of motion and
+    turning together. The scene's up axis, else the mean of its cameras', else z, is upwards. Lens and shape of the
+    images are those of the first camera, with at most 1,280 pixels a side. ``ConfigError`` for an impossible length.
     """
     count = round(seconds * frames_per_second) if math.isfinite(seconds * frames_per_second) else 0
     if not (1 <= count <= MOST_FRAMES and seconds > 0):

@@ -47,10 +47,7 @@ class Later:
 
 
 class LazyOutputs(UserDict[str, Any]):
-    """Named outputs. One that is :class:`Later` is computed on first access, without gradients, and then kept.
-
-    No ``dict``, because ``dict(outputs)`` and ``{**outputs}`` would then skip the computation.
-    """
+    """Named outputs. One that is :class:`Later` is computed on first access, without gradients, and then kept."""
 
     def __getitem__(self, name: str) -> Any:
         value = self.data[name]
@@ -68,10 +65,7 @@ class ShownResponse:
         self._last: tuple[GaussiansKey | None, Tensor | None] = (None, None)
 
     def values(self, gaussians: Gaussians, key: GaussiansKey | None, rule: PruneRule) -> Tensor | None:
-        """Values in [0, 1] ``[N]``; None without a response, as for a single Gaussian, or without a ``key``.
-
-        ``key`` is the state of the Gaussians; None while they grow.
-        """
+        """Values in [0, 1] ``[N]``; None without a response, as for a single Gaussian, or while Gaussians grow."""
         of, values = self._last
         if of != key:
             values = None
@@ -137,15 +131,13 @@ def fill_depth(depth: Tensor, alpha: Tensor) -> Tensor:
 
 
 def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean ``[F]``, first three principal directions ``[F, 3]`` and standard deviations ``[3]`` of features ``[N, F]``.
-
-    With fewer than three channels, the missing directions are zero. Signs are fixed, so displayed colours are stable.
-    """
+    """Mean ``[F]``, first principal directions ``[F, 3]`` and standard deviations ``[3]`` of features ``[N, F]``."""
     mean = features.mean(dim=0)
     centred = features - mean
     variances, directions = torch.linalg.eigh(centred.T @ centred / max(len(features), 1))
     missing = (0, max(3 - features.shape[1], 0))
     directions = directions[:, -3:].flip(-1)
+    # Signs are fixed, so that displayed colours are stable.
     signs = torch.where(directions.sum(dim=0) < 0, -1.0, 1.0)
     return mean, pad(directions * signs, missing), pad(variances[-3:].flip(-1).clamp_min(0).sqrt(), missing)
 

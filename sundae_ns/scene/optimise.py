@@ -23,12 +23,8 @@ def optimise(
     Args:
         step: takes step ``i``: its loss, gradients and updates.
         optimizers: by name. The present rates are the initial ones, unless a group holds ``initial_lr``.
-        factor: of the initial rate of an optimizer (by name) at a step.
-        first: number of steps that were taken before.
-        on_step: called after each step with the number of steps taken; False stops.
-
-    Returns:
-        Whether all steps were taken.
+        factor: of the initial rate of an optimizer (by name) at a step; ``first`` steps were taken before.
+        on_step: called with the number of steps taken; False stops, and :func:`optimise` returns False.
     """
     groups = [(name, group) for name, optimizer in optimizers.items() for group in optimizer.param_groups]
     for _, group in groups:

@@ -34,10 +34,7 @@ def page_of(scene: Scene, packed: bytes, *, title: str) -> str:
 
 
 def write_page(path: Path, scene: Scene, packed: bytes, *, title: str) -> int:
-    """Write the page of a scene as one file, or without a suffix as a folder for a web server; returns the bytes.
-
-    ``scene`` gives the first image, ``packed`` is its packed file.
-    """
+    """Write the page of a scene as one file, or without a suffix as a folder for a web server; returns the bytes."""
     if path.suffix:
         write_text(path, page_of(scene, packed, title=title))
         return path.stat().st_size

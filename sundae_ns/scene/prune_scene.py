@@ -136,10 +136,7 @@ def at_most(camera: Camera, pixels: int) -> Camera:
 def weights_in(
     scene: Scene, cameras: Sequence[Camera], count: int | None = None, console: Console | None = None
 ) -> Tensor:
-    """Blending weight of each Gaussian of a finite scene over the pixels of cameras ``[N]``; see :func:`.contribution`.
-
-    ``DataError`` if the cameras see none.
-    """
+    """Blending weight of each Gaussian of a finite scene ``[N]``, by :func:`.contribution`; ``DataError`` for none."""
     sized, scaled = of_unit_size(scene, [at_most(camera, MOST_PIXELS) for camera in cameras])
     views = [TrainingCamera(camera.to(scene.device), None) for camera in scaled]
     source, settings = GaussianSource(sized.gaussians), scene.settings(head=False)

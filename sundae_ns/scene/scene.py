@@ -133,10 +133,7 @@ class Scene:
         return dataclasses.replace(self, gaussians=self.gaussians.to(device), head=head)
 
     def settings(self, backend: BackendName = "auto", *, head: bool = True) -> RenderSettings:
-        """Settings that render the scene with all of its SH degrees; ``auto`` is gsplat on CUDA, else compiled loops.
-
-        Raises ``BackendError`` if the rasteriser cannot run on the device of the scene.
-        """
+        """Settings that render the scene with all of its SH degrees; ``BackendError`` without the rasteriser."""
         rasteriser, enabled = select_backend(backend, self.device), self.head if head else None
         return RenderSettings(rasteriser, antialiased=self.antialiased, head=enabled, trained_focal=self.trained_focal)
 
