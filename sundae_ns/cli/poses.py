@@ -67,9 +67,8 @@ def poses(
     pycolmap()
     request = Request(photos, out, options.matching, options.frames, masks)
     placed = _interruptible(lambda: find_poses(request, _report, _warn), request.work)
-    cameras = "1 camera" if placed.cameras == 1 else f"{placed.cameras} cameras"
-    counts = f"{len(placed.placed):,} of {placed.total:,} photos have a pose, of {cameras}"
-    print(f"{out}: {counts}; mean reprojection error {placed.error:.2f} px")
+    counts = f"{len(placed.placed):,} of {placed.total:,} photos have a pose, of {placed.cameras} camera"
+    print(f"{out}: {counts}{'s' * (placed.cameras > 1)}; mean reprojection error {placed.error:.2f} px")
     if others := ", ".join(f"{count:,}" for count in placed.models[1:]):
         print(f"# this is the largest of {len(placed.models)} models that do not join; others have {others} photos")
     if placed.masks is not None:

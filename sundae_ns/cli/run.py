@@ -201,13 +201,14 @@ def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
     Each step prints the command that it runs. The same command again skips the steps that are done, and resumes an
     interrupted training.
     """
-    out, poses = project.out, project.poses
+    out = project.out
     project.check()
     if not project.posed and not _passes(project.placed):
-        check_poses(project.photos, poses.frames, poses.masks, remarks=False)  # sundae poses prints them
+        check_poses(
+            project.photos, project.poses.frames, project.poses.masks, remarks=False
+        )  # sundae poses prints them
     project.claim()
-    plan = project.plan()
-    for number, step in enumerate(plan, start=1):
+    for number, step in enumerate(plan := project.plan(), start=1):
         heading = f"# step {number} of {len(plan)}, {step.name}"
         if _passes(step.check):
             print(f"{heading}: done", flush=True)

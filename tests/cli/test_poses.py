@@ -54,17 +54,6 @@ def test_each_stage_and_the_result_are_one_line(colmap: FakeColmap, capsys: pyte
     assert len(json.loads(Path("capture/transforms.json").read_text())["frames"]) == 4
 
 
-@pytest.mark.parametrize("name", ["-a folder", "$(touch PWNED)", "a'b\"c", "ünï cöde 像"])
-def test_hostile_names(colmap: FakeColmap, name: str) -> None:
-    Path("photos").rename(name)
-    for path in list(Path(name).iterdir())[:3]:
-        path.rename(path.with_name(f"-x {name}{path.name}"))
-    assert poses(f"./{name}", "-o", f"./{name} capture") == 0
-    assert Path(f"{name} capture/transforms.json").is_file()
-    assert not Path("PWNED").exists()
-    assert sorted(path.name for path in Path().iterdir()) == sorted([name, f"{name} capture"])
-
-
 def test_masks_beside_the_photos_are_used(colmap: FakeColmap, capsys: pytest.CaptureFixture[str]) -> None:
     Path("photos/masks").mkdir()
     for index in range(PHOTOS):
@@ -86,15 +75,6 @@ def test_a_video(colmap: FakeColmap, capsys: pytest.CaptureFixture[str]) -> None
     write_video(Path("walk.mp4"), 40)
     assert poses("walk.mp4", "-o", "capture", "--frames", "9") == 0
     assert "frames: 9 of 9" in capsys.readouterr().out
-
-
-def test_without_pycolmap_one_line_says_so(
-    colmap: FakeColmap, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    line = refusal(capsys, "photos", "-o", "capture")
-    assert line == 'sundae: camera poses need pycolmap; install it with pip install "sundae_ns[photos]"'
-    assert not Path("capture.partial").exists()
 
 
 def test_an_error_of_colmap_is_one_line(colmap: FakeColmap, capsys: pytest.CaptureFixture[str]) -> None:

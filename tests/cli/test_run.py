@@ -137,24 +137,6 @@ def test_a_gpu_packs_with_a_fine_tune(commands: Commands, capsys: pytest.Capture
     assert not any("--finetune" in words for words in commands.ran)
 
 
-def test_a_fine_tune_that_fails_is_left_out(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
-    """For example because the GPU's memory is full; a scene that is larger is better than none."""
-    commands.gpu = commands.out_of_memory = True
-    assert run("photos", "-o", "out") == 0
-    assert commands.names == [*STEPS[:3], *STEPS[2:]]
-    assert commands.ran[3] == commands.ran[2][:-2]
-    said = f"# the fine-tune ended with 2; packing without it:\n{shlex.join(commands.ran[3])}\n"
-    assert said in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("code", [3, 130])
-def test_a_pack_that_fails_or_stops_with_a_fine_tune_ends(commands: Commands, code: int) -> None:
-    commands.gpu = True
-    commands.codes["sundae pack"] = code
-    assert run("photos", "-o", "out") == code
-    assert commands.names[2:] == ["sundae pack"] * (1 if code == 130 else 2)
-
-
 # ---------------------------------------------------------------------------------------------- the same command again
 
 

@@ -187,7 +187,7 @@ def test_a_run_of_the_user_s_own_name_is_packed(commands: Commands, given: list[
 
 @pytest.mark.parametrize(("failed", "last"), [(False, "--finetune"), (True, "scene.sundae")])
 def test_a_gpu_fine_tunes_the_pack_or_leaves_it(
-    commands: Commands, monkeypatch: pytest.MonkeyPatch, failed: bool, last: str
+    commands: Commands, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], failed: bool, last: str
 ) -> None:
     monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: True)
     commands.codes = {"--finetune": int(failed)}
@@ -196,6 +196,7 @@ def test_a_gpu_fine_tunes_the_pack_or_leaves_it(
     assert option_of(training, "--finetune-steps") == "1500", "in place of the last steps"
     assert packs[0][-2:] == ["--finetune", "1500"]
     assert len(packs) == 1 + failed
+    assert ("# the fine-tune ended with 1; packing without it:\n" in capsys.readouterr().out) == failed
     assert any(last in word for word in packs[-1][-2:])
 
 
