@@ -152,29 +152,23 @@ def test_the_sharpest_frame_of_each_stretch(tmp_path: Path) -> None:
     assert left[:13] == [1 + 3 * number for number in range(13)]
 
 
-def test_a_short_video_gives_all_its_frames(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mp4", 7)
-    write_frames(tmp_path / "a.mp4", tmp_path / "frames", 150, lambda _: None)
-    assert [path.name for path in sorted((tmp_path / "frames").iterdir())] == [f"{i:05d}.jpg" for i in range(1, 8)]
-
-
 @pytest.mark.parametrize("name", ["a.mkv", "a.mts", "\udcff.mp4"])
 def test_frames_are_counted_where_no_length_is_stated(tmp_path: Path, name: str) -> None:
     write_colours(tmp_path / name, 5 * [patches()], 1)
     assert _length(tmp_path / name) == 5
 
 
-def test_frames_are_there_only_once_they_are_whole(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mp4", 30)
+def test_all_frames_of_a_short_video_are_there_only_once_they_are_whole(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", 7)
 
     def stop(count: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_frames(tmp_path / "a.mp4", tmp_path / "frames", 10, stop)
+        write_frames(tmp_path / "a.mp4", tmp_path / "frames", 150, stop)
     assert not (tmp_path / "frames").exists()
-    write_frames(tmp_path / "a.mp4", tmp_path / "frames", 10, lambda _: None)
-    assert len(frames_of(tmp_path / "frames")) == 10
+    write_frames(tmp_path / "a.mp4", tmp_path / "frames", 150, lambda _: None)
+    assert [path.name for path in sorted((tmp_path / "frames").iterdir())] == [f"{i:05d}.jpg" for i in range(1, 8)]
     assert not (tmp_path / "frames.partial").exists()
 
 
