@@ -74,13 +74,9 @@ def check_ranges(options: Any) -> None:
 
 
 def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, images: bool = True) -> None:
-    """Check a capture in nerfstudio's or COLMAP's layout before its parser reads it.
+    """Check a capture, a folder or a ``transforms.json``, in nerfstudio's or COLMAP's layout before it is parsed.
 
-    Args:
-        parser: configuration of the parser; captures of other parsers are not checked.
-        data: the capture: a folder, or a ``transforms.json``.
-        splits: splits that will be read.
-        images: whether the images will be needed; a viewer needs the cameras only.
+    ``images`` says whether they will be needed beside the cameras of the ``splits``.
 
     Raises:
         ConfigError: an option of the parser is out of its range.
@@ -139,16 +135,10 @@ def _distances_of(centres: Array) -> tuple[Array, Array]:
 
 
 def stray_cameras(centres: Array, points: Callable[[], Array | None] = lambda: None) -> NDArray[np.bool_]:
-    """Cameras so far from all others that they must not set the scene's centre and scale.
+    """Which cameras ``[N]``, by their centres ``[N, 3]``, stand too far away to set the scene's centre and scale.
 
-    Few cameras far away may also be all that moves, in a panorama from one place. There the points are as far as they.
-
-    Args:
-        centres: camera centres ``[N, 3]``.
-        points: gives points of the scene ``[M, 3]``, in the same coordinates; called only if a camera is far away.
-
-    Returns:
-        Flags ``[N]``; of fewer than four cameras none.
+    Few cameras far away may also be all that moves, in a panorama from one place. There the points of the scene
+    ``[M, 3]`` are as far as they; ``points`` is called only if a camera is far away. Of three none is stray.
     """
     if len(centres) < 4:
         return np.zeros(len(centres), dtype=bool)

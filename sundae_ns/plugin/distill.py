@@ -88,6 +88,8 @@ class Distillation:
         config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
         tiny = {"size": "tiny", "pixel_unshuffle": 1, "num_features": 5} if teacher.device.type == "cpu" else {}
         self.state = self._start(cut.scene.gaussians, HeadConfig(mode="residual", **cast(Any, tiny)) if head else None)
+        counts = [self._teacher.num_gaussians, self.state.gaussians.num_gaussians, len(self.cameras)]
+        self._options = {"steps": steps, "seed": seed, "counts": counts}  # What a resumed training must share
         self.step = 0  # Number of steps that were trained
         self.gain: float | None = None  # PSNR that the head gained in its trial, dB; None before it, and without one
         self._mean = RunningMean()
@@ -226,7 +228,7 @@ class Distillation:
     def save(self, path: Path) -> None:
         """Write what a resumed training needs, atomically."""
         content = {
-            "options": self._options(),
+            "options": self._options,
             "step": self.step,
             "gain": self.gain,
             "model": self._modules.state_dict(),
@@ -241,7 +243,7 @@ class Distillation:
         state, kind = self.state, "a checkpoint of this scene and these options"
         with reading(path, kind, CheckpointError, remedy="remove it to start anew"):
             saved = torch.load(path, map_location=state.device, weights_only=True)
-            if saved["options"] != self._options():
+            if saved["options"] != self._options:
                 raise ValueError("other options")
             self.step, self.gain = int(saved["step"]), saved["gain"]
             if not any(name.startswith("networks.") for name in saved["model"]):
@@ -252,11 +254,6 @@ class Distillation:
             self._mean = RunningMean.of(saved["mean"], state.device)
         if state.head is not None:
             state.head_starts_at = -math.inf
-
-    def _options(self) -> dict[str, Any]:
-        """What a resumed training must share."""
-        counts = [self._teacher.num_gaussians, self.state.gaussians.num_gaussians, len(self.cameras)]
-        return {"steps": self.steps, "seed": self._seed, "counts": counts}
 
 
 def distill(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -114,8 +115,6 @@ class ProgressWriter(LocalWriter):
             left = self._time_left.update(done, total, self._printed_at)
             speed = 1000 * (self._time_left.step_s or 0.0)
             pace = "" if left is None else f"{duration(left)} left at {speed:.0f} ms a step  "
-            print(
-                f"{done} ({100 * done / max(total, 1):.2f}%)  {pace}PSNR {float(self._metrics['psnr']):.2f} dB  "
-                f"{self._metrics['gaussian_count']:,} Gaussians",
-                flush=True,
-            )
+            figures = f"PSNR {float(self._metrics['psnr']):.2f} dB  {self._metrics['gaussian_count']:,} Gaussians"
+            with suppress(BrokenPipeError):  # of a killed `sundae run`, after which this training still saves
+                print(f"{done} ({100 * done / max(total, 1):.2f}%)  {pace}{figures}", flush=True)

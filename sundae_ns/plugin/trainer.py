@@ -22,8 +22,8 @@ from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
-from sundae_ns.core.errors import NOTHING_SAVED, CheckpointError, SundaeError, one_line
-from sundae_ns.core.files import write_text, writing
+from sundae_ns.core.errors import NOTHING_SAVED, CheckpointError, reading, writing
+from sundae_ns.core.files import write_text
 from sundae_ns.core.values import usual_defaults
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io import checkpoint, run_folder
@@ -310,7 +310,8 @@ class SundaeTrainer(Trainer):
         if path is None:
             return
         loaded = checkpoint.read(path)
-        try:
+        remedy = "load it with the options that it was trained with"
+        with reading(path, "a checkpoint that fits this run", CheckpointError, remedy=remedy):
             self.step = int(loaded["step"])  # else a run of no further step would be saved as step 0
             self._start_step = self.step + 1
             self.pipeline.load_pipeline(loaded["pipeline"], loaded["step"])
@@ -320,12 +321,6 @@ class SundaeTrainer(Trainer):
             self.grad_scaler.load_state_dict(loaded["scalers"])
             if "random" in loaded:  # nerfstudio's own trainer saves none
                 set_random_state(loaded["random"])
-        except SundaeError:
-            raise
-        except Exception as error:  # torch and nerfstudio raise many kinds; each means that the checkpoint does not fit
-            raise CheckpointError(
-                f"{path} does not fit this run ({one_line(error)}); load it with the options that it was trained with"
-            ) from error
         _log.info(f"Resuming after step {loaded['step']} from {path}")
         outputs = self._datamanager.train_dataparser_outputs
         warn_of_other_frame(path.parent.parent, outputs.dataparser_transform, outputs.dataparser_scale)

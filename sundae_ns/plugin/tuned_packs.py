@@ -60,19 +60,12 @@ def finetune(
     """Train the Gaussians and head of a run with the rounding of its pack in the loop. The run is only read.
 
     Args:
-        run, data: as in :func:`load_model`, with its errors.
-        scene: the same run, from ``scene.packing.contents_of``.
+        run, data: as in :func:`load_model`, with its errors, and a ``CheckpointError`` if the run still densifies.
+        scene: the same run, from ``scene.packing.contents_of``; the trained one and its codecs are returned.
         config: bits of the pack.
         steps: number of steps, at least 1.
         rate: added to the loss for each bit per stored number.
         progress: called after each step with its loss ``[]``, which the next step overwrites.
-
-    Returns:
-        The trained scene, and its codecs for ``write_fitted``.
-
-    Raises:
-        CheckpointError: the run still densifies.
-        MemoryExhaustedError: the GPU's memory is full.
     """
     if steps < 1:
         raise ConfigError(f"a fine-tune of {steps} steps changes nothing; give 1 or more")

@@ -11,8 +11,8 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 
@@ -136,7 +136,7 @@ class Interruption:
             signal.signal(number, handler)
         self._before = {}
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
+    def _handle(self, number: int, frame: object) -> None:
         if self.number == 0:
             self.number = number
             self._say("\nStopping after this step, to save a checkpoint; Ctrl-C again leaves at once.\n")
@@ -146,8 +146,8 @@ class Interruption:
             os._exit(128 + number)
 
     def _say(self, text: str) -> None:
-        if not self._quiet:
-            os.write(2, text.encode())  # a handler may interrupt a print
+        with suppress(OSError):  # who read it may have been killed
+            os.write(2, b"" if self._quiet else text.encode())  # a handler may interrupt a print
 
 
 def resume_command(program: Sequence[str], folder: Path, method: str, data: object) -> str:

@@ -17,6 +17,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
+from trial_runs import served_views
 
 from sundae_ns.core.errors import CheckpointError, MemoryExhaustedError
 from sundae_ns.core.gaussians import SPLAT_NAMES
@@ -137,23 +138,14 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(tiny: Any, trainer_of: A
         config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, start, tiny.save_every
 
     trainer = trainer_of(change)
-    served = []
-    next_train = trainer.pipeline.datamanager.next_train
-
-    def watched(step: int) -> Any:
-        camera, batch = next_train(step)
-        served.append((step, batch["image_idx"]))
-        return camera, batch
-
-    trainer.pipeline.datamanager.next_train = watched
+    served = served_views(trainer)
     before = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
     trainer.train()
 
     end = start + tiny.save_every
-    assert [step for step, _ in served] == list(range(start + 1, end + 1))
     # The views that an uninterrupted run sees at these steps.
     fresh = trainer.config.pipeline.datamanager.setup(device="cpu", test_mode="val")
-    assert [number for _, number in served] == [fresh.view_of_step(step) for step in range(start + 1, end + 1)]
+    assert served == [fresh.view_of_step(step) for step in range(start + 1, end + 1)]
 
     model = trainer.pipeline.model
     assert model.num_points == report(tiny)["after"]
@@ -170,9 +162,8 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(tiny: Any, trainer_of: A
     assert_same(load(tiny.checkpoint(end)), load(trainer.checkpoint_dir / f"step-{end:09d}.ckpt"))
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(
-    tiny: Any, trainer_of: Any, capsys: Any, number: int, code: int
+    tiny: Any, trainer_of: Any, capsys: Any
 ) -> None:
     def to_step_60(config: Any) -> None:
         config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 30, 30
@@ -182,15 +173,15 @@ def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(
 
     def interrupted(step: int) -> Any:
         if step == 50:
-            signal.raise_signal(signal.Signals(number))
+            signal.raise_signal(signal.SIGTERM)
         return serve(step)
 
     trainer.pipeline.datamanager.next_train = interrupted
-    handler = signal.getsignal(number)
+    handler = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as end:
         trainer.train()
-    assert end.value.code == code
-    assert signal.getsignal(number) is handler
+    assert end.value.code == 143
+    assert signal.getsignal(signal.SIGTERM) is handler
     assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000050.ckpt"]
     last = capsys.readouterr().out.splitlines()[-1].split()
     assert last[:2] == ["ns-train", "sundae-tiny"]

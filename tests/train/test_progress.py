@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -100,9 +101,15 @@ def test_a_training_of_hours_on_a_cpu_is_foretold() -> None:
         assert part in text
 
 
-def test_the_first_signal_is_noted_and_the_handlers_come_back() -> None:
+def test_the_first_signal_is_noted_and_the_handlers_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if who read the output was killed."""
+
+    def broken(*_: Any) -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(os, "write", broken)
     before, asked = signal.getsignal(signal.SIGTERM), []
-    with Interruption(lambda: asked.append(True), quiet=True) as interruption:
+    with Interruption(lambda: asked.append(True)) as interruption:
         assert interruption.number == 0
         signal.raise_signal(signal.SIGTERM)
         signal.raise_signal(signal.SIGTERM)  # of a scheduler that asks again
