@@ -51,19 +51,16 @@ def read_count_curve(folder: Path) -> CountCurve | None:
         record = json.loads(path.read_text(encoding="utf-8")).get("count")
         if record is None:
             return None
-        points = [CurvePoint(**{name: _number(point[name]) for name in names}) for point in record["curve"]]  # type: ignore[arg-type]
-        return CountCurve(int(record["chosen"]), int(record["full"]), str(record["reason"]), tuple(points))
+        points = [{name: point[name] for name in names} for point in record["curve"]]
+        # Infinite losses are stored as null, and unknown bytes too.
+        if odd := [x for point in points for x in point.values() if x is not None and type(x) not in (int, float)]:
+            raise TypeError(f"{odd[0]!r} is no number")
+        curve = tuple(CurvePoint(**point) for point in points)
+        return CountCurve(int(record["chosen"]), int(record["full"]), str(record["reason"]), curve)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path} cannot be read ({error}); remove it, or train the run again") from error
-
-
-def _number(value: object) -> float | None:
-    """A number of the record; infinite losses are stored as null, and unknown bytes too."""
-    if value is None or isinstance(value, (int, float)) and not isinstance(value, bool):
-        return value
-    raise TypeError(f"{value!r} is no number")
 
 
 def expected_change(points: Sequence[CurvePoint], count: int, other: int) -> tuple[float, float] | None:
