@@ -97,9 +97,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     merged_depth = total(cover) / mean_projected_area(deviations)
 
     merged = {name: mean(name) for name in source if name not in ("means", "scales", "quats", "opacities")}
-    merged["means"] = origin + shift
-    merged["scales"] = deviations.log()
-    merged["quats"] = quats
+    merged |= {"means": origin + shift, "scales": deviations.log(), "quats": quats}
     merged["opacities"] = _logit_of_depth(merged_depth)[:, None]
     changed = (torch.bincount(group, minlength=count) > 1) & (largest > 0) & bounded
     for value in merged.values():

@@ -49,8 +49,7 @@ def psnr(pred: Tensor, target: Tensor) -> Tensor:
 def fitted_psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """PSNR after the affine map of colours (12 numbers) that brings an image nearest to its target.
 
-    It leaves out differences in light and exposure. Images and errors as for :func:`psnr`; ``mask`` has the pixels that
-    count, bool ``[H, W]``. A float64 scalar, dB, at most :data:`MOST_PSNR`; NaN if the image is not finite.
+    ``mask`` has the pixels that count, bool ``[H, W]``. At most :data:`MOST_PSNR`; NaN if the image is not finite.
     """
     check_pair(pred, target)
     chosen = ... if mask is None else mask

@@ -13,10 +13,8 @@ from torch import Tensor
 
 from sundae_ns.core.errors import ConfigError, DataError
 
-AnyArray = ArrayLike | Tensor
-"""Lists, arrays and tensors."""
-_WHITE = {"uint8": 255.0, "uint16": 65535.0}
-"""Types of stored images, and their white."""
+AnyArray = ArrayLike | Tensor  # lists too
+_WHITE = {"uint8": 255.0, "uint16": 65535.0}  # of stored images, by their type
 
 
 def numbers(values: Any, name: str, *shapes: tuple[int, ...]) -> Tensor:
@@ -39,12 +37,9 @@ def whole(value: Any, name: str, least: int = 1) -> int:
 
 
 def floats(values: Any, name: str, *, colors: bool = False) -> Tensor:
-    """Real numbers of any shape as a float32 tensor; on the CPU, or where a tensor is.
+    """Real numbers of any shape as a float32 tensor, on the CPU or where a tensor is; ``DataError`` for anything else.
 
     With ``colors``, values of 8 or 16 bits become [0, 1] by their type, and others have to be there.
-
-    Raises:
-        DataError: the values are of another type or range.
     """
     try:
         given = values if isinstance(values, Tensor) else np.asarray(values)

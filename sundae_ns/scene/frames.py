@@ -40,10 +40,9 @@ REPLAYED = ("rgb", "base_rgb", "accumulation")  # images of a recorded frame
 
 @dataclass(frozen=True)
 class Later:
-    """An output that is not computed yet."""
+    """An output that is not computed yet. It may be in another thread, after the model has changed."""
 
     make: Callable[[], Any]
-    """May run in another thread after the model has changed, so it must hold what it reads."""
 
 
 class LazyOutputs(UserDict[str, Any]):
@@ -60,8 +59,7 @@ class LazyOutputs(UserDict[str, Any]):
 class ShownResponse:
     """Spectral response for display, kept until the Gaussians are pruned again."""
 
-    def __init__(self) -> None:
-        # One tuple, because the viewer reads it from its own thread.
+    def __init__(self) -> None:  # one tuple, because the viewer reads it from its own thread
         self._last: tuple[GaussiansKey | None, Tensor | None] = (None, None)
 
     def values(self, gaussians: Gaussians, key: GaussiansKey | None, rule: PruneRule) -> Tensor | None:
@@ -162,8 +160,7 @@ class _Frame(NamedTuple):
     """A graph, the tensors that it reads and writes, the pairs that fit, and those of the last replay, int64 ``[]``."""
 
     graph: torch.cuda.CUDAGraph
-    inputs: tuple[Tensor, Tensor, Tensor]
-    """World-to-camera, intrinsics and background."""
+    inputs: tuple[Tensor, Tensor, Tensor]  # world-to-camera, intrinsics and background
     images: dict[str, Tensor]
     capacity: int
     needed: Tensor

@@ -77,11 +77,9 @@ def render_first(scene: Scene) -> Image.Image:
 class Embedded:
     """The web page of a scene, which a notebook shows if it is the value of a cell."""
 
-    page: str = field(repr=False)
-    """HTML of the page, the scene included."""
+    page: str = field(repr=False)  # HTML, the scene included
     title: str
-    height: int
-    """Of the frame, pixels; it is as wide as the notebook."""
+    height: int  # of the frame, pixels; it is as wide as the notebook
 
     def _repr_html_(self) -> str:  # notebooks call this
         # srcdoc, not an address: notebooks serve no files beside them, and browsers limit the length of data addresses.

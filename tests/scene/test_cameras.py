@@ -460,6 +460,9 @@ def test_the_camera_in_front_stands_upright(up: Any) -> None:
     camera = camera_in_front(two_seen(up=up))
     wanted = torch.tensor(up or (0.0, 0.0, 1.0))
     assert torch.allclose(camera.pose[:, 1], wanted, atol=1e-5)
+    for virtual_camera in sn.virtual_cameras(two_seen(up=up), 2, size=8):
+        assert abs(float(virtual_camera.pose[:, 0] @ wanted)) < 1e-5
+        assert float(virtual_camera.pose[:, 1] @ wanted) > 0
     if up is None:
         assert torch.allclose(camera.pose[:, 2], torch.tensor([0.0, -1.0, 0.0]), atol=1e-6)
 
