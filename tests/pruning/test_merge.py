@@ -202,8 +202,7 @@ def test_equal_pairs_merge_many_at_once() -> None:
 
 def test_clones_that_share_their_neighbours_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(merge, "MOST_ROUNDS", 3)
-    pruned = prune_gaussians(row(*[0.0] * 256), PAIRS, 64, torch.ones(256))
-    assert pruned.gaussians.num_gaussians == 64
+    assert prune_gaussians(row(*[0.0] * 256), PAIRS, 64, torch.ones(256)).gaussians.num_gaussians == 64
 
 
 def test_of_islands_the_heaviest_stay() -> None:
