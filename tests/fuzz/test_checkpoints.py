@@ -91,15 +91,11 @@ def resume(path: Path) -> None:
     made._load_checkpoint()
 
 
-def start_warm(path: Path) -> None:
-    read_gaussians(path)
-
-
 def test_a_valid_checkpoint_is_read(good: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     path.write_bytes(good)
     assert verdict(lambda: resume(path), len(good)) is None
-    assert verdict(lambda: start_warm(path), len(good)) is None
+    assert verdict(lambda: read_gaussians(path), len(good)) is None
 
 
 @pytest.fixture
@@ -203,7 +199,7 @@ def test_odd_contents_are_refused(good: bytes, tmp_path: Path, kind: str) -> Non
     path = tmp_path / "a.ckpt"
     torch.save(state, path)
     assert verdict(lambda: resume(path), path.stat().st_size) is not None
-    verdict(lambda: start_warm(path), path.stat().st_size)
+    verdict(lambda: read_gaussians(path), path.stat().st_size)
 
 
 class MakesFolder:
@@ -225,6 +221,6 @@ def test_nothing_in_a_checkpoint_is_run(good: bytes, tmp_path: Path, place: str)
     torch.load(path, weights_only=False)
     assert folder.exists(), "unpickling does not make the folder, so this test could not fail"
     folder.rmdir()
-    for read in (resume, start_warm):
+    for read in (resume, read_gaussians):
         assert verdict(lambda read=read: read(path), path.stat().st_size) is not None
     assert not folder.exists()

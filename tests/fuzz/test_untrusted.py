@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import shutil
 import stat
 import sys
 import zipfile
@@ -19,14 +18,17 @@ from typing import Any
 
 import pytest
 import torch
+from foreign_files import small_field
 from limits import verdict
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from small_captures import meta_of
 
 from sundae_ns.io import checkpoint
 from sundae_ns.io.formats import read_gaussians, write_for_viewers
 from sundae_ns.io.pack import container
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
 from sundae_ns.io.ply import read_ply, write_ply
-from sundae_ns.scene.initialization import from_points
+from sundae_ns.plugin.dataparsers import LightNerfstudioParser, check_capture
 
 PLACES = (
     "../../outside",
@@ -76,15 +78,10 @@ def test_the_hook_records_writes_and_no_reads(tmp_path: Path) -> None:
     assert [line.split()[0] for line in found] == ["os.mkdir", "open"]
 
 
-def gaussians() -> dict[str, torch.Tensor]:
-    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
-    return from_points(points, points, sh_degree=1, num_features=0)
-
-
 def a_checkpoint(path: Path, place: str) -> None:
     """Write a checkpoint that names ``place`` as a member of its archive, as the target of a link and as a tensor."""
     buffer = io.BytesIO()
-    state = {f"_model.gauss_params.{name}": value for name, value in gaussians().items()}
+    state = {f"_model.gauss_params.{name}": value for name, value in small_field(20).items()}
     torch.save({"step": 3, "pipeline": state | {place: torch.zeros(2)}}, buffer)
     with zipfile.ZipFile(buffer, "a", zipfile.ZIP_STORED) as archive:
         archive.writestr(place, b"outside")
@@ -94,13 +91,10 @@ def a_checkpoint(path: Path, place: str) -> None:
     path.write_bytes(buffer.getvalue())
 
 
-def a_pack(path: Path, place: str, *, section: bool = True) -> None:
+def a_pack(path: Path, place: str) -> None:
     """Write a packed scene that names ``place`` throughout its header, and as a section, which readers may refuse."""
-    write_scene(
-        path, PackedScene(gaussians(), meta={"source": {"method": place}, "name": place, "model": {"sh_degree": 1}})
-    )
-    if not section:
-        return
+    about = {"source": {"method": place}, "name": place, "model": {"sh_degree": 1}}
+    write_scene(path, PackedScene(small_field(20), meta=about))
     header = container.read_header(path)
     meta = {name: value for name, value in header.meta.items() if name != "sections"}
     arrays = container.read_sections(path, header)
@@ -109,7 +103,7 @@ def a_pack(path: Path, place: str, *, section: bool = True) -> None:
 
 def a_ply(path: Path, place: str) -> None:
     """Write a .ply that names ``place`` in its comments."""
-    write_ply(path, gaussians(), comments=[place, f"TextureFile {place}"])
+    write_ply(path, small_field(20), comments=[place, f"TextureFile {place}"])
 
 
 CASES: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], Any]]] = {
@@ -135,29 +129,20 @@ def test_nothing_leaves_the_file(tmp_path: Path, name: str, place: str) -> None:
 
 def test_members_of_an_exported_archive_are_plain_names(tmp_path: Path) -> None:
     """A .sog is a zip that other programs unpack."""
-    write_for_viewers(tmp_path / "a.sog", gaussians())
+    write_for_viewers(tmp_path / "a.sog", small_field(20))
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         names = archive.namelist()
     assert "meta.json" in names
     assert all(Path(name).name == name for name in names)
 
 
-def test_reading_a_capture_writes_nothing(tmp_path: Path) -> None:
-    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-
-    from harness.still_life import write_still_life
-    from sundae_ns.plugin.dataparsers import LightNerfstudioParser, check_capture
-
-    data = write_still_life(tmp_path / "scene", train_views=3, test_views=1, width=16, height=16, points=30, samples=1)
-    for place in PLACES:
-        copy = Path(shutil.copytree(data, tmp_path / "copy"))
-        meta = json.loads((copy / "transforms.json").read_text())
-        meta["frames"][0]["file_path"] = place
-        meta["ply_file_path"] = place
-        (copy / "transforms.json").write_text(json.dumps(meta))
-        parser = NerfstudioDataParserConfig(_target=LightNerfstudioParser, data=copy)
-        with watched() as found:
-            error = verdict(lambda parser=parser, copy=copy: check_capture(parser, copy, ("train",)), 10**4)
-        assert error is not None
-        assert found == []
-        shutil.rmtree(copy)
+@pytest.mark.parametrize("place", PLACES)
+def test_reading_a_capture_writes_nothing(capture: Path, place: str) -> None:
+    meta = meta_of(capture)
+    meta["frames"][0]["file_path"] = meta["ply_file_path"] = place
+    (capture / "transforms.json").write_text(json.dumps(meta))
+    parser = NerfstudioDataParserConfig(_target=LightNerfstudioParser, data=capture)
+    with watched() as found:
+        error = verdict(lambda: check_capture(parser, capture, ("train",)), 10**4)
+    assert error is not None
+    assert found == []
