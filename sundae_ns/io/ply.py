@@ -213,7 +213,7 @@ class _Ply:
                         columns.append((name, _LIST))
                     case ["property", kind, name]:
                         columns.append((name, order + _TYPES[kind]))
-            least, start = 0, self.header.count(b"\n") if self.text else len(self.header)
+            least, start = 0, len(self.header.splitlines()) if self.text else len(self.header)
             for name, (rows, columns) in stated.items():
                 if rows < 0 or (rows > 0 and not columns):
                     raise ValueError("an element has no properties, or a negative number of rows")

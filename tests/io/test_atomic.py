@@ -37,13 +37,6 @@ def small_disk(limit: int) -> Iterator[None]:
         signal.signal(signal.SIGXFSZ, before)
 
 
-def test_a_new_text_replaces_the_old(tmp_path: Path) -> None:
-    write_text(tmp_path / "a.txt", "old")
-    write_text(tmp_path / "a.txt", "new, ünïcode")
-    assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "new, ünïcode"
-    assert os.listdir(tmp_path) == ["a.txt"]
-
-
 def test_an_error_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
     write_text(tmp_path / "a.txt", "old")
 
@@ -125,11 +118,6 @@ def test_system_errors_become_one_line(
 def test_missing_folders_are_made(tmp_path: Path) -> None:
     write_text(tmp_path / "new" / "folder" / "a.txt", "new")
     assert (tmp_path / "new" / "folder" / "a.txt").read_text() == "new"
-
-
-def test_other_errors_are_not_converted(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), replacing(tmp_path / "a.txt"):
-        (tmp_path / "nowhere").read_text()
 
 
 def test_only_errors_that_a_user_can_correct_are_converted() -> None:

@@ -96,17 +96,6 @@ def test_no_code_that_it_names_runs(tmp_path: Path, kind: str) -> None:
         assert not mark.exists()
 
 
-def test_nerfstudios_own_reader_runs_it(tmp_path: Path) -> None:
-    """README warns of this; if the test fails one day, remove the warning."""
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    mark, path = tmp_path / "ran", tmp_path / "config.yml"
-    path.write_text(HOSTILE["a call"].format(mark))
-    with pytest.raises(AssertionError):
-        eval_setup(path)
-    assert mark.exists()
-
-
 @pytest.mark.parametrize("text", ["3", "- 1", "!!python/object:nerfstudio.engine.trainer.TrainerConfig {pipeline: 3}"])
 def test_a_file_that_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "config.yml"

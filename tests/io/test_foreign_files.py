@@ -32,7 +32,7 @@ from torch import Tensor
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import SPLAT_NAMES
-from sundae_ns.io.formats import kind_of, read_gaussian_file, unread
+from sundae_ns.io.formats import read_gaussian_file, unread
 from sundae_ns.io.sog import write_sog
 from sundae_ns.io.splat import read_ksplat
 
@@ -222,14 +222,6 @@ def test_other_folders_are_refused(tmp_path: Path, change: dict[str, Any], messa
     meta.write_text(json.dumps(content))
     with pytest.raises(DataError, match=re.escape(message)):
         read_gaussian_file(meta)
-
-
-def test_kinds(tmp_path: Path) -> None:
-    kinds = {}
-    for name, write in FOREIGN.items():
-        write(tmp_path / name, FIELD)
-        kinds[name] = kind_of(tmp_path / name)
-    assert list(kinds.values()) == ["splat", "ply", "ply", "gsplat", "ksplat", "ply"]
 
 
 def test_folders_of_3dgs_name_their_file(tmp_path: Path) -> None:

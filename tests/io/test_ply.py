@@ -60,22 +60,6 @@ def test_round_trip_is_exact(tmp_path: Path, n: int, degree: int) -> None:
         assert torch.equal(back[name], value), name
 
 
-def test_layout(tmp_path: Path) -> None:
-    params = small_field(3, 1)
-    write_ply(tmp_path / "a.ply", params, comments=["SplatRenderMode: mip"])
-    data = PlyData.read(str(tmp_path / "a.ply"))
-    assert data.byte_order == "<"
-    assert data.comments == ["SplatRenderMode: mip"]
-    vertex = data["vertex"]
-    expected = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 " + " ".join(f"f_rest_{i}" for i in range(9))
-    expected += " opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
-    assert [prop.name for prop in vertex.properties] == expected.split()
-    # Channel-major: three coefficients of red, then those of green.
-    np.testing.assert_array_equal(vertex["f_rest_1"], params["features_rest"][:, 1, 0])
-    np.testing.assert_array_equal(vertex["f_rest_3"], params["features_rest"][:, 0, 1])
-    np.testing.assert_array_equal(vertex["rot_0"], params["quats"][:, 0])
-
-
 def test_same_vertices_as_nerfstudio_exports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # The exporter needs open3d for meshes only, and open3d cannot be imported on every machine.
     monkeypatch.setitem(sys.modules, "open3d", types.ModuleType("open3d"))
@@ -134,6 +118,7 @@ COMMENT = "comment Küche, 東京, end_header\n".encode() + b"comment \xff\xe9\n
 SAME: dict[str, Callable[[Path], object]] = {
     "more properties, doubles, another order": _big_endian_doubles,
     "text": _text,
+    "text of old Macs": lambda path: (_text(path), path.write_bytes(path.read_bytes().replace(b"\n", b"\r"))),
     "faces": _faces,
     "no faces": _header(b"end_header", b"element face 0\nproperty list uchar uint vertex_indices\nend_header"),
     "no faces first": _header(b"element", b"element face 0\nproperty list uchar uint vertex_indices\nelement"),
