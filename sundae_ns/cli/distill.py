@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sundae_ns.cli.inputs import chosen_cameras, warn_if_few
 from sundae_ns.cli.options import Out, Overwrite, Scene, Share, check_exclusive, check_file, check_suffix, progress_bar
-from sundae_ns.core.errors import ConfigError, writing
+from sundae_ns.core.errors import ConfigError
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.load_save import SUFFIXES, load, save
 from sundae_ns.scene.virtual_cameras import virtual_cameras
@@ -68,8 +68,7 @@ def distill(
     if not finished:
         said = "nothing is saved yet: the trial of the head had not ended"
         if training.step > 0:
-            with writing(f"cannot write {partial}"):
-                training.save(partial)
+            training.save(partial)
             said = f"saved step {training.step:,} of {training.steps:,} as {partial}; the same command resumes"
         print(f"sundae: interrupted; {said}", file=sys.stderr)
         return 130
@@ -80,6 +79,6 @@ def distill(
     print(f"{out}: {counts}, {'with' if result.head else 'without'} a head")
     if training.gain is not None:
         print(f"a head gained {training.gain:.2f} dB in its trial, on cameras that no step sees")
-    held_out = f"{len(training.held_out)} cameras that no step sees"
-    print(f"{training.quality():.2f} dB against the full scene on {held_out}; {out.stat().st_size:,} bytes")
+    quality = f"{training.quality():.2f} dB against the full scene on {len(training.held_out)} cameras"
+    print(f"{quality} that no step sees; {out.stat().st_size:,} bytes")
     return 0

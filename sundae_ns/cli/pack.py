@@ -71,10 +71,8 @@ def pack(
     if target_drop is not None and not 0 < target_drop < 100:
         raise ConfigError(f"target-drop is {target_drop}; give a positive number of dB")
     if cleaning.chosen and (finetune or target_drop is not None):
-        raise ConfigError(
-            f"--finetune and --target-drop look at photos of the whole scene; leave out {cleaning.chosen}, or cut the "
-            "scene by `sundae export` or `sundae prune` afterwards"
-        )
+        whole = "--finetune and --target-drop look at photos of the whole scene"
+        raise ConfigError(f"{whole}; leave out {cleaning.chosen}, or cut the scene by `sundae prune` afterwards")
     given = {name: value for name, value in vars(precision).items() if type(value) in (int, float)}
     precision, config = PackConfig(**given), PackConfig(**{**(FINETUNED if finetune else {}), **given})
     config.validate()
@@ -150,10 +148,8 @@ def _measured(judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Cod
         without = views.quality(*plain).psnr
         size, plain_size = (len(pack_bytes(*pack)[0]) for pack in (packs[0], plain))
         if not is_worth(after.psnr, size, without, plain_size):
-            print(
-                f"the fine-tune of {finetune:,} steps loses {before.psnr - after.psnr:.2f} dB; a pack without it has "
-                f"{plain_size:,} bytes and loses {before.psnr - without:.2f} dB, which is worth more: give more steps, "
-                "or leave out --finetune",
-                file=sys.stderr,
-            )
+            lost, plain_lost = before.psnr - after.psnr, before.psnr - without
+            other = f"a pack without it has {plain_size:,} bytes and loses {plain_lost:.2f} dB, which is worth more"
+            remedy = "give more steps, or leave out --finetune"
+            print(f"the fine-tune of {finetune:,} steps loses {lost:.2f} dB; {other}: {remedy}", file=sys.stderr)
     return {**figures, "views": views.cameras, "test_views": views.all_cameras}

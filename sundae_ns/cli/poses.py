@@ -75,8 +75,9 @@ def poses(
         print(f"# masks: {placed.masks}")
     if placed.left_out:
         names = ", ".join(placed.left_out[:3]) + (", ..." if len(placed.left_out) > 3 else "")
-        mark = "" if placed.enough else "warning: "
-        print(f"# {mark}without a pose: {names}; to add them, {placed.again}", flush=True)
+        print(
+            f"# {'' if placed.enough else 'warning: '}without a pose: {names}; to add them, {placed.again}", flush=True
+        )
     return 0
 
 

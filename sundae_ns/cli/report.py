@@ -17,7 +17,7 @@ import tyro
 from rich.markup import escape
 
 from sundae_ns.cli.options import Out, Overwrite, check_folder, check_least, progress_bar
-from sundae_ns.core.errors import ConfigError, SundaeError, writing
+from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.files import write_files
 from sundae_ns.core.metrics import Lpips, Net, flip_available, lpips_weights
 from sundae_ns.report.measured import Measured, csv_text, markdown
@@ -72,8 +72,6 @@ def report(
                 label = _label(opened, {run.measured.label for run in done})
                 progress.update(task, description=f"Measuring {escape(label)}", total=len(opened.cameras))
                 measured = measure(opened, label=label, progress=partial(progress.advance, task))
-                with writing(f"cannot write to {out}"):
-                    out.mkdir(parents=True, exist_ok=True)
                 progress.update(task, description=f"Encoding views of {escape(label)}")
                 views = _views(opened, measured, cameras_for_each(len(runs)))
                 curve = read_count_curve(opened.source) if opened.packed_bytes is None else None

@@ -21,7 +21,7 @@ from sundae_ns.cli.process import quoted, run_command, word
 from sundae_ns.cli.train import FINETUNE_WORDS, TrainOptions, has_gpu, pack_run
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 from sundae_ns.core.files import put_aside, write_text
-from sundae_ns.data.capture_files import Placed, placed_in
+from sundae_ns.data.capture_files import placed_in
 from sundae_ns.data.layouts import is_model, is_posed, no_transforms, posed_layout
 from sundae_ns.io.config_file import schedule_length
 from sundae_ns.io.pack import container
@@ -89,14 +89,11 @@ class Project:
         mb, draft, method = self.max_mb, self.quality == "draft", self.train.method
         fixed = self.train.keep is not None or method != "sundae"
         decides = "needs a method that decides the number of Gaussians; leave out --keep and --method"
-        masks = (
-            f"{self.photos} has poses already; give each frame of transforms.json its mask_path, or a COLMAP model its "
-            "masks with `sundae train CAPTURE -- colmap --masks-path`"
-        )
+        masks = "give frames their mask_path in transforms.json, or use `sundae train CAPTURE -- colmap --masks-path`"
         steps = f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality"
         for wrong, message in (
             (mb is not None and not 0.01 <= mb <= 1e6, f"max-mb is {mb or 0:g}; give at least 0.01"),
-            (self.poses.masks is not None and self.posed, masks),
+            (self.poses.masks is not None and self.posed, f"{self.photos} has poses already; {masks}"),
             (draft and self.train.steps is not None, steps),
             (draft and method == "sundae-tiny", "sundae-tiny is shorter than a draft; leave out --quality"),
             (fixed and mb is not None, f"--max-mb {decides}"),
@@ -119,23 +116,19 @@ class Project:
             Step("report", lambda: run_command(measure), lambda: _check_report(report), report),
             Step("web page", lambda: run_command(export), lambda: _check_page(page), page),
         ]
-        return steps if self.posed else [Step("camera poses", self._find_poses, self.placed), *steps]
+        poses = Step("camera poses", self._find_poses, lambda: placed_in(self.capture))
+        return steps if self.posed else [poses, *steps]
 
     def _find_poses(self) -> int:
         put_aside(self.capture)  # damaged
         return run_command(["sundae", "poses", word(self.photos), "-o", word(self.capture), *self.poses.words()])
 
-    def placed(self) -> Placed:
-        """Which photos have a pose in the capture; an error unless it is whole."""
-        return placed_in(self.capture)
-
     def _train(self) -> int:
         """Train, or resume a training; ``DataError`` if too few photos have a pose."""
-        if not self.posed and not (placed := self.placed()).enough:
-            raise DataError(
-                f"COLMAP placed {len(placed.placed)} of {placed.total} photos; {placed.again}, and start in another "
-                f"folder, or train on these with `sundae run {quoted(self.capture)} -o OTHER`"
-            )
+        if not self.posed and not (placed := placed_in(self.capture)).enough:
+            counts = f"COLMAP placed {len(placed.placed)} of {placed.total} photos"
+            other = f"train on these with `sundae run {quoted(self.capture)} -o OTHER`"
+            raise DataError(f"{counts}; {placed.again}, and start in another folder, or {other}")
         saved, options = self.run / "nerfstudio_models", self.train
         # The name may begin with a dash.
         more = [f"--experiment-name={self.run.parent.parent.name}", "--timestamp", self.run.name]
@@ -203,7 +196,7 @@ def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
     """
     out = project.out
     project.check()
-    if not project.posed and not _passes(project.placed):
+    if not project.posed and not _passes(lambda: placed_in(project.capture)):
         check_poses(
             project.photos, project.poses.frames, project.poses.masks, remarks=False
         )  # sundae poses prints them

@@ -91,8 +91,7 @@ def train(
     (old, step, length), more = unfinished_run(out, options.method, capture) or (None, 0, 0), list(further)
     if resume and old is None:
         raise ConfigError(f"{out} has no unfinished run of {options.method} on {capture}; leave out --resume")
-    given = _value_of("--timestamp", more)
-    name = given or new_name()
+    name = (given := _value_of("--timestamp", more)) or new_name()
     if resume and old is not None:
         name = old.name
         more[:0] = [f"--experiment-name={old.parent.parent.name}", "--load-dir", word(old / "nerfstudio_models")]

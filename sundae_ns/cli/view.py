@@ -24,10 +24,9 @@ class _Server(ThreadingHTTPServer):
 
 
 def serve(page: str, port: int) -> ThreadingHTTPServer:
-    """A server of one page on 127.0.0.1, not yet started; ``ConfigError`` if the port is in use or not allowed.
+    """A server of one page on 127.0.0.1, not yet started.
 
-    It answers only requests that name this machine and its port: else a site whose name resolves to 127.0.0.1 (DNS
-    rebinding) could read the scene.
+    It answers only requests that name this machine: a site whose name resolves to 127.0.0.1 could read others.
     """
     content = page.encode(errors="backslashreplace")
 

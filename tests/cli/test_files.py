@@ -70,7 +70,8 @@ def test_export_of_a_ply_of_any_program(
     assert caplog.messages[0].endswith("unnamed.bin: 200 Gaussians: dropped 1 that were not finite (NaN or infinite)")
     assert caplog.messages[1].endswith("states no upward direction; it is 0 -1 0, as files of its kind have")
     finite = {name: value[torch.arange(200) != 3] for name, value in given.items()}
-    write_for_viewers(same, finite, Marks(antialiased=bool(comments)))
+    up = sn.load(tmp_path / "unnamed.bin").up
+    write_for_viewers(same, finite, Marks(antialiased=bool(comments), up=up))
     assert out.read_bytes() == same.read_bytes()
 
 
