@@ -69,11 +69,7 @@ class CheckedDataset(InputDataset):
         self._checked = False
 
     def check_images(self) -> None:
-        """Check the files once: undistortion, which comes with loading, crops the cameras.
-
-        Raises:
-            DataError: an image or a mask cannot be read, or has another size.
-        """
+        """Check the files once, because undistortion crops the cameras; ``DataError`` names a wrong image or mask."""
         if self._checked:
             return
         masks: Sequence[Path | None] = self._dataparser_outputs.mask_filenames or [None] * len(self)
@@ -102,11 +98,7 @@ class CheckedDataset(InputDataset):
         return pixels if turn is None else np.array(turned(Image.fromarray(pixels), turn))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """Image, and mask if the capture has masks.
-
-        Raises:
-            DataError: a file of this view is damaged.
-        """
+        """Image, and mask if the capture has masks; ``DataError`` if a file of this view is damaged."""
         with reading(self.image_filenames[image_idx], "an image that can be decoded", remedy="repair or remove it"):
             return super().get_data(image_idx, image_type)
 
@@ -247,7 +239,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             yield self.train_dataset.cameras[index : index + 1], mask
 
     def cameras(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, Tensor]]]:
-        """Training views as camera and batch, as nerfstudio's evaluation takes them; loaded one at a time."""
+        """Training views as camera and batch, loaded one at a time."""
         return map(self._camera, indices)
 
     def _camera(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
@@ -300,8 +292,6 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             )
         return loaded
 
-
-# ---------------------------------------------------------------------------------------------------- undistortion
 
 Result = tuple[NDArray[Any], NDArray[Any], Any]  # Intrinsics [3, 3], image [H, W, C] and mask
 

@@ -125,9 +125,6 @@ def replaced(module: Any, **names: Any) -> SimpleNamespace:
     return SimpleNamespace(**{**vars(module), **names})
 
 
-# --------------------------------------------------------------------------------------- where cameras and points stand
-
-
 def _distances_of(centres: Array) -> tuple[Array, Array]:
     """The middle ``[3]`` of camera centres ``[N, 3]`` and the distance ``[N]`` of each from it."""
     middle = np.median(centres, axis=0)
@@ -374,9 +371,6 @@ class CarefulColmapParser(_Placed, ColmapDataParser):
         return {"points3D_xyz": points, "points3D_rgb": torch.from_numpy(colours)}
 
 
-# -------------------------------------------------------------------------------------------------- parsed cameras
-
-
 def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None = None) -> None:
     """Refuse or warn of poses and lenses of the cameras ``[N]`` of training images ``names``, in any units.
 
@@ -496,13 +490,9 @@ def warn_of_other_frame(run: Path, transform: Tensor, scale: float) -> None:
 
 
 def camera_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None = None, downscale: int = 1) -> Camera:
-    """The rasteriser's form of a camera of shape ``(1,)``; ``camera`` does not change.
+    """The rasteriser's form of a nerfstudio camera of shape ``(1,)``, at a divisor of its resolution.
 
-    Args:
-        camera: nerfstudio camera, camera-to-world with OpenGL axes.
-        device: device of the view.
-        pose: camera-to-world in place of the camera's own, ``[..., 3, 4]``; differentiable.
-        downscale: divisor of the resolution.
+    A ``pose``, camera-to-world with OpenGL axes ``[..., 3, 4]``, takes the place of the camera's own; differentiable.
     """
     # nerfstudio's methods of cameras build tensors and cameras at each call; here one copy from the device does.
     parts = (camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)

@@ -125,9 +125,9 @@ class Distillation:
 
     @usual_defaults()
     def train(self, after_step: Callable[[int, int], bool]) -> bool:
-        """Decide on the head, if that is due, and train the steps that are left; whether all steps were trained.
+        """Decide on the head, if that is due, and train the steps that are left, while ``after_step`` returns True.
 
-        ``after_step`` is called after each step with the number of steps so far and of all; False stops.
+        It gets the number of steps so far and of all. Returns whether all steps were trained.
         """
         # Each of both trials, without and with a head, takes a tenth of the steps.
         trial = max(round(0.1 * self.steps), 1) if self.state.head is not None and self.gain is None else 0

@@ -75,8 +75,7 @@ class Opened:
     packed_bytes: int | None = None  # Size of the packed file; None for a run
     pipeline: Any = None  # nerfstudio's pipeline of a run
     cameras: list[Cameras] = field(default_factory=list)  # Test cameras, each of shape (1,), on the model's device
-    truths: list[Tensor] = field(default_factory=list)
-    """True images ``[H, W, 3]`` in [0, 1], over the model's background, on the model's device."""
+    truths: list[Tensor] = field(default_factory=list)  # True images [H, W, 3] over the model's background, likewise
 
     @property
     def scene(self) -> str:
@@ -276,9 +275,7 @@ def _parser_options(kind: type[DataParserConfig]) -> dict[str, Any]:
 def datamanager_of(scene: Scene, data: Path) -> SundaeDatamanagerConfig:
     """Configuration that parses, splits and scales a capture as in the training of a packed scene.
 
-    Raises:
-        DataError: the capture is missing, or cannot be used.
-        PackError: the scene does not say how its capture is read, or states something impossible.
+    ``DataError`` if the capture cannot be used, ``PackError`` if the scene does not say how, or the impossible.
     """
     stated: Any = scene.meta.get("capture")
     parser, scale = stated_capture(stated)

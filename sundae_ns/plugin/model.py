@@ -102,10 +102,6 @@ class SundaeModel(SplatfactoModel):
 
     A subclass of ``SplatfactoModel``, because nerfstudio's exporter and viewer test for it. Everything that ties the
     original to CUDA or to downloads is replaced: initialisation, view matrix, outputs, LPIPS.
-
-    Raises:
-        ConfigError: options that cannot work.
-        CheckpointError: the warm start cannot be read.
     """
 
     config: SundaeModelConfig
@@ -130,8 +126,8 @@ class SundaeModel(SplatfactoModel):
         self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution, self.count_curve)
         self.compensated = True  # Whether images outside of a viewer get the head's correction
         self._response, self._replay = ShownResponse(), FrameReplay()
+        # Views of training cameras that do not move, by index and divisor of their sides
         self._cameras: dict[tuple[int | None, int], Camera] = {}
-        """Views of training cameras that do not move, by index and divisor of their sides."""
 
     # ------------------------------------------------------------------------------------------------ the Gaussians
 
@@ -194,12 +190,9 @@ class SundaeModel(SplatfactoModel):
             callback.load_state_dict(self.state, state["extensions"].get(callback.name, {}))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
-        """Load a SUNDAE checkpoint with any number of Gaussians.
+        """Load a SUNDAE checkpoint with any number of Gaussians; ``CheckpointError`` for another kind or head.
 
         Parameters are resized in place, because optimizers may hold them already.
-
-        Raises:
-            CheckpointError: a checkpoint of another method or format, or of another feature width or head.
         """
         extra = checkpoint.check_extra_state(state_dict, self.config.num_features, self.state.gaussians.encoding)
         for callback in self.train_callbacks:
@@ -459,10 +452,7 @@ class NerfstudioRun:
     # -------------------------------------------------------------------------------------------------------- callbacks
 
     def start(self) -> list[TrainingCallback]:
-        """Hand the optimizers to the state, take over records, and let our callbacks check the run.
-
-        nerfstudio's callbacks set the step, call ours after each step, and let them report at the end.
-        """
+        """nerfstudio's callbacks, after ours have checked the run with the optimizers and records that they need."""
         assert self._optimizers is not None
         self.state.optimizers, self.state.schedulers = self._optimizers.optimizers, self._optimizers.schedulers
         if self.folder is not None:

@@ -117,12 +117,10 @@ class RoundedTraining:
 
     def __init__(self, model: SundaeModel, codecs: Codecs, rate: float, *, head: bool) -> None:
         self._model, self._codecs = model, codecs
+        # Weights of the head, parameters of the model, and the values that are trained, by the same names
         self.head = dict(model.head.named_parameters()) if head and model.head is not None else {}
-        """Weights of the head by name; empty without one."""
         self.rounded = {name: model.gauss_params[name] for name in codecs.gaussians} | self.head
-        """Parameters of the model by name."""
         self.exact = {name: value.detach().clone().requires_grad_() for name, value in self.rounded.items()}
-        """The values that are trained, by the same names."""
         self._rate = rate / sum(value.numel() for value in self.exact.values())
         groups: list[dict[str, Any]] = [
             {"params": [self.exact[name]], "lr": RATES[name], "eps": 1e-15} for name in codecs.gaussians
@@ -237,12 +235,9 @@ class Candidate(NamedTuple):
 
 
 class Search:
-    """Packs of one scene at several factors.
+    """Packs of one scene at several factors, judged by the run's test views; ``PackError`` if none meets a limit.
 
-    Args:
-        scene: exact, or fine-tuned with the rounding of codecs.
-        fit: the options at the factor 1, or the codecs of the fine-tune, whose grids and bases no factor changes.
-        judge: opens the run's test views when they are first needed.
+    ``fit`` has the options at the factor 1, or the codecs of a fine-tune, whose grids and bases no factor changes.
     """
 
     def __init__(self, scene: PackedScene, fit: PackConfig | Codecs, judge: Callable[[], Judge]) -> None:
@@ -271,10 +266,7 @@ class Search:
         return drop if math.isfinite(drop) else math.inf
 
     def smaller_than(self, limit: int) -> Candidate:
-        """The finest pack of at most ``limit`` bytes; that at the factor 1 if it fits too and, by chance, loses less.
-
-        ``PackError`` if even the coarsest is larger.
-        """
+        """The finest pack of at most ``limit`` bytes; that at the factor 1 if it fits and, by chance, loses less."""
         coarsest = self.at(COARSEST)
         if coarsest.bytes > limit:
             drop = ""
@@ -290,10 +282,7 @@ class Search:
         return finest
 
     def better_than(self, limit: float) -> Candidate:
-        """The coarsest pack that loses at most ``limit`` dB, no larger than that at the factor 1 if this one fits.
-
-        ``PackError`` if even the finest loses more.
-        """
+        """The coarsest pack that loses at most ``limit`` dB, no larger than that at the factor 1 if this one fits."""
 
         def fits(candidate: Candidate) -> bool:
             return self.drop(candidate) <= limit

@@ -73,15 +73,10 @@ class Visible(NamedTuple):
 
 
 class ViewerControls(torch.nn.Module):
-    """The controls, and what the preview has computed of the present Gaussians.
+    """The controls, and what the preview has computed of the Gaussians of a state by the ``configured`` rule.
 
-    A module without parameters, because nerfstudio looks for viewer elements in modules only.
-
-    Args:
-        state: of the model.
-        configured: the rule of the run's prune.
-        contribute: computes contributions.
-        curve: gives the curve by which trials have chosen the number of Gaussians; empty without them.
+    A module without parameters, because nerfstudio looks for viewer elements in modules only. ``curve`` gives that by
+    which trials have chosen the number of Gaussians; empty without them.
     """
 
     def __init__(
@@ -143,8 +138,7 @@ class ViewerControls(torch.nn.Module):
     def preview(self) -> Pruned | None:
         """The previewed prune; None outside of the viewer, with the slider at 1, or if the rule cannot be applied.
 
-        Graphs are built once. The pass over the training views is repeated if the rule weights pixels by the count that
-        stays. The caller holds nerfstudio's lock on the model, so training in another thread waits.
+        The caller holds nerfstudio's lock on the model, so training in another thread waits.
         """
         name, ratio = self.rule.value, round(float(self.keep_ratio.value), 6)
         if ratio >= 1 or not in_viewer():
