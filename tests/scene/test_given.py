@@ -129,6 +129,12 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "array": (lambda: sn.render(SCENE, CAMERA._replace(K=np.eye(3))), "no finite tensors"),
     "path": (lambda: sn.prune(SCENE, keep=0.5, cameras="a.json"), "'a.json' is no camera"),  # type: ignore[arg-type]
     "share": (lambda: sn.prune(SCENE, keep="0.1"), "keep is not made of 1 finite number"),  # type: ignore[arg-type]
+    "neither": (lambda: sn.prune(SCENE), "either keep .* or count"),
+    "both": (lambda: sn.prune(SCENE, keep=0.5, count=5), "either keep .* or count"),
+    "none": (lambda: sn.prune(SCENE, keep=0.0), "keep is 0.0"),
+    "150%": (lambda: sn.prune(SCENE, keep=1.5), "keep is 1.5"),
+    "no view": (lambda: sn.measure(SCENE, SCENE), "no view to measure in"),
+    "height": (lambda: sn.show(SCENE, height="400"), "height is '400'"),  # type: ignore[arg-type]
     "half": (lambda: sn.prune(SCENE, count=0.5), "count is 0.5"),  # type: ignore[arg-type]
     "rule": (lambda: sn.prune(SCENE, keep=0.5, rule="pairs"), "the rule is 'pairs'"),  # type: ignore[arg-type]
     "2.5 views": (lambda: sn.virtual_cameras(SCENE, 2.5), "n is 2.5"),  # type: ignore[arg-type]

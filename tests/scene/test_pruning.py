@@ -165,11 +165,6 @@ def test_the_count_meets_the_tolerated_loss(drop: float, ball: sn.Scene, cameras
     assert tolerated / 2 < error < 2 * tolerated
 
 
-def test_more_loss_keeps_fewer(ball: sn.Scene, cameras: list[sn.Camera]) -> None:
-    one, three = (count_for_drop(ball, drop, cameras, sn.PruneRule())[0] for drop in (0.5, 6.0))
-    assert three < one
-
-
 class Doubles(TorchDispatchMode):
     """Collects the numbers of elements of the float64 tensors that are made."""
 
