@@ -28,7 +28,7 @@ from sundae_ns.scene.scene import Scene, measure, usable_cameras
 from sundae_ns.scene.virtual_cameras import by_device, of_unit_size, resized, size_of, split, virtual_cameras
 
 REFIT_STEPS, REFIT_VIEWS = {"cpu": 64, "cuda": 128}, 4  # steps of a refit by the device, and the images of each
-REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 23  # most pixels of an image of a refit, and of one that tells what is seen
+REFIT_PIXELS, MOST_PIXELS = 1 << 18, 1 << 22  # most pixels of an image of a refit, and of one that tells what is seen
 
 
 class PrunedScene(NamedTuple):
