@@ -114,7 +114,7 @@ def test_export_writes_pages(packed: Path, tmp_path: Path, capsys: pytest.Captur
 def test_the_page_is_built_from_its_sources(tmp_path: Path) -> None:
     built = tmp_path / "page.html"
     subprocess.run(["node", "build.mjs", built], cwd=WEB, check=True)
-    assert built.read_text() == (ROOT / "sundae_ns" / "api" / "page.html").read_text(), "run make web"
+    assert built.read_text() == (ROOT / "sundae_ns" / "scene" / "page.html").read_text(), "run make web"
 
 
 @needs_node
