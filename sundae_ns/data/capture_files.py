@@ -215,10 +215,10 @@ def write_demo_capture(out: Path) -> Path:
         raise DataError(f"{out} is a file; name a folder for the capture")
     if out.is_dir() and any(out.iterdir()) and not (out / MARKER).exists():
         raise DataError(f"{out} holds other files than the demo's capture; name a new or an empty folder")
-    out.mkdir(parents=True, exist_ok=True)
+    (out / "images").mkdir(parents=True, exist_ok=True)
     (out / MARKER).touch()
     (out / TRANSFORMS).unlink(missing_ok=True)
     with zipfile.ZipFile(ARCHIVE) as archive:
         for name in sorted(archive.namelist(), key=lambda name: (name == TRANSFORMS, name)):
-            archive.extract(name, out)
+            (out / name).write_bytes(archive.read(name))
     return out

@@ -103,6 +103,7 @@ def run_and_capture(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny.folder, "RUN")
     shutil.copytree(tiny.scene, "CAPTURE")
+    shutil.copytree("CAPTURE/images", "CAPTURE/images_2")
     images = sorted(path.name for path in Path("CAPTURE/images").iterdir())
     write_model(Path("CAPTURE/sparse/0"), images, (48, 48))
     with pytest.raises(SystemExit):

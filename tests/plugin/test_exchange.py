@@ -132,7 +132,7 @@ def check_drawing(rank: int) -> None:
             radii = radii.maximum(image.radii.double() / max(cam.width, cam.height))
         for name, expected in (("grad2d", norms), ("count", counts), ("radii", radii)):
             found = state.densification[name]
-            torch.testing.assert_close(found, expected[start:end].float(), rtol=1e-6, atol=1e-8)
+            torch.testing.assert_close(found, expected[start:end], rtol=1e-6, atol=1e-8)
 
 
 class Halving(Callback):

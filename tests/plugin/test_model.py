@@ -120,8 +120,8 @@ def _stock(state: dict[str, Any]) -> dict[str, Any]:
     ("options", "change", "cause"),
     [
         ({}, _stock, "splatfacto checkpoint.*warm-start"),
-        ({"head": {"num_features": 1}}, None, "length 1"),
-        ({"head": {"mode": "off"}}, None, "length 0"),
+        ({"head": {"num_features": 1}}, None, "has num_features 1, the model 5"),
+        ({"head": {"mode": "off"}}, None, "has num_features 0, the model 5"),
         ({"head": {"size": "compact"}}, None, "head"),
         ({"head": {"mode": "features"}}, None, "head"),
         ({"sh_degree": 2}, None, "features_rest"),

@@ -145,7 +145,7 @@ UNPACKABLE: list[tuple[PackedScene, str]] = [
     (PackedScene({k: v for k, v in random_field().items() if k != "quats"}), "no quats"),
     (_with(scales=torch.zeros(600, 2)), "scales has shape"),
     (_with(features_rest=torch.zeros(600, 7, 3)), "features_rest has shape"),
-    (_with(features=torch.zeros(7, 3)), r"features has shape .*; it must be \[600, 1 to 256\]"),
+    (_with(features=torch.zeros(7, 3)), r"features has shape .*; it must be \[600, 3\]"),
     (_with(features=torch.zeros(600)), "features has shape"),
     (_with(features=torch.zeros(600, 0)), "features has shape"),
     (PackedScene(random_field(), {"a": torch.full((2, 2), torch.nan)}), "head has weights that are not finite"),
