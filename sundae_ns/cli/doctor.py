@@ -79,7 +79,7 @@ def parts(compile_kernels: bool = False) -> list[Part]:
         ("gsplat kernels", partial(_gsplat, compile_kernels), "sundae doctor --compile, with CUDA and nvcc", ""),
         ("our kernels", _kernels, "update the driver; without them the CPU and PyTorch do their work", ""),
         ("rasteriser", _rasterizer, "pip install numba", ""),
-        ("LPIPS weights", lambda: str(weights) * weights.is_file(), fix_weights, "LPIPS among the metrics"),
+        ("LPIPS weights", lambda: str(weights) if weights.is_file() else None, fix_weights, "LPIPS among the metrics"),
         ("libusb-1.0", partial(library, "usb-1.0"), "apt-get install libusb-1.0-0", "ns-export"),
         ("libGL", partial(library, "GL"), "apt-get install libgl1", "ns-export"),
         ("pycolmap", partial(_module, "pycolmap"), fix_photos, "sundae poses"),

@@ -40,7 +40,8 @@ class Cleaning:
     @property
     def chosen(self) -> str:
         """Name of the first option that is given, or empty."""
-        return "--crop" if self.crop is not None else "--remove-floaters" * self.remove_floaters
+        floaters = "--remove-floaters" if self.remove_floaters else ""
+        return floaters if self.crop is None else "--crop"
 
     def mask(self, scene: Scene, cameras: Sequence[Camera]) -> Tensor:
         """True for Gaussians that stay, bool ``[N]``; prints their numbers to stderr."""
@@ -49,11 +50,10 @@ class Cleaning:
             mask = crop_mask(scene, self.crop[:3], self.crop[3:])
             print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
         if self.remove_floaters:
-            left = int(mask.sum())
             floats = floater_mask(kept(scene, mask), cameras, console=Console(stderr=True))
             mask[mask.clone()] = ~floats
             rule = "" if cameras else ", by their neighbours alone: no camera of the photographs is known"
-            print(f"removed {int(floats.sum()):,} floaters of {left:,} Gaussians{rule}", file=sys.stderr)
+            print(f"removed {int(floats.sum()):,} floaters of {len(floats):,} Gaussians{rule}", file=sys.stderr)
             if not bool(mask.any()):
                 raise DataError("all Gaussians float; leave out --remove-floaters")
         return mask
