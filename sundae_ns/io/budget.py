@@ -19,7 +19,7 @@ def afford(unpacked: int, size: int, spare: int = SPARE, ratio: int = RATIO) -> 
 
 
 def afford_gaussians(count: int, coefficients: int, size: int) -> None:
-    """The same for the float32 of Gaussians with so many SH coefficients of degrees 1 and up for each channel."""
+    """As :func:`afford`, for float32 Gaussians with ``coefficients`` SH terms of degrees 1 and up in each channel."""
     if count < 1 or sh_degree_of(coefficients) is None:
         raise ValueError(f"it states {count:,} Gaussians of {coefficients} SH coefficients")
     afford(4 * count * (14 + 3 * coefficients), size)

@@ -274,7 +274,7 @@ def load_tensors(file: BinaryIO) -> Any:
 
 
 def _check_pickle(pickled: bytes) -> None:
-    ranks: dict[Any, int] = {}  # of tuples, by their place in the memo: up to so many hold each other twice
+    ranks: dict[Any, int] = {}  # nesting depth of each tuple, by its index in the pickle's memo
     rank, is_tuple = 0, False
     for operation, argument, _ in pickletools.genops(pickled):
         rank = max(rank, ranks.get(argument, 0)) if "GET" in operation.name else rank

@@ -48,8 +48,7 @@ def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tenso
         columns = slice(degree**2, (degree + 1) ** 2)
         matrix = torch.linalg.lstsq(after[..., columns], before[..., columns]).solution
         rows = slice(degree**2 - 1, (degree + 1) ** 2 - 1)
-        turned = torch.einsum("...ij,njc->...nic", matrix.to(features_rest), features_rest[:, rows])
-        rotated[..., rows, :] = turned
+        rotated[..., rows, :] = torch.einsum("...ij,njc->...nic", matrix.to(features_rest), features_rest[:, rows])
     return rotated
 
 
