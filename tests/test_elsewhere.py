@@ -1,7 +1,5 @@
 """Elsewhere: Windows, as far as Linux can tell, and a folder in which an editor looks at a user's program."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -43,14 +41,14 @@ print(sum(name.startswith("sundae_ns.") for name in sys.modules))
 """
 
 
-def test_every_module_is_imported_without_what_only_posix_has() -> None:
+def test_every_module_is_imported_without_what_only_posix_has():
     words = [sys.executable, "-c", IMPORTER, " ".join(POSIX_MODULES)]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout.split()[-1]) > 100
 
 
-def test_an_editor_finds_the_types_of_an_editable_install(tmp_path: Path) -> None:
+def test_an_editor_finds_the_types_of_an_editable_install(tmp_path):
     source, out = tmp_path / "source", tmp_path / "program.py"
     for name in ("sundae_ns", "method_configs"):
         shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))

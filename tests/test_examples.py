@@ -1,11 +1,8 @@
 """The programs in ``examples/`` run, and show what they say."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,15 +13,14 @@ from short_prunes import short_prunes  # noqa: F401
 
 import sundae_ns as sn
 
-Run = Callable[..., str]
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 @pytest.fixture
-def run(short_prunes: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:  # noqa: F811
+def run(short_prunes, monkeypatch, capsys):  # noqa: F811
     """Run a program in this process; returns what it printed."""
 
-    def run(name: str, *words: object) -> str:
+    def run(name, *words):
         monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
         runpy.run_path(str(EXAMPLES / name), run_name="__main__")
         return capsys.readouterr().out
@@ -33,7 +29,7 @@ def run(short_prunes: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
 
 @pytest.fixture(scope="module")
-def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cloud(tmp_path_factory):
     """A ball of smooth colours."""
     generator = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(600, 3, generator=generator), dim=1)
@@ -44,26 +40,26 @@ def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_every_example_is_tested() -> None:
+def test_every_example_is_tested():
     programs = {"plot_curve.py", "prune_ply.py", "render_packed.py"}
     assert {path.name for path in EXAMPLES.iterdir() if path.is_file()} == {"notebook.ipynb", *programs}
 
 
-def test_prune_ply(run: Run, cloud: Path, tmp_path: Path) -> None:
+def test_prune_ply(run, cloud, tmp_path):
     text = run("prune_ply.py", cloud, tmp_path / "a.spz", "--keep", 0.5, "--cameras", 8)
     assert "300 of 600 Gaussians" in text
     assert float(re.findall(r"PSNR ([\d.]+) dB", text)[0]) > 20
     assert sn.load(tmp_path / "a.spz").num_gaussians == 300
 
 
-def test_render_packed(run: Run, tmp_path: Path) -> None:
+def test_render_packed(run, tmp_path):
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
     assert "tiny head" in run("render_packed.py", packed, tmp_path / "a.png", "--camera", 1)
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.size == (3 * 50, 37)
 
 
-def test_plot_curve(run: Run, cloud: Path, tmp_path: Path) -> None:
+def test_plot_curve(run, cloud, tmp_path):
     text = run("plot_curve.py", cloud, tmp_path / "a.png", "--cameras", 4)
     quality = [float(value) for value in re.findall(r"merged: [\d,]+ Gaussians, ([\d.]+) dB", text)]
     assert len(quality) == 10
@@ -71,7 +67,7 @@ def test_plot_curve(run: Run, cloud: Path, tmp_path: Path) -> None:
     assert Image.open(tmp_path / "a.png").size == (750, 525)
 
 
-def test_the_notebook(tmp_path: Path) -> None:
+def test_the_notebook(tmp_path):
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     text = (EXAMPLES / "notebook.ipynb").read_text(encoding="utf-8")
     notebook = nbformat.reads(text, as_version=4)

@@ -1,14 +1,11 @@
 """The layer rule: a room imports only lower rooms, type checking included, stays light, and keeps its budget."""
 
-from __future__ import annotations
-
 import ast
 import csv
 import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -38,7 +35,7 @@ print(json.dumps(sorted(sys.modules)))
 
 
 @cache
-def modules() -> dict[str, Path]:
+def modules():
     """Files of the package by the names of their modules."""
     names = {}
     for base in (PACKAGE, "method_configs"):
@@ -49,13 +46,13 @@ def modules() -> dict[str, Path]:
     return names
 
 
-def room_of(module: str) -> str | None:
+def room_of(module):
     """The room of a module of the package; None for other modules and for the package itself."""
     parts = module.split(".")
     return parts[1] if parts[0] == PACKAGE and len(parts) > 1 else None
 
 
-def imports_of(source: str) -> Iterator[str]:
+def imports_of(source):
     """Modules that a source imports anywhere, under ``TYPE_CHECKING`` and inside functions too."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -67,17 +64,17 @@ def imports_of(source: str) -> Iterator[str]:
                 yield name if node.module == PACKAGE or name in modules() else node.module
 
 
-def violations(room: str, imported: Iterable[str]) -> set[str]:
+def violations(room, imported):
     """Rooms that ``room`` must not import: those of its own floor and above."""
     rooms = {other for module in imported if (other := room_of(module)) is not None} - {room}
     return {other for other in rooms if FLOORS[other] >= FLOORS[room]}
 
 
-def circles(edges: dict[str, set[str]]) -> list[str]:
+def circles(edges):
     """Modules on a circle of imports."""
     on_circle = []
     for start in edges:
-        reached: set[str] = set()
+        reached = set()
         waiting = [start]
         while waiting:
             for target in edges.get(waiting.pop(), set()) - reached:
@@ -88,9 +85,9 @@ def circles(edges: dict[str, set[str]]) -> list[str]:
     return on_circle
 
 
-def lines_of_rooms() -> dict[str, int]:
+def lines_of_rooms():
     """Lines of each room; the package's first module and ``method_configs`` are its front."""
-    lines: dict[str, int] = {}
+    lines = {}
     for name, path in modules().items():
         room = room_of(name)
         room = "front" if room in (None, "method_configs") else room
@@ -98,7 +95,7 @@ def lines_of_rooms() -> dict[str, int]:
     return lines
 
 
-def out_of_budget(lines: dict[str, int], budgets: dict[str, int]) -> dict[str, str]:
+def out_of_budget(lines, budgets):
     """Rooms with more lines than their budget, or with so many fewer that the budget has to follow."""
     return {
         room: f"{lines.get(room, 0)} lines, budget {budgets.get(room, 0)}"
@@ -107,25 +104,25 @@ def out_of_budget(lines: dict[str, int], budgets: dict[str, int]) -> dict[str, s
     }
 
 
-def test_every_room_has_a_floor() -> None:
+def test_every_room_has_a_floor():
     rooms = {room for module in modules() if (room := room_of(module)) is not None}
     assert rooms == FLOORS.keys()
     assert {path.name for path in (ROOT / PACKAGE).glob("*.py")} == {"__init__.py"}
 
 
-def test_every_room_keeps_its_budget() -> None:
+def test_every_room_keeps_its_budget():
     with BUDGETS.open() as file:
         budgets = {row["room"]: int(row["lines"]) for row in csv.DictReader(file)}
     assert not out_of_budget(lines_of_rooms(), budgets)
 
 
-def test_file_names_are_told_apart() -> None:
+def test_file_names_are_told_apart():
     names = [path.name for path in modules().values() if path.name != "__init__.py"]
     twins = sorted({name for name in names if names.count(name) > 1})
     assert len(twins) <= MAX_TWINS, twins
 
 
-def test_rooms_import_only_lower_floors() -> None:
+def test_rooms_import_only_lower_floors():
     wrong = {}
     for module, path in modules().items():
         room = room_of(module)
@@ -134,11 +131,11 @@ def test_rooms_import_only_lower_floors() -> None:
     assert not wrong
 
 
-def test_no_module_is_on_a_circle() -> None:
+def test_no_module_is_on_a_circle():
     assert not circles({name: set(imports_of(path.read_text())) for name, path in modules().items()})
 
 
-def test_only_the_plugin_imports_nerfstudio() -> None:
+def test_only_the_plugin_imports_nerfstudio():
     allowed = ("plugin", "method_configs")
     assert not [
         module
@@ -149,13 +146,13 @@ def test_only_the_plugin_imports_nerfstudio() -> None:
 
 
 @pytest.mark.parametrize("package", BARE)
-def test_the_lower_rooms_do_not_load_it(package: str) -> None:
+def test_the_lower_rooms_do_not_load_it(package):
     rooms = [f"{PACKAGE}.{room}" for room, floor in FLOORS.items() if floor < FLOORS[BARE[package]]]
     result = subprocess.run([sys.executable, "-c", LISTER, *rooms], capture_output=True, text=True, check=True)
     assert package not in json.loads(result.stdout.splitlines()[-1])
 
 
-def test_the_detectors_can_fail() -> None:
+def test_the_detectors_can_fail():
     assert violations("core", ["sundae_ns.pruning.decision", "sundae_ns.core.errors"]) == {"pruning"}
     assert violations("io", ["sundae_ns.pruning.decision"]) == {"pruning"}
     source = "if TYPE_CHECKING:\n    from sundae_ns.plugin.model import M\ndef f():\n    from sundae_ns import cli\n"
@@ -165,5 +162,5 @@ def test_the_detectors_can_fail() -> None:
 
 
 @pytest.mark.parametrize("word", ["shards", "budget", "preview"])
-def test_the_model_asks_for_no_kind(word: str) -> None:
+def test_the_model_asks_for_no_kind(word):
     assert word not in (ROOT / PACKAGE / "plugin" / "model.py").read_text().lower()

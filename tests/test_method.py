@@ -1,11 +1,8 @@
 """docs/method.md: every function that it names exists, and no equation stands without one."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -14,12 +11,12 @@ NAME = re.compile(r"`(sundae_ns(?:\.\w+)+)`")
 EQUATION = re.compile(r"```math\n(.*?)```\n", re.DOTALL)
 
 
-def resolve(name: str) -> Any:
+def resolve(name):
     """What a dotted name stands for; modules come before things of the same name in their package."""
     parts = name.split(".")
     for cut in range(len(parts), 0, -1):
         try:
-            found: Any = importlib.import_module(".".join(parts[:cut]))
+            found = importlib.import_module(".".join(parts[:cut]))
         except ModuleNotFoundError:
             continue
         for part in parts[cut:]:
@@ -28,7 +25,7 @@ def resolve(name: str) -> Any:
     raise AttributeError(name)
 
 
-def lonely(text: str) -> list[str]:
+def lonely(text):
     """Equations after which no function is named before the next equation or heading."""
     pieces = EQUATION.split(text)
     return [
@@ -39,17 +36,17 @@ def lonely(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", sorted(set(NAME.findall(PAGE.read_text(encoding="utf-8")))))
-def test_every_function_exists(name: str) -> None:
+def test_every_function_exists(name):
     assert callable(resolve(name))
 
 
-def test_every_equation_has_its_function() -> None:
+def test_every_equation_has_its_function():
     text = PAGE.read_text(encoding="utf-8")
     assert len(EQUATION.findall(text)) > 15
     assert lonely(text) == []
 
 
-def test_what_github_cannot_render_is_not_there() -> None:
+def test_what_github_cannot_render_is_not_there():
     text = PAGE.read_text(encoding="utf-8")
     # GitHub takes ```math blocks and single dollars; other ways stay as they are typed.
     assert "$$" not in text

@@ -1,9 +1,6 @@
 """No line of the package runs what a file says: no eval, no pickle, no unsafe YAML, no shell."""
 
-from __future__ import annotations
-
 import ast
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,13 +14,13 @@ METHODS = {"extract", "extractall"}
 """Of archives: nothing is unpacked to a disk."""
 
 
-def dotted(node: ast.expr) -> str:
+def dotted(node):
     if isinstance(node, ast.Attribute):
         return f"{dotted(node.value)}.{node.attr}"
     return node.id if isinstance(node, ast.Name) else "?"
 
 
-def sins(source: str) -> Iterator[str]:
+def sins(source):
     for node in ast.walk(ast.parse(source)):
         if not isinstance(node, ast.Call):
             continue
@@ -59,11 +56,11 @@ def sins(source: str) -> Iterator[str]:
         "np.load(path, allow_pickle=True)",
     ],
 )
-def test_it_would_be_noticed(source: str) -> None:
+def test_it_would_be_noticed(source):
     assert list(sins(source))
 
 
-def test_the_package_has_none_of_it() -> None:
+def test_the_package_has_none_of_it():
     files = [*(ROOT / "sundae_ns").rglob("*.py"), *(ROOT / "method_configs").rglob("*.py")]
     assert len(files) > 100
     found = {str(path.relative_to(ROOT)): list(sins(path.read_text(encoding="utf-8"))) for path in files}

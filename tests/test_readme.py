@@ -1,10 +1,7 @@
 """README and docs: links resolve, and commands and their options exist."""
 
-from __future__ import annotations
-
 import re
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +13,7 @@ TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "CONT
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
 
-def commands_of(program: str) -> Iterator[list[str]]:
+def commands_of(program):
     """Commands of a program in indented blocks and in backticks of all pages, as words without comments."""
     for path in TEXTS:
         text = path.read_text(encoding="utf-8")
@@ -27,7 +24,7 @@ def commands_of(program: str) -> Iterator[list[str]]:
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
-def test_links_resolve(path: Path) -> None:
+def test_links_resolve(path):
     for target in LINK.findall(path.read_text(encoding="utf-8")):
         name, _, anchor = target.partition("#")
         if "://" in name:
@@ -39,8 +36,8 @@ def test_links_resolve(path: Path) -> None:
             assert anchor in {re.sub(r"[^\w\- ]", "", line.lower()).replace(" ", "-") for line in headings}, target
 
 
-def test_commands_of_sundae_exist(capsys: pytest.CaptureFixture[str]) -> None:
-    helps: dict[str, str] = {}
+def test_commands_of_sundae_exist(capsys):
+    helps = {}
     for _, command, *words in (words for words in commands_of("sundae") if len(words) > 1 and words[1][:1] != "-"):
         if command not in helps:
             with pytest.raises(SystemExit) as caught:
@@ -52,7 +49,7 @@ def test_commands_of_sundae_exist(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(helps) > 5
 
 
-def test_scripts_and_targets_exist() -> None:
+def test_scripts_and_targets_exist():
     for words in commands_of("python"):
         assert not words[1].endswith(".py") or (ROOT / words[1]).is_file(), words
     makefile = (ROOT / "Makefile").read_text()

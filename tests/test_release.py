@@ -1,13 +1,10 @@
 """The release: what the wheel holds, and the version."""
 
-from __future__ import annotations
-
 import re
 import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import check_wheel
 import pytest
@@ -15,15 +12,15 @@ import pytest
 import sundae_ns
 
 ROOT = Path(__file__).parents[1]
-PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def built(tmp_path_factory):
     return check_wheel.build(tmp_path_factory.mktemp("built"))
 
 
-def test_the_wheel_holds_the_package_and_nothing_else(built: tuple[Path, Path]) -> None:
+def test_the_wheel_holds_the_package_and_nothing_else(built):
     _, wheel = built
     assert check_wheel.missing(wheel) == []
     with zipfile.ZipFile(wheel) as archive:
@@ -36,7 +33,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(built: tuple[Path, Path]) 
     assert f"\nRequires-Python: {','.join(sorted(PROJECT['requires-python'].split(',')))}\n" in metadata
 
 
-def test_the_sdist_holds_files_in_place_of_the_link(built: tuple[Path, Path]) -> None:
+def test_the_sdist_holds_files_in_place_of_the_link(built):
     with tarfile.open(built[0]) as archive:
         members = {member.name.partition("/")[2]: member for member in archive.getmembers()}
     assert members["sundae_ns/method_configs/sundae.py"].isfile()
@@ -44,7 +41,7 @@ def test_the_sdist_holds_files_in_place_of_the_link(built: tuple[Path, Path]) ->
     assert not [name for name, member in members.items() if member.issym() or member.islnk()]
 
 
-def test_a_file_that_the_wheel_lacks_is_found(built: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_file_that_the_wheel_lacks_is_found(built, tmp_path):
     with zipfile.ZipFile(built[1]) as archive, zipfile.ZipFile(tmp_path / "a.whl", "w") as cut:
         for name in archive.namelist():
             if not name.endswith((".zip", "method_configs/sundae.py")):
@@ -53,7 +50,7 @@ def test_a_file_that_the_wheel_lacks_is_found(built: tuple[Path, Path], tmp_path
     assert check_wheel.missing(tmp_path / "a.whl") == lost
 
 
-def test_one_version_everywhere() -> None:
+def test_one_version_everywhere():
     version = PROJECT["version"]
     assert sundae_ns.__version__ == version
     assert re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1] == version

@@ -1,14 +1,12 @@
 """Arms of a comparison: read from a file, checked before anything is trained, and made into commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 
 from harness.arms import DEFAULT_FILE, Entry, choose_arms, read_entries
 from harness.job import configure
-from harness.plan import Arm, Job, plan_scene
+from harness.plan import plan_scene
 from sundae_ns.core.errors import ConfigError
 
 DEFAULTS = [
@@ -35,17 +33,17 @@ MINE = """
 """
 
 
-def written(folder: Path, text: str) -> Path:
+def written(folder, text):
     path = folder / "mine.yaml"
     path.write_text(text)
     return path
 
 
-def chosen(path: Path, scale: float = 1.0) -> dict[str, Arm]:
+def chosen(path, scale=1.0):
     return {arm.name: arm for arm in choose_arms([str(path)], "sundae", scale)}
 
 
-def jobs_of(arms: dict[str, Arm]) -> dict[str, Job]:
+def jobs_of(arms):
     jobs = plan_scene(Path("fox"), (), list(arms.values()), keep_ratios=[0.1], seeds=[42], repeat_at=[])
     return {job.arm: job for job in jobs}
 
@@ -53,7 +51,7 @@ def jobs_of(arms: dict[str, Arm]) -> dict[str, Job]:
 # ----------------------------------------------------------------------------------------------------- what a file says
 
 
-def test_a_file_of_arms(tmp_path: Path) -> None:
+def test_a_file_of_arms(tmp_path):
     gentle, listed, stock, steady = read_entries(written(tmp_path, MINE))
     assert gentle.method == "sundae"
     assert gentle.options == {
@@ -92,13 +90,13 @@ def test_a_file_of_arms(tmp_path: Path) -> None:
         ("- name: a\n  options: {machine.seed: 1}", "sets machine.seed, which the command sets itself; remove it"),
     ],
 )
-def test_files_that_are_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_files_that_are_refused(tmp_path, text, said):
     with pytest.raises(ConfigError, match=said) as raised:
         read_entries(written(tmp_path, text))
     assert "\n" not in str(raised.value)
 
 
-def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read(tmp_path):
     with pytest.raises(ConfigError, match=r"gone\.yaml cannot be read .*; give a file of arms"):
         choose_arms([str(tmp_path / "gone.yaml")], "sundae")
     (tmp_path / "mine.yaml").write_bytes(b"\xff\xfe\x00")
@@ -109,7 +107,7 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------------- what is chosen
 
 
-def test_the_default_arms_are_a_file_like_any_other() -> None:
+def test_the_default_arms_are_a_file_like_any_other():
     assert [entry.name for entry in read_entries(DEFAULT_FILE)] == DEFAULTS
     arms = choose_arms([], "sundae")
     assert [arm.name for arm in arms] == DEFAULTS
@@ -118,7 +116,7 @@ def test_the_default_arms_are_a_file_like_any_other() -> None:
     assert [(arm.name, arm.kind, arm.method) for arm in tiny] == [("band", "branch", "sundae-tiny")]
 
 
-def test_default_arms_and_those_of_a_file_together(tmp_path: Path) -> None:
+def test_default_arms_and_those_of_a_file_together(tmp_path):
     path = str(written(tmp_path, "- name: stock\n  method: splatfacto"))
     assert [arm.name for arm in choose_arms(["band", path], "sundae")] == ["band", "stock"]
     with pytest.raises(ConfigError, match="--arms has band twice; give each once"):
@@ -155,13 +153,13 @@ def test_default_arms_and_those_of_a_file_together(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_methods_and_options_are_checked_before_anything_is_trained(tmp_path: Path, text: str, said: str) -> None:
+def test_methods_and_options_are_checked_before_anything_is_trained(tmp_path, text, said):
     with pytest.raises(ConfigError, match=said) as raised:
         chosen(written(tmp_path, text))
     assert "\n" not in str(raised.value)
 
 
-def test_lengths_come_from_the_method_times_a_factor(tmp_path: Path) -> None:
+def test_lengths_come_from_the_method_times_a_factor(tmp_path):
     path = written(tmp_path, MINE)
     lengths = {name: (arm.kind, arm.warmup, arm.steps) for name, arm in chosen(path).items()}
     assert lengths == {
@@ -180,7 +178,7 @@ def test_lengths_come_from_the_method_times_a_factor(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------------ what is trained
 
 
-def test_arms_of_a_file_become_commands_of_ns_train(tmp_path: Path) -> None:
+def test_arms_of_a_file_become_commands_of_ns_train(tmp_path):
     jobs = jobs_of(chosen(written(tmp_path, MINE)))
     assert set(jobs) == {"sundae-warm-up", "gentle", "listed", "stock", "steady"}
     assert (jobs["gentle"].keep_ratio, jobs["listed"].keep_ratio, jobs["stock"].keep_ratio) == (0.3, 0.1, None)
@@ -193,8 +191,8 @@ def test_arms_of_a_file_become_commands_of_ns_train(tmp_path: Path) -> None:
         == "ns-train splatfacto --data fox --machine.seed 42 --max-num-iterations 1000 --pipeline.model.sh-degree 2"
     )
     stock, _ = configure(jobs["stock"], tmp_path / "out")
-    assert (stock.max_num_iterations, stock.pipeline.model.sh_degree) == (1000, 2)  # type: ignore[attr-defined]
+    assert (stock.max_num_iterations, stock.pipeline.model.sh_degree) == (1000, 2)
     steady, _ = configure(jobs["steady"], tmp_path / "out")
-    pruning = steady.pipeline.model.pruning  # type: ignore[attr-defined]
+    pruning = steady.pipeline.model.pruning
     assert (steady.max_num_iterations, pruning.mode, pruning.keep_ratio) == (30_000, "continuous", 0.4)
-    assert not steady.pipeline.model.evaluate_prune  # type: ignore[attr-defined]
+    assert not steady.pipeline.model.evaluate_prune

@@ -1,7 +1,5 @@
 """Scripts of ``benchmarks/``: their help, their results, and the tables that they write into README and docs."""
 
-from __future__ import annotations
-
 import ast
 import json
 import runpy
@@ -16,7 +14,7 @@ SCRIPTS = sorted(path.name for path in FOLDER.glob("*.py"))
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_help(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help(name, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(FOLDER))
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     with pytest.raises(SystemExit) as caught:
@@ -26,7 +24,7 @@ def test_help(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     assert f"python benchmarks/{name}" in (ast.get_docstring(ast.parse((FOLDER / name).read_text())) or "")
 
 
-def test_tables_of_all_pages_are_those_of_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_of_all_pages_are_those_of_the_results(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     tables = runpy.run_path(str(FOLDER / "tables.py"))
     for page in tables["PAGES"]:
@@ -34,6 +32,6 @@ def test_tables_of_all_pages_are_those_of_the_results(monkeypatch: pytest.Monkey
         assert tables["with_tables"](text) == text, f"{page.name} is not current; run: python benchmarks/tables.py"
 
 
-def test_results_can_be_read() -> None:
+def test_results_can_be_read():
     for path in (FOLDER / "results").glob("*.jsonl"):
         assert all(isinstance(json.loads(line), dict) for line in path.read_text().splitlines()), path.name

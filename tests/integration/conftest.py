@@ -1,30 +1,22 @@
 """One tiny run for all tests of this folder, made by the commands that users type."""
 
-from __future__ import annotations
-
 import io
 import os
 import shutil
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 import yaml
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import profiler, writer
 from short_prunes import short_prunes  # noqa: F401
 
 from harness.still_life import write_still_life
-
-Call = Callable[..., "subprocess.CompletedProcess[str]"]
-CallHere = Callable[..., str]
-Once = Callable[[str, Callable[[Path], None]], Path]
 
 
 class TinyRun(NamedTuple):
@@ -42,19 +34,19 @@ class TinyRun(NamedTuple):
     keep_ratio: float
 
     @property
-    def config(self) -> Path:
+    def config(self):
         return self.folder / "config.yml"
 
     @property
-    def checkpoints(self) -> Path:
+    def checkpoints(self):
         return self.folder / "nerfstudio_models"
 
-    def checkpoint(self, step: int) -> Path:
+    def checkpoint(self, step):
         return self.checkpoints / f"step-{step:09d}.ckpt"
 
 
 @pytest.fixture(scope="session")
-def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def environment(tmp_path_factory):
     """Variables for the installed commands: where they lie, a wide terminal, and no network."""
     folder = tmp_path_factory.mktemp("bin")
     ffmpeg = folder / "ffmpeg"
@@ -68,10 +60,10 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.fixture(scope="session")
-def call(environment: dict[str, str]) -> Call:
+def call(environment):
     """Run an installed command in a fresh process, out of reach of any network; its output is in the error, if any."""
 
-    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    def run(*arguments):
         words = [str(word) for word in arguments]
         # Beside the interpreter, or where a package was put that the interpreter only knows of.
         command = shutil.which(words[0], path=environment["PATH"])
@@ -92,10 +84,10 @@ def call(environment: dict[str, str]) -> Call:
 
 
 @pytest.fixture(scope="session")
-def call_here(environment: dict[str, str]) -> CallHere:
+def call_here(environment):
     """Run an installed command in this process, which has imported nerfstudio; returns what it printed."""
 
-    def run(*arguments: object) -> str:
+    def run(*arguments):
         words = [str(word) for word in arguments]
         (command,) = entry_points(group="console_scripts", name=words[0])
         with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out:
@@ -113,10 +105,10 @@ def call_here(environment: dict[str, str]) -> CallHere:
 
 
 @pytest.fixture(scope="session")
-def tiny(call: Call, once: Once) -> TinyRun:
+def tiny(call, once):
     points, prune_at, save_every, steps, keep_ratio = 300, 45, 30, 120, 0.5
 
-    def train(root: Path) -> None:
+    def train(root):
         write_still_life(root / "scene", train_views=12, test_views=3, width=48, height=48, points=points)
         options = {
             "data": root / "scene",
@@ -148,28 +140,28 @@ def tiny(call: Call, once: Once) -> TinyRun:
 
 
 @pytest.fixture(scope="session")
-def exported(tiny: TinyRun, call_here: CallHere, open3d: None, once: Once) -> Path:
+def exported(tiny, call_here, open3d, once):
     """The .ply that ns-export writes of the tiny run; skips where open3d does not import."""
 
-    def export(folder: Path) -> None:
+    def export(folder):
         call_here("ns-export", "gaussian-splat", "--load-config", tiny.config, "--output-dir", folder)
 
     return once("exported", export) / "splat.ply"
 
 
 @pytest.fixture(autouse=True)
-def _no_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
+def _no_network(monkeypatch):
+    def refuse(*_, **__):
         raise OSError("no network in tests")
 
     monkeypatch.setattr(urllib.request, "urlopen", refuse)
 
 
 @pytest.fixture
-def trainer_of(tiny: TinyRun, tmp_path: Path) -> Iterator[Callable[..., Trainer]]:
+def trainer_of(tiny, tmp_path):
     """Set up nerfstudio's trainer in this process with the tiny run's configuration, changed by a function."""
 
-    def make(change: Callable[[TrainerConfig], Any]) -> Trainer:
+    def make(change):
         config = yaml.load(tiny.config.read_text(), Loader=yaml.Loader)
         config.output_dir = tmp_path
         config.steps_per_save = 10000

@@ -4,12 +4,6 @@ Screenshots are compared with pictures of the loaded model by the page's own cam
 and the browser's enlarging to the size of its canvas, done here by the same bilinear filter.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -18,9 +12,7 @@ from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.utils import colormaps
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.utils import CameraState, get_camera
-from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 from viser import transforms
 
 from harness.viewer_page import Server, ViewerPage
@@ -38,7 +30,7 @@ MEAN, SHARE = 3.0, 0.02
 
 
 @pytest.fixture
-def server(tiny: Any, tmp_path: Path) -> Iterator[Any]:
+def server(tiny, tmp_path):
     """``ns-viewer`` on the tiny run."""
     command = ("ns-viewer", "--load-config", tiny.config)
     server = Server(command, tmp_path / "viewer.log", "Caching / undistorting")
@@ -47,12 +39,12 @@ def server(tiny: Any, tmp_path: Path) -> Iterator[Any]:
 
 
 @pytest.fixture
-def page() -> Iterator[Any]:
+def page():
     with ViewerPage(CHROMIUM, 640, 400) as page:
         yield page
 
 
-def camera_of(page: Any) -> Any:
+def camera_of(page):
     """nerfstudio's camera for the page's, as its viewer makes it."""
     seen = page.camera
     rotation = transforms.SO3(wxyz=np.array(seen.wxyz)) @ transforms.SO3.from_x_radians(np.pi)
@@ -62,7 +54,7 @@ def camera_of(page: Any) -> Any:
     return get_camera(CameraState(seen.fov, seen.aspect, pose, CameraType.PERSPECTIVE), height, width)
 
 
-def scene(page: Any) -> NDArray[np.float64]:
+def scene(page):
     """What the page last showed of the scene ``[H, W, 3]``, to 255, the axes in its lower left corner blackened."""
     left, top, width, height = page.canvas()
     seen = page.seen[top : top + height, left : left + width].astype(float)
@@ -70,7 +62,7 @@ def scene(page: Any) -> NDArray[np.float64]:
     return seen
 
 
-def differences(seen: NDArray[np.float64], picture: Tensor) -> tuple[float, float]:
+def differences(seen, picture):
     """Mean difference of what is seen and a picture ``[H, W, C]``, and the share of pixels that are far off."""
     options = colormaps.ColormapOptions(normalize=True)
     shown = (colormaps.apply_colormap(picture, options) * 255).to(torch.uint8).numpy()
@@ -81,7 +73,7 @@ def differences(seen: NDArray[np.float64], picture: Tensor) -> tuple[float, floa
     return float(error.mean()), float((error.max(axis=2) > FAR).mean())
 
 
-def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> None:
+def test_every_control_does_what_it_says(tiny, server, page):
     _, pipeline, _, _ = eval_setup(tiny.config, test_mode="test")
     model = pipeline.model
     browser.wait_for(server.listens, "ns-viewer", 120)
@@ -91,10 +83,10 @@ def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> N
     page.settle(lambda: page.press("Fast"), SIDE)
     page.settle(lambda: page.drag(200, 250, 140, 230), SIDE)
     page.rest()
-    found: dict[str, tuple[float, float]] = {}
+    found = {}
 
     @torch.no_grad()
-    def outputs() -> dict[str, Tensor]:
+    def outputs():
         model.set_background(torch.tensor([38, 42, 55]) / 255)  # what the viewer's menu is set to at first
         return dict(model.eval().get_outputs_for_camera(camera_of(page)))
 
@@ -120,7 +112,7 @@ def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> N
     assert said > 0
     assert np.abs(off - seen["base_rgb"]).mean() < 0.3 * said
 
-    def as_at_first() -> bool:
+    def as_at_first():
         page.rest(0.2)
         return bool(np.abs(scene(page) - first).mean() < 0.3 * said)
 

@@ -1,12 +1,9 @@
 """nerfstudio's own commands on a finished run."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +15,7 @@ from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.ply import ply_marks, read_ply
 
 
-def test_ns_eval(tiny: Any, call_here: Any, tmp_path: Path) -> None:
+def test_ns_eval(tiny, call_here, tmp_path):
     call_here("ns-eval", "--load-config", tiny.config, "--output-path", tmp_path / "eval.json")
     result = json.loads((tmp_path / "eval.json").read_text())
     assert result["method_name"] == "sundae-tiny"
@@ -34,7 +31,7 @@ def test_ns_eval(tiny: Any, call_here: Any, tmp_path: Path) -> None:
     assert found["psnr"] > prune["pruned"]["psnr"]
 
 
-def test_a_copied_run_is_evaluated_by_its_own_checkpoint(tiny: Any, call_here: Any, tmp_path: Path) -> None:
+def test_a_copied_run_is_evaluated_by_its_own_checkpoint(tiny, call_here, tmp_path):
     """The original is still there, with another checkpoint."""
     copy = Path(shutil.copytree(tiny.folder, tmp_path / "copy"))
     for path in (copy / "nerfstudio_models").iterdir():
@@ -49,11 +46,11 @@ def test_a_copied_run_is_evaluated_by_its_own_checkpoint(tiny: Any, call_here: A
     assert ours["configurations"][0]["mean"]["psnr"] == pytest.approx(result["results"]["psnr"], abs=1e-5)
 
 
-def pictures(folder: Path) -> list[np.ndarray]:
+def pictures(folder):
     return [np.asarray(Image.open(path)) for path in sorted(folder.glob("*.png"))]
 
 
-def test_ns_render_interpolate(tiny: Any, call_here: Any, tmp_path: Path) -> None:
+def test_ns_render_interpolate(tiny, call_here, tmp_path):
     names = ("rgb", "base_rgb", "depth", "accumulation", "features", "response", "background")
     call_here(
         *("ns-render", "interpolate", "--load-config", tiny.config, "--output-path", tmp_path / "out"),
@@ -70,7 +67,7 @@ def test_ns_render_interpolate(tiny: Any, call_here: Any, tmp_path: Path) -> Non
     assert 0 < np.abs(rgb - frames[0][:, 48:96]).mean() < 30
 
 
-def test_ns_render_camera_path(tiny: Any, call_here: Any, tmp_path: Path) -> None:
+def test_ns_render_camera_path(tiny, call_here, tmp_path):
     pose = torch.eye(4)
     pose[2, 3] = 1.0
     turned = pose.clone()
@@ -93,7 +90,7 @@ def test_ns_render_camera_path(tiny: Any, call_here: Any, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("kind", ["equirectangular", "fisheye", "vr180", "omnidirectional"])
-def test_other_projections_of_a_camera_path_are_refused(tiny: Any, call_here: Any, tmp_path: Path, kind: str) -> None:
+def test_other_projections_of_a_camera_path_are_refused(tiny, call_here, tmp_path, kind):
     pose = torch.eye(4).flatten().tolist()
     path = {
         **{"camera_type": kind, "render_height": 32, "render_width": 64, "seconds": 1},
@@ -108,7 +105,7 @@ def test_other_projections_of_a_camera_path_are_refused(tiny: Any, call_here: An
     assert not list((tmp_path / "out").glob("*.jpg"))
 
 
-def test_ns_export(tiny: Any, exported: Path) -> None:
+def test_ns_export(tiny, exported):
     assert ply_marks(exported).in_model_frame
     found = read_ply(exported)
     state = torch.load(tiny.checkpoint(tiny.steps - 1), map_location="cpu")["pipeline"]

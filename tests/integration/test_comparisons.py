@@ -1,15 +1,11 @@
 """``quality.py`` and ``suite.py`` with tiny trainings: stopped and resumed, and published layouts."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import shutil
 import struct
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import forked
 import numpy as np
@@ -22,7 +18,7 @@ from suite import SuiteOptions, run_suite
 from harness import job as jobs
 from harness.arms import choose_arms
 from harness.job import perform
-from harness.plan import Job, parser_of, plan_scene
+from harness.plan import parser_of, plan_scene
 from harness.results import read_results
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.plugin.finished_runs import load_model
@@ -33,17 +29,17 @@ SCALE, WARMUP = 0.02, 12
 WARM_UP = "sundae-tiny-warm-up"
 
 
-def in_process(job: Job, out: Path, on_percent: Callable[[float], object]) -> None:
+def in_process(job, out, on_percent):
     """A job without a process of its own, which would load everything anew."""
     perform(job, out)
 
 
 @pytest.fixture
-def forked_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+def forked_jobs(tmp_path, monkeypatch):
     """Fork the processes of jobs off one that has imported nerfstudio; their command lines."""
-    started: list[list[str]] = []
+    started = []
 
-    def run_logged(words: list[str], log: Path, on_line: Callable[[str], object]) -> tuple[int, str]:
+    def run_logged(words, log, on_line):
         python, option, code, *arguments = words
         assert (python, option) == (sys.executable, "-c")
         (tmp_path / "job.py").write_text(code)
@@ -58,9 +54,7 @@ def forked_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[st
     return started
 
 
-def test_stopped_and_continued(
-    tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forked_jobs: list[list[str]]
-) -> None:
+def test_stopped_and_continued(tiny, tmp_path, monkeypatch, forked_jobs):
     arms, out = ["sundae", "band-no-head"], tmp_path / "out"
     jobs = plan_scene(
         tiny.scene.resolve(),
@@ -115,7 +109,7 @@ def test_stopped_and_continued(
         assert packed["bytes"] < 0.7 * results[arm]["measured"]["bytes_total"]
 
 
-def test_a_run_is_packed_with_a_fine_tune(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_is_packed_with_a_fine_tune(tiny, tmp_path, monkeypatch):
     """As a job does on a GPU."""
     monkeypatch.setattr(jobs, "FINETUNE_STEPS", 3)
     opened = load_model(tiny.folder)
@@ -133,7 +127,7 @@ def test_a_run_is_packed_with_a_fine_tune(tiny: Any, tmp_path: Path, monkeypatch
     assert jobs.tune(load_model(tmp_path / "run"), tmp_path / "b.sundae") is None  # it still densifies
 
 
-def test_the_suite_trains_a_method_as_its_command_does(tiny: Any, tmp_path: Path) -> None:
+def test_the_suite_trains_a_method_as_its_command_does(tiny, tmp_path):
     captures = tmp_path / "captures"
     shutil.copytree(tiny.scene, captures / "still-life")
     (captures / "torn").mkdir()
@@ -154,7 +148,7 @@ def test_the_suite_trains_a_method_as_its_command_does(tiny: Any, tmp_path: Path
     assert "- torn: " in page
 
 
-def published(scene: Path, out: Path, *, factor: int) -> None:
+def published(scene, out, *, factor):
     """The still life laid out as Mip-NeRF 360 is published: a COLMAP model of large pictures, and ``images_N``."""
     meta = json.loads((scene / "transforms.json").read_text())
     width, height = factor * meta["w"] - 1, factor * meta["h"] - factor // 2  # rounded up, by a hair
@@ -183,7 +177,7 @@ def published(scene: Path, out: Path, *, factor: int) -> None:
         (model / f"{name}.bin").write_bytes(content)
 
 
-def test_a_scene_as_it_is_published(tiny: Any, tmp_path: Path) -> None:
+def test_a_scene_as_it_is_published(tiny, tmp_path):
     published(tiny.scene, tmp_path / "360_v2" / "bicycle", factor=4)
     published(tiny.scene, tmp_path / "360_v2" / "counter", factor=2)
     options = SuiteOptions(

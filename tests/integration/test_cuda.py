@@ -1,11 +1,7 @@
 """What only a GPU can show: memory that really runs out, and resuming where sums come out in any order."""
 
-from __future__ import annotations
-
 import json
 import re
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 import torch
@@ -21,10 +17,10 @@ ROOM = 256 << 20
 
 
 @pytest.fixture
-def little_memory() -> Iterator[Any]:
+def little_memory():
     """Limits what torch may take of the GPU; all of it is free again afterwards."""
 
-    def limit(bytes_: int) -> None:
+    def limit(bytes_):
         torch.cuda.set_per_process_memory_fraction(bytes_ / torch.cuda.get_device_properties(0).total_memory)
 
     yield limit
@@ -32,18 +28,16 @@ def little_memory() -> Iterator[Any]:
     torch.cuda.empty_cache()
 
 
-def quality(trainer: Any) -> dict[str, float]:
+def quality(trainer):
     trainer.pipeline.eval()
-    found: dict[str, float] = trainer.pipeline.get_average_eval_image_metrics()
+    found = trainer.pipeline.get_average_eval_image_metrics()
     return found
 
 
-def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkpoint(
-    tiny: Any, trainer_of: Any, little_memory: Any
-) -> None:
+def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkpoint(tiny, trainer_of, little_memory):
     """The field all but doubles every few steps, until the GPU has no more for it."""
 
-    def growing(config: Any) -> None:
+    def growing(config):
         config.max_num_iterations, config.steps_per_save = 400, 10
         model = config.pipeline.model
         model.pruning.mode = "off"
@@ -76,7 +70,7 @@ def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkp
     assert step >= 10
     little_memory(torch.cuda.get_device_properties(0).total_memory)
 
-    def onwards(config: Any) -> None:
+    def onwards(config):
         config.load_dir, config.max_num_iterations = saved.parent, 2
         config.pipeline.model.pruning.mode, config.pipeline.model.stop_split_at = "off", 0
 
@@ -86,25 +80,25 @@ def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkp
 
 
 @pytest.mark.parametrize("start", [30, 45, 60])
-def test_a_resumed_run_keeps_as_many_and_is_as_good(tiny: Any, trainer_of: Any, start: int) -> None:
+def test_a_resumed_run_keeps_as_many_and_is_as_good(tiny, trainer_of, start):
     """Stopped before the warm-up's end, right at the prune, and after it; compared with the run that never stopped."""
     folder = tiny.checkpoints
     if start == tiny.prune_at:
 
-        def to_the_prune(config: Any) -> None:
+        def to_the_prune(config):
             config.load_dir, config.load_step, config.max_num_iterations = folder, 30, tiny.prune_at - 30
 
         stopped = trainer_of(to_the_prune)
         stopped.train()
         folder = stopped.checkpoint_dir
 
-    def onwards(config: Any) -> None:
+    def onwards(config):
         config.load_dir, config.load_step, config.max_num_iterations = folder, start, tiny.steps - 1 - start
 
     resumed = trainer_of(onwards)
     resumed.train()
 
-    def finished(config: Any) -> None:
+    def finished(config):
         config.load_dir, config.load_step = tiny.checkpoints, tiny.steps - 1
 
     whole = trainer_of(finished)

@@ -1,13 +1,10 @@
 """``bench_formats.py``: a finished run in every packed format, loaded again and measured on its test views."""
 
-from __future__ import annotations
-
 import csv
 import runpy
 import stat
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -27,19 +24,19 @@ else:
 """
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+def run(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", [SCRIPT.name, *map(str, arguments)])
     with pytest.raises(SystemExit) as caught:
         runpy.run_path(str(SCRIPT), run_name="__main__")
     assert caught.value.code == 0
 
 
-def rows_of(path: Path) -> list[dict[str, str]]:
+def rows_of(path):
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
 @pytest.fixture
-def transform(tmp_path: Path) -> Path:
+def transform(tmp_path):
     """A program with the command line of splat-transform."""
     path = tmp_path / "splat-transform"
     path.write_text(TRANSFORM.format(python=sys.executable))
@@ -47,7 +44,7 @@ def transform(tmp_path: Path) -> Path:
     return path
 
 
-def test_each_format_has_a_row(tiny: Any, transform: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_format_has_a_row(tiny, transform, tmp_path, monkeypatch):
     out = tmp_path / "formats.csv"
     run(monkeypatch, tiny.folder, "-o", out, "--splat-transform", transform)
     rows = {(row["format"], row["program"]): row for row in rows_of(out)}
@@ -74,9 +71,7 @@ def test_each_format_has_a_row(tiny: Any, transform: Path, tmp_path: Path, monke
     assert sizes["fp32", ""] > sizes[".sundae", "sundae_ns"]
 
 
-def test_a_program_that_fails_costs_its_own_row_alone(
-    tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_program_that_fails_costs_its_own_row_alone(tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "path", [str(SCRIPT.parent), *sys.path])
     files = runpy.run_path(str(SCRIPT))["packed_files"]
     made = [one.file.suffix for one in files(tiny.folder, sn.load(tiny.folder), tmp_path, None, "false --gpu cpu")]
@@ -84,9 +79,7 @@ def test_a_program_that_fails_costs_its_own_row_alone(
     assert "false --gpu cpu has failed" in capsys.readouterr().err
 
 
-def test_a_file_of_another_program_takes_the_place_of_its_own_row(
-    tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_of_another_program_takes_the_place_of_its_own_row(tiny, tmp_path, monkeypatch):
     out, file = tmp_path / "formats.csv", tmp_path / "other.ply"
     scene = sn.load(tiny.folder)
     cameras = sn.virtual_cameras(scene, 2)

@@ -1,13 +1,9 @@
 """A stranger's run whose ``config.yml`` starts a program: no command of sundae starts it."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
 from http.server import ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -15,13 +11,13 @@ import yaml
 from sundae_ns.cli import main
 from sundae_ns.cli.main import COMMANDS
 
-CONFIGS: dict[str, Callable[[str], str]] = {
+CONFIGS = {
     "nothing else": lambda text: "!!python/object/apply:os.system ['touch PWNED']\n",
     "among options": lambda text: text.replace(
         "\nload_step: null\n", "\nload_step: !!python/object/new:os.system ['touch PWNED']\n"
     ),
 }
-WORDS: dict[str, list[str]] = {
+WORDS = {
     "run": ["CAPTURE", "-o", "PROJECT", "--method", "sundae-tiny"],
     "poses": ["RUN", "-o", "capture"],
     "train": ["CAPTURE", "-o", "runs"],
@@ -39,9 +35,7 @@ WORDS: dict[str, list[str]] = {
 
 
 @pytest.fixture(params=CONFIGS)
-def hostile(
-    request: pytest.FixtureRequest, tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Path]:
+def hostile(request, tiny, tmp_path, monkeypatch):
     """A hostile run: alone, in a project of ``sundae run``, and in a folder of ``sundae demo``."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny.scene, "CAPTURE")
@@ -57,22 +51,22 @@ def hostile(
 
 
 @pytest.mark.parametrize("kind", CONFIGS)
-def test_nerfstudio_would_run_it(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nerfstudio_would_run_it(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     yaml.load(CONFIGS[kind]("a: 1\nload_step: null\n"), Loader=yaml.Loader)
     assert Path("PWNED").exists()
 
 
-def test_no_command_is_forgotten() -> None:
+def test_no_command_is_forgotten():
     assert WORDS.keys() == COMMANDS.keys()
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.usefixtures("hostile", "short_prunes")
-def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
+def test_no_command_runs_it(command, monkeypatch):
+    asked = []
 
-    def start(words: Sequence[str], *_: Any, **__: Any) -> int:
+    def start(words, *_, **__):
         """A command of sundae in this process; one of nerfstudio is only noted."""
         asked.append(Path(words[0]).name)
         if asked[-1] != "sundae":
@@ -81,7 +75,7 @@ def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> No
             main(list(words[1:]))
         return int(caught.value.code or 0)
 
-    def stop(server: ThreadingHTTPServer) -> None:
+    def stop(server):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sundae_ns.cli.run.run_command", start)
@@ -104,8 +98,8 @@ def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> No
     ],
 )
 @pytest.mark.usefixtures("hostile")
-def test_training_from_it_runs_nothing_of_it(words: list[str], call_here: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[Any] = []
+def test_training_from_it_runs_nothing_of_it(words, call_here, monkeypatch):
+    begun = []
     monkeypatch.setattr("nerfstudio.scripts.train.launch", lambda config, **_: begun.append(config.setup(local_rank=0)))
     call_here(
         "ns-train", "sundae-tiny", "--data", "CAPTURE", "--max-num-iterations", "60", "--vis", "tensorboard", *words

@@ -1,15 +1,11 @@
 """Measurements of a finished run."""
 
-from __future__ import annotations
-
 import copy
 import json
 import os
 import shutil
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -18,16 +14,15 @@ import yaml
 from sundae_ns.core.errors import CheckpointError, DataError
 from sundae_ns.io import checkpoint
 from sundae_ns.plugin import finished_runs as opening
-from sundae_ns.plugin.finished_runs import Opened, load_model
+from sundae_ns.plugin.finished_runs import load_model
 from sundae_ns.report.measure import compensation, frame_times, measure_scene, sizes
-from sundae_ns.report.measured import Measured
 
 
-def figures_of(run: Opened) -> Measured:
+def figures_of(run):
     return measure_scene(run, label="", warmup=0, repeats=1)
 
 
-def test_figures_of_a_run(tiny: Any) -> None:
+def test_figures_of_a_run(tiny):
     run = load_model(tiny.config)
     model, cameras, truths = run.model, run.cameras, run.truths
     assert [truth.shape[:2] for truth in truths] == [(int(c.height), int(c.width)) for c in cameras]
@@ -42,9 +37,7 @@ def test_figures_of_a_run(tiny: Any) -> None:
     assert frame_times(model, cameras[0], warmup=0, repeats=1).head == 0
 
 
-def test_a_run_opens_while_its_training_replaces_the_checkpoint(
-    tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_opens_while_its_training_replaces_the_checkpoint(tiny, tmp_path, monkeypatch):
     run = Path(shutil.copytree(tiny.folder, tmp_path / "run"))
     newest = checkpoint.newest_whole(run)[0]
     monkeypatch.setattr(opening, "fastest_device", lambda: (newest.unlink(missing_ok=True), torch.device("cpu"))[1])
@@ -52,13 +45,13 @@ def test_a_run_opens_while_its_training_replaces_the_checkpoint(
 
 
 @torch.no_grad()
-def test_the_head_is_timed_at_the_size_at_which_it_runs(tiny: Any) -> None:
+def test_the_head_is_timed_at_the_size_at_which_it_runs(tiny):
     run = load_model(tiny.config)
     model, whole = run.model, tuple(run.truths[0].shape[:2])
-    seen: list[tuple[int, ...]] = []
+    seen = []
     model.head.register_forward_pre_hook(lambda _, arguments: seen.append(tuple(arguments[0].shape[:2])))
 
-    def sizes_seen(fn: Callable[[], Any]) -> set[tuple[int, ...]]:
+    def sizes_seen(fn):
         seen.clear()
         fn()
         return set(seen)
@@ -72,10 +65,10 @@ def test_the_head_is_timed_at_the_size_at_which_it_runs(tiny: Any) -> None:
     assert frame_times(model, camera, warmup=0, repeats=1).head == 0
 
 
-def test_the_head_is_disabled_inside_a_block(tiny: Any) -> None:
+def test_the_head_is_disabled_inside_a_block(tiny):
     run = load_model(tiny.config)
 
-    def corrected() -> bool:
+    def corrected():
         shown = run.model.get_outputs_for_camera(run.cameras[0])
         return not torch.equal(shown["rgb"], shown["base_rgb"])
 
@@ -88,7 +81,7 @@ def test_the_head_is_disabled_inside_a_block(tiny: Any) -> None:
     assert corrected()
 
 
-def test_a_capture_that_has_moved_is_found_or_named(tiny: Any, tmp_path: Path) -> None:
+def test_a_capture_that_has_moved_is_found_or_named(tiny, tmp_path):
     """Found where it stands as before as seen from the run, and otherwise by --data."""
     root = Path(os.path.commonpath([tiny.scene, tiny.folder]))
     run = Path(shutil.copytree(tiny.folder, tmp_path / tiny.folder.relative_to(root)))
@@ -104,7 +97,7 @@ def test_a_capture_that_has_moved_is_found_or_named(tiny: Any, tmp_path: Path) -
     assert load_model(run).capture == capture
 
 
-def test_a_head_that_is_not_enabled_yet_counts_no_bytes(tiny: Any) -> None:
+def test_a_head_that_is_not_enabled_yet_counts_no_bytes(tiny):
     run = load_model(tiny.config)
     assert figures_of(run).bytes_head > 0
     run.model.state.head_starts_at = 10**9
@@ -113,7 +106,7 @@ def test_a_head_that_is_not_enabled_yet_counts_no_bytes(tiny: Any) -> None:
     assert figures.bytes_total == figures.full.bytes
 
 
-def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path) -> None:
+def test_the_share_kept_is_the_product_over_all_prunes(tiny, tmp_path):
     assert load_model(tiny.config).kept == pytest.approx(tiny.keep_ratio, abs=0.01)  # a whole number of Gaussians
     run = Path(shutil.copytree(tiny.folder, tmp_path / "run"))
     prunes = [{"before": 200, "after": 50, "seconds": 1.0}, {"before": 80, "after": 40, "seconds": 0.5}]
@@ -125,6 +118,6 @@ def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path
     assert (found.kept, found.prune_s) == (None, None)
 
 
-def test_a_run_that_is_not_there(tmp_path: Path) -> None:
+def test_a_run_that_is_not_there(tmp_path):
     with pytest.raises(CheckpointError, match="does not exist"):
         load_model(tmp_path / "config.yml")

@@ -1,13 +1,9 @@
 """``sundae pack`` with a target of bytes or of quality, on a finished run."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -25,14 +21,14 @@ from sundae_ns.plugin.tuned_packs import COARSEST, Candidate, Search, best_pack,
 from sundae_ns.scene.packing import contents_of
 
 
-def packed(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
+def packed(capsys, *words):
     with pytest.raises(SystemExit, match="0"):
         main(["pack", *map(str, words), "--json"])
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    found = json.loads(capsys.readouterr().out)
     return found
 
 
-def test_a_target_of_bytes_is_met_and_used(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_target_of_bytes_is_met_and_used(tiny, tmp_path, capsys):
     plain = packed(capsys, tiny.folder, "-o", tmp_path / "a.sundae")
     assert plain["bytes"] == (tmp_path / "a.sundae").stat().st_size
     assert sum(value for name, value in plain["bits"].items() if name != "all") == pytest.approx(
@@ -49,19 +45,19 @@ class Stated:
 
     before, cameras, all_cameras = Quality((30.0,), (0.9,)), 3, 3
 
-    def __init__(self, drop: Callable[[PackConfig], float]) -> None:
+    def __init__(self, drop):
         self.drop = drop
 
-    def quality(self, _: PackedScene, codecs: Codecs) -> Quality:
+    def quality(self, _, codecs):
         return Quality((30 - self.drop(codecs.config),), (0.9,))
 
 
-def search(run: Path, drop: Callable[[PackConfig], float], config: PackConfig | None = None) -> Search:
+def search(run, drop, config=None):
     scene = contents_of(load_run(run, max_cameras=0))
-    return Search(scene, config or PackConfig(), lambda: Stated(drop))  # type: ignore[arg-type, return-value]
+    return Search(scene, config or PackConfig(), lambda: Stated(drop))
 
 
-def test_the_search_uses_what_is_allowed(tiny: Any) -> None:
+def test_the_search_uses_what_is_allowed(tiny):
     """With a loss that grows with the steps, from below the default to above it."""
     with_steps = search(tiny.folder, lambda config: config.harmonics_step)
     for limit in (0.01, 0.1):
@@ -69,7 +65,7 @@ def test_the_search_uses_what_is_allowed(tiny: Any) -> None:
         assert 0.95 * limit < found.codecs.config.harmonics_step <= limit
 
 
-def test_a_target_is_never_larger_than_a_default_that_meets_it(tiny: Any) -> None:
+def test_a_target_is_never_larger_than_a_default_that_meets_it(tiny):
     """Even where finer steps happen to lose more."""
     by_chance = search(tiny.folder, lambda config: 0.06 if config.harmonics_step == 0.02 else 0.3)
     default = by_chance.default
@@ -81,7 +77,7 @@ def test_a_target_is_never_larger_than_a_default_that_meets_it(tiny: Any) -> Non
     assert found.bytes == default.bytes
 
 
-def test_the_quality_before_and_after_is_stated(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_quality_before_and_after_is_stated(tiny, tmp_path, capsys):
     found = packed(capsys, tiny.folder, "-o", tmp_path / "a.sundae", "--target-drop", 0.005)
     (before, after), (before_ssim, after_ssim) = found["psnr"], found["ssim"]
     assert before - 0.005 <= after < before + 0.05
@@ -89,7 +85,7 @@ def test_the_quality_before_and_after_is_stated(tiny: Any, tmp_path: Path, capsy
     assert found["views"] == 3
 
 
-def test_positions_are_rounded_once(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_positions_are_rounded_once(tiny, tmp_path, capsys):
     """By the steps that the search finds, not by those that it begins with."""
     exact = contents_of(load_run(tiny.folder, max_cameras=0)).gaussians["means"].double()
     errors = []
@@ -104,11 +100,11 @@ def test_positions_are_rounded_once(tiny: Any, tmp_path: Path, capsys: pytest.Ca
 class Faithful(Stated):
     """Judges a fine-tuned scene: other bases than those of its training lose 1 dB more."""
 
-    def __init__(self, trained: Codecs, drop: Callable[[PackConfig], float]) -> None:
+    def __init__(self, trained, drop):
         super().__init__(drop)
         self.trained = trained
 
-    def quality(self, scene: PackedScene, codecs: Codecs) -> Quality:
+    def quality(self, scene, codecs):
         pairs = [
             (codecs.gaussians[name], one) for name, one in self.trained.gaussians.items() if isinstance(one, Transform)
         ]
@@ -122,14 +118,14 @@ class Tuned(NamedTuple):
     bytes: int
     """Of the pack without a target."""
 
-    def search(self, drop: Callable[[PackConfig], float]) -> Search:
-        return Search(self.scene, self.codecs, lambda: Faithful(self.codecs, drop))  # type: ignore[arg-type, return-value]
+    def search(self, drop):
+        return Search(self.scene, self.codecs, lambda: Faithful(self.codecs, drop))
 
 
 @pytest.fixture(scope="module")
-def tuned(tiny: Any) -> Tuned:
+def tuned(tiny):
     """A scene whose rows have moved since its codecs were fitted, as training moves them."""
-    config = PackConfig(**FINETUNED)  # type: ignore[arg-type]
+    config = PackConfig(**FINETUNED)
     scene, codecs = fit_scene(contents_of(load_run(tiny.folder, max_cameras=0)), config)
     generator = torch.Generator().manual_seed(0)
     for name in codecs.gaussians:
@@ -137,7 +133,7 @@ def tuned(tiny: Any) -> Tuned:
     return Tuned(scene, codecs, len(pack_bytes(scene, codecs)[0]))
 
 
-def test_a_target_begins_with_the_pack_of_the_fine_tune(tuned: Tuned) -> None:
+def test_a_target_begins_with_the_pack_of_the_fine_tune(tuned):
     """Not with grids, bases and steps that are fitted anew, which the training did not know."""
     search = tuned.search(lambda config: config.harmonics_step)
     assert search.default == (tuned.scene, tuned.codecs, tuned.bytes)
@@ -153,7 +149,7 @@ def test_a_target_begins_with_the_pack_of_the_fine_tune(tuned: Tuned) -> None:
     assert search.drop(found) <= lost
 
 
-def test_a_fine_tune_that_does_not_help_is_left_out(tiny: Any, tuned: Tuned) -> None:
+def test_a_fine_tune_that_does_not_help_is_left_out(tiny, tuned):
     plain = search(tiny.folder, lambda config: config.harmonics_step)
     plain_default = plain.default.bytes
     assert tuned.bytes < plain_default
@@ -176,15 +172,15 @@ def test_a_fine_tune_that_does_not_help_is_left_out(tiny: Any, tuned: Tuned) -> 
         best_pack([bad, plain], most_drop=0.0001)
 
 
-def test_coarser_steps_that_take_more_bytes_are_not_taken(tuned: Tuned) -> None:
+def test_coarser_steps_that_take_more_bytes_are_not_taken(tuned):
     class Growing(Search):
-        def at(self, power: float) -> Candidate:
+        def at(self, power):
             return Candidate(self.scene, tuned.codecs, round(100 + 10 * power))
 
-    assert Growing(tuned.scene, tuned.codecs, lambda: Stated(lambda _: 0.0)).better_than(0.1).bytes == 100  # type: ignore[arg-type, return-value]
+    assert Growing(tuned.scene, tuned.codecs, lambda: Stated(lambda _: 0.0)).better_than(0.1).bytes == 100
 
 
-def test_targets_that_cannot_be_met(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_targets_that_cannot_be_met(tiny, tmp_path, capsys):
     """One line with the smallest size and its loss, and no file."""
     with pytest.raises(SystemExit, match="2"):
         main(["pack", str(tiny.folder), "-o", str(tmp_path / "a.sundae"), "--target-bytes", "500"])
@@ -198,15 +194,13 @@ def test_targets_that_cannot_be_met(tiny: Any, tmp_path: Path, capsys: pytest.Ca
         search(tiny.folder, lambda _: 0.5, scaled(PackConfig(), COARSEST)).better_than(0.1)
 
 
-def test_a_pack_is_worth_its_bytes_at_the_price_of_trials() -> None:
+def test_a_pack_is_worth_its_bytes_at_the_price_of_trials():
     assert tuned_packs.is_worth(30.0, 100, 30.0, 100)
     assert tuned_packs.is_worth(29.7, 50, 30.0, 100)
     assert not tuned_packs.is_worth(29.5, 50, 30.0, 100)  # half of the bytes are worth 0.4 dB
 
 
-def test_a_fine_tune_that_loses_says_so(
-    tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fine_tune_that_loses_says_so(tiny, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tuned_packs, "is_worth", lambda *_: False)
     plain = packed(capsys, tiny.folder, "-o", tmp_path / "plain.sundae")
     words = [tiny.folder, "-o", tmp_path / "a.sundae", "--finetune", 1, "--head-step", "0.021", "--color-step", "1"]
@@ -218,9 +212,7 @@ def test_a_fine_tune_that_loses_says_so(
     assert plain["psnr"][1] < plain["psnr"][0] + 0.1
 
 
-def test_a_pack_without_its_capture_says_that_it_is_not_measured(
-    tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_pack_without_its_capture_says_that_it_is_not_measured(tiny, tmp_path, capsys):
     shutil.copytree(tiny.folder, tmp_path / "run")
     config = tmp_path / "run" / "config.yml"
     config.write_text(config.read_text().replace(f"- {tiny.scene.name}\n", "- elsewhere\n"))
@@ -231,7 +223,7 @@ def test_a_pack_without_its_capture_says_that_it_is_not_measured(
     assert re.match(r"the quality is not measured: the capture .*elsewhere is missing; give its folder", shown.err)
 
 
-def test_steps_grow_together() -> None:
+def test_steps_grow_together():
     finer, coarser = scaled(PackConfig(), -1.0), scaled(PackConfig(), 2.0)
     assert finer.harmonics_step == PackConfig().harmonics_step / 2
     assert coarser.opacity_step == 4 * PackConfig().opacity_step

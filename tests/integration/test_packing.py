@@ -1,13 +1,11 @@
 """``sundae pack`` on a finished run, and what reads its file: measurements, and a warm start."""
 
-from __future__ import annotations
-
 import io
 import re
 from contextlib import redirect_stdout
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -25,14 +23,14 @@ class Packed(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def packed(tiny: Any, tmp_path_factory: pytest.TempPathFactory) -> Packed:
+def packed(tiny, tmp_path_factory):
     file = tmp_path_factory.mktemp("packed") / "tiny.sundae"
     with redirect_stdout(io.StringIO()) as output, pytest.raises(SystemExit, match="0"):
         main(["pack", str(tiny.folder), "-o", str(file)])
     return Packed(file, output.getvalue())
 
 
-def test_the_report_counts_every_byte(packed: Packed) -> None:
+def test_the_report_counts_every_byte(packed):
     table, _, quality = packed.output.partition("bits per Gaussian")[2].partition("\nPSNR ")
     assert re.fullmatch(
         r"\d+\.\d\d -> \d+\.\d\d dB, SSIM 0\.\d{4} -> 0\.\d{4}, before and after, on 3 of 3 test views\n", quality
@@ -44,7 +42,7 @@ def test_the_report_counts_every_byte(packed: Packed) -> None:
     assert {"means", "quats", "scales", "features", "head", "cameras", "header"} <= set(rows)
 
 
-def test_the_up_axis_is_that_of_the_capture(packed: Packed) -> None:
+def test_the_up_axis_is_that_of_the_capture(packed):
     """nerfstudio turns a capture until the mean of its cameras' upward directions is z."""
     found = load(packed.file)
     assert found.up == (0, 0, 1)
@@ -52,9 +50,7 @@ def test_the_up_axis_is_that_of_the_capture(packed: Packed) -> None:
     assert torch.nn.functional.cosine_similarity(ups, torch.tensor(found.up), dim=0) > 0.99
 
 
-def test_a_run_is_cut_before_it_is_packed_or_exported(
-    tiny: Any, packed: Packed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_is_cut_before_it_is_packed_or_exported(tiny, packed, tmp_path, capsys):
     whole = load(packed.file)
     places = load(tiny.folder).gaussians["means"][:, 0]
     middle = float(places.median())
@@ -80,7 +76,7 @@ def test_a_run_is_cut_before_it_is_packed_or_exported(
         assert load(tmp_path / "a.ply").num_gaussians == found.num_gaussians
 
 
-def test_a_packed_scene_is_measured_on_its_capture(tiny: Any, packed: Packed) -> None:
+def test_a_packed_scene_is_measured_on_its_capture(tiny, packed):
     before, after = load_model(tiny.config), load_model(packed.file, data=tiny.scene)
     for name in ("rgb", "base_rgb"):
         values = [
@@ -94,7 +90,7 @@ def test_a_packed_scene_is_measured_on_its_capture(tiny: Any, packed: Packed) ->
     assert torch.equal(before.cameras[1].camera_to_worlds, after.cameras[1].camera_to_worlds)
 
 
-def test_a_warm_start_reads_a_packed_scene(packed: Packed) -> None:
+def test_a_warm_start_reads_a_packed_scene(packed):
     (params, in_model_frame), truth = read_gaussians(packed.file), load(packed.file)
     assert in_model_frame
     assert "features" not in params

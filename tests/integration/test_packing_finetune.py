@@ -1,19 +1,14 @@
 """``sundae pack --finetune`` on a finished run: the gain, what is stored, and what does not change."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import shutil
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 import yaml
 from nerfstudio.configs.method_configs import all_methods
-from torch import Tensor
 
 from sundae_ns.cli import main
 from sundae_ns.cli.pack import pack
@@ -41,12 +36,12 @@ COARSE = PackConfig(
 )
 
 
-def digests(folder: Path) -> dict[str, str]:
+def digests(folder):
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def quality(run: Any, file: Path) -> float:
+def quality(run, file):
     """Mean PSNR of a packed scene on the test views, dB."""
     pipeline = load_model(file, data=run.scene)
     with torch.no_grad():
@@ -57,20 +52,20 @@ def quality(run: Any, file: Path) -> float:
     return sum(values) / len(values)
 
 
-def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_makes_up_for_the_rounding(tiny, tmp_path, monkeypatch):
     # Ten times the rates for a twentieth of the steps.
     monkeypatch.setattr(tuned_packs, "RATES", {name: 10 * rate for name, rate in tuned_packs.RATES.items()})
-    seen: list[dict[str, Tensor]] = []
+    seen = []
     train = RoundedTraining.step
 
-    def watched(training: RoundedTraining, *arguments: Any) -> Any:
+    def watched(training, *arguments):
         result = train(training, *arguments)
         seen.append({name: value.detach().clone() for name, value in training._model.named_parameters()})
         return result
 
     before = digests(tiny.folder)
     scene = contents_of(load_run(tiny.folder))
-    losses: list[Tensor] = []
+    losses = []
     with monkeypatch.context() as patch:
         patch.setattr(RoundedTraining, "step", watched)
         trained, codecs = finetune(tiny.folder, scene, COARSE, 60, progress=losses.append)
@@ -110,7 +105,7 @@ def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypat
     assert (tmp_path / "a.sundae").stat().st_size < 1.05 * (tmp_path / "b.sundae").stat().st_size
 
 
-def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(tiny, tmp_path, capsys):
     """On a run whose capture has moved."""
     run, file = tmp_path / "run", tmp_path / "a.sundae"
     shutil.copytree(tiny.folder, run)
@@ -127,16 +122,16 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     meta = read_header(file).meta
     assert meta["source"]["finetuned"] == 3
     stored = meta["attributes"]
-    config = PackConfig(**{**FINETUNED, "feature_step": 0.01, "color_step": plain})  # type: ignore[arg-type]
+    config = PackConfig(**{**FINETUNED, "feature_step": 0.01, "color_step": plain})
     _, codecs = fit_scene(contents_of(load_run(run, data=tiny.scene)), config)
     for name in codecs.gaussians:
-        assert stored[name]["step"] == codecs.gaussians[name].step, name  # type: ignore[attr-defined]
+        assert stored[name]["step"] == codecs.gaussians[name].step, name
     assert stored["scales"]["step"] == FINETUNED["scale_step"]
     assert 0.01 <= stored["features"]["step"] < 0.01 / 0.02**0.5
 
 
-def test_an_interrupt_leaves_nothing(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(step: int, steps: int) -> float:
+def test_an_interrupt_leaves_nothing(tiny, tmp_path, monkeypatch):
+    def interrupted(step, steps):
         if step == 2:
             raise KeyboardInterrupt
         return 1.0
@@ -153,8 +148,8 @@ def test_an_interrupt_leaves_nothing(tiny: Any, tmp_path: Path, monkeypatch: pyt
     assert digests(tiny.folder) == before
 
 
-def test_full_memory_is_one_line(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any, **__: Any) -> None:
+def test_full_memory_is_one_line(tiny, monkeypatch):
+    def full(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 300.00 MiB.")
 
     scene = contents_of(load_run(tiny.folder, max_cameras=0))
@@ -164,7 +159,7 @@ def test_full_memory_is_one_line(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> 
         finetune(tiny.folder, scene, PackConfig(), 1)
 
 
-def test_a_run_of_splatfacto(tiny: Any, tmp_path: Path) -> None:
+def test_a_run_of_splatfacto(tiny, tmp_path):
     config = copy.deepcopy(all_methods["splatfacto"])
     config.data = config.pipeline.datamanager.data = tiny.scene
     config.pipeline.model.sh_degree = 2
@@ -186,7 +181,7 @@ def test_a_run_of_splatfacto(tiny: Any, tmp_path: Path) -> None:
     assert not torch.equal(trained.gaussians["features_rest"], fitted.gaussians["features_rest"])
 
 
-def test_runs_that_cannot_be_fine_tuned(tiny: Any, tmp_path: Path) -> None:
+def test_runs_that_cannot_be_fine_tuned(tiny, tmp_path):
     run = tmp_path / "run"
     (run / "nerfstudio_models").mkdir(parents=True)
     shutil.copy(tiny.config, run)
@@ -198,7 +193,7 @@ def test_runs_that_cannot_be_fine_tuned(tiny: Any, tmp_path: Path) -> None:
         finetune(run, scene, PackConfig(), 0)
 
 
-def test_rates_rise_and_fall_to_nothing() -> None:
+def test_rates_rise_and_fall_to_nothing():
     for steps in (1, 2, 10, 1000):
         factors = [rate_factor(step, steps) for step in range(steps)]
         assert all(0 < factor <= 1 for factor in factors)
@@ -208,27 +203,27 @@ def test_rates_rise_and_fall_to_nothing() -> None:
     assert factors[0] < 0.05
 
 
-def test_gradients_follow_a_quaternion_to_its_negative() -> None:
+def test_gradients_follow_a_quaternion_to_its_negative():
     exact = torch.nn.functional.normalize(torch.tensor([[-1.0, 0.2, 0.3, 0.1], [1.0, 0.2, 0.3, 0.1]]))
-    training: Any = SimpleNamespace(exact={"quats": exact}, rounded={"quats": exact * torch.tensor([[-1.0], [1.0]])})
+    training = SimpleNamespace(exact={"quats": exact}, rounded={"quats": exact * torch.tensor([[-1.0], [1.0]])})
     RoundedTraining.set_gradient(training, "quats", torch.ones(2, 4), None)
     assert exact.grad is not None
     assert torch.equal(exact.grad, torch.tensor([[-1.0], [1.0]]).expand(2, 4))
 
 
 @pytest.mark.gpu
-def test_replayed_steps_train_the_same_scene(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replayed_steps_train_the_same_scene(tiny, monkeypatch):
     """One training kernel by kernel, one by recordings: the same losses up to the order of sums."""
     scene = contents_of(load_run(tiny.folder))
-    steps: list[RoundedTraining] = []
+    steps = []
     train = RoundedTraining.step
 
-    def watched(training: RoundedTraining, *arguments: Any) -> Any:
+    def watched(training, *arguments):
         steps.append(training)
         return train(training, *arguments)
 
-    def losses() -> list[float]:
-        found: list[float] = []
+    def losses():
+        found = []
         finetune(tiny.folder, scene, COARSE, 30, progress=lambda loss: found.append(loss.item()))
         return found
 

@@ -4,26 +4,21 @@ Images are compared with Python's of the same file. The page's are bytes, whose 
 ``make browser SCENE=scene.sundae`` adds a scene.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import io
 import json
 import os
 import threading
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packages, touch
-from numpy.typing import NDArray
 from packed_scenes import KINDS, write_bomb, write_kind
 from PIL import Image
 
@@ -60,9 +55,7 @@ SAID = "document.getElementById('said').textContent"
 
 
 @contextmanager
-def opened(
-    address: str, *, state: str = "ready", flags: Any = browser.WEBGPU, size: tuple[int, int] = SIZE, before: str = ""
-) -> Iterator[Any]:
+def opened(address, *, state="ready", flags=browser.WEBGPU, size=SIZE, before=""):
     """The page of an address, once it has a state; ``before`` is a script that runs before those of the page."""
     with browser.Browser(CHROMIUM, *size, flags) as page:
         page.call("Page.addScriptToEvaluateOnNewDocument", {"source": before})
@@ -75,11 +68,11 @@ def opened(
 
 
 class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+    def log_message(self, format, *args):  # noqa: A002
         pass
 
 
-def rested(page: Any) -> NDArray[np.int64]:
+def rested(page):
     """The canvas once it rests, without what lies over it."""
     browser.wait_for(lambda: page.evaluate("sundae.still"), "the image of a camera at rest", SECONDS)
     over = "'panel', 'message', 'status'"
@@ -93,7 +86,7 @@ def rested(page: Any) -> NDArray[np.int64]:
     return shots[-1]
 
 
-def hold(page: Any, code: str) -> None:
+def hold(page, code):
     """Hold a key for two frames."""
     before = page.evaluate("sundae.frames")
     page.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": code, "code": code})
@@ -102,7 +95,7 @@ def hold(page: Any, code: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A folder with the packed scene a.sundae, its page a.html, and its page as a folder, ``site``."""
     folder = tmp_path_factory.mktemp("page")
     scene = packed_file(write_kind(folder / "a.sundae", KINDS["residual"]))
@@ -112,7 +105,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def site(folder: Path) -> Iterator[str]:
+def site(folder):
     """Address of the folder's site."""
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder / "site")) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -121,7 +114,7 @@ def site(folder: Path) -> Iterator[str]:
 
 
 @pytest.fixture
-def at(folder: Path) -> str:
+def at(folder):
     """Address of the folder's page."""
     return (folder / "a.html").as_uri()
 
@@ -129,7 +122,7 @@ def at(folder: Path) -> str:
 # -------------------------------------------------------------------------------------------------------------- images
 
 
-def check(page: Any, packed: Path, cameras: list[int]) -> None:
+def check(page, packed, cameras):
     for camera in cameras:
         truth = truths(read_scene(packed))[camera]
         assert psnr(image(page, camera, False), truth["base_rgb"]) > LEAST
@@ -142,7 +135,7 @@ def check(page: Any, packed: Path, cameras: list[int]) -> None:
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name == "residual, folded" else in_browser) for name in KINDS]
 )
-def test_images_of_the_page_are_those_of_python(name: str, tmp_path: Path) -> None:
+def test_images_of_the_page_are_those_of_python(name, tmp_path):
     packed = write_kind(tmp_path / "a.sundae", KINDS[name])
     write_page(tmp_path / "a.html", *packed_file(packed), title="a")
     with opened((tmp_path / "a.html").as_uri()) as page:
@@ -150,7 +143,7 @@ def test_images_of_the_page_are_those_of_python(name: str, tmp_path: Path) -> No
 
 
 @pytest.fixture(params=["a trained capture", "SCENE"])
-def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+def capture(request, tmp_path):
     """A packed capture: the tiny run, and the scene that was given to ``make browser``."""
     if request.param == "SCENE":
         given = os.environ.get("SUNDAE_BROWSER_SCENE")
@@ -160,7 +153,7 @@ def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @in_browser
-def test_six_cameras_of_a_packed_capture(capture: Path) -> None:
+def test_six_cameras_of_a_packed_capture(capture):
     row = bench_page.compared(capture, half=True)
     print(json.dumps(row))
     assert len(row["psnr_base"]) == 6
@@ -172,7 +165,7 @@ def test_six_cameras_of_a_packed_capture(capture: Path) -> None:
 @needs_packages
 @in_browser
 @pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.head])
-def test_the_head_in_half_precision(name: str, tmp_path: Path) -> None:
+def test_the_head_in_half_precision(name, tmp_path):
     packed = write_kind(tmp_path / "a.sundae", KINDS[name])
     made = bench_page.half_images(packed)
     if made is None:
@@ -183,15 +176,15 @@ def test_the_head_in_half_precision(name: str, tmp_path: Path) -> None:
 
 
 @in_browser
-def test_the_controls(folder: Path) -> None:
+def test_the_controls(folder):
     server = serve(page_of(*packed_file(folder / "a.sundae"), title="a"), 0)
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
-    def look(page: Any) -> tuple[NDArray[np.int64], str]:
+    def look(page):
         """The canvas once it rests, and the words beside the stop."""
         return rested(page), page.evaluate(STOP)
 
-    def after(page: Any, act: Callable[[], Any]) -> tuple[NDArray[np.int64], str]:
+    def after(page, act):
         """The same after an act has changed the canvas."""
         frames = "sundae.frames"
         before = page.evaluate(frames)
@@ -199,7 +192,7 @@ def test_the_controls(folder: Path) -> None:
         browser.wait_for(lambda: page.evaluate(frames) > before, "a frame", SECONDS)
         return look(page)
 
-    def press(page: Any, name: str) -> Callable[[], Any]:
+    def press(page, name):
         return lambda: page.evaluate(f"document.getElementById('{name}').click()")
 
     try:
@@ -245,7 +238,7 @@ def test_the_controls(folder: Path) -> None:
 
 
 @in_browser
-def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(folder: Path, tmp_path: Path) -> None:
+def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(folder, tmp_path):
     plain, content = packed_file(folder / "a.sundae")
     second = plain.views[1]
     free = second._replace(viewmat=second.viewmat + 0.05 * torch.eye(4)[[3, 3, 3, 3]])
@@ -271,7 +264,7 @@ def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(folder: Pa
                 said = "document.getElementById('stop').textContent"
                 browser.wait_for(lambda page=page, s=said: page.evaluate(s) == "1 of 2", "the next stop", SECONDS)
 
-    def differ(one: str, other: str, i: int) -> float:
+    def differ(one, other, i):
         return float(np.abs(shots[one][i] - shots[other][i]).mean())
 
     assert differ("x", "z", 0) < 0.1
@@ -280,7 +273,7 @@ def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(folder: Pa
 
 
 @in_browser
-def test_a_hostile_file_ends_in_a_message(folder: Path, tmp_path: Path) -> None:
+def test_a_hostile_file_ends_in_a_message(folder, tmp_path):
     page, content = (folder / "a.html").read_text(), (folder / "a.sundae").read_bytes()
     wrong = page.replace(base64.b64encode(content).decode(), base64.b64encode(content[:-1] + b"~").decode())
     (tmp_path / "a.html").write_text(wrong)
@@ -291,7 +284,7 @@ def test_a_hostile_file_ends_in_a_message(folder: Path, tmp_path: Path) -> None:
 
 @in_browser
 @pytest.mark.parametrize("drawn", ["webgpu", "webgl"])
-def test_a_view_of_too_many_primitives_is_not_drawn(drawn: str, tmp_path: Path) -> None:
+def test_a_view_of_too_many_primitives_is_not_drawn(drawn, tmp_path):
     packed = write_bomb(tmp_path / "a.sundae")
     write_page(tmp_path / "a.html", *packed_file(packed), title="a")
     flags = browser.WEBGPU if drawn == "webgpu" else WEBGL
@@ -304,7 +297,7 @@ def test_a_view_of_too_many_primitives_is_not_drawn(drawn: str, tmp_path: Path) 
 
 
 @in_browser
-def test_a_folder_is_served_and_says_so_when_opened_from_disk(site: str, folder: Path) -> None:
+def test_a_folder_is_served_and_says_so_when_opened_from_disk(site, folder):
     with opened(site) as page:
         assert psnr(image(page, 0, True), truths(read_scene(folder / "a.sundae"))[0]["rgb"]) > LEAST
     with browser.Browser(CHROMIUM, *SIZE, browser.WEBGPU) as page:
@@ -327,7 +320,7 @@ GPUQueue.prototype.writeBuffer = function (buffer, offset, data, ...rest) {
 
 
 @in_browser
-def test_the_head_fades_in_once_the_camera_rests(site: str) -> None:
+def test_the_head_fades_in_once_the_camera_rests(site):
     key = {"key": "w", "code": "KeyW"}
     with opened(site, before=WEIGHTS) as page:
         rested(page)
@@ -360,8 +353,8 @@ PINCH = [[(70, 60), (90, 60)], [(60, 60), (100, 60)], [(50, 60), (110, 60)]]
 
 @in_browser
 @pytest.mark.parametrize("drawn", ["webgpu", "webgl"])
-def test_fingers_turn_and_zoom(drawn: str, site: str) -> None:
-    def linked() -> list[float]:
+def test_fingers_turn_and_zoom(drawn, site):
+    def linked():
         page.evaluate("document.getElementById('link').click()")
         return [float(word) for word in page.evaluate("location.hash").removeprefix("#camera=").split(",")]
 
@@ -381,7 +374,7 @@ def test_fingers_turn_and_zoom(drawn: str, site: str) -> None:
 
 
 @in_browser
-def test_the_panel_of_a_phone(site: str) -> None:
+def test_the_panel_of_a_phone(site):
     with opened(site, flags=WEBGL, size=(390, 844)) as page:
         assert "W A S D" in page.evaluate("panel.innerText")
     with browser.Browser(CHROMIUM, 390, 844, WEBGL) as page:
@@ -402,7 +395,7 @@ def test_the_panel_of_a_phone(site: str) -> None:
 
 
 @in_browser
-def test_links_lead_to_views(site: str) -> None:
+def test_links_lead_to_views(site):
     copy = "{ value: { writeText: async (text) => { window.copied = text } } }"
     before = f"Object.defineProperty(navigator, 'clipboard', {copy})"
     with opened(f"{site}#camera=2", flags=WEBGL, before=before) as page:
@@ -431,7 +424,7 @@ def test_links_lead_to_views(site: str) -> None:
 
 @in_browser
 @pytest.mark.parametrize("drawn", ["webgpu", "webgl"])
-def test_a_picture_of_what_is_seen(drawn: str, site: str) -> None:
+def test_a_picture_of_what_is_seen(drawn, site):
     before = """
       const make = URL.createObjectURL;
       URL.createObjectURL = (blob) => { window.blob = blob; return make(blob) };
@@ -451,7 +444,7 @@ def test_a_picture_of_what_is_seen(drawn: str, site: str) -> None:
 
 
 @in_browser
-def test_keys(site: str) -> None:
+def test_keys(site):
     before = "HTMLElement.prototype.requestFullscreen = async function () { window.whole = this.tagName };"
     with opened(site, flags=WEBGL, before=before) as page:
         page.key("PageDown", 34)
@@ -474,7 +467,7 @@ def test_keys(site: str) -> None:
 
 
 @in_browser
-def test_controls_have_names_and_loading_a_bar(site: str) -> None:
+def test_controls_have_names_and_loading_a_bar(site):
     before = """
       window.bar = [];
       const { set } = Object.getOwnPropertyDescriptor(HTMLProgressElement.prototype, 'value');
@@ -526,7 +519,7 @@ REFUSALS = {
 """How WebGPU fails at the start, as scripts."""
 
 
-def check_base_colours(page: Any, packed: Path) -> None:
+def check_base_colours(page, packed):
     """The page draws by WebGL2 and says so."""
     assert page.evaluate("[sundae.state, sundae.drawn]") == ["ready", "webgl"]
     assert page.evaluate(SAID).endswith("base colours; the compensation head is not shown.")
@@ -538,7 +531,7 @@ def check_base_colours(page: Any, packed: Path) -> None:
 
 
 @in_browser
-def test_without_webgpu_the_page_shows_base_colours(at: str, folder: Path) -> None:
+def test_without_webgpu_the_page_shows_base_colours(at, folder):
     with opened(at, flags=WEBGL) as page:
         assert page.evaluate(SAID).startswith("This browser has no WebGPU")
         check_base_colours(page, folder / "a.sundae")
@@ -546,14 +539,14 @@ def test_without_webgpu_the_page_shows_base_colours(at: str, folder: Path) -> No
 
 @in_browser
 @pytest.mark.parametrize("refusal", REFUSALS)
-def test_a_gpu_that_fails_at_the_start_leaves_base_colours(refusal: str, at: str, folder: Path) -> None:
+def test_a_gpu_that_fails_at_the_start_leaves_base_colours(refusal, at, folder):
     with opened(at, before=REFUSALS[refusal]) as page:
         check_base_colours(page, folder / "a.sundae")
 
 
 @in_browser
 @pytest.mark.parametrize("loss", ["the device", "an error of its work", "the GPU process"])
-def test_a_lost_gpu_leaves_camera_and_controls(loss: str, at: str, folder: Path) -> None:
+def test_a_lost_gpu_leaves_camera_and_controls(loss, at, folder):
     with opened(at, before=DEVICES) as page:
         assert page.evaluate("sundae.drawn") == "webgpu"
         page.evaluate("{ head.click(); scale.value = 80; scale.dispatchEvent(new Event('input')) }")
@@ -578,7 +571,7 @@ def test_a_lost_gpu_leaves_camera_and_controls(loss: str, at: str, folder: Path)
 
 
 @in_browser
-def test_a_gpu_lost_without_webgl_leaves_the_image(at: str) -> None:
+def test_a_gpu_lost_without_webgl_leaves_the_image(at):
     with opened(at, before=DEVICES) as page:
         page.evaluate(f"{{ {NO_WEBGL} devices[0].destroy() }}")
         browser.wait_for(lambda: page.evaluate("sundae.state") == "failed", "the end", SECONDS)
@@ -587,7 +580,7 @@ def test_a_gpu_lost_without_webgl_leaves_the_image(at: str) -> None:
 
 
 @in_browser
-def test_a_lost_webgl_context_is_opened_again(at: str, folder: Path) -> None:
+def test_a_lost_webgl_context_is_opened_again(at, folder):
     lose = "document.querySelector('canvas').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
     with opened(at, flags=WEBGL) as page:
         for _ in range(2):
@@ -601,7 +594,7 @@ def test_a_lost_webgl_context_is_opened_again(at: str, folder: Path) -> None:
 
 
 @in_browser
-def test_without_webgl_the_page_shows_an_image(at: str) -> None:
+def test_without_webgl_the_page_shows_an_image(at):
     flags = ["--disable-features=WebGPU", "--disable-3d-apis"]
     with opened(at, state="failed", flags=flags) as page:
         assert "no WebGPU, and WebGL2 is missing too" in page.evaluate(SAID)

@@ -1,23 +1,16 @@
 """The commands in README and docs run as they stand there, page by page; those of training up to their first step."""
 
-from __future__ import annotations
-
 import runpy
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 from colmap_models import write_model
 
 from sundae_ns.cli import main
-from sundae_ns.plugin.trainer import SundaeTrainerConfig
-
-CallHere = Callable[..., str]
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -42,18 +35,18 @@ MORE = {"prune": ["--num-cameras", "4"], "distill": ["--steps", "4"], "render": 
 OURS = ("sundae ", "python benchmarks/")
 
 
-def lines_of(page: Path, *programs: str) -> list[str]:
+def lines_of(page, *programs):
     """Commands that start so, in indented blocks."""
     lines = page.read_text(encoding="utf-8").replace("\\\n", " ").splitlines()
     return [line.strip() for line in lines if line.startswith(tuple(f"    {program}" for program in programs))]
 
 
-def elsewhere(line: str) -> list[str]:
+def elsewhere(line):
     """Entries of ``ELSEWHERE`` that a command belongs to."""
     return [start for start in ELSEWHERE if line.removeprefix("sundae ").startswith(start)]
 
 
-def commands_of(page: Path, *programs: str) -> Iterator[list[str]]:
+def commands_of(page, *programs):
     for line in lines_of(page, *programs or OURS):
         if not elsewhere(line):
             words = [NAMES.get(word, word.replace("$RUN", "RUN")) for word in shlex.split(line, comments=True)]
@@ -65,14 +58,14 @@ def commands_of(page: Path, *programs: str) -> Iterator[list[str]]:
 
 @pytest.mark.usefixtures("short_prunes")
 @pytest.mark.parametrize("page", [page for page in PAGES if list(commands_of(page))], ids=lambda page: page.name)
-def test_commands_run_as_they_stand(page: Path, tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_run_as_they_stand(page, tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sundae_ns.plugin.distill.CAMERAS", 8)
     monkeypatch.setattr("sundae_ns.cli.render.SECONDS", 1)
     shutil.copytree(tiny.folder, "RUN")
     shutil.copytree(tiny.scene, "CAPTURE")
 
-    def run(program: str, *words: str) -> None:
+    def run(program, *words):
         script = partial(runpy.run_path, str(ROOT / words[0]), run_name="__main__")
         monkeypatch.setattr(sys, "argv", [*words])
         with pytest.raises(SystemExit) as caught:
@@ -87,18 +80,18 @@ def test_commands_run_as_they_stand(page: Path, tiny: Any, tmp_path: Path, monke
         run(*words)
 
 
-def test_nothing_is_left_out_without_need() -> None:
+def test_nothing_is_left_out_without_need():
     left_out = [start for page in PAGES for line in lines_of(page, "") for start in elsewhere(line)]
     assert set(left_out) == set(ELSEWHERE)
 
 
-def test_the_readme_has_commands_to_run() -> None:
+def test_the_readme_has_commands_to_run():
     found = {words[1] for words in commands_of(PAGES[0])}
     assert {"doctor", "pack", "export", "prune", "report"} <= found
 
 
 @pytest.fixture
-def run_and_capture(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def run_and_capture(tiny, tmp_path, monkeypatch):
     """A folder with the files that the pages name: a run, its capture with a COLMAP model, and a .ply."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny.folder, "RUN")
@@ -111,9 +104,9 @@ def run_and_capture(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.usefixtures("run_and_capture")
-def test_commands_of_training_start(tiny: Any, call_here: CallHere, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_of_training_start(tiny, call_here, monkeypatch):
     Path("RUN/nerfstudio_models", tiny.checkpoint(tiny.steps - 1).name).unlink()  # a finished run is not resumed
-    begun: list[SundaeTrainerConfig] = []
+    begun = []
     # Everything but the steps: options, capture, schedule, config.yml.
     monkeypatch.setattr("nerfstudio.scripts.train.launch", lambda config, **_: begun.append(config))
     commands = [words for page in PAGES for words in commands_of(page, "ns-train ")]
@@ -126,8 +119,8 @@ def test_commands_of_training_start(tiny: Any, call_here: CallHere, monkeypatch:
 
 
 @pytest.mark.usefixtures("run_and_capture")
-def test_commands_on_runs_run(call_here: CallHere, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown: list[int] = []
+def test_commands_on_runs_run(call_here, monkeypatch):
+    shown = []
     # The viewer never ends; test_viewer.py renders in it.
     monkeypatch.setattr("nerfstudio.scripts.viewer.run_viewer._start_viewer", lambda *run: shown.append(run[2]))
     commands = [words for page in PAGES for kind in ("ns-eval ", "ns-viewer ") for words in commands_of(page, kind)]
@@ -139,6 +132,6 @@ def test_commands_on_runs_run(call_here: CallHere, monkeypatch: pytest.MonkeyPat
     assert len(shown) == sum(words[0] == "ns-viewer" for words in commands)
 
 
-def test_no_other_program_of_nerfstudio_is_named_in_a_block() -> None:
+def test_no_other_program_of_nerfstudio_is_named_in_a_block():
     programs = {line.split()[0] for page in PAGES for line in lines_of(page, "ns-")}
     assert programs == {"ns-train", "ns-eval", "ns-viewer"}

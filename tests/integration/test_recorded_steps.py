@@ -1,21 +1,12 @@
 """Whole runs by nerfstudio's trainer whose steps are those of recordings, run kernel by kernel on the CPU."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 import torch
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 
 from sundae_ns.core.errors import BackendError
 from sundae_ns.io import checkpoint
 from sundae_ns.train.graphed_step import RecordedStep
-from sundae_ns.train.step import StepResult
-
-MakeTrainer = Callable[[Callable[[TrainerConfig], Any]], Trainer]
 
 
 class Failing(RecordedStep):
@@ -23,29 +14,29 @@ class Failing(RecordedStep):
 
     steps = 0
 
-    def _step(self, *arguments: Any) -> StepResult:
+    def _step(self, *arguments):
         self.steps += 1
         if self.steps == 10:
             raise BackendError("no memory for a recording\nand a long story")
         return super()._step(*arguments)
 
 
-def trained(trainer_of: MakeTrainer, steps: type[RecordedStep] | None, seed: int) -> Any:
+def trained(trainer_of, steps, seed):
     """A run of the tiny scene through growth, prune and trials of the head, saved every 40 steps."""
 
-    def change(config: Any) -> None:
+    def change(config):
         config.steps_per_save, config.save_only_latest_checkpoint = 40, False
         config.pipeline.model.background_color = "black"  # a failed step draws a random one twice
 
     torch.manual_seed(seed)
-    trainer: Any = trainer_of(change)
+    trainer = trainer_of(change)
     if steps is not None:
         trainer._recorded = steps(trainer.model.losses, record=False)
     trainer.train()
     return trainer
 
 
-def differences(one: Any, other: Any) -> dict[str, float]:
+def differences(one, other):
     """Largest difference of the quartiles of each parameter; infinite if numbers of Gaussians differ by over 2%."""
     if one.num_points != pytest.approx(other.num_points, rel=0.02):
         return {"primitives": float("inf")}
@@ -59,12 +50,12 @@ def differences(one: Any, other: Any) -> dict[str, float]:
 
 
 @pytest.fixture(scope="module")
-def usual_runs() -> dict[int, Any]:
+def usual_runs():
     """Usual runs by seed, with which both tests compare."""
     return {}
 
 
-def alike(trainer_of: MakeTrainer, steps: type[RecordedStep], usual_runs: dict[int, Any]) -> tuple[Any, Any]:
+def alike(trainer_of, steps, usual_runs):
     """A usual run and one by recorded steps that end alike, at the first of a few seeds.
 
     Rounding decides about Gaussians at thresholds of densification. Of ten seeds two part by 0.03 and 0.07, six by
@@ -82,7 +73,7 @@ def alike(trainer_of: MakeTrainer, steps: type[RecordedStep], usual_runs: dict[i
     pytest.fail(f"runs differ at every seed: {found}")
 
 
-def test_a_run_by_recorded_steps_is_the_same(trainer_of: MakeTrainer, usual_runs: dict[int, Any]) -> None:
+def test_a_run_by_recorded_steps_is_the_same(trainer_of, usual_runs):
     usual, recorded = alike(trainer_of, RecordedStep, usual_runs)
     assert recorded._recorded is not None
     for path in sorted(recorded.checkpoint_dir.glob("*.ckpt")):
@@ -94,18 +85,16 @@ def test_a_run_by_recorded_steps_is_the_same(trainer_of: MakeTrainer, usual_runs
     assert not rates  # all are written
 
 
-def test_training_goes_on_where_a_recording_fails(
-    trainer_of: MakeTrainer, usual_runs: dict[int, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_training_goes_on_where_a_recording_fails(trainer_of, usual_runs, capsys):
     _, recorded = alike(trainer_of, Failing, usual_runs)
     assert recorded._recorded is None
     assert "without recordings, slower: no memory for a recording" in " ".join(capsys.readouterr().out.split())
 
 
-def test_what_cannot_be_recorded_runs_as_before_under_every_default_dtype(trainer_of: MakeTrainer) -> None:
+def test_what_cannot_be_recorded_runs_as_before_under_every_default_dtype(trainer_of):
     """On a CPU there is nothing to record; on a GPU, options decide."""
 
-    def change(config: Any) -> None:
+    def change(config):
         config.max_num_iterations = 2
 
     fields = []
@@ -113,7 +102,7 @@ def test_what_cannot_be_recorded_runs_as_before_under_every_default_dtype(traine
         torch.manual_seed(0)
         torch.set_default_dtype(dtype)
         try:
-            trainer: Any = trainer_of(change)
+            trainer = trainer_of(change)
             trainer.train()
             assert torch.get_default_dtype() == dtype
         finally:

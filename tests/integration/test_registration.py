@@ -1,11 +1,8 @@
 """How nerfstudio finds the methods: entry points, help, configurations, and an import path that is light."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from importlib.metadata import entry_points
-from typing import Any
 
 import pytest
 import yaml
@@ -30,12 +27,12 @@ METHODS = {
 }
 
 
-def ours() -> dict[str, MethodSpecification]:
+def ours():
     group = entry_points(group="nerfstudio.method_configs")
     return {point.name: point.load() for point in group if point.value.startswith("sundae_ns.")}
 
 
-def test_every_method_is_registered_under_its_own_name() -> None:
+def test_every_method_is_registered_under_its_own_name():
     from nerfstudio.configs.method_configs import all_descriptions, all_methods
 
     assert set(ours()) == set(METHODS) == set(METHODS) & set(all_methods) & set(all_descriptions)
@@ -45,7 +42,7 @@ RULE = ("score", "selection", "redistribution", "edges", "signal")
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_configuration(name: str) -> None:
+def test_configuration(name):
     method = ours()[name]
     assert isinstance(method, MethodSpecification)
     assert method.description
@@ -72,8 +69,8 @@ def test_configuration(name: str) -> None:
     assert yaml.load(yaml.dump(config), Loader=yaml.Loader) == config
 
 
-def test_methods_share_no_objects() -> None:
-    def parts(value: Any) -> set[int]:
+def test_methods_share_no_objects():
+    def parts(value):
         inner = vars(value) if hasattr(value, "__dataclass_fields__") and not isinstance(value, type) else value
         own = set() if inner is value else {id(value)}
         return own.union(*map(parts, inner.values())) if isinstance(inner, dict) else own
@@ -82,7 +79,7 @@ def test_methods_share_no_objects() -> None:
     assert len(set().union(*found)) == sum(map(len, found)) > 100
 
 
-def test_import_is_light_and_errors_of_ns_train_are_one_line() -> None:
+def test_import_is_light_and_errors_of_ns_train_are_one_line():
     masked = ("open3d", "torchmetrics", "wandb", "comet_ml", "tinycudann")
     # An import error here would break every ns-* command, and so would importing what imports the entry points.
     code = (

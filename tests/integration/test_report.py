@@ -1,15 +1,11 @@
 """``sundae report`` on the tiny run, and on a run of stock splatfacto with the same Gaussians."""
 
-from __future__ import annotations
-
 import base64
 import copy
 import csv
 import json
 import re
 from io import BytesIO
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +25,7 @@ from sundae_ns.scene.render import render_view
 
 
 @pytest.fixture(scope="module")
-def stock(tiny: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stock(tiny, tmp_path_factory):
     """A run of splatfacto as nerfstudio writes it, with the field of the tiny run: it cannot train without CUDA."""
     config = copy.deepcopy(method_configs["splatfacto"])
     config.data = config.pipeline.datamanager.data = tiny.scene
@@ -48,13 +44,13 @@ def stock(tiny: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def report(tiny: Any, stock: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report(tiny, stock, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
     assert run("report", tiny.folder, stock / "config.yml", "-o", out, "--warmup", 0, "--repeats", 1) == 0
     return out
 
 
-def test_rows_are_of_the_runs(report: Path, tiny: Any) -> None:
+def test_rows_are_of_the_runs(report, tiny):
     assert {path.name for path in report.iterdir()} == {f"report.{kind}" for kind in ("json", "csv", "md", "html")}
     with open(report / "report.csv", newline="") as file:
         assert tuple(next(csv.reader(file))) == COLUMNS
@@ -71,7 +67,7 @@ def test_rows_are_of_the_runs(report: Path, tiny: Any) -> None:
     assert ours.command.startswith("sundae report ")
 
 
-def test_the_page_shows_the_views_with_their_figures(report: Path, tiny: Any) -> None:
+def test_the_page_shows_the_views_with_their_figures(report, tiny):
     text = (report / "report.html").read_text(encoding="utf-8")
     ours, theirs = json.loads((report / "report.json").read_text())
     cards = re.findall("<article.*?</article>", text, re.DOTALL)
@@ -94,9 +90,7 @@ def test_the_page_shows_the_views_with_their_figures(report: Path, tiny: Any) ->
     assert len({*re.findall('<option value="(v[0-9-]+)">', text)}) == len(views)  # each stands beside the other run's
 
 
-def test_the_page_of_many_views_is_limited(
-    tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_page_of_many_views_is_limited(tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sundae_ns.report.report_page.MOST_VIEWS", 2)
     assert run("report", tiny.folder, "-o", tmp_path / "out", "--repeats", 0) == 0
     said, page = " ".join(capsys.readouterr().out.split()), tmp_path / "out" / "report.html"
@@ -104,7 +98,7 @@ def test_the_page_of_many_views_is_limited(
     assert "2 of 3 test views" in page.read_text(encoding="utf-8")
 
 
-def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any) -> None:
+def test_times_come_with_the_error_of_the_same_rendering(report, tiny):
     ours, theirs = json.loads((report / "report.json").read_text())
     assert [way["name"] for way in ours["configurations"]] == ["head on", "head off"]
     assert [way["name"] for way in theirs["configurations"]] == ["head off"]
@@ -125,7 +119,7 @@ def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any
     assert ours["configurations"][1]["bytes"] == without
 
 
-def test_nerfstudios_own_evaluation_agrees(report: Path, tiny: Any) -> None:
+def test_nerfstudios_own_evaluation_agrees(report, tiny):
     ours, _ = json.loads((report / "report.json").read_text())
     opened = load_model(tiny.folder)
     with torch.no_grad():
@@ -136,13 +130,13 @@ def test_nerfstudios_own_evaluation_agrees(report: Path, tiny: Any) -> None:
             assert way["views"][2][name] == pytest.approx(theirs[name + suffix], rel=1e-5)
 
 
-def one_line(capsys: pytest.CaptureFixture[str]) -> str:
+def one_line(capsys):
     lines = [line for line in capsys.readouterr().err.strip().splitlines() if line.startswith("sundae: ")]
     assert len(lines) == 1
     return lines[0]
 
 
-def test_errors_are_one_line(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_are_one_line(tiny, tmp_path, capsys):
     out = tmp_path / "out"
     for name, text in (("other", yaml.dump(method_configs["nerfacto"])), ("damaged", "a: [")):
         (tmp_path / name).mkdir()
@@ -160,9 +154,7 @@ def test_errors_are_one_line(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFi
         assert message in one_line(capsys)
 
 
-def test_a_run_that_cannot_be_opened_does_not_lose_the_others(
-    tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_cannot_be_opened_does_not_lose_the_others(tiny, tmp_path, capsys):
     paths = (tmp_path / "nowhere", tiny.folder, tiny.scene)
     assert run("report", *paths, "-o", tmp_path / "out", "--repeats", 0) == 1
     assert len(read_rows(tmp_path / "out" / "report.csv")) == 1
@@ -172,9 +164,7 @@ def test_a_run_that_cannot_be_opened_does_not_lose_the_others(
         assert text in page
 
 
-def test_a_packed_scene_counts_the_bytes_of_its_file(
-    report: Path, tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_packed_scene_counts_the_bytes_of_its_file(report, tiny, tmp_path, capsys):
     packed = tmp_path / "tiny.sundae"
     with torch.no_grad():
         write_scene(packed, contents_of(load_run(tiny.folder)))

@@ -1,7 +1,5 @@
 """``sundae run`` with the real commands: an interrupted training and its rest; poses by a COLMAP that can wait."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -9,10 +7,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
 
 import pytest
 from fake_colmap import FakeColmap
@@ -26,17 +22,16 @@ from sundae_ns.io.run_folder import reserve
 from sundae_ns.plugin.trainer import SundaeTrainer
 
 STEPS, STOP_AT = 40, 25
-Run = Callable[..., int]
 
 
 @pytest.fixture
-def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+def run(tiny, tmp_path, monkeypatch):
     """Run ``sundae run`` with its commands in this process, which has imported nerfstudio; poses are the scene's."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny.scene / "images", "photos")
-    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())
 
-    def here(words: Sequence[str], log: Path | None = None) -> int:
+    def here(words, log=None):
         if words[:2] == ["sundae", "poses"]:
             shutil.copytree(tiny.scene, words[words.index("-o") + 1])
             return 0
@@ -54,7 +49,7 @@ def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     for module in ("run", "train"):
         monkeypatch.setattr(f"sundae_ns.cli.{module}.run_command", here)
 
-    def sundae_run(*words: str) -> int:
+    def sundae_run(*words):
         with pytest.raises(SystemExit) as caught:
             main(["run", *words])
         assert isinstance(caught.value.code, int)
@@ -63,14 +58,12 @@ def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     return sundae_run
 
 
-def test_photos_to_a_report_with_an_interruption(
-    run: Run, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_photos_to_a_report_with_an_interruption(run, monkeypatch, capfd):
     words = ("photos", "-o", "out", "--method", "sundae-tiny", "--keep", "0.5", "--steps", str(STEPS))
     folder = Path("out/runs/photos/sundae-tiny/run")
     trained = SundaeTrainer.train_iteration
 
-    def interrupted(self: SundaeTrainer, step: int) -> Any:
+    def interrupted(self, step):
         if step == STOP_AT:
             signal.raise_signal(signal.SIGINT)
         return trained(self, step)
@@ -118,7 +111,7 @@ NASTY = """-a b'c"d$(touch PWNED)`touch PWNED`;touch PWNED&"""
 
 
 @pytest.fixture
-def poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+def poses(tmp_path, monkeypatch):
     """Our own program with another COLMAP; no command runs after it. Those asked."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "site").mkdir()
@@ -126,9 +119,9 @@ def poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     (tmp_path / "site" / "pycolmap.py").write_text(COLMAP.format(support=support))
     monkeypatch.syspath_prepend(tmp_path / "site")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
-    asked: list[list[str]] = []
+    asked = []
 
-    def only_poses(words: list[str], log: Path | None = None) -> int:
+    def only_poses(words, log=None):
         asked.append(words)
         return run_command(words) if words[:2] == ["sundae", "poses"] else 3
 
@@ -136,13 +129,13 @@ def poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     return asked
 
 
-def run_poses(photos: str, out: str) -> None:
+def run_poses(photos, out):
     with pytest.raises(SystemExit) as caught:
         main(["run", photos, "-o", out])
     assert caught.value.code == 3
 
 
-def test_no_name_reaches_a_shell(poses: list[list[str]], tmp_path: Path) -> None:
+def test_no_name_reaches_a_shell(poses, tmp_path):
     folder, out = Path(NASTY), Path(f"out{NASTY}")
     folder.mkdir()
     for name in (f"{NASTY}.png", "-b.PNG", "--help.png", "plain.png"):
@@ -156,7 +149,7 @@ def test_no_name_reaches_a_shell(poses: list[list[str]], tmp_path: Path) -> None
     assert not list(tmp_path.rglob("PWNED"))
 
 
-def test_a_killed_command_takes_colmap_with_it_and_the_next_one_works(poses: list[list[str]], tmp_path: Path) -> None:
+def test_a_killed_command_takes_colmap_with_it_and_the_next_one_works(poses, tmp_path):
     (tmp_path / "photos").mkdir()
     for name in ("a.png", "b.png", "c.png", "d.png"):
         Image.new("RGB", (16, 12), "grey").save(tmp_path / "photos" / name)
@@ -179,7 +172,7 @@ def test_a_killed_command_takes_colmap_with_it_and_the_next_one_works(poses: lis
     assert [words[0] for words in poses] == ["sundae", "ns-train"]
 
 
-def is_locked(folder: Path) -> bool:
+def is_locked(folder):
     try:
         reserve(folder)
     except StorageError:
@@ -187,7 +180,7 @@ def is_locked(folder: Path) -> bool:
     return False
 
 
-def wait(condition: Callable[[], bool]) -> None:
+def wait(condition):
     for _ in range(6000):
         if condition():
             return

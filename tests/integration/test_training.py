@@ -1,13 +1,10 @@
 """Train, prune, save, resume: the tiny run, and runs that resume it."""
 
-from __future__ import annotations
-
 import gc
 import json
 import re
 import signal
 import tracemalloc
-from typing import Any
 
 import pytest
 import torch
@@ -27,28 +24,28 @@ from sundae_ns.plugin.datamanager import SundaeDatamanager
 from sundae_ns.plugin.model import SundaeModel
 
 
-def load(path: Any) -> dict[str, Any]:
+def load(path):
     """With plain ``torch.load``, as nerfstudio does it."""
     return torch.load(path, map_location="cpu")
 
 
-def gaussians(state: dict[str, Any]) -> dict[str, Tensor]:
+def gaussians(state):
     prefix = "_model.gauss_params."
     return {name[len(prefix) :]: value for name, value in state["pipeline"].items() if name.startswith(prefix)}
 
 
-def report(tiny: Any) -> dict[str, Any]:
+def report(tiny):
     (only,) = json.loads((tiny.folder / "prune.json").read_text())
     return only
 
 
 @pytest.fixture(scope="module")
-def scalars(tiny: Any) -> dict[str, dict[int, float]]:
+def scalars(tiny):
     events = EventAccumulator(str(tiny.folder), size_guidance={"scalars": 0}).Reload()
     return {tag: {e.step: e.value for e in events.Scalars(tag)} for tag in events.Tags()["scalars"]}
 
 
-def test_prune_keeps_exactly_the_share(tiny: Any) -> None:
+def test_prune_keeps_exactly_the_share(tiny):
     found = report(tiny)
     assert found["step"] == tiny.prune_at
     assert found["before"] > tiny.points, "densification added nothing"
@@ -62,7 +59,7 @@ def test_prune_keeps_exactly_the_share(tiny: Any) -> None:
     assert f"kept {found['after']:,} of {found['before']:,} Gaussians" in " ".join(tiny.output.split())
 
 
-def test_the_schedule_follows_the_number_of_steps(tiny: Any) -> None:
+def test_the_schedule_follows_the_number_of_steps(tiny):
     """A tenth of the method's own steps; what the command sets stays."""
     config = yaml.load(tiny.config.read_text(), Loader=yaml.Loader)
     model, rates = config.pipeline.model, config.optimizers["compensation"]["scheduler"]
@@ -74,7 +71,7 @@ def test_the_schedule_follows_the_number_of_steps(tiny: Any) -> None:
     assert re.search(rf"prune .* after {tiny.prune_at}", tiny.output)
 
 
-def test_a_finished_training_says_what_it_made(tiny: Any) -> None:
+def test_a_finished_training_says_what_it_made(tiny):
     """Quality, size and the next command."""
     n = report(tiny)["after"]
     found = re.search(r"trained: PSNR (\d+\.\d\d) dB, SSIM 0\.\d{4} on 3 test views\n(.*)\nnext: (.*)\n", tiny.output)
@@ -84,7 +81,7 @@ def test_a_finished_training_says_what_it_made(tiny: Any) -> None:
     assert found[3] == f"sundae pack {tiny.folder} -o scene.sundae"
 
 
-def test_prune_costs_quality_and_training_brings_it_back(tiny: Any) -> None:
+def test_prune_costs_quality_and_training_brings_it_back(tiny):
     found = report(tiny)
     assert found["pruned"]["psnr"] < found["warm_up"]["psnr"]
     _, pipeline, _, _ = eval_setup(tiny.config, test_mode="test")
@@ -94,7 +91,7 @@ def test_prune_costs_quality_and_training_brings_it_back(tiny: Any) -> None:
     assert after["gaussian_count"] == found["after"]
 
 
-def test_tensorboard_has_counts_and_both_psnrs(scalars: dict[str, dict[int, float]], tiny: Any) -> None:
+def test_tensorboard_has_counts_and_both_psnrs(scalars, tiny):
     found = report(tiny)
     counts = scalars["Train Metrics Dict/gaussian_count"]
     assert counts[tiny.prune_at] == found["before"]
@@ -108,7 +105,7 @@ def test_tensorboard_has_counts_and_both_psnrs(scalars: dict[str, dict[int, floa
         assert any(tag.endswith("/" + name) and set(values) == {50, 100} for tag, values in evaluated.items()), name
 
 
-def test_checkpoints_are_plain_and_hold_no_lpips(tiny: Any) -> None:
+def test_checkpoints_are_plain_and_hold_no_lpips(tiny):
     for step in (30, 119):
         state = load(tiny.checkpoint(step))
         assert not [name for name in state["pipeline"] if "lpips" in name]
@@ -122,7 +119,7 @@ def test_checkpoints_are_plain_and_hold_no_lpips(tiny: Any) -> None:
         assert (extra["format"], extra["running"]["pruning"]["pruned_at"]) == (2, pruned_at)
 
 
-def assert_live(trainer: Any) -> None:
+def assert_live(trainer):
     """Model, optimizers and nerfstudio's own list hold the same tensors, with moments of their shape."""
     optimizers = trainer.optimizers
     for name, value in trainer.pipeline.model.gauss_params.items():
@@ -133,8 +130,8 @@ def assert_live(trainer: Any) -> None:
 
 
 @pytest.mark.parametrize("start", [30, 60], ids=["before the prune", "after the prune"])
-def test_a_resumed_run_ends_like_one_that_never_stopped(tiny: Any, trainer_of: Any, start: int) -> None:
-    def change(config: Any) -> None:
+def test_a_resumed_run_ends_like_one_that_never_stopped(tiny, trainer_of, start):
+    def change(config):
         config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, start, tiny.save_every
 
     trainer = trainer_of(change)
@@ -162,16 +159,14 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(tiny: Any, trainer_of: A
     assert_same(load(tiny.checkpoint(end)), load(trainer.checkpoint_dir / f"step-{end:09d}.ckpt"))
 
 
-def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(
-    tiny: Any, trainer_of: Any, capsys: Any
-) -> None:
-    def to_step_60(config: Any) -> None:
+def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(tiny, trainer_of, capsys):
+    def to_step_60(config):
         config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 30, 30
 
     trainer = trainer_of(to_step_60)
     serve = trainer.pipeline.datamanager.next_train
 
-    def interrupted(step: int) -> Any:
+    def interrupted(step):
         if step == 50:
             signal.raise_signal(signal.SIGTERM)
         return serve(step)
@@ -187,7 +182,7 @@ def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(
     assert last[:2] == ["ns-train", "sundae-tiny"]
     assert last[last.index("--load-dir") + 1] == str(trainer.checkpoint_dir)
 
-    def onwards(config: Any) -> None:
+    def onwards(config):
         config.load_dir, config.max_num_iterations = trainer.checkpoint_dir.parent, 10  # the run's folder
 
     again = trainer_of(onwards)
@@ -196,8 +191,8 @@ def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(
     assert_same(load(tiny.checkpoint(60)), load(again.checkpoint_dir / "step-000000060.ckpt"))
 
 
-def test_a_signal_before_the_first_step_saves_nothing(tiny: Any, trainer_of: Any, monkeypatch: Any) -> None:
-    def stop(*_: Any, **__: Any) -> None:
+def test_a_signal_before_the_first_step_saves_nothing(tiny, trainer_of, monkeypatch):
+    def stop(*_, **__):
         # To this thread; os.kill may reach another one, and then the handler runs a little later.
         signal.raise_signal(signal.SIGINT)
 
@@ -212,7 +207,7 @@ def test_a_signal_before_the_first_step_saves_nothing(tiny: Any, trainer_of: Any
     assert end.value.code == 130
 
 
-def assert_same(whole: dict[str, Any], resumed: dict[str, Any]) -> None:
+def assert_same(whole, resumed):
     """Tensors, moments, rates and random state of two checkpoints: bit for bit on a CPU; CUDA sums in any order."""
     tolerance = {"atol": 0.02, "rtol": 0.02} if torch.cuda.is_available() else {"atol": 0.0, "rtol": 0.0}
     for name, value in whole["pipeline"].items():
@@ -228,18 +223,18 @@ def assert_same(whole: dict[str, Any], resumed: dict[str, Any]) -> None:
     assert torch.equal(whole["random"]["torch"], resumed["random"]["torch"])
 
 
-def test_memory_does_not_grow_past_the_prune(tiny: Any, trainer_of: Any) -> None:
+def test_memory_does_not_grow_past_the_prune(tiny, trainer_of):
     steps, settled = 60, 20
 
-    def change(config: Any) -> None:
+    def change(config):
         config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 60, steps
         config.pipeline.model.average_share = 1.0  # from the first step on
 
     trainer = trainer_of(change)
-    seen: list[tuple[int, int]] = []
+    seen = []
     iterate = trainer.train_iteration
 
-    def watched(step: int) -> Any:
+    def watched(step):
         if step - 60 in (settled, steps):
             gc.collect()
             tensors = sum(isinstance(thing, Tensor) for thing in gc.get_objects())
@@ -258,11 +253,11 @@ def test_memory_does_not_grow_past_the_prune(tiny: Any, trainer_of: Any) -> None
     assert (after - before) / (steps - settled) < 2000
 
 
-def test_full_memory_in_the_backward_pass(tiny: Any, trainer_of: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def change(config: Any) -> None:
+def test_full_memory_in_the_backward_pass(tiny, trainer_of, monkeypatch):
+    def change(config):
         config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 60, 5
 
-    def full(*_: Any, **__: Any) -> None:
+    def full(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 300.00 MiB.")
 
     trainer = trainer_of(change)
@@ -272,10 +267,10 @@ def test_full_memory_in_the_backward_pass(tiny: Any, trainer_of: Any, monkeypatc
         trainer.train()
 
 
-def warm(trainer_of: Any, path: Any) -> tuple[dict[str, Tensor], Any]:
+def warm(trainer_of, path):
     """The field as it was read, and the trainer after three steps."""
 
-    def change(config: Any) -> None:
+    def change(config):
         config.pipeline.model.warm_start, config.max_num_iterations = path, 3
 
     trainer = trainer_of(change)
@@ -284,7 +279,7 @@ def warm(trainer_of: Any, path: Any) -> tuple[dict[str, Tensor], Any]:
     return start, trainer
 
 
-def check_warm(tiny: Any, params: dict[str, Tensor], start: dict[str, Tensor], trainer: Any) -> None:
+def check_warm(tiny, params, start, trainer):
     for name in SPLAT_NAMES:
         assert torch.equal(start[name].cpu(), params[name]), name
     (found,) = json.loads((trainer.base_dir / "prune.json").read_text())
@@ -299,7 +294,7 @@ def check_warm(tiny: Any, params: dict[str, Tensor], start: dict[str, Tensor], t
 
 
 @pytest.mark.parametrize("source", ["checkpoint", "ply", "exported"])
-def test_warm_start(tiny: Any, trainer_of: Any, tmp_path: Any, source: str, request: pytest.FixtureRequest) -> None:
+def test_warm_start(tiny, trainer_of, tmp_path, source, request):
     params = gaussians(load(tiny.checkpoint(119)))
     params = {name: value for name, value in params.items() if name in SPLAT_NAMES}
     path = tiny.checkpoints
@@ -311,7 +306,7 @@ def test_warm_start(tiny: Any, trainer_of: Any, tmp_path: Any, source: str, requ
     check_warm(tiny, params, *warm(trainer_of, path))
 
 
-def test_warm_start_from_a_stock_checkpoint(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
+def test_warm_start_from_a_stock_checkpoint(tiny, trainer_of, tmp_path):
     params = {name: value for name, value in gaussians(load(tiny.checkpoint(30))).items() if name in SPLAT_NAMES}
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
     config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
@@ -326,28 +321,28 @@ def test_warm_start_from_a_stock_checkpoint(tiny: Any, trainer_of: Any, tmp_path
     check_warm(tiny, params, *warm(trainer_of, path))
 
 
-def test_a_splatfacto_checkpoint_is_refused(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
+def test_a_splatfacto_checkpoint_is_refused(tiny, trainer_of, tmp_path):
     state = load(tiny.checkpoint(30))
     stock = [name for name in state["pipeline"] if name.startswith("_model.gauss_params.") and "features" not in name]
     state["pipeline"] = {name: state["pipeline"][name] for name in stock}
     torch.save(state, tmp_path / "step-000000030.ckpt")
 
-    def change(config: Any) -> None:
+    def change(config):
         config.load_checkpoint = tmp_path / "step-000000030.ckpt"
 
     with pytest.raises(ValueError, match="warm-start"):
         trainer_of(change)
 
 
-def test_a_checkpoint_of_format_1_is_refused_in_one_line(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
+def test_a_checkpoint_of_format_1_is_refused_in_one_line(tiny, trainer_of, tmp_path):
     state = load(tiny.checkpoint(30))
     state["pipeline"]["_model._extra_state"] = {"method": "sundae", "format": 1, "step": 30, "num_features": 5}
     torch.save(state, tmp_path / "step-000000030.ckpt")
 
-    def resume(config: Any) -> None:
+    def resume(config):
         config.load_dir = tmp_path
 
-    def start_warm(config: Any) -> None:
+    def start_warm(config):
         config.pipeline.model.warm_start = tmp_path
 
     for change in (resume, start_warm):
@@ -358,7 +353,7 @@ def test_a_checkpoint_of_format_1_is_refused_in_one_line(tiny: Any, trainer_of: 
         assert "\n" not in str(raised.value)
 
 
-def test_saved_config_is_read_back_the_same(tiny: Any) -> None:
+def test_saved_config_is_read_back_the_same(tiny):
     config, pipeline, _, step = eval_setup(tiny.config, test_mode="inference")
     assert step == tiny.steps - 1
     assert isinstance(pipeline.model, SundaeModel)

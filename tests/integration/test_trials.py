@@ -1,228 +1,581 @@
-"""Whole runs that decide how they are finished, on a scene of a few pixels."""
+"""Whole runs that decide by trials how many Gaussians they keep, with which head, and for how many steps they train."""
 
-from __future__ import annotations
-
+import json
 import math
-from collections.abc import Callable, Iterator
-from functools import cache
-from pathlib import Path
-from typing import Any
+from functools import cache, partial
 
 import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
-from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
-from trial_runs import LENGTH, PRUNE_AT, records_of, served_views, tidy, tiny_run, tiny_scene, trials_of
+from trial_runs import LENGTH, PRUNE_AT, STEPS, records_of, same, served_views, tidy, tiny_run, tiny_scene, trials_of
 
+from sundae_ns.plugin import optimizer_configs
 from sundae_ns.plugin.finished_runs import load_run
 from sundae_ns.plugin.model import NerfstudioRun
+from sundae_ns.pruning.rule import kept_count
 from sundae_ns.report.measure import sizes
 from sundae_ns.scene.packing import contents_of
-from sundae_ns.train import choice, trials
+from sundae_ns.train import averaging, choice, trials
 from sundae_ns.train.choice import HeldOutQuality
+from sundae_ns.train.curve import read_count_curve
+from sundae_ns.train.pruning import PruningConfig
 
-DECIDED = PRUNE_AT + 3 * LENGTH
-"""Step of the decision if all candidates are tried."""
-NONE = (0.0, 0.0)
-Make = Callable[..., Trainer]
+VIEWS = 40
+"""Of a run that decides its count; one that decides its head alone has 16."""
+WINDOW = 2
+"""Steps of a trial of a count, and between two measurements of a length: a fiftieth of so short a run."""
 
 
 @pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
-    folder = tmp_path_factory.mktemp("scenes")
-    return cache(lambda views: tiny_scene(folder, views))
+def scenes(tmp_path_factory):
+    return cache(partial(tiny_scene, tmp_path_factory.mktemp("scenes")))
 
 
 @pytest.fixture
-def make(scenes: Callable[[int], Path], tmp_path: Path) -> Iterator[Make]:
+def make(scenes, tmp_path):
+    """Make a run that decides its head and its length."""
     yield lambda views=16, **options: tiny_run(scenes(views), tmp_path, **options)
     tidy()
 
 
 @pytest.fixture
-def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Fixes what the candidates gain on every held-out view: PSNR in dB, SSIM. Bytes of a tiny field do not count."""
-    monkeypatch.setattr(choice, "GAIN_PER_DOUBLING", 0.0)
-    monkeypatch.setattr(trials, "AVERAGED_EVERY", 1)  # means, in trials of five steps
-    monkeypatch.setattr(trials, "MEAN_SHARE", 0.6)
+def make_counting(make):
+    """Make a run that decides its count; options are those of pruning."""
 
-    def fix(head: tuple[float, float] = NONE, features: tuple[float, float] = NONE) -> None:
-        real = trials.measure_heldout
+    def made(head="off", views=VIEWS, **pruning):
+        config = PruningConfig(**{"keep_ratio": None, "prune_at": PRUNE_AT, **pruning})
+        return make(views, model={"head.mode": head, "dense_start_views": 0, "pruning": config})
 
-        def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
-            state, width = run.state, run.state.gaussians["features"].shape[1]
-            decibels, similarity = NONE
-            if state.head_enabled:
-                assert state.head.config.num_features == width
-                decibels, similarity = features if width == 29 else head
-            # With a trace of what was measured, so that other weights have other figures.
-            return [
-                HeldOutQuality(view.pixels, 20 + decibels + 1e-4 * view.psnr, 0.5 + similarity) for view in real(run)
-            ]
+    return made
 
-        monkeypatch.setattr(trials, "measure_heldout", measured)
+
+def judged(monkeypatch, quality):
+    """Fix the qualities of held-out views of a run; means of weights are taken in trials of few steps."""
+    monkeypatch.setattr(trials, "AVERAGED_EVERY", 1)
+    monkeypatch.setattr(trials, "measure_heldout", lambda run, **_: quality(run))
+
+
+def after_each_step(callback, note):
+    """Call a function with the run after each act of a callback."""
+    act = callback.after_step
+
+    def after_step(run):
+        act(run)
+        note(run)
+
+    callback.after_step = after_step
+
+
+def centers_of(model):
+    return model.gauss_params["means"].detach().clone()
+
+
+# ----------------------------------------------------------------------------------------------------------- the count
+
+
+@pytest.fixture
+def judge_counts(monkeypatch):
+    """Fix what the counts lose against all Gaussians, PSNR in dB by share, and what a head gains at a tenth."""
+    real = trials.measure_heldout
+
+    def fix(losses, head=0.0):
+        def quality(run):
+            progress = trials_of(run.model).progress
+            if progress.stage not in ("count", "tenth"):
+                return real(run)
+            tenth = progress.of("tenth")
+            if progress.stage == "tenth":
+                assert run.state.head_enabled == (len(tenth) == 1)
+                assert run.source.total == kept_count(0.1, progress.full)
+                decibels, similarity = 30 + head * len(tenth), 0.9
+            else:
+                loss = losses[trials.SHARES[len(progress.of("count"))]]
+                decibels, similarity = 30 - loss, 0.9 - 0.03 * loss
+            return [HeldOutQuality(100, decibels, similarity, decibels) for _ in run.heldout_views()]
+
+        judged(monkeypatch, quality)
 
     return fix
 
 
-def _record(trainer: Trainer) -> dict[str, Any]:
-    return dict(records_of(trainer)["head"])
+def head_steps(model):
+    """Steps in which the head was trained, without those that were taken back."""
+    return model.state.schedule_step - model.state.head_starts_at - trials_of(model).taken_back
 
 
-def test_a_head_that_pays_stays_and_all_views_are_trained_on_again(make: Make, judge: Any) -> None:
-    judge(head=(0.5, 0.01))
-    trainer = make()
-    served = served_views(trainer)
+LEVEL = {1.0: 0.0, 0.4: 0.0, 0.2: 0.05, 0.1: 1.0, 0.05: 2.0, 0.025: 3.0}
+"""Losses that level off: between a tenth and a fifth of the Gaussians are enough."""
+
+
+def test_trials_choose_the_count_and_leave_nothing_else_behind(make_counting, judge_counts):
+    judge_counts(LEVEL)
+    trainer = make_counting(head="auto")
+    served, model, fields = served_views(trainer), trainer.pipeline.model, {}
+    deciding, pruning = trials_of(model), next(one for one in model.train_callbacks if one.name == "pruning")
+    begin, prune = deciding._begin_counts, pruning.after_step
+
+    def began(run):
+        fields["before"] = centers_of(model)
+        begin(run)
+
+    def pruned(run):
+        if run.state.schedule_step >= PRUNE_AT and "count" in deciding.progress.chosen and "after" not in fields:
+            fields["after"] = centers_of(model)
+        prune(run)
+
+    deciding._begin_counts, pruning.after_step = began, pruned
     trainer.train()
-    model: Any = trainer.pipeline.model
-    record = _record(trainer)
+    record = records_of(trainer)["count"]
+    full, chosen, held = record["full"], record["chosen"], set(record["held_out_views"])
+    assert full / 10 < chosen <= full / 5
+    assert model.num_points == chosen
+    # A count that loses a decibel is clearly too few, so smaller ones are not tried.
+    assert [round(one["count"] / full, 2) for one in record["curve"]] == [1.0, 0.4, 0.2, 0.1]
+    assert record["step"] == PRUNE_AT + 4 * WINDOW + 2 * LENGTH
+    assert [len(one["measured"]) for one in record["curve"]] == [len(held)] * 4
+    assert all(one["bytes"] > 0 for one in record["curve"])
+    assert torch.equal(fields["before"], fields["after"])
+    # Held out from the first step.
+    assert len(held) == VIEWS // 8
+    assert not held & set(served[: PRUNE_AT + 4 * WINDOW])
+    assert held & set(served[record["step"] + 1 :])
+    points = read_count_curve(trainer.base_dir).points
+    assert [point.count for point in points] == [one["count"] for one in record["curve"]]
+    (prune,) = json.loads((trainer.base_dir / "prune.json").read_text())
+    assert (prune["before"], prune["after"], prune["step"]) == (full, chosen, record["step"])
+
+
+@pytest.mark.parametrize(("gain", "decision"), [(4.0, "head"), (0.2, "plain")])
+def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make_counting, judge_counts, gain, decision):
+    """If it gains enough for its bytes, which are several times those of these Gaussians."""
+    judge_counts(LEVEL, gain)
+    trainer = make_counting(head="auto")
+    model = trainer.pipeline.model
+    fresh, settled = {name: value.clone() for name, value in model.state.head.state_dict().items()}, {}
+    deciding = trials_of(model)
+    settle = deciding._finish_with
+
+    def finish_with(*words):
+        settled.update({name: value.clone() for name, value in model.state.head.state_dict().items()})
+        settle(*words)
+
+    deciding._finish_with = finish_with
+    trainer.train()
+    record, verdict = records_of(trainer)["count"], records_of(trainer)["head"]
+    assert (record["head"]["pays"], verdict["decision"]) == (decision == "head", decision)
+    assert record["head"]["head"]["psnr"] - record["head"]["plain"]["psnr"] == pytest.approx(gain)
+    assert verdict["step"] == record["step"]
+    assert (model.state.head is None) == (decision == "plain")
+    # What the head learnt on a tenth does not fit the chosen Gaussians.
+    same(fresh, settled)
+    if decision == "head":
+        assert any(not torch.equal(fresh[name], value) for name, value in model.state.head.state_dict().items())
+        assert head_steps(model) == STEPS - 1 - record["step"]
+        assert not model.state.provisional
+
+
+def test_where_a_tenth_is_kept_the_head_has_its_usual_trials(make_counting, judge_counts):
+    judge_counts(dict.fromkeys(trials.SHARES, 0.0), 0.2)
+    trainer = make_counting(head="auto")
+    trainer.train()
+    record, verdict = records_of(trainer)["count"], records_of(trainer)["head"]
+    assert record["chosen"] <= record["full"] / 10
+    assert "head" not in record
+    assert verdict["step"] > record["step"]
+    assert not set(record["held_out_views"]) & set(verdict["held_out_views"])
+
+
+def test_a_head_in_any_case_rests_during_the_trials_and_counts_its_own_steps(make_counting, judge_counts):
+    judge_counts(LEVEL)
+    trainer = make_counting(head="residual")
+    model, enabled = trainer.pipeline.model, []
+    after_each_step(model.train_callbacks[-1], lambda run: enabled.append(run.state.head_enabled))
+    trainer.train()
+    decided = records_of(trainer)["count"]["step"]
+    assert not any(enabled[:decided])
+    assert all(enabled[decided + 1 :])
+    assert head_steps(model) == STEPS - 1 - decided
+    assert not model.state.provisional
+
+
+def test_a_budget_works_on_the_same_curve(make_counting, judge_counts):
+    judge_counts(LEVEL)
+    trainer = make_counting(max_gaussians=9)
+    trainer.train()
+    assert trainer.pipeline.model.num_points == records_of(trainer)["count"]["chosen"] == 9
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"prune_at": 75}, "the steps after the prune are too few"),
+        ({"views": 16}, "16 training views are too few"),
+    ],
+)
+def test_where_trials_cannot_decide_a_tenth_stays_and_one_line_says_so(make_counting, options, reason, capsys):
+    trainer = make_counting(**options)
+    trainer.train()
+    assert trainer.pipeline.model.num_points == 20
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count(f"pruning keeps 10% of the Gaussians: {reason}") == 1
+    assert "count" not in records_of(trainer)
+
+
+# ------------------------------------------------------------------------------------------------------------ the head
+
+
+@pytest.fixture
+def judge_heads(monkeypatch):
+    """Fix what the candidates gain on every held-out view: PSNR in dB, SSIM. Bytes of tiny Gaussians do not count."""
+    monkeypatch.setattr(choice, "GAIN_PER_DOUBLING", 0.0)
+    monkeypatch.setattr(trials, "MEAN_SHARE", 0.6)
+    real = trials.measure_heldout
+
+    def fix(head=(0.0, 0.0), features=(0.0, 0.0)):
+        def quality(run):
+            width, gain = run.state.gaussians["features"].shape[1], (0.0, 0.0)
+            if run.state.head_enabled:
+                assert run.state.head.config.num_features == width
+                gain = features if width == 29 else head
+            # With a trace of what was measured, so that other weights have other figures.
+            return [HeldOutQuality(view.pixels, 20 + gain[0] + 1e-4 * view.psnr, 0.5 + gain[1]) for view in real(run)]
+
+        judged(monkeypatch, quality)
+
+    return fix
+
+
+def images_of(trainer, *models):
+    """Images of models from the first training camera, with their bases."""
+    camera = trainer.pipeline.datamanager.train_dataset.cameras[0:1]
+    with torch.no_grad():
+        outputs = [model.eval().get_outputs_for_camera(camera) for model in models]
+        return [(output["rgb"], output["base_rgb"]) for output in outputs]
+
+
+def test_a_head_that_pays_stays_and_all_views_are_trained_on_again(make, judge_heads):
+    judge_heads(head=(0.5, 0.01))
+    trainer = make()
+    served, model = served_views(trainer), trainer.pipeline.model
+    trainer.train()
+    record, decided = records_of(trainer)["head"], PRUNE_AT + 3 * LENGTH
     held = set(record["held_out_views"])
-    assert record["decision"] == "head"
-    assert record["step"] == DECIDED
+    assert (record["decision"], record["step"]) == ("head", decided)
     assert record["arms"]["head"]["psnr"] == pytest.approx(20.5, abs=0.01)
     assert record["arms"]["head"]["bytes"] == sum(sizes(model))
-    assert model.head is not None
     assert model.state.head_enabled
     assert len(held) == 2
-    assert not held & set(served[31 : DECIDED + 1])
+    assert not held & set(served[31 : decided + 1])
     assert held & set(served[:30])
-    assert held & set(served[DECIDED + 1 :])
-    moved = model.head.net.out.weight.abs().max()
-    assert moved > 0
+    assert held & set(served[decided + 1 :])
+    assert model.head.net.out.weight.abs().max() > 0
 
 
 @pytest.mark.parametrize("gains", [(0.5, -0.001), (math.nan, 0.01)])
-def test_a_head_that_does_not_pay_costs_nothing(make: Make, judge: Any, gains: tuple[float, float]) -> None:
-    judge(head=gains)
+def test_a_head_that_does_not_pay_costs_nothing(make, judge_heads, gains):
+    judge_heads(head=gains)
     trainer = make()
     trainer.train()
-    model: Any = trainer.pipeline.model
-    assert _record(trainer)["decision"] == "plain"
+    model = trainer.pipeline.model
+    assert records_of(trainer)["head"]["decision"] == "plain"
     assert model.head is None
     assert model.gauss_params["features"].numel() == 0
     saved = torch.load(next(trainer.checkpoint_dir.glob("*.ckpt")), map_location="cpu", weights_only=True)
     assert not [name for name in saved["pipeline"] if "head" in name]
     opened = eval_setup(trainer.base_dir / "config.yml", test_mode="test")[1].model
     assert opened.head is None
-    camera = trainer.pipeline.datamanager.train_dataset.cameras[0:1]
-    with torch.no_grad():
-        images = [one.eval().get_outputs_for_camera(camera) for one in (model, opened)]
-    assert torch.equal(images[0]["rgb"], images[1]["rgb"])
-    assert torch.equal(images[0]["rgb"], images[0]["base_rgb"])
+    (image, base), (again, _) = images_of(trainer, model, opened)
+    assert torch.equal(image, again)
+    assert torch.equal(image, base)
     scene = contents_of(load_run(trainer.base_dir))
     assert not scene.head
     assert not any(value.numel() for name, value in scene.gaussians.items() if name == "features")
 
 
-@pytest.mark.parametrize(
-    ("chosen", "head", "features", "tried"),
-    [("plain", -1.0, 0.0, 2), ("features", 0.3, 0.5, 3)],
-)
-def test_the_trials_start_alike_and_the_chosen_field_continues(
-    make: Make, judge: Any, chosen: str, head: float, features: float, tried: int
-) -> None:
-    judge(head=(head, 0.01), features=(features, 0.02))
+@pytest.mark.parametrize(("chosen", "head", "features", "tried"), [("plain", -1.0, 0.0, 2), ("features", 0.3, 0.5, 3)])
+def test_the_trials_start_alike_and_the_chosen_field_continues(make, judge_heads, chosen, head, features, tried):
+    judge_heads(head=(head, 0.01), features=(features, 0.02))
     trainer = make()
-    model: Any = trainer.pipeline.model
-    trial = trials_of(model)
-    seen: dict[int, tuple[torch.Tensor, float]] = {}
-    head_rates: dict[int, list[float]] = {}
-    real = trial.after_prune
+    model = trainer.pipeline.model
+    trial, seen, rates, head_rates = trials_of(model), {}, {}, {}
+    act = trial.after_prune
 
-    def after_step(run: Any) -> None:
-        real(run)
-        head_rates[run.state.step] = [group["lr"] for group in run.state.optimizers["compensation"].param_groups]
-        rate = run.state.schedulers["means"].lr_lambdas[0](run.state.step)
-        seen[run.state.step] = (model.gauss_params["means"].detach().clone(), rate)
+    def after_prune(run):
+        act(run)
+        step = run.state.step
+        head_rates[step] = [group["lr"] for group in run.state.optimizers["compensation"].param_groups]
+        seen[step], rates[step] = centers_of(model), run.state.schedulers["means"].lr_lambdas[0](step)
 
-    trial.after_prune = after_step
+    trial.after_prune = after_prune
     trainer.train()
     starts = [PRUNE_AT + i * LENGTH for i in range(tried)]
-    # All trials start from the field and the rate right after the prune.
     for step in starts[1:]:
-        assert torch.equal(seen[starts[0]][0], seen[step][0])
-        assert seen[starts[0]][1] == pytest.approx(seen[step][1])
-    # Each head's rate rises from the first step of its trial on, and is as high as it may be well before the end.
-    for step in starts[1:]:
+        # All trials start from the Gaussians and the rate right after the prune.
+        assert torch.equal(seen[starts[0]], seen[step])
+        assert rates[starts[0]] == pytest.approx(rates[step])
+        # Each head's rate rises from the first step of its trial on, and is as high as it may be well before the end.
         for lowest, highest in zip(head_rates[step], head_rates[step + LENGTH // 2], strict=True):
             assert lowest == pytest.approx(highest * 2 / (round(trials.RISE_SHARE * LENGTH) + 1), rel=0.05)
-    decided, place = PRUNE_AT + tried * LENGTH, choice.HEADS.index(chosen) + 1
-    end = seen[PRUNE_AT + place * LENGTH - 1][0]
-    assert not torch.equal(end, seen[PRUNE_AT][0])
-    # The field at the end of the chosen trial is one step away from the last that was seen of it.
-    distances = [(seen[decided][0] - seen[PRUNE_AT + i * LENGTH - 1][0]).abs().max() for i in range(1, tried + 1)]
-    assert min(distances) == distances[place - 1]
-    record = _record(trainer)
+    decided, place = PRUNE_AT + tried * LENGTH, choice.HEADS.index(chosen)
+    ends = [seen[step + LENGTH - 1] for step in starts]
+    assert not torch.equal(ends[place], seen[PRUNE_AT])
+    # The Gaussians at the end of the chosen trial are one step away from the last that were seen of it.
+    distances = [(seen[decided] - end).abs().max() for end in ends]
+    assert min(distances) == distances[place]
+    record = records_of(trainer)["head"]
     assert (record["decision"], record["step"], len(record["arms"])) == (chosen, decided, tried)
     # A head that was chosen has trained for one trial.
-    assert trials_of(model).taken_back == (tried - 1) * LENGTH
+    assert trial.taken_back == (tried - 1) * LENGTH
     width = {"plain": 0, "head": 5, "features": 29}[chosen]
     assert model.gauss_params["features"].shape[1] == width
     assert (model.head is None) == (chosen == "plain")
     opened = eval_setup(trainer.base_dir / "config.yml", test_mode="test")[1].model
-    camera = trainer.pipeline.datamanager.train_dataset.cameras[0:1]
-    with torch.no_grad():
-        images = [one.eval().get_outputs_for_camera(camera)["rgb"] for one in (model, opened)]
-    assert torch.equal(*images)
+    (image, _), (again, _) = images_of(trainer, model, opened)
+    assert torch.equal(image, again)
     assert contents_of(load_run(trainer.base_dir)).gaussians.get("features", torch.zeros(1, 0)).shape[1] == width
 
 
-def test_with_few_views_two_are_held_out_in_turn(make: Make, judge: Any) -> None:
-    judge(head=(0.5, 0.01))
+def test_with_few_views_two_are_held_out_in_turn(make, judge_heads):
+    judge_heads(head=(0.5, 0.01))
     trainer = make(8)
     served = served_views(trainer)
     trainer.train()
-    first, second = _record(trainer)["held_out_views"]
-    length = LENGTH // 2
+    record, length = records_of(trainer)["head"], LENGTH // 2
+    first, second = record["held_out_views"]
     served_by_trial = [served[PRUNE_AT + 1 + i * length : PRUNE_AT + 1 + (i + 1) * length] for i in range(6)]
-    assert _record(trainer)["decision"] == "head"
-    assert _record(trainer)["steps_per_trial"] == length
+    assert (record["decision"], record["steps_per_trial"]) == ("head", length)
     assert not any(first in trial for trial in served_by_trial[::2])
     assert not any(second in trial for trial in served_by_trial[1::2])
     assert trainer.pipeline.model.head.config.num_features == 5
 
 
-def test_with_too_few_views_the_head_stays_off(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+def test_with_too_few_views_the_head_stays_off(make, capsys):
     trainer = make(5)
     trainer.train()
     assert trainer.pipeline.model.head is None
-    assert _record(trainer) == {
-        "decision": "plain",
-        "reason": "5 training views are too few to tell whether a head helps",
-        "step": 0,
-    }
+    reason = "5 training views are too few to tell whether a head helps"
+    assert records_of(trainer)["head"] == {"decision": "plain", "reason": reason, "step": 0}
     assert "the head is removed: 5 training views are too few" in " ".join(capsys.readouterr().out.split())
 
 
-def test_masks_that_leave_no_pixel_leave_no_head(make: Make, judge: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    judge(head=(0.5, 0.01))
-    monkeypatch.setattr(trials, "measure_heldout", lambda run, **_: [])
+def test_masks_that_leave_no_pixel_leave_no_head(make, judge_heads, monkeypatch):
+    judge_heads(head=(0.5, 0.01))
+    judged(monkeypatch, lambda _: [])
     trainer = make()
     trainer.train()
-    assert _record(trainer)["decision"] == "plain"
-    assert _record(trainer)["reason"] == "masks leave no pixel of the held-out training views"
+    record = records_of(trainer)["head"]
+    assert record["decision"] == "plain"
+    assert record["reason"] == "masks leave no pixel of the held-out training views"
     assert trainer.pipeline.model.head is None
     assert trainer.pipeline.datamanager.holdout_indices == []
 
 
-def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any) -> None:
+def test_several_gpus_train_the_head_without_trials(make, judge_heads):
     """The head of the trial that one GPU was in."""
-    judge(head=(0.5, 0.05))
+    judge_heads(head=(0.5, 0.05))
     stop = PRUNE_AT + 2 * LENGTH + 2
-    whole = make(name="whole", save_every=stop)
+    whole = make(name="whole", steps_per_save=stop)
     whole.train()
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=3)
-    model: Any = resumed.pipeline.model
-    trials_of_run = trials_of(model)
-    assert "start" in trials_of_run.kept
+    model = resumed.pipeline.model
+    deciding = trials_of(model)
+    assert "start" in deciding.kept
     resumed.ranks.count = 2
     attributes = TrainingCallbackAttributes(resumed.optimizers, resumed.grad_scaler, resumed.pipeline, resumed)
-    trials_of_run.before_training(NerfstudioRun(model, attributes))
+    deciding.before_training(NerfstudioRun(model, attributes))
     resumed.ranks.count = 1
     resumed.train()
-    assert _record(resumed)["reason"] == "trials need a single GPU"
+    assert records_of(resumed)["head"]["reason"] == "trials need a single GPU"
     assert model.state.head_enabled
     assert model.gauss_params["features"].shape[1] == 29
     assert resumed.pipeline.datamanager.holdout_indices == []
-    assert trials_of_run.kept == {}
+    assert deciding.kept == {}
+
+
+# ---------------------------------------------------------------------------------------------------------- the length
+
+DECIDED = PRUNE_AT + 2 * LENGTH
+"""Step of the decision about the length, after trials of no head and of a head."""
+
+
+@pytest.fixture
+def curve(monkeypatch):
+    """Fix the PSNR of the held-out views at a step; trials end without a head."""
+    monkeypatch.setattr(choice, "best_head", lambda tried, folds: "plain")
+
+    def fix(decibels, held_out=2):
+        def quality(run):
+            assert len(list(run.heldout_views())) == held_out
+            return [HeldOutQuality(576, decibels(run.state.step), 0.5)]
+
+        judged(monkeypatch, quality)
+
+    return fix
+
+
+def watched(trainer):
+    """Collect the training views that are served, and the centres and their rate after the callbacks of each step."""
+    model, centers, rates = trainer.pipeline.model, {}, {}
+
+    def note(run):
+        centers[run.state.step] = centers_of(model)
+        rates[run.state.step] = run.state.schedulers["means"].lr_lambdas[0](run.state.step)
+
+    after_each_step(model.train_callbacks[-1], note)
+    return served_views(trainer), centers, rates
+
+
+def test_the_field_goes_back_trains_as_long_as_was_best_and_pauses(make, curve):
+    best = DECIDED + 2 * WINDOW
+    curve(lambda step: 20 - 0.08 * abs(step - best) / WINDOW)
+    trainer = make()
+    served, centers, rates = watched(trainer)
+    trainer.train()
+    # 0.08 dB below the best are 0.4% of the loss and noise, 0.16 are not.
+    back, rest = best + 2 * WINDOW, best + 2 * WINDOW + 2 * WINDOW
+    record = records_of(trainer)["length"]
+    held = set(record["held_out_views"])
+    assert record["steps_per_measurement"] == WINDOW
+    assert [one["psnr"] for one in record["measured"]] == pytest.approx([19.92, 20, 19.92, 19.84])
+    assert record["measured"][1]["loss"] == pytest.approx(0.8 * 0.1 + 0.2 * 0.5)
+    assert record["steps_on_all_views"] == 2 * WINDOW
+    assert torch.equal(centers[back], centers[DECIDED])
+    assert not torch.equal(centers[back - 1], centers[DECIDED])
+    # The rate has gone back too; it decays by 0.0006 in a window of this length.
+    assert rates[back] == pytest.approx(rates[DECIDED], rel=1e-5)
+    assert rates[back - 1] < (1 - 5e-4) * rates[DECIDED]
+    assert len(held) == 2
+    assert not held & set(served[DECIDED + 1 : back + 1])
+    assert len(served) == rest + 1
+    # The mean of the last window stays: the own weights of its last step have moved on.
+    assert all(torch.equal(centers[rest], centers[step]) for step in range(rest, STEPS))
+    assert not torch.equal(centers[rest], centers[rest - 1])
+    assert list(trainer.checkpoint_dir.glob("*.ckpt")) == [trainer.checkpoint_dir / f"step-{STEPS - 1:09d}.ckpt"]
+
+
+def test_a_pause_in_the_last_steps_is_not_averaged(make, curve, monkeypatch):
+    """The mean at the end of a run has counted weights before the pause."""
+    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 1)
+    curve(lambda step: 20 - 0.08 * abs(step - DECIDED - 10 * WINDOW) / WINDOW)
+    trainer = make()
+    _, centers, _ = watched(trainer)
+    trainer.train()
+    rest = DECIDED + 22 * WINDOW
+    assert STEPS - 10 < rest < STEPS - 1
+    assert not torch.equal(centers[rest], centers[rest - 1])
+    assert all(torch.equal(centers[rest], centers[step]) for step in range(rest, STEPS))
+
+
+def test_views_that_a_trial_has_seen_are_not_watched(make, curve):
+    """With few views a trial holds out one of two, and the Gaussians that go on have seen the other."""
+    trainer = make(8)
+    served, *_ = watched(trainer)
+    curve(lambda _: 20.0, held_out=1)
+    trainer.train()
+    (held,) = records_of(trainer)["length"]["held_out_views"]
+    other, last = records_of(trainer)["head"]["held_out_views"]
+    assert held == last
+    length = LENGTH // 2
+    assert held not in served[PRUNE_AT + length + 1 : PRUNE_AT + 2 * length + 1]  # the second trial of no head
+    # The views of the watch are those that are not held out, the seen one among them.
+    assert other in served[PRUNE_AT + 4 * length + 1 :]
+
+
+def test_a_field_that_loses_nothing_trains_to_the_end_on_all_views(make, curve):
+    curve(lambda _: math.nan)
+    trainer = make()
+    served, centers, _ = watched(trainer)
+    trainer.train()
+    record, end = records_of(trainer)["length"], DECIDED + (STEPS - DECIDED) // 2
+    assert len(record["measured"]) == (end - DECIDED) // WINDOW
+    assert record["steps_on_all_views"] is None
+    assert not set(record["held_out_views"]) & set(served[DECIDED + 1 : end + 1])
+    assert set(record["held_out_views"]) & set(served[end + 1 :])
+    assert len(served) == STEPS
+    assert not torch.equal(centers[STEPS - 1], centers[STEPS - 2])
+
+
+def test_a_warm_start_is_not_watched(make, curve):
+    """Its Gaussians know the views that would be held out."""
+    curve(lambda step: 20 - step)
+    trainer = make()
+    trainer.pipeline.model.state.offset = PRUNE_AT
+    served = served_views(trainer)
+    trainer.train()
+    assert "head" in records_of(trainer)
+    assert "length" not in records_of(trainer)
+    assert len(served) == STEPS
+
+
+def test_a_paused_run_is_resumed_with_figures_and_trains_again_after_its_schedule(make, curve, monkeypatch, capsys):
+    curve(lambda step: 20 - step)
+    stop, losses, put_scalar = STEPS - 25, [], writer.put_scalar
+    whole = make(name="whole", steps_per_save=stop)
+    whole.train()
+    longer = make(name="longer", load_dir=whole.checkpoint_dir, max_num_iterations=5)
+    served = served_views(longer)
+    longer.train()
+    assert len(served) == 5
+
+    def noted(name, scalar, step):
+        losses.extend([float(scalar)] if name == "Train Loss" else [])
+        put_scalar(name, scalar, step)
+
+    monkeypatch.setattr(writer, "put_scalar", noted)
+    monkeypatch.setattr(optimizer_configs, "LINE_EVERY", 0.0)
+    resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1)
+    served, centers, _ = watched(resumed)
+    capsys.readouterr()
+    resumed.train()
+    assert len(served) == 1, "one image is measured, and none is trained on"
+    assert all(torch.equal(centers[stop + 1], center) for center in centers.values())
+    assert len(losses) == 2
+    assert all(0 < loss < 1 for loss in losses)
+    assert "PSNR" in capsys.readouterr().out
+
+
+# -------------------------------------------------------------------------------------------------------------- resumed
+
+
+@pytest.mark.parametrize(
+    ("views", "keep_ratio", "stages", "stops"),
+    [
+        # Before, in trials of counts and of a head on a tenth, after the decision, and while weights are averaged.
+        (40, None, {"count", "tenth"}, (11, 45, 57, 68, 95)),
+        # Before the prune and right after it, in trials of heads, in those of the length, on all views, and paused.
+        (16, 0.1, {"head", "length", "repeat", "paused"}, (37, 40, 43, 52, 61, 68, 85)),
+    ],
+)
+def test_a_run_resumed_at_any_step_is_the_run(make, monkeypatch, views, keep_ratio, stages, stops):
+    """By figures of which a fifth of the Gaussians is enough, heads pay, and later training harms."""
+    monkeypatch.setattr(choice, "GAIN_PER_DOUBLING", 0.0)
+    losses, found_stages = (0.0, 0.0, 0.05, 0.45, 0.65, 0.8), set()
+
+    def quality(run):
+        progress = trials_of(run.model).progress
+        n = len(progress.of(progress.stage))
+        gain = {"count": -losses[n % 6], "tenth": 0.3 * n, "head": 0.5 * n, "length": -0.1 * abs(n - 3)}
+        # With a trace of the weights, so that other weights have other figures.
+        figure = 25 + gain[progress.stage] + 1e-6 * float(run.state.gaussians["means"].detach().abs().mean())
+        return [HeldOutQuality(100, figure, 0.5 + figure / 100, figure) for _ in run.heldout_views()]
+
+    judged(monkeypatch, quality)
+
+    def run(name, **options):
+        pruning = PruningConfig(keep_ratio=keep_ratio, prune_at=PRUNE_AT)
+        trainer = make(views, name=name, model={"dense_start_views": 0, "pruning": pruning}, **options)
+        found_stages.add(trials_of(trainer.model).progress.stage)
+        trainer.train()
+        path = trainer.checkpoint_dir / f"step-{STEPS - 1:09d}.ckpt"
+        return trainer, torch.load(path, map_location="cpu", weights_only=True), records_of(trainer)
+
+    trainer, expected, records = run("whole", steps_per_save=1)
+    for stop in stops:
+        place = {"load_dir": trainer.checkpoint_dir, "load_step": stop, "max_num_iterations": STEPS - stop - 1}
+        _, found, again = run(f"from {stop}", **place)
+        for part in ("pipeline", "optimizers", "schedulers"):
+            same(expected[part], found[part])
+        assert again == records
+    assert found_stages >= stages

@@ -1,12 +1,9 @@
 """Training that is killed, and faults as a user of the commands sees them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
 import kill_and_resume
 import pytest
@@ -14,9 +11,7 @@ import pytest
 from sundae_ns.core.errors import DataError
 
 
-def test_killed_anywhere_it_goes_on_as_if_never_killed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_killed_anywhere_it_goes_on_as_if_never_killed(monkeypatch, capsys):
     """The short version of ``benchmarks/kill_and_resume.py``, which says where the kills fall."""
     monkeypatch.setattr(sys, "argv", ["kill_and_resume.py", "--kinds", "training", "--kills", "2"])
     with pytest.raises(SystemExit) as ended:
@@ -27,7 +22,7 @@ def test_killed_anywhere_it_goes_on_as_if_never_killed(
     assert found["same seed, same result"]
 
 
-def test_ns_train_names_bad_input(tiny: Any, call_here: Any, tmp_path: Path) -> None:
+def test_ns_train_names_bad_input(tiny, call_here, tmp_path):
     """In one line: test_registration.py raises such an error in a process of its own."""
     data = Path(shutil.copytree(tiny.scene, tmp_path / "scene"))
     meta = json.loads((data / "transforms.json").read_text())

@@ -1,9 +1,6 @@
 """What nerfstudio's viewer asks of a model, on the trained run, without a browser."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -18,11 +15,11 @@ from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerElement
 
 
 @pytest.fixture(scope="module")
-def pipeline(tiny: Any) -> Any:
+def pipeline(tiny):
     return eval_setup(tiny.config, test_mode="inference")[1]
 
 
-def camera(pipeline: Any, height: int, aspect: float) -> Cameras:
+def camera(pipeline, height, aspect):
     """A test camera at another size, as the viewer makes it."""
     known = pipeline.datamanager.eval_dataset.cameras[0:1]
     width = int(height * aspect)
@@ -33,7 +30,7 @@ def camera(pipeline: Any, height: int, aspect: float) -> Cameras:
 
 @pytest.mark.parametrize(("height", "aspect"), [(30, 1.0), (31, 1.7), (75, 0.6)])
 @torch.no_grad()
-def test_every_output_becomes_a_picture(pipeline: Any, height: int, aspect: float) -> None:
+def test_every_output_becomes_a_picture(pipeline, height, aspect):
     assert isinstance(pipeline.model, SplatfactoModel)
     pipeline.model.set_background(torch.tensor([0.1, 0.2, 0.3], device=pipeline.device))
     outputs = pipeline.model.get_outputs_for_camera(camera(pipeline, height, aspect), obb_box=None)
@@ -48,7 +45,7 @@ def test_every_output_becomes_a_picture(pipeline: Any, height: int, aspect: floa
 
 
 @torch.no_grad()
-def test_check_box_switches_the_head_off(pipeline: Any) -> None:
+def test_check_box_switches_the_head_off(pipeline):
     # As nerfstudio's control panel finds them.
     controls = [control for _, control in parse_object(pipeline.model, ViewerElement, "Custom Elements")]
     (box,) = [control for control in controls if isinstance(control, ViewerCheckbox) and "compensation" in control.name]
@@ -65,7 +62,7 @@ def test_check_box_switches_the_head_off(pipeline: Any) -> None:
     assert torch.equal(evaluated["rgb"], on["rgb"])
 
 
-def listening(port: int) -> set[str]:
+def listening(port):
     """Addresses at which something listens on a port, as Linux tells them: hexadecimal, 0100007F is 127.0.0.1."""
     found = set()
     for table in ("tcp", "tcp6"):
@@ -79,8 +76,8 @@ def listening(port: int) -> set[str]:
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="looks where Linux lists sockets")
-def test_the_viewer_listens_where_the_user_asked_and_nowhere_else(trainer_of: Any) -> None:
-    def change(config: Any) -> None:
+def test_the_viewer_listens_where_the_user_asked_and_nowhere_else(trainer_of):
+    def change(config):
         config.vis, config.viewer.websocket_host = "viewer", "127.0.0.1"
         config.get_base_dir().mkdir(parents=True)  # ns-train has written config.yml there by then
 

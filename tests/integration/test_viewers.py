@@ -1,10 +1,5 @@
 """Exports in other viewers, in a headless Chromium, against Python's images of the same field."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import pytest
 from chromium import bench_viewers, needs_chromium, needs_packages
 
@@ -27,7 +22,7 @@ A .spz rounds everything; GaussianSplats3D rounds base colours to bytes, and doe
 
 
 @pytest.mark.parametrize("kind", ["ply", "spz", "sog", "glb"])
-def test_viewers_agree_with_python(kind: str, tiny: Any, tmp_path: Path) -> None:
+def test_viewers_agree_with_python(kind, tiny, tmp_path):
     write_scene(tmp_path / "a.sundae", contents_of(load_run(tiny.folder)))
     rows = list(bench_viewers.rows(tmp_path / "a.sundae", kind=kind, center=True))
     found = {(row["viewer"], kind): row["psnr_of_all"] for row in rows}

@@ -1,9 +1,5 @@
 """Hand-made measurements for the tests of tables and plots."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import pytest
 
 from sundae_ns.core.metrics import ViewQuality
@@ -11,9 +7,9 @@ from sundae_ns.report.measured import HEAD_OFF, HEAD_ON, Configuration, Measured
 
 
 @pytest.fixture
-def measured() -> Callable[..., Measured]:
-    def make(label: str = "a run", *, head: bool = True, psnr: float = 25.0, scene: str = "bicycle") -> Measured:
-        def views(shift: float) -> tuple[ViewQuality, ...]:
+def measured():
+    def make(label="a run", *, head=True, psnr=25.0, scene="bicycle"):
+        def views(shift):
             return tuple(ViewQuality(psnr + shift + i, 0.8 + shift / 10, 0.2) for i in (-1, 0, 1))
 
         ways = [Configuration(HEAD_OFF, 2.0, 1_000_000, views(0.0))]

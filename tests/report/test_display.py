@@ -1,27 +1,25 @@
 """Viewer colours of features, depth and response stay in range for any input."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 from sundae_ns.scene import frames as display
 
 
-def test_empty_pixels_get_the_largest_depth() -> None:
+def test_empty_pixels_get_the_largest_depth():
     depth = torch.tensor([[[2.0], [0.0]], [[5.0], [1.0]]])
     alpha = torch.tensor([[[0.5], [0.0]], [[1.0], [0.1]]])
     assert display.fill_depth(depth, alpha)[..., 0].tolist() == [[2.0, 5.0], [5.0, 1.0]]
     assert not display.fill_depth(torch.zeros(2, 3, 1), torch.zeros(2, 3, 1)).any()
 
 
-def features(n: int = 2000) -> torch.Tensor:
+def features(n=2000):
     generator = torch.Generator().manual_seed(0)
     spread = torch.tensor([0.1, 3.0, 0.01, 1.0, 0.3])
     return torch.randn(n, 5, generator=generator) * spread + torch.arange(5.0)
 
 
-def test_principal_components_are_sorted_by_variance() -> None:
+def test_principal_components_are_sorted_by_variance():
     mean, basis, deviations = display.principal_components(features())
     torch.testing.assert_close(mean, torch.arange(5.0), atol=0.2, rtol=0)
     assert basis.abs().argmax(dim=0).tolist() == [1, 3, 4]
@@ -29,7 +27,7 @@ def test_principal_components_are_sorted_by_variance() -> None:
     torch.testing.assert_close(deviations, torch.tensor([3.0, 1.0, 0.3]), atol=0, rtol=0.1)
 
 
-def test_signs_are_fixed() -> None:
+def test_signs_are_fixed():
     for seed in range(8):
         values = torch.randn(50, 6, generator=torch.Generator().manual_seed(seed))
         _, basis, _ = display.principal_components(values)
@@ -37,7 +35,7 @@ def test_signs_are_fixed() -> None:
 
 
 @pytest.mark.parametrize("width", [1, 2])
-def test_fewer_channels_than_colours(width: int) -> None:
+def test_fewer_channels_than_colours(width):
     mean, basis, deviations = display.principal_components(features()[:, :width])
     assert basis.shape == (width, 3)
     assert not basis[:, width:].any()
@@ -48,7 +46,7 @@ def test_fewer_channels_than_colours(width: int) -> None:
     torch.testing.assert_close(colors[..., width:], torch.full((4, 6, 3 - width), 0.5))
 
 
-def test_colours_are_in_range_grey_at_the_mean_and_black_in_empty_pixels() -> None:
+def test_colours_are_in_range_grey_at_the_mean_and_black_in_empty_pixels():
     values = features()
     parts = display.principal_components(values)
     alpha = torch.ones(40, 50, 1)
@@ -63,7 +61,7 @@ def test_colours_are_in_range_grey_at_the_mean_and_black_in_empty_pixels() -> No
     assert not display.feature_colors(torch.zeros(2, 2, 5), *parts, torch.zeros(2, 2, 1)).any()
 
 
-def test_equal_features_have_finite_colours() -> None:
+def test_equal_features_have_finite_colours():
     values = torch.full((30, 4), 0.3)
     parts = display.principal_components(values)
     colors = display.feature_colors(values[:6].reshape(2, 3, 4), *parts, torch.ones(2, 3, 1))
@@ -71,7 +69,7 @@ def test_equal_features_have_finite_colours() -> None:
     assert ((colors >= 0) & (colors <= 1)).all()
 
 
-def test_response_values_are_ranks() -> None:
+def test_response_values_are_ranks():
     response = torch.tensor([10.0, torch.nan, 0.1, 1e6, 0.0])
     values = display.response_values(response)
     assert values.tolist() == [0.75, 0.0, 0.5, 1.0, 0.25]

@@ -1,30 +1,25 @@
-from __future__ import annotations
-
 import csv
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from sundae_ns.core.errors import CheckpointError
 from sundae_ns.core.metrics import ViewQuality
 from sundae_ns.core.tables import number
-from sundae_ns.report.measured import COLUMNS, Configuration, Measured, csv_text, markdown
+from sundae_ns.report.measured import COLUMNS, Configuration, csv_text, markdown
 from sundae_ns.train.curve import CountCurve, CurvePoint, read_count_curve
 
 
-def row_of(run: Measured) -> dict[str, str]:
+def row_of(run):
     header, row = csv.reader(StringIO(csv_text([run.as_json()])))
     assert tuple(header) == COLUMNS
     return dict(zip(header, row, strict=True))
 
 
-def test_a_row_pairs_each_time_with_the_quality_of_its_configuration(measured: Callable[..., Measured]) -> None:
+def test_a_row_pairs_each_time_with_the_quality_of_its_configuration(measured):
     row = row_of(replace(measured(), command='sundae report "a, b"', seed=None))
     assert (row["ms_frame"], float(row["psnr"])) == ("3.5", pytest.approx(25.5))
     assert (row["ms_splat"], float(row["psnr_base"])) == ("2.0", pytest.approx(25.0))
@@ -34,14 +29,14 @@ def test_a_row_pairs_each_time_with_the_quality_of_its_configuration(measured: C
     assert row["command"] == 'sundae report "a, b"'
 
 
-def test_without_a_head_full_and_base_are_the_same(measured: Callable[..., Measured]) -> None:
+def test_without_a_head_full_and_base_are_the_same(measured):
     run = measured(head=False)
     assert not run.has_head
     row = row_of(run)
     assert (row["psnr"], row["ms_frame"]) == (row["psnr_base"], row["ms_splat"]) == ("25.0", "2.0")
 
 
-def test_a_mean_needs_all_views() -> None:
+def test_a_mean_needs_all_views():
     whole = (ViewQuality(20.0, 0.5, 0.1), ViewQuality(22.0, 0.7, 0.3))
     assert Configuration("x", 1.0, 1, whole).mean("flip") == pytest.approx(0.2)
     assert Configuration("x", 1.0, 1, whole).mean("lpips") is None
@@ -50,7 +45,7 @@ def test_a_mean_needs_all_views() -> None:
     assert Configuration("x", 1.0, 1, ()).mean("psnr") is None
 
 
-def test_the_net_is_named_only_if_lpips_was_measured(measured: Callable[..., Measured]) -> None:
+def test_the_net_is_named_only_if_lpips_was_measured(measured):
     run = replace(measured(head=False), lpips_net="alex")
     assert row_of(run)["lpips_net"] == ""
     views = tuple(replace(view, lpips=0.3) for view in run.full.views)
@@ -59,7 +54,7 @@ def test_the_net_is_named_only_if_lpips_was_measured(measured: Callable[..., Mea
     assert (float(row["lpips"]), row["lpips_net"]) == (pytest.approx(0.3), "alex")
 
 
-def test_json_has_no_nan(measured: Callable[..., Measured]) -> None:
+def test_json_has_no_nan(measured):
     run = measured(head=False)
     run = replace(run, configurations=(replace(run.full, views=(ViewQuality(math.inf, math.nan),)),))
     read = json.loads(json.dumps(run.as_json(), allow_nan=False))
@@ -67,7 +62,7 @@ def test_json_has_no_nan(measured: Callable[..., Measured]) -> None:
     assert read["bytes_total"] == 1_000_000
 
 
-def test_each_configuration_has_a_row_of_the_table(measured: Callable[..., Measured]) -> None:
+def test_each_configuration_has_a_row_of_the_table(measured):
     run = measured("theirs", head=False)
     views = tuple(replace(view, lpips=0.25) for view in run.full.views)
     run = replace(run, lpips_net="vgg", configurations=(replace(run.full, views=views),))
@@ -85,19 +80,19 @@ def test_each_configuration_has_a_row_of_the_table(measured: Callable[..., Measu
     assert number(1234.567, 1) == "1,234.6"
 
 
-def test_names_stay_text_in_markdown(measured: Callable[..., Measured]) -> None:
+def test_names_stay_text_in_markdown(measured):
     hostile = "<script>a|b`c\n# d*[e](f)"
     text = markdown({hostile: [measured(hostile)]}, [hostile])
     assert text.count("&lt;script&gt;a\\|b\\`c # d\\*\\[e\\](f)") == 4
     assert len(text.splitlines()) == len(markdown({"a": [measured()]}, ["a"]).splitlines())
 
 
-POINT: dict[str, Any] = {"count": 200, "bytes": None, "psnr": 30.0, "ssim": 0.91, "psnr_loss": 0.25, "ssim_loss": 0.0}
+POINT = {"count": 200, "bytes": None, "psnr": 30.0, "ssim": 0.91, "psnr_loss": 0.25, "ssim_loss": 0.0}
 POINT |= {"psnr_error": 0.02, "ssim_error": 0.0005}
-COUNT: dict[str, Any] = {"chosen": 240, "full": 1000, "reason": "the fewest that are as good", "curve": [POINT]}
+COUNT = {"chosen": 240, "full": 1000, "reason": "the fewest that are as good", "curve": [POINT]}
 
 
-def test_the_record_of_trials_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
+def test_the_record_of_trials_is_read_or_refused_in_one_line(tmp_path):
     assert read_count_curve(tmp_path) is None
     path = tmp_path / "trials.json"
     path.write_text(json.dumps({"count": COUNT}))

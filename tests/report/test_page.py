@@ -1,16 +1,11 @@
 """The report as a web page: what it holds, that it asks nobody for anything, and its sliders in a browser."""
 
-from __future__ import annotations
-
 import base64
 import math
 import re
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +14,7 @@ from chromium import CHROMIUM, browser, needs_chromium, touch
 from PIL import Image
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.report.measured import Measured, rows_of
+from sundae_ns.report.measured import rows_of
 from sundae_ns.report.report_page import (
     ERROR_COLORS,
     EXACT_SIDE,
@@ -28,7 +23,6 @@ from sundae_ns.report.report_page import (
     MOST_ON_A_PAGE,
     MOST_VIEWS,
     ShownRun,
-    ShownView,
     cameras_for_each,
     choose_cameras,
     error_map,
@@ -53,40 +47,40 @@ CURVE = CountCurve(
 class Page(HTMLParser):
     """The elements of a page, with their attributes and text; refuses elements that are not closed in order."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
-        self.text: list[str] = []
+        self.elements = []
+        self.open = []
+        self.text = []
         self.feed(text)
         self.close()
         assert self.open == []
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         assert len(dict(attrs)) == len(attrs), "an attribute stands twice"
         self.elements.append((tag, dict(attrs)))
         if tag not in VOID:
             self.open.append(tag)
 
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_startendtag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if not {"style", "script"} & set(self.open):
             self.text.append(data)
 
     @property
-    def words(self) -> str:
+    def words(self):
         return " ".join(" ".join(self.text).split())
 
-    def all(self, tag: str) -> Iterator[dict[str, str | None]]:
+    def all(self, tag):
         return (attributes for name, attributes in self.elements if name == tag)
 
 
-def decoded(address: str | None) -> Image.Image:
+def decoded(address):
     found = re.fullmatch(r"data:image/(png|webp);base64,([\w+/=]+)", address or "")
     assert found
     image = Image.open(BytesIO(base64.b64decode(found[2], validate=True)))
@@ -95,18 +89,18 @@ def decoded(address: str | None) -> Image.Image:
     return image
 
 
-def images(seed: int = 0, height: int = 24, width: int = 32) -> Any:
+def images(seed=0, height=24, width=32):
     """A photo, its rendering, and that without the head."""
     return torch.rand(3, height, width, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def shown(run: Measured, *, name: str = "", **options: Any) -> ShownRun:
+def shown(run, *, name="", **options):
     bases = run.base.views if run.has_head else [None] * len(run.full.views)
     pairs = enumerate(zip(run.full.views, bases, strict=True))
     return ShownRun(run, [shown_view(i, f"{i}{name}", *images(i), *pair) for i, pair in pairs], **options)
 
 
-def page_of(*runs: ShownRun, notes: tuple[str, ...] = ()) -> str:
+def page_of(*runs, notes=()):
     return report_page(runs, notes, "sundae report x")
 
 
@@ -114,7 +108,7 @@ def page_of(*runs: ShownRun, notes: tuple[str, ...] = ()) -> str:
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 23, 24, 25, 300, 1000])
-def test_the_worst_and_the_best_view_are_among_those_that_are_shown(count: int) -> None:
+def test_the_worst_and_the_best_view_are_among_those_that_are_shown(count):
     random = np.random.default_rng(count)
     for _ in range(20):
         qualities = random.uniform(10, 40, count).tolist()
@@ -125,7 +119,7 @@ def test_the_worst_and_the_best_view_are_among_those_that_are_shown(count: int) 
             assert {int(np.argmin(qualities)), int(np.argmax(qualities))} <= set(chosen)
 
 
-def test_other_views_are_evenly_spaced() -> None:
+def test_other_views_are_evenly_spaced():
     qualities = [25.0] * 300
     qualities[107], qualities[206] = 10.0, 40.0  # not among the evenly spaced ones
     chosen = [index for index in choose_cameras(qualities, 24) if index not in (107, 206)]
@@ -135,7 +129,7 @@ def test_other_views_are_evenly_spaced() -> None:
     assert choose_cameras(qualities, 2) == [31, 206]
 
 
-def test_a_page_of_many_runs_shows_fewer_views_of_each() -> None:
+def test_a_page_of_many_runs_shows_fewer_views_of_each():
     assert cameras_for_each(1) == MOST_VIEWS
     assert all(runs * cameras_for_each(runs) <= MOST_ON_A_PAGE for runs in range(1, MOST_ON_A_PAGE // 2 + 1))
     assert cameras_for_each(1000) == 2
@@ -144,14 +138,14 @@ def test_a_page_of_many_runs_shows_fewer_views_of_each() -> None:
 # ------------------------------------------------------------------------------------------------------- the error map
 
 
-def test_the_error_map_of_equal_images_has_one_color() -> None:
+def test_the_error_map_of_equal_images_has_one_color():
     image = torch.rand(9, 12, 3)
     found = error_map(image, image.clone())
     assert found.size == (12, 9)
     assert np.array_equal(np.unique(np.asarray(found.convert("RGB")).reshape(-1, 3), axis=0), ERROR_COLORS[:1])
 
 
-def test_errors_have_their_place_among_the_colors() -> None:
+def test_errors_have_their_place_among_the_colors():
     photo = torch.zeros(1, 4, 3)
     levels = torch.tensor([0.0, LARGEST_ERROR / 2, LARGEST_ERROR, 255]) / 255
     found = np.asarray(error_map(levels[None, :, None].expand(1, 4, 3), photo).convert("RGB"))[0]
@@ -166,14 +160,14 @@ def test_errors_have_their_place_among_the_colors() -> None:
     assert np.array_equal(error_map(one, photo), error_map(photo, three))
 
 
-def test_a_smaller_error_map_has_the_mean_of_its_pixels() -> None:
+def test_a_smaller_error_map_has_the_mean_of_its_pixels():
     photo, rendering = torch.zeros(2, 8, 16, 3)
     rendering[:, ::2] = LARGEST_ERROR / 255
     half = torch.full((4, 8, 3), LARGEST_ERROR / 255 / 2)
     assert np.array_equal(error_map(rendering, photo, (8, 4)), error_map(half, torch.zeros(4, 8, 3)))
 
 
-def test_an_error_map_needs_two_images_of_one_size() -> None:
+def test_an_error_map_needs_two_images_of_one_size():
     for shape in ((8, 9, 3), (8, 8, 1), (8, 8)):
         with pytest.raises(DataError, match="give two of one size"):
             error_map(torch.zeros(shape), torch.zeros(8, 8, shape[-1]))
@@ -182,17 +176,13 @@ def test_an_error_map_needs_two_images_of_one_size() -> None:
 # ------------------------------------------------------------------------------------------------------------ one view
 
 
-def camera_of(
-    measured: Callable[..., Measured], height: int, width: int, *, head: bool = True
-) -> tuple[ShownView, Any]:
+def camera_of(measured, height, width, *, head=True):
     run, photos = measured(), images(0, height, width)
     return shown_view(3, "a.png", *photos, run.full.views[0], run.base.views[0] if head else None), photos
 
 
 @pytest.mark.parametrize(("size", "expected"), [((24, 32), (32, 24)), ((700, 2400), (LONGEST_SIDE, 350))])
-def test_images_of_a_view_have_one_size(
-    measured: Callable[..., Measured], size: tuple[int, int], expected: tuple[int, int]
-) -> None:
+def test_images_of_a_view_have_one_size(measured, size, expected):
     view, _ = camera_of(measured, *size)
     assert (view.index, view.name, view.size, view.shown) == (3, "a.png", size[::-1], expected)
     assert list(view.images) == ["rendering", "head off", "error map"]
@@ -202,7 +192,7 @@ def test_images_of_a_view_have_one_size(
 
 
 @pytest.mark.parametrize(("width", "exact"), [(EXACT_SIDE, True), (EXACT_SIDE + 2, False)])
-def test_small_images_lose_nothing(measured: Callable[..., Measured], width: int, exact: bool) -> None:
+def test_small_images_lose_nothing(measured, width, exact):
     view, (photo, rendering, bare) = camera_of(measured, 24, width)
     addresses = (view.photo, view.images["rendering"], view.images["head off"])
     for address, image in zip(addresses, (photo, rendering, bare), strict=True):
@@ -211,7 +201,7 @@ def test_small_images_lose_nothing(measured: Callable[..., Measured], width: int
     assert np.array_equal(decoded(view.images["error map"]).convert("RGB"), errors)
 
 
-def test_a_rendering_that_is_not_finite_is_shown(measured: Callable[..., Measured]) -> None:
+def test_a_rendering_that_is_not_finite_is_shown(measured):
     broken = torch.full((16, 16, 3), math.nan)
     view = shown_view(0, "a", torch.ones(16, 16, 3), broken, broken, measured().full.views[0], None)
     assert np.asarray(decoded(view.images["rendering"])).max() == 0
@@ -222,7 +212,7 @@ def test_a_rendering_that_is_not_finite_is_shown(measured: Callable[..., Measure
 # ------------------------------------------------------------------------------------------------------------ the page
 
 
-def outside(text: str) -> list[str]:
+def outside(text):
     """Addresses in a page that are not in it."""
     plain = re.sub(r"data:[\w/+]+;base64,[\w+/=]+", "", text)
     named = r"\b(?:https?|ftp|file|wss?):|@import|url\((?!#)|<(?:link|iframe|object|base)\b"
@@ -230,7 +220,7 @@ def outside(text: str) -> list[str]:
     return re.findall(named, plain, re.IGNORECASE)
 
 
-def test_it_asks_nobody_for_anything(measured: Callable[..., Measured]) -> None:
+def test_it_asks_nobody_for_anything(measured):
     text = page_of(shown(measured(), curve=CURVE), shown(measured("b", head=False)))
     assert outside(text) == []
     for wrong in ('<img src="a.png">', "fetch('https://a')", "url(a.png)", "<link>"):
@@ -242,7 +232,7 @@ def test_it_asks_nobody_for_anything(measured: Callable[..., Measured]) -> None:
     assert re.fullmatch(r"'sha256-[\w+/=]+'", rules["script-src"])
 
 
-def test_every_image_decodes(measured: Callable[..., Measured]) -> None:
+def test_every_image_decodes(measured):
     page = Page(page_of(shown(measured()), shown(measured("b", head=False))))
     drawn = [image for image in page.all("img") if "width" in image]
     # Photo, rendering, rendering without the head and error map; photo, rendering and error map.
@@ -253,7 +243,7 @@ def test_every_image_decodes(measured: Callable[..., Measured]) -> None:
     assert all(image["alt"] for image in page.all("img"))
 
 
-def test_its_figures_are_those_of_the_report(measured: Callable[..., Measured]) -> None:
+def test_its_figures_are_those_of_the_report(measured):
     run = measured()
     page = Page(page_of(shown(run)))
     for row in rows_of([run]):
@@ -268,7 +258,7 @@ def test_its_figures_are_those_of_the_report(measured: Callable[..., Measured]) 
     assert "All 3 test views" in page.words
 
 
-def test_hostile_names_stay_text(measured: Callable[..., Measured]) -> None:
+def test_hostile_names_stay_text(measured):
     run = replace(measured(HOSTILE, scene=HOSTILE), source=HOSTILE, method=HOSTILE, variant=HOSTILE)
     text = page_of(shown(run, name=HOSTILE, curve=CURVE), notes=(HOSTILE,))
     hostile = Page(text)
@@ -280,7 +270,7 @@ def test_hostile_names_stay_text(measured: Callable[..., Measured]) -> None:
     assert any(f"0{HOSTILE}" == card["data-name"] for card in hostile.all("article"))
 
 
-def test_names_of_elements_are_unique(measured: Callable[..., Measured]) -> None:
+def test_names_of_elements_are_unique(measured):
     page = Page(page_of(shown(measured(), curve=CURVE), shown(measured("b"), curve=CURVE)))
     names = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
     assert len(names) == len(set(names))
@@ -290,7 +280,7 @@ def test_names_of_elements_are_unique(measured: Callable[..., Measured]) -> None
     assert set(wanted) <= set(names)
 
 
-def test_the_curve_marks_the_choice(measured: Callable[..., Measured]) -> None:
+def test_the_curve_marks_the_choice(measured):
     page = Page(page_of(shown(measured(), curve=CURVE)))
     assert "Chosen: 3,000 of 9,000 Gaussians" in page.words
     (plot,) = [image for image in page.all("img") if (image["src"] or "").startswith("data:image/svg+xml;base64,")]
@@ -301,7 +291,7 @@ def test_the_curve_marks_the_choice(measured: Callable[..., Measured]) -> None:
     assert "svg+xml" not in page_of(shown(measured()))
 
 
-def test_views_of_other_runs_stand_beside_those_of_the_same_capture(measured: Callable[..., Measured]) -> None:
+def test_views_of_other_runs_stand_beside_those_of_the_same_capture(measured):
     page = Page(
         page_of(
             shown(measured("a"), capture="x"),
@@ -319,7 +309,7 @@ def test_views_of_other_runs_stand_beside_those_of_the_same_capture(measured: Ca
 
 
 @pytest.fixture
-def opened(measured: Callable[..., Measured], tmp_path: Path) -> Iterator[Any]:
+def opened(measured, tmp_path):
     runs = [shown(measured("a"), curve=CURVE, capture="x", name=HOSTILE), shown(measured(HOSTILE, head=False))]
     runs.append(shown(measured("c"), capture="x", name=HOSTILE))
     (tmp_path / "report.html").write_text(page_of(*runs), encoding="utf-8")
@@ -332,12 +322,12 @@ def opened(measured: Callable[..., Measured], tmp_path: Path) -> Iterator[Any]:
         assert page.errors == []
 
 
-def of_first(page: Any, body: str) -> Any:
+def of_first(page, body):
     """A value that a script finds in the first view of the page."""
     return page.evaluate(f"(() => {{ const card = document.querySelector('.view'); return {body}; }})()")
 
 
-def place(page: Any) -> tuple[float, float, float, float]:
+def place(page):
     """Left, top, width and height of the first view's image in the window, in pixels."""
     found = "[r.x, r.y, r.width, r.height]"
     stage = "card.querySelector('.stage')"
@@ -350,7 +340,7 @@ CLIP = "getComputedStyle(card.querySelector('.over:not([hidden])')).clipPath"
 
 @pytest.mark.browser
 @needs_chromium
-def test_keys_and_pointer_move_the_slider(opened: Any) -> None:
+def test_keys_and_pointer_move_the_slider(opened):
     assert of_first(opened, CLIP) == "inset(0px 0px 0px 50%)"
     of_first(opened, "card.querySelector('input[type=range]').focus()")
     for _ in range(3):
@@ -370,7 +360,7 @@ def test_keys_and_pointer_move_the_slider(opened: Any) -> None:
 
 @pytest.mark.browser
 @needs_chromium
-def test_a_finger_moves_the_slider_or_scrolls_the_page(opened: Any) -> None:
+def test_a_finger_moves_the_slider_or_scrolls_the_page(opened):
     x, y, width, height = place(opened)
     value, scrolled = "card.querySelector('input[type=range]').value", "window.scrollY"
     middle = round(y + height / 2)
@@ -384,7 +374,7 @@ def test_a_finger_moves_the_slider_or_scrolls_the_page(opened: Any) -> None:
 
 @pytest.mark.browser
 @needs_chromium
-def test_layers_order_and_the_other_run(opened: Any) -> None:
+def test_layers_order_and_the_other_run(opened):
     drawn = "[...card.querySelectorAll('.over:not([hidden])')].map(e => e.dataset.layer).join()"
     assert of_first(opened, drawn) == "rendering"
     of_first(opened, "card.querySelector('input[value=\"error map\"]').click()")

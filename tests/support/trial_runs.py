@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Mapping
 from copy import deepcopy
+from functools import reduce
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -27,30 +29,29 @@ def tiny_scene(folder: Path, cameras: int) -> Path:
     )
 
 
+def set_options(config: Any, options: Mapping[str, Any]) -> None:
+    """Set options of a config by their dotted names."""
+    for name, value in options.items():
+        *owners, last = name.split(".")
+        setattr(reduce(getattr, owners, config), last, value)
+
+
 def tiny_run(
-    scene: Path,
-    out: Path,
-    *,
-    name: str = "run",
-    save_every: int = 1000,
-    start_at: int | None = None,
-    change: Callable[[Any], object] = lambda config: None,
-    **options: Any,
+    scene: Path, out: Path, *, name: str = "run", model: Mapping[str, Any] = MappingProxyType({}), **options: Any
 ) -> Trainer:
+    """A trainer of the default method; options, and those of the model, by their dotted names."""
     config = deepcopy(sundae.config)
     config.data = config.pipeline.datamanager.data = scene
     config.output_dir, config.experiment_name, config.timestamp = out, name, "now"
-    config.max_num_iterations, config.steps_per_save, config.save_only_latest_checkpoint = STEPS, save_every, False
+    config.max_num_iterations, config.steps_per_save, config.save_only_latest_checkpoint = STEPS, 1000, False
     config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
     config.vis, config.viewer.quit_on_train_completion = "tensorboard", True
-    model = config.pipeline.model
-    model.num_downscales, model.sh_degree, model.sh_degree_interval, model.warmup_length = 0, 1, 5, 10**9
-    model.pruning.prune_at, model.evaluate_prune = PRUNE_AT, False
-    model.head.size, model.head.pixel_unshuffle, model.head.num_features = "tiny", 1, 5
-    model.head.start_at = start_at
-    for option, value in options.items():
-        setattr(config, option, value)
-    change(config)
+    short = {"num_downscales": 0, "sh_degree": 1, "sh_degree_interval": 5, "warmup_length": 10**9}
+    small = {"head.size": "tiny", "head.pixel_unshuffle": 1, "head.num_features": 5}
+    set_options(
+        config.pipeline.model, {**short, **small, "pruning.prune_at": PRUNE_AT, "evaluate_prune": False, **model}
+    )
+    set_options(config, options)
     torch.manual_seed(7)
     config.save_config()
     made: Trainer = config.setup(local_rank=0, world_size=1)
