@@ -1,9 +1,7 @@
-"""One tiny run for all tests of this folder, made by the commands that users type."""
+"""One tiny run for all tests of this folder, made by the command that users type."""
 
 import io
 import os
-import shutil
-import subprocess
 import sys
 import urllib.request
 from contextlib import redirect_stdout
@@ -13,8 +11,8 @@ from typing import NamedTuple
 
 import pytest
 import yaml
-from nerfstudio.utils import profiler, writer
 from short_prunes import short_prunes  # noqa: F401
+from trial_runs import set_options, tidy
 
 from harness.still_life import write_still_life
 
@@ -26,12 +24,12 @@ class TinyRun(NamedTuple):
     folder: Path
     output: str
     """What ns-train printed."""
-    points: int
+    points: int = 300
     """Size of the sparse cloud."""
-    prune_at: int
-    save_every: int
-    steps: int
-    keep_ratio: float
+    prune_at: int = 45
+    save_every: int = 30
+    steps: int = 120
+    keep_ratio: float = 0.5
 
     @property
     def config(self):
@@ -46,53 +44,23 @@ class TinyRun(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def environment(tmp_path_factory):
-    """Variables for the installed commands: where they lie, a wide terminal, and no network."""
-    folder = tmp_path_factory.mktemp("bin")
-    ffmpeg = folder / "ffmpeg"
+def call_here(tmp_path_factory):
+    """Run an installed command in this process, which has imported nerfstudio, out of reach of any network.
+
+    Returns what it printed.
+    """
+    ffmpeg = tmp_path_factory.mktemp("bin") / "ffmpeg"
     ffmpeg.write_text("#!/bin/sh\nexit 1\n")
     ffmpeg.chmod(0o755)
-    commands = Path(sys.executable).parent
     # ns-render asks for ffmpeg even where it writes images only; one that is installed comes first.
-    path = os.pathsep.join([str(commands), os.environ.get("PATH", ""), str(folder)])
-    nowhere = "http://127.0.0.1:9"
-    return {"PATH": path, "COLUMNS": "250", "https_proxy": nowhere, "http_proxy": nowhere}
-
-
-@pytest.fixture(scope="session")
-def call(environment):
-    """Run an installed command in a fresh process, out of reach of any network; its output is in the error, if any."""
-
-    def run(*arguments):
-        words = [str(word) for word in arguments]
-        # Beside the interpreter, or where a package was put that the interpreter only knows of.
-        command = shutil.which(words[0], path=environment["PATH"])
-        assert command is not None, f"{words[0]} is not installed"
-        result = subprocess.run(
-            [command, *words[1:]],
-            capture_output=True,
-            text=True,
-            env={**os.environ, **environment},
-            stdin=subprocess.DEVNULL,
-            check=False,
-        )
-        if result.returncode != 0:
-            pytest.fail(f"{' '.join(words)}\nexit code {result.returncode}\n{result.stdout}\n{result.stderr}")
-        return result
-
-    return run
-
-
-@pytest.fixture(scope="session")
-def call_here(environment):
-    """Run an installed command in this process, which has imported nerfstudio; returns what it printed."""
+    path, nowhere = os.pathsep.join([os.environ.get("PATH", ""), str(ffmpeg.parent)]), "http://127.0.0.1:9"
 
     def run(*arguments):
         words = [str(word) for word in arguments]
         (command,) = entry_points(group="console_scripts", name=words[0])
         with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out:
             patch.setattr(sys, "argv", words)
-            for name, value in environment.items():
+            for name, value in {"PATH": path, "https_proxy": nowhere, "http_proxy": nowhere}.items():
                 patch.setenv(name, value)
             try:
                 command.load()()
@@ -105,38 +73,38 @@ def call_here(environment):
 
 
 @pytest.fixture(scope="session")
-def tiny(call, once):
-    points, prune_at, save_every, steps, keep_ratio = 300, 45, 30, 120, 0.5
+def tiny(call_here, once):
+    known = TinyRun(Path(), Path(), "")
 
     def train(root):
-        write_still_life(root / "scene", train_views=12, test_views=3, width=48, height=48, points=points)
+        scene = write_still_life(root / "scene", train_views=12, test_views=3, width=48, height=48, points=known.points)
         options = {
-            "data": root / "scene",
+            "data": scene,
             "output-dir": root / "outputs",
             "experiment-name": "tiny",
             "timestamp": "now",
-            "max-num-iterations": steps,
-            "steps-per-save": save_every,
+            "max-num-iterations": known.steps,
+            "steps-per-save": known.save_every,
             "save-only-latest-checkpoint": False,
             "steps-per-eval-image": 50,
             "vis": "tensorboard",
             "viewer.quit-on-train-completion": True,
             "logging.steps-per-log": 5,
-            "pipeline.model.pruning.prune-at": prune_at,
-            "pipeline.model.pruning.keep-ratio": keep_ratio,
+            "pipeline.model.pruning.prune-at": known.prune_at,
+            "pipeline.model.pruning.keep-ratio": known.keep_ratio,
             # One round of densification, at step 30.
             "pipeline.model.warmup-length": 20,
             "pipeline.model.refine-every": 15,
             "pipeline.model.densify-grad-thresh": 0.0004,
             "pipeline.model.sh-degree-interval": 20,
         }
-        arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
-        (root / "output.txt").write_text(call("ns-train", "sundae-tiny", *arguments).stdout)
+        words = [word for name, value in options.items() for word in (f"--{name}", value)]
+        (root / "output.txt").write_text(call_here("ns-train", "sundae-tiny", *words))
+        tidy()
 
     root = once("tiny", train)
     folder = root / "outputs" / "tiny" / "sundae-tiny" / "now"
-    output = (root / "output.txt").read_text()
-    return TinyRun(root / "scene", folder, output, points, prune_at, save_every, steps, keep_ratio)
+    return TinyRun(root / "scene", folder, (root / "output.txt").read_text())
 
 
 @pytest.fixture(scope="session")
@@ -159,22 +127,25 @@ def _no_network(monkeypatch):
 
 @pytest.fixture
 def trainer_of(tiny, tmp_path):
-    """Set up nerfstudio's trainer in this process with the tiny run's configuration, changed by a function."""
+    """Set up nerfstudio's trainer in this process with the configuration of the tiny run; options, and those of the
+    model, by their dotted names."""
 
-    def make(change):
+    def make(model=(), **options):
         config = yaml.load(tiny.config.read_text(), Loader=yaml.Loader)
-        config.output_dir = tmp_path
-        config.steps_per_save = 10000
-        config.steps_per_eval_image = 10000
-        config.pipeline.model.evaluate_prune = False
-        change(config)
+        rare = {"output_dir": tmp_path, "steps_per_save": 10000, "steps_per_eval_image": 10000}
+        set_options(config, {**rare, **options})
+        set_options(config.pipeline.model, {"evaluate_prune": False, **dict(model)})
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         return trainer
 
     yield make
-    # nerfstudio keeps its loggers in globals.
-    writer.EVENT_WRITERS.clear()
-    writer.EVENT_STORAGE.clear()
-    writer.GLOBAL_BUFFER.clear()
-    profiler.PROFILER.clear()
+    tidy()
+
+
+@pytest.fixture
+def resumed(trainer_of):
+    """Resume a run, of the checkpoints in a folder, after a step and for some steps."""
+    return lambda folder, step, steps, **options: trainer_of(
+        load_dir=folder, load_step=step, max_num_iterations=steps, **options
+    )

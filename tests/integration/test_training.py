@@ -1,11 +1,14 @@
-"""Train, prune, save, resume: the tiny run, and runs that resume it."""
+"""Train, prune, save, resume, start warm: the tiny run, and runs that resume it."""
 
 import gc
 import json
 import re
+import shutil
 import signal
+import sys
 import tracemalloc
 
+import kill_and_resume
 import pytest
 import torch
 import yaml
@@ -16,12 +19,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import Tensor
 from trial_runs import served_views
 
-from sundae_ns.core.errors import CheckpointError, MemoryExhaustedError
+from sundae_ns.core.errors import BackendError, CheckpointError, DataError, MemoryExhaustedError
 from sundae_ns.core.gaussians import SPLAT_NAMES
+from sundae_ns.io import checkpoint
 from sundae_ns.io.ply import MODEL_FRAME, write_ply
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.plugin.datamanager import SundaeDatamanager
 from sundae_ns.plugin.model import SundaeModel
+from sundae_ns.train import initialize
+from sundae_ns.train.graphed_step import RecordedStep
 
 
 def load(path):
@@ -34,29 +40,23 @@ def gaussians(state):
     return {name[len(prefix) :]: value for name, value in state["pipeline"].items() if name.startswith(prefix)}
 
 
+@pytest.fixture(scope="module")
 def report(tiny):
     (only,) = json.loads((tiny.folder / "prune.json").read_text())
     return only
 
 
-@pytest.fixture(scope="module")
-def scalars(tiny):
-    events = EventAccumulator(str(tiny.folder), size_guidance={"scalars": 0}).Reload()
-    return {tag: {e.step: e.value for e in events.Scalars(tag)} for tag in events.Tags()["scalars"]}
-
-
-def test_prune_keeps_exactly_the_share(tiny):
-    found = report(tiny)
-    assert found["step"] == tiny.prune_at
-    assert found["before"] > tiny.points, "densification added nothing"
-    assert found["after"] == round(tiny.keep_ratio * found["before"])
-    assert found["peak"] >= found["before"]  # densification also drops some
-    assert found["seconds"] > 0
-    assert found["sigma"] > 0
+def test_prune_keeps_exactly_the_share(tiny, report):
+    assert report["step"] == tiny.prune_at
+    assert report["before"] > tiny.points, "densification added nothing"
+    assert report["after"] == round(tiny.keep_ratio * report["before"])
+    assert report["peak"] >= report["before"]  # densification also drops some
+    assert report["seconds"] > 0
+    assert report["sigma"] > 0
     counts = {step: len(gaussians(load(tiny.checkpoint(step)))["means"]) for step in (30, 60, 90, 119)}
-    assert found["before"] <= counts.pop(30) <= found["peak"]
-    assert counts == {60: found["after"], 90: found["after"], 119: found["after"]}
-    assert f"kept {found['after']:,} of {found['before']:,} Gaussians" in " ".join(tiny.output.split())
+    assert report["before"] <= counts.pop(30) <= report["peak"]
+    assert counts == {60: report["after"], 90: report["after"], 119: report["after"]}
+    assert f"kept {report['after']:,} of {report['before']:,} Gaussians" in " ".join(tiny.output.split())
 
 
 def test_the_schedule_follows_the_number_of_steps(tiny):
@@ -71,33 +71,34 @@ def test_the_schedule_follows_the_number_of_steps(tiny):
     assert re.search(rf"prune .* after {tiny.prune_at}", tiny.output)
 
 
-def test_a_finished_training_says_what_it_made(tiny):
+def test_a_finished_training_says_what_it_made(tiny, report):
     """Quality, size and the next command."""
-    n = report(tiny)["after"]
     found = re.search(r"trained: PSNR (\d+\.\d\d) dB, SSIM 0\.\d{4} on 3 test views\n(.*)\nnext: (.*)\n", tiny.output)
-    assert found is not None, tiny.output
     assert 5 < float(found[1]) < 60
-    assert re.fullmatch(rf"{n:,} Gaussians, with a head: 0\.\d\d MB before packing", found[2])
+    assert re.fullmatch(rf"{report['after']:,} Gaussians, with a head: 0\.\d\d MB before packing", found[2])
     assert found[3] == f"sundae pack {tiny.folder} -o scene.sundae"
 
 
-def test_prune_costs_quality_and_training_brings_it_back(tiny):
-    found = report(tiny)
-    assert found["pruned"]["psnr"] < found["warm_up"]["psnr"]
-    _, pipeline, _, _ = eval_setup(tiny.config, test_mode="test")
+def test_a_finished_run_is_opened_and_its_training_has_made_up_for_the_prune(tiny, report):
+    assert report["pruned"]["psnr"] < report["warm_up"]["psnr"]
+    config, pipeline, _, step = eval_setup(tiny.config, test_mode="test")
+    assert step == tiny.steps - 1
+    assert isinstance(pipeline.model, SundaeModel)
+    assert config.pipeline.model.pruning.prune_at == tiny.prune_at
     after = pipeline.get_average_eval_image_metrics()
-    assert after["psnr"] > found["pruned"]["psnr"] + 0.5
-    assert after["psnr_base"] > found["pruned"]["psnr"]
-    assert after["gaussian_count"] == found["after"]
+    assert after["psnr"] > report["pruned"]["psnr"] + 0.5
+    assert after["psnr_base"] > report["pruned"]["psnr"]
+    assert after["gaussian_count"] == report["after"]
 
 
-def test_tensorboard_has_counts_and_both_psnrs(scalars, tiny):
-    found = report(tiny)
+def test_tensorboard_has_counts_and_both_psnrs(tiny, report):
+    events = EventAccumulator(str(tiny.folder), size_guidance={"scalars": 0}).Reload()
+    scalars = {tag: {e.step: e.value for e in events.Scalars(tag)} for tag in events.Tags()["scalars"]}
     counts = scalars["Train Metrics Dict/gaussian_count"]
-    assert counts[tiny.prune_at] == found["before"]
-    assert counts[tiny.prune_at + 5] == found["after"]
-    assert scalars["Prune/before"] == {tiny.prune_at: found["before"]}
-    assert scalars["Prune/after"] == {tiny.prune_at: found["after"]}
+    assert counts[tiny.prune_at] == report["before"]
+    assert counts[tiny.prune_at + 5] == report["after"]
+    assert scalars["Prune/before"] == {tiny.prune_at: report["before"]}
+    assert scalars["Prune/after"] == {tiny.prune_at: report["after"]}
     for tag in ("Train Metrics Dict/psnr", "Train Metrics Dict/psnr_base"):
         assert len(scalars[tag]) == tiny.steps / 5
     evaluated = {tag: values for tag, values in scalars.items() if tag.startswith("Eval Images Metrics")}
@@ -105,18 +106,29 @@ def test_tensorboard_has_counts_and_both_psnrs(scalars, tiny):
         assert any(tag.endswith("/" + name) and set(values) == {50, 100} for tag, values in evaluated.items()), name
 
 
-def test_checkpoints_are_plain_and_hold_no_lpips(tiny):
-    for step in (30, 119):
-        state = load(tiny.checkpoint(step))
-        assert not [name for name in state["pipeline"] if "lpips" in name]
-        assert state["pipeline"]["_model._extra_state"]["step"] == step
-        for name, value in gaussians(state).items():
-            (moments,) = state["optimizers"][name]["state"].values()
-            # Features have no gradient, and so no moments, before the head is enabled.
-            assert (moments == {}) if (name, step) == ("features", 30) else moments["exp_avg"].shape == value.shape
-    for step, pruned_at in ((30, -1), (119, tiny.prune_at)):
-        extra = load(tiny.checkpoint(step))["pipeline"]["_model._extra_state"]
-        assert (extra["format"], extra["running"]["pruning"]["pruned_at"]) == (2, pruned_at)
+@pytest.mark.parametrize(("step", "pruned_at"), [(30, -1), (119, 45)])
+def test_checkpoints_are_plain_and_hold_no_lpips(tiny, step, pruned_at):
+    state = load(tiny.checkpoint(step))
+    extra = state["pipeline"]["_model._extra_state"]
+    assert not [name for name in state["pipeline"] if "lpips" in name]
+    assert (extra["format"], extra["step"], extra["running"]["pruning"]["pruned_at"]) == (2, step, pruned_at)
+    for name, value in gaussians(state).items():
+        (moments,) = state["optimizers"][name]["state"].values()
+        # Features have no gradient, and so no moments, before the head is enabled.
+        assert (moments == {}) if (name, step) == ("features", 30) else moments["exp_avg"].shape == value.shape
+
+
+def test_ns_train_names_bad_input(tiny, call_here, tmp_path):
+    """In one line: test_registration.py raises such an error in a process of its own."""
+    data = shutil.copytree(tiny.scene, tmp_path / "scene")
+    meta = json.loads((data / "transforms.json").read_text())
+    meta["frames"][3]["transform_matrix"][0][3] = float("nan")
+    (data / "transforms.json").write_text(json.dumps(meta))
+    with pytest.raises(DataError, match=r"^transforms\.json, frame 3 \(.*transform_matrix is nan; it must be finite"):
+        call_here("ns-train", "sundae-tiny", "--data", data, "--output-dir", tmp_path / "out", "--vis", "tensorboard")
+
+
+# ------------------------------------------------------------------------------------------------------------- resumed
 
 
 def assert_live(trainer):
@@ -127,84 +139,6 @@ def assert_live(trainer):
         assert held is value
         assert optimizers.parameters[name] == [value]
         assert optimizers.optimizers[name].state[value]["exp_avg"].shape == value.shape
-
-
-@pytest.mark.parametrize("start", [30, 60], ids=["before the prune", "after the prune"])
-def test_a_resumed_run_ends_like_one_that_never_stopped(tiny, trainer_of, start):
-    def change(config):
-        config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, start, tiny.save_every
-
-    trainer = trainer_of(change)
-    served = served_views(trainer)
-    before = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
-    trainer.train()
-
-    end = start + tiny.save_every
-    # The views that an uninterrupted run sees at these steps.
-    fresh = trainer.config.pipeline.datamanager.setup(device="cpu", test_mode="val")
-    assert served == [fresh.view_of_step(step) for step in range(start + 1, end + 1)]
-
-    model = trainer.pipeline.model
-    assert model.num_points == report(tiny)["after"]
-    assert model.state.pruning["num_prunes"] == 1
-    assert model.state.pruning["pruned_at"] == tiny.prune_at
-    # The record of a prune before the checkpoint comes from the folder of the run that is resumed.
-    records = [json.loads((folder / "prune.json").read_text()) for folder in (tiny.folder, trainer.base_dir)]
-    facts = [{name: record[name] for name in ("step", "before", "after", "peak")} for (record,) in records]
-    assert facts[0] == facts[1]
-    assert_live(trainer)
-    if start > tiny.prune_at:
-        assert all((value.detach() - before[name]).abs().max() > 0 for name, value in model.gauss_params.items())
-
-    assert_same(load(tiny.checkpoint(end)), load(trainer.checkpoint_dir / f"step-{end:09d}.ckpt"))
-
-
-def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(tiny, trainer_of, capsys):
-    def to_step_60(config):
-        config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 30, 30
-
-    trainer = trainer_of(to_step_60)
-    serve = trainer.pipeline.datamanager.next_train
-
-    def interrupted(step):
-        if step == 50:
-            signal.raise_signal(signal.SIGTERM)
-        return serve(step)
-
-    trainer.pipeline.datamanager.next_train = interrupted
-    handler = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(SystemExit) as end:
-        trainer.train()
-    assert end.value.code == 143
-    assert signal.getsignal(signal.SIGTERM) is handler
-    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000050.ckpt"]
-    last = capsys.readouterr().out.splitlines()[-1].split()
-    assert last[:2] == ["ns-train", "sundae-tiny"]
-    assert last[last.index("--load-dir") + 1] == str(trainer.checkpoint_dir)
-
-    def onwards(config):
-        config.load_dir, config.max_num_iterations = trainer.checkpoint_dir.parent, 10  # the run's folder
-
-    again = trainer_of(onwards)
-    assert writer.GLOBAL_BUFFER["max_iter"] == 61, "progress counts the steps before"
-    again.train()
-    assert_same(load(tiny.checkpoint(60)), load(again.checkpoint_dir / "step-000000060.ckpt"))
-
-
-def test_a_signal_before_the_first_step_saves_nothing(tiny, trainer_of, monkeypatch):
-    def stop(*_, **__):
-        # To this thread; os.kill may reach another one, and then the handler runs a little later.
-        signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(SundaeDatamanager, "create_train_dataset", stop)
-    # A shell starts background jobs with this signal ignored.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(SystemExit) as end:
-            trainer_of(lambda config: None)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert end.value.code == 130
 
 
 def assert_same(whole, resumed):
@@ -223,15 +157,83 @@ def assert_same(whole, resumed):
     assert torch.equal(whole["random"]["torch"], resumed["random"]["torch"])
 
 
-def test_memory_does_not_grow_past_the_prune(tiny, trainer_of):
-    steps, settled = 60, 20
+@pytest.mark.parametrize("start", [30, 60], ids=["before the prune", "after the prune"])
+def test_a_resumed_run_ends_like_one_that_never_stopped(tiny, report, resumed, start):
+    trainer = resumed(tiny.checkpoints, start, tiny.save_every)
+    served, model = served_views(trainer), trainer.pipeline.model
+    before = {name: value.detach().clone() for name, value in model.gauss_params.items()}
+    trainer.train()
 
-    def change(config):
-        config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 60, steps
-        config.pipeline.model.average_share = 1.0  # from the first step on
+    end = start + tiny.save_every
+    # The views that an uninterrupted run sees at these steps.
+    fresh = trainer.config.pipeline.datamanager.setup(device="cpu", test_mode="val")
+    assert served == [fresh.view_of_step(step) for step in range(start + 1, end + 1)]
+    assert model.num_points == report["after"]
+    assert (model.state.pruning["num_prunes"], model.state.pruning["pruned_at"]) == (1, tiny.prune_at)
+    # The record of a prune before the checkpoint comes from the folder of the run that is resumed.
+    (again,) = json.loads((trainer.base_dir / "prune.json").read_text())
+    assert all(again[name] == report[name] for name in ("step", "before", "after", "peak"))
+    assert_live(trainer)
+    if start > tiny.prune_at:
+        assert all((value.detach() - before[name]).abs().max() > 0 for name, value in model.gauss_params.items())
+    assert_same(load(tiny.checkpoint(end)), load(trainer.checkpoint_dir / f"step-{end:09d}.ckpt"))
 
-    trainer = trainer_of(change)
-    seen = []
+
+def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(tiny, resumed, capsys):
+    trainer = resumed(tiny.checkpoints, 30, 30)
+    serve = trainer.pipeline.datamanager.next_train
+
+    def interrupted(step):
+        if step == 50:
+            signal.raise_signal(signal.SIGTERM)
+        return serve(step)
+
+    trainer.pipeline.datamanager.next_train = interrupted
+    handler = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as end:
+        trainer.train()
+    assert end.value.code == 143
+    assert signal.getsignal(signal.SIGTERM) is handler
+    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000050.ckpt"]
+    last = capsys.readouterr().out.splitlines()[-1].split()
+    assert last[:2] == ["ns-train", "sundae-tiny"]
+    assert last[last.index("--load-dir") + 1] == str(trainer.checkpoint_dir)
+
+    again = resumed(trainer.checkpoint_dir.parent, None, 10)  # the run's folder
+    assert writer.GLOBAL_BUFFER["max_iter"] == 61, "progress counts the steps before"
+    again.train()
+    assert_same(load(tiny.checkpoint(60)), load(again.checkpoint_dir / "step-000000060.ckpt"))
+
+
+def test_a_signal_before_the_first_step_saves_nothing(trainer_of, monkeypatch):
+    def stop(*_, **__):
+        # To this thread; os.kill may reach another one, and then the handler runs a little later.
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(SundaeDatamanager, "create_train_dataset", stop)
+    # A shell starts background jobs with this signal ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(SystemExit) as end:
+            trainer_of()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert end.value.code == 130
+
+
+def test_killed_anywhere_it_goes_on_as_if_never_killed(monkeypatch, capsys):
+    """The short version of ``benchmarks/kill_and_resume.py``, which says where the kills fall."""
+    monkeypatch.setattr(sys, "argv", ["kill_and_resume.py", "--kinds", "training", "--kills", "2"])
+    with pytest.raises(SystemExit, match="0"):
+        kill_and_resume.main()
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["killed"] == found["one prune"] == found["the same result"] == found["nothing left lying"] == 2
+    assert found["same seed, same result"]
+
+
+def test_memory_does_not_grow_past_the_prune(tiny, resumed):
+    steps, settled, seen = 60, 20, []
+    trainer = resumed(tiny.checkpoints, 60, steps, model={"average_share": 1.0})  # from the first step on
     iterate = trainer.train_iteration
 
     def watched(step):
@@ -253,57 +255,68 @@ def test_memory_does_not_grow_past_the_prune(tiny, trainer_of):
     assert (after - before) / (steps - settled) < 2000
 
 
-def test_full_memory_in_the_backward_pass(tiny, trainer_of, monkeypatch):
-    def change(config):
-        config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 60, 5
-
+def test_full_memory_in_the_backward_pass(tiny, resumed, monkeypatch):
     def full(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 300.00 MiB.")
 
-    trainer = trainer_of(change)
+    trainer = resumed(tiny.checkpoints, 60, 5)
     monkeypatch.setattr(Tensor, "backward", full)
     count = trainer.pipeline.model.num_points
     with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} Gaussians"):
         trainer.train()
 
 
-def warm(trainer_of, path):
-    """The field as it was read, and the trainer after three steps."""
-
-    def change(config):
-        config.pipeline.model.warm_start, config.max_num_iterations = path, 3
-
-    trainer = trainer_of(change)
-    start = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
-    trainer.train()
-    return start, trainer
+def saved(folder, tiny, change):
+    """A checkpoint of the tiny run from before the prune, changed by a function."""
+    state = load(tiny.checkpoint(30))
+    change(state["pipeline"])
+    torch.save(state, folder / "step-000000030.ckpt")
+    return folder
 
 
-def check_warm(tiny, params, start, trainer):
+def test_a_splatfacto_checkpoint_is_refused(tiny, trainer_of, tmp_path):
+    def strip(pipeline):
+        for name in [name for name in pipeline if not name.startswith("_model.gauss_params.") or "features" in name]:
+            del pipeline[name]
+
+    with pytest.raises(ValueError, match="warm-start"):
+        trainer_of(load_checkpoint=saved(tmp_path, tiny, strip) / "step-000000030.ckpt")
+
+
+@pytest.mark.parametrize("option", ["load_dir", "pipeline.model.warm_start"])
+def test_a_checkpoint_of_format_1_is_refused_in_one_line(tiny, trainer_of, tmp_path, option):
+    extra = {"method": "sundae", "format": 1, "step": 30, "num_features": 5}
+    folder = saved(tmp_path, tiny, lambda pipeline: pipeline.update({"_model._extra_state": extra}))
+    with pytest.raises(CheckpointError, match=r"^.*format 1, this version reads 2; use the version that wrote.*$"):
+        trainer_of(**{option: folder})
+
+
+# ---------------------------------------------------------------------------------------------------------- warm starts
+
+
+def check_warm(tiny, trainer_of, params, path):
+    trainer = trainer_of(model={"warm_start": path}, max_num_iterations=3)
+    model = trainer.pipeline.model
     for name in SPLAT_NAMES:
-        assert torch.equal(start[name].cpu(), params[name]), name
+        assert torch.equal(model.gauss_params[name].cpu(), params[name]), name
+    trainer.train()
     (found,) = json.loads((trainer.base_dir / "prune.json").read_text())
     kept = round(tiny.keep_ratio * found["before"])  # the last refinement may drop some before
     assert 0.95 * len(params["means"]) < found["before"] <= len(params["means"])
-    assert found["after"] == kept
-    assert trainer.pipeline.model.num_points == kept
-    assert trainer.pipeline.model.state.pruning["num_prunes"] == 1
-    assert trainer.pipeline.model.state.head_enabled
+    assert found["after"] == model.num_points == kept
+    assert model.state.pruning["num_prunes"] == 1
+    assert model.state.head_enabled
     assert_live(trainer)
     assert load(trainer.checkpoint_dir / "step-000000002.ckpt")["step"] == 2
 
 
 @pytest.mark.parametrize("source", ["checkpoint", "ply", "exported"])
 def test_warm_start(tiny, trainer_of, tmp_path, source, request):
-    params = gaussians(load(tiny.checkpoint(119)))
-    params = {name: value for name, value in params.items() if name in SPLAT_NAMES}
-    path = tiny.checkpoints
-    if source == "exported":
-        path = request.getfixturevalue("exported")
-    elif source == "ply":
-        path = tmp_path / "a.ply"
+    params = {name: value for name, value in gaussians(load(tiny.checkpoint(119))).items() if name in SPLAT_NAMES}
+    path = {"checkpoint": tiny.checkpoints, "ply": tmp_path / "a.ply"}.get(source)
+    if source == "ply":
         write_ply(path, params, comments=[MODEL_FRAME])
-    check_warm(tiny, params, *warm(trainer_of, path))
+    check_warm(tiny, trainer_of, params, path or request.getfixturevalue("exported"))
 
 
 def test_warm_start_from_a_stock_checkpoint(tiny, trainer_of, tmp_path):
@@ -318,43 +331,183 @@ def test_warm_start_from_a_stock_checkpoint(tiny, trainer_of, tmp_path):
     torch.save({"step": 29999, "pipeline": pipeline, "schedulers": {"means": scheduler.state_dict()}}, path)
     with pytest.raises(Exception, match="[Ww]eights.only"):
         load(path)
-    check_warm(tiny, params, *warm(trainer_of, path))
+    check_warm(tiny, trainer_of, params, path)
 
 
-def test_a_splatfacto_checkpoint_is_refused(tiny, trainer_of, tmp_path):
-    state = load(tiny.checkpoint(30))
-    stock = [name for name in state["pipeline"] if name.startswith("_model.gauss_params.") and "features" not in name]
-    state["pipeline"] = {name: state["pipeline"][name] for name in stock}
-    torch.save(state, tmp_path / "step-000000030.ckpt")
-
-    def change(config):
-        config.load_checkpoint = tmp_path / "step-000000030.ckpt"
-
-    with pytest.raises(ValueError, match="warm-start"):
-        trainer_of(change)
-
-
-def test_a_checkpoint_of_format_1_is_refused_in_one_line(tiny, trainer_of, tmp_path):
-    state = load(tiny.checkpoint(30))
-    state["pipeline"]["_model._extra_state"] = {"method": "sundae", "format": 1, "step": 30, "num_features": 5}
-    torch.save(state, tmp_path / "step-000000030.ckpt")
-
-    def resume(config):
-        config.load_dir = tmp_path
-
-    def start_warm(config):
-        config.pipeline.model.warm_start = tmp_path
-
-    for change in (resume, start_warm):
-        with pytest.raises(
-            CheckpointError, match="format 1, this version reads 2; use the version that wrote"
-        ) as raised:
-            trainer_of(change)
-        assert "\n" not in str(raised.value)
+def test_few_views_start_from_more_points_and_resume_without_looking_for_them_again(
+    tiny, trainer_of, resumed, capsys, monkeypatch
+):
+    monkeypatch.setitem(initialize.SIDES, "cpu", 48)
+    monkeypatch.setitem(initialize.FILLED, "cpu", 800)
+    options = {"model": {"dense_start_views": 12}, "steps_per_save": 5, "save_only_latest_checkpoint": False}
+    whole = trainer_of(max_num_iterations=10, **options)
+    whole.train()
+    assert whole.model.num_points == tiny.points + 500
+    assert "500 points by a plane sweep beside 300 sparse ones" in " ".join(capsys.readouterr().out.split())
+    monkeypatch.setattr(initialize, "Sweep", None)
+    again = resumed(whole.checkpoint_dir, 5, 4, timestamp="resumed", **options)
+    again.train()
+    for name, value in whole.model.gauss_params.items():
+        assert torch.equal(again.model.gauss_params[name], value), name
 
 
-def test_saved_config_is_read_back_the_same(tiny):
-    config, pipeline, _, step = eval_setup(tiny.config, test_mode="inference")
-    assert step == tiny.steps - 1
-    assert isinstance(pipeline.model, SundaeModel)
-    assert config.pipeline.model.pruning.prune_at == tiny.prune_at
+# ------------------------------------------------------------------------------------------------------- recorded steps
+
+
+class Failing(RecordedStep):
+    """Fails at its tenth step, as a GPU does whose memory does not suffice."""
+
+    steps = 0
+
+    def _step(self, *arguments):
+        self.steps += 1
+        if self.steps == 10:
+            raise BackendError("no memory for a recording\nand a long story")
+        return super()._step(*arguments)
+
+
+def recorded(trainer_of, seed, steps=None):
+    """A run of the tiny scene through growth, prune and trials of the head; by recorded steps, kernel by kernel."""
+    torch.manual_seed(seed)
+    # A failed step draws a random background twice.
+    trainer = trainer_of(steps_per_save=40, save_only_latest_checkpoint=False, model={"background_color": "black"})
+    if steps is not None:
+        trainer._recorded = steps(trainer.model.losses, record=False)
+    trainer.train()
+    return trainer
+
+
+def difference(one, other):
+    """Largest difference of the quartiles of any parameter; infinite if numbers of Gaussians differ by over 2%."""
+    if one.num_points != pytest.approx(other.num_points, rel=0.02):
+        return float("inf")
+    shares = torch.tensor([0.25, 0.5, 0.75])
+    names = ("means", "scales", "opacities", "features_dc")
+    quartiles = [[model.gauss_params[name].detach().quantile(shares) for name in names] for model in (one, other)]
+    return max(float((a - b).abs().max()) for a, b in zip(*quartiles, strict=True))
+
+
+@pytest.fixture(scope="module")
+def usual_runs():
+    """Usual runs by seed, with which both tests compare."""
+    return {}
+
+
+@pytest.mark.parametrize("steps", [RecordedStep, Failing])
+def test_a_run_by_recorded_steps_is_the_same_also_if_they_fail(trainer_of, usual_runs, steps, capsys):
+    """At the first of a few seeds.
+
+    Rounding decides about Gaussians at thresholds of densification. Of ten seeds two part by 0.03 and 0.07, six by
+    0.004 to 0.02, and two agree to 1e-5; which ones, depends on the processor. With L1 in place of the root all part by
+    0.04 and more.
+    """
+    found = []
+    for seed in (5, 1, 2):
+        usual = usual_runs[seed] if seed in usual_runs else usual_runs.setdefault(seed, recorded(trainer_of, seed))
+        trainer = recorded(trainer_of, seed, steps)
+        found.append(difference(trainer.model, usual.model))
+        if found[-1] < 0.02:
+            break
+    assert found[-1] < 0.02, found
+    assert (trainer._recorded is None) == (steps is Failing)
+    told = "without recordings, slower: no memory for a recording" in " ".join(capsys.readouterr().out.split())
+    assert told == (steps is Failing)
+    for path in sorted(trainer.checkpoint_dir.glob("*.ckpt")):
+        loaded = checkpoint.read(path)
+        means = loaded["pipeline"]["_model.gauss_params.means"]
+        assert means.untyped_storage().nbytes() == means.numel() * 4  # and not the memory beyond the Gaussians
+        assert loaded["optimizers"].keys() == usual.optimizers.optimizers.keys()
+    events = [str(event["name"]) for event in writer.EVENT_STORAGE]
+    assert not [name for name in events if name.startswith("learning_rate")]  # all are written
+
+
+def test_what_cannot_be_recorded_runs_as_before_under_every_default_dtype(trainer_of):
+    """On a CPU there is nothing to record; on a GPU, options decide."""
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        torch.manual_seed(0)
+        torch.set_default_dtype(dtype)
+        try:
+            trainer = trainer_of(max_num_iterations=2)
+            trainer.train()
+            assert torch.get_default_dtype() == dtype
+        finally:
+            torch.set_default_dtype(torch.float32)
+        assert trainer._recorded is None
+        assert not trainer._recordable()
+        results.append(dict(trainer.model.gauss_params))
+    assert all(torch.equal(value, results[1][name]) for name, value in results[0].items())
+
+
+# ------------------------------------------------------------------------------------------------------------ on a GPU
+
+SPREAD = 1.0
+"""dB between two runs of one seed: CUDA sums in no fixed order; five such runs had a standard deviation of 0.2 dB."""
+ROOM = 256 << 20
+"""Bytes that training may take beyond what it has when it starts."""
+
+
+@pytest.fixture
+def little_memory():
+    """Limits what torch may take of the GPU; all of it is free again afterwards."""
+
+    def limit(bytes_):
+        torch.cuda.set_per_process_memory_fraction(bytes_ / torch.cuda.get_device_properties(0).total_memory)
+
+    yield limit
+    torch.cuda.set_per_process_memory_fraction(1.0)
+    torch.cuda.empty_cache()
+
+
+@pytest.mark.gpu
+def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkpoint(
+    tiny, trainer_of, resumed, little_memory
+):
+    """Gaussians all but double every few steps, until the GPU has no more memory for them."""
+    growing = {"pruning.mode": "off", "warmup_length": 4, "refine_every": 5, "stop_split_at": 400}
+    growing |= {"densify_grad_thresh": 0.0, "cull_alpha_thresh": 0.005, "reset_alpha_every": 1000}
+    trainer = trainer_of(max_num_iterations=400, steps_per_save=10, model={**growing, "stop_screen_size_at": 0})
+    torch.cuda.empty_cache()
+    little_memory(torch.cuda.memory_reserved() + ROOM)
+    with pytest.raises(MemoryExhaustedError) as raised:
+        trainer.train()
+    found = re.fullmatch(
+        r"the GPU's memory is full: cannot allocate [\d.]+ [KMG]iB more with ([\d,]+) Gaussians; try "
+        r"--pipeline\.datamanager\.cache-images cpu \(.*\), "
+        r"--pipeline\.datamanager\.camera-res-scale-factor 0\.5 \(.*\), "
+        r"or --pipeline\.model\.pruning\.mode continuous .*--pipeline\.model\.pruning\.max-gaussians (\d+) \(.*\); "
+        r"--load-dir resumes from the last checkpoint",
+        str(raised.value),
+    )
+    assert found, str(raised.value)
+    count = int(found[1].replace(",", ""))
+    assert count > 10 * tiny.points
+    assert int(found[2]) == count // 2
+
+    newest, passed_over = checkpoint.newest_whole(trainer.checkpoint_dir)
+    assert passed_over == []
+    step = checkpoint.read(newest)["step"]
+    assert step >= 10
+    little_memory(torch.cuda.get_device_properties(0).total_memory)
+    again = resumed(newest.parent, None, 2, model={"pruning.mode": "off", "stop_split_at": 0})
+    again.train()
+    assert again.step == step + 2
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("start", [30, 45, 60])
+def test_a_run_resumed_on_a_gpu_keeps_as_many_and_is_as_good(tiny, report, resumed, start):
+    """Stopped before the warm-up's end, right at the prune, and after it; compared with the run that never stopped."""
+    folder, qualities = tiny.checkpoints, []
+    if start == tiny.prune_at:
+        stopped = resumed(folder, 30, tiny.prune_at - 30)
+        stopped.train()
+        folder = stopped.checkpoint_dir
+    again = resumed(folder, start, tiny.steps - 1 - start)
+    again.train()
+    for trainer in (again, resumed(tiny.checkpoints, tiny.steps - 1, tiny.steps)):
+        assert trainer.pipeline.model.num_points == report["after"]
+        trainer.pipeline.eval()
+        qualities.append(trainer.pipeline.get_average_eval_image_metrics())
+    for name in ("psnr", "psnr_base"):
+        assert qualities[0][name] == pytest.approx(qualities[1][name], abs=SPREAD)
