@@ -1,12 +1,9 @@
 """A field: its shapes, its initial values from points, and values beyond the finite numbers."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from sundae_ns.core.covariance import rotation_matrices
@@ -20,8 +17,6 @@ from sundae_ns.core.gaussians import (
     sh_degree_of,
     sh_to_rgb,
 )
-from sundae_ns.pruning.decision import Pruner, prune_gaussians
-from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.scene.initialization import (
     INITIAL_OPACITY,
     from_points,
@@ -33,17 +28,14 @@ from sundae_ns.scene.initialization import (
 N = 40
 
 
-def gaussians() -> dict[str, Tensor]:
+def gaussians():
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(N, 3, generator=generator)
     return from_points(points, points, sh_degree=1, num_features=3, generator=generator)
 
 
-# --------------------------------------------------------------------------------------------------------------- shapes
-
-
 @pytest.mark.parametrize("degree", range(MAX_SH_DEGREE + 1))
-def test_fields_have_no_odd_shapes(degree: int) -> None:
+def test_fields_have_no_odd_shapes(degree):
     points = torch.rand(7, 3)
     assert odd_shapes(from_points(points, points, sh_degree=degree, num_features=3)) == []
     assert sh_degree_of((degree + 1) ** 2 - 1) == degree
@@ -51,27 +43,24 @@ def test_fields_have_no_odd_shapes(degree: int) -> None:
 
 @pytest.mark.parametrize("name", [*(name for name in SPLAT_NAMES if name != "means"), "features"])
 @pytest.mark.parametrize("shape", [(), (N,), (6, 3), (N, 3, 3, 1), (N, 7, 3), (N, 3, 4), (N, 35, 3)])
-def test_an_odd_shape_is_named(name: str, shape: tuple[int, ...]) -> None:
+def test_an_odd_shape_is_named(name, shape):
     (found,) = odd_shapes(gaussians() | {name: torch.zeros(shape)})
     assert found.startswith(f"{name} has shape {list(shape)}; it must be [{N}, ")
 
 
-def test_means_set_the_number_of_primitives() -> None:
+def test_means_set_the_number_of_primitives():
     found = odd_shapes(gaussians() | {"means": torch.zeros(N, 4)})
     assert found == [f"means has shape [{N}, 4]; it must be [{N}, 3]"]
     assert len(odd_shapes(gaussians() | {"means": torch.zeros(6, 3)})) == len(SPLAT_NAMES)
     assert len(odd_shapes(gaussians() | {"means": torch.zeros(())})) == len(SPLAT_NAMES) + 1
 
 
-# ------------------------------------------------------------------------------------------------------- initial values
-
-
-def cloud(n: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
+def cloud(n=50):
     generator = torch.Generator().manual_seed(0)
     return torch.randn(n, 3, generator=generator), torch.rand(n, 3, generator=generator)
 
 
-def test_one_primitive_per_point() -> None:
+def test_one_primitive_per_point():
     points, rgb = cloud()
     params = from_points(points, rgb, sh_degree=3, num_features=5)
     assert {name: tuple(value.shape[1:]) for name, value in params.items()} == {
@@ -96,13 +85,13 @@ def test_one_primitive_per_point() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_few_points(n: int) -> None:
+def test_few_points(n):
     points, rgb = cloud(n)
     params = from_points(points, rgb, sh_degree=1, num_features=2)
     assert all(len(value) == n and torch.isfinite(value).all() for value in params.values())
 
 
-def test_coincident_points_get_a_finite_width() -> None:
+def test_coincident_points_get_a_finite_width():
     points, rgb = cloud()
     points[:10] = points[0]
     scales = from_points(points, rgb, sh_degree=0, num_features=0)["scales"]
@@ -112,7 +101,7 @@ def test_coincident_points_get_a_finite_width() -> None:
     assert torch.isfinite(same).all()
 
 
-def test_points_that_are_not_finite_are_dropped() -> None:
+def test_points_that_are_not_finite_are_dropped():
     points, rgb = cloud()
     points[3, 1], points[7, 0], rgb[9, 2] = torch.nan, torch.inf, torch.nan
     params = from_points(points, rgb, sh_degree=1, num_features=1)
@@ -125,7 +114,7 @@ def test_points_that_are_not_finite_are_dropped() -> None:
 
 
 @pytest.mark.parametrize("width", [1, 3, 13])
-def test_features_begin_with_the_colour_and_differ(width: int) -> None:
+def test_features_begin_with_the_colour_and_differ(width):
     dc = torch.randn(200, 3)
     features = initial_features(dc, width)
     assert features.shape == (200, width)
@@ -135,7 +124,7 @@ def test_features_begin_with_the_colour_and_differ(width: int) -> None:
     assert (noise.std(dim=0) > 0.02).all()
 
 
-def test_random_points_fill_the_cube_and_rotations_are_uniform() -> None:
+def test_random_points_fill_the_cube_and_rotations_are_uniform():
     points, rgb = random_points(5000, 10.0, torch.Generator().manual_seed(0))
     assert 4.9 < points.abs().max() <= 5
     assert points.mean(dim=0).abs().max() < 0.2
@@ -145,17 +134,14 @@ def test_random_points_fill_the_cube_and_rotations_are_uniform() -> None:
     torch.testing.assert_close(quats.T @ quats / 20000, torch.eye(4) / 4, atol=0.01, rtol=0)
 
 
-# -------------------------------------------------------------------------------------------------------------- mending
-
-
-def test_a_finite_field_is_returned_as_it_is() -> None:
+def test_a_finite_field_is_returned_as_it_is():
     for given in (gaussians(), {name: value[:0] for name, value in gaussians().items()}):
         sanitised = sanitise(given)
         assert all(sanitised.gaussians[name] is value for name, value in given.items())
         assert (sanitised.clamped, sanitised.dropped, sanitised.summary()) == (False, 0, "")
 
 
-def test_values_with_a_meaning_are_clamped() -> None:
+def test_values_with_a_meaning_are_clamped():
     given = gaussians()
     given["opacities"][:10], given["opacities"][10:12] = math.inf, -math.inf
     given["scales"][5:20, 2] = -math.inf
@@ -181,7 +167,7 @@ def test_values_with_a_meaning_are_clamped() -> None:
     assert all(torch.equal(given[name], before[name]) for name in given)
 
 
-def test_flat_primitives_of_a_tiny_scene_are_as_narrow_as_its_narrowest() -> None:
+def test_flat_primitives_of_a_tiny_scene_are_as_narrow_as_its_narrowest():
     given = gaussians()
     given["scales"] -= 60
     given["scales"][3, 0] = -math.inf
@@ -190,7 +176,7 @@ def test_flat_primitives_of_a_tiny_scene_are_as_narrow_as_its_narrowest() -> Non
 
 
 @pytest.mark.parametrize("size", [1e-30, 1e-15, 1e25])
-def test_quaternions_of_any_length_keep_their_rotation(size: float) -> None:
+def test_quaternions_of_any_length_keep_their_rotation(size):
     given = gaussians()
     turned = normalize(torch.tensor([0.5, -0.3, 0.2, 0.7]), dim=0)
     given["quats"][7] = size * turned
@@ -213,7 +199,7 @@ def test_quaternions_of_any_length_keep_their_rotation(size: float) -> None:
         ("quats", -math.inf),
     ],
 )
-def test_primitives_without_a_meaning_are_left_out(name: str, value: float) -> None:
+def test_primitives_without_a_meaning_are_left_out(name, value):
     given = gaussians()
     given[name][4].view(-1)[0] = value
     given["opacities"][8] = math.inf
@@ -223,28 +209,3 @@ def test_primitives_without_a_meaning_are_left_out(name: str, value: float) -> N
     assert (~sanitised.mask).nonzero().flatten().tolist() == [4]
     assert sanitised.gaussians.num_gaussians == N - 1
     assert sanitised.summary().endswith("finite values, dropped 1 that were not finite (NaN or infinite)")
-
-
-@pytest.mark.parametrize("redistribution", ["none", "merge"])
-@pytest.mark.parametrize("count", [10, N])
-def test_a_prune_of_opaque_and_flat_primitives_is_exact_and_finite(redistribution: str, count: int) -> None:
-    given = gaussians()
-    given["opacities"][:], given["scales"][:, 1] = math.inf, -math.inf
-    rule = PruneRule(redistribution=redistribution)  # type: ignore[arg-type]
-    contribution = torch.linspace(0, 1, N)
-    found = prune_gaussians(given, rule, count, contribution)
-    assert found.decision.dropped_nonfinite == 0
-    assert found.gaussians.num_gaussians == count
-    assert all(value.isfinite().all() for value in found.gaussians.values())
-
-
-def test_training_keeps_them_too() -> None:
-    params = {name: torch.nn.Parameter(value) for name, value in gaussians().items()}
-    with torch.no_grad():
-        params["opacities"][:6], params["means"][9] = math.inf, math.nan
-    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
-    assert Pruner(params, optimizers).drop_nonfinite() == 1
-    assert len(params["means"]) == N - 1
-    assert (params["opacities"][:6].sigmoid() > 1 - 1e-6).all()
-    assert all(value.isfinite().all() for value in params.values())
-    assert optimizers["opacities"].param_groups[0]["params"][0] is params["opacities"]

@@ -1,13 +1,11 @@
-"""Covariances, overlap, merging, and overwriting a field during training."""
-
-from __future__ import annotations
+"""Covariances, overlap and merging."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
-from torch import Tensor
-from torch.nn import Parameter
+from fields import normal_field
 
 from sundae_ns.core.covariance import (
     covariances,
@@ -18,23 +16,16 @@ from sundae_ns.core.covariance import (
     rotation_matrices,
     scales_and_quaternions,
 )
-from sundae_ns.core.errors import DataError
 from sundae_ns.core.merging import merge
-from sundae_ns.core.surgery import rewrite
+
+gaussians = partial(normal_field, n=12, features=5, dtype=torch.float64)
 
 
-def gaussians(n: int = 12, seed: int = 0) -> dict[str, Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "features_rest": (3, 3)}
-    shapes |= {"opacities": (1,), "features": (5,)}
-    return {name: torch.randn(n, *s, generator=generator, dtype=torch.float64) for name, s in shapes.items()}
-
-
-def covariance_of(params: dict[str, Tensor]) -> Tensor:
+def covariance_of(params):
     return covariances(params["scales"].exp(), params["quats"])
 
 
-def test_a_group_becomes_one_with_the_moments_of_the_mixture() -> None:
+def test_a_group_becomes_one_with_the_moments_of_the_mixture():
     params, w = gaussians(), torch.rand(12, dtype=torch.float64)
     label = torch.tensor([0, 0, 0, 0, 4, 4, 6, 7, 7, 7, 0, -1])
     found = merge(params, label, w)
@@ -55,24 +46,24 @@ def test_a_group_becomes_one_with_the_moments_of_the_mixture() -> None:
     assert all(torch.equal(found[name][2], params[name][6]) for name in params)
 
 
-def test_transmittances_of_clones_multiply() -> None:
-    params = {name: value.expand(3, *value.shape[1:]).clone() for name, value in gaussians(1).items()}
+def test_transmittances_of_clones_multiply():
+    params = {name: value.expand(3, *value.shape[1:]).clone() for name, value in gaussians(n=1).items()}
     params["opacities"][:] = math.log(0.3 / 0.7)
     found = merge(params, torch.zeros(3, dtype=torch.long), torch.ones(3))
     assert float(found["opacities"].sigmoid()) == pytest.approx(1 - 0.7**3)
     torch.testing.assert_close(covariance_of(found), covariance_of(params)[:1])
 
 
-def test_a_wall_of_small_primitives_absorbs_as_much_light_after_merging() -> None:
+def test_a_wall_of_small_primitives_absorbs_as_much_light_after_merging():
     # From afar, a Gaussian absorbs its optical depth times its projected area.
-    params = gaussians(100)
+    params = gaussians(n=100)
     params["means"] = torch.cartesian_prod(*[torch.arange(10.0).double()] * 2, torch.zeros(1).double())
     params["scales"][:] = torch.tensor([0.4, 0.4, 1e-3]).double().log()
     params["quats"][:] = torch.tensor([1.0, 0, 0, 0]).double()
     params["opacities"][:] = -2.0
     found = merge(params, torch.zeros(100, dtype=torch.long), torch.ones(100))
 
-    def absorption(p: dict[str, Tensor]) -> float:
+    def absorption(p):
         return float(
             (-torch.log1p(-p["opacities"].sigmoid().squeeze(1)) * mean_projected_area(p["scales"].exp())).sum()
         )
@@ -81,7 +72,7 @@ def test_a_wall_of_small_primitives_absorbs_as_much_light_after_merging() -> Non
     assert float(found["scales"].exp().min()) == pytest.approx(1e-3)
 
 
-def test_merging_commutes_with_rotation_scale_and_shift() -> None:
+def test_merging_commutes_with_rotation_scale_and_shift():
     params, label, w = gaussians(), torch.tensor([0, 0, 0, 3, 3, 3, 6, 6, 6, 9, 9, -1]), torch.rand(12)
     turn = torch.randn(1, 4, dtype=torch.float64)
     R = rotation_matrices(turn)[0]
@@ -93,7 +84,7 @@ def test_merging_commutes_with_rotation_scale_and_shift() -> None:
     torch.testing.assert_close(after["opacities"], before["opacities"])
 
 
-def test_only_positive_weights_count_and_their_scale_does_not() -> None:
+def test_only_positive_weights_count_and_their_scale_does_not():
     params, label, w = gaussians(), torch.tensor([0] * 6 + [6] * 6), torch.rand(12, dtype=torch.float64)
     for none in (torch.zeros(12), torch.full((12,), torch.nan)):
         found = merge(params, label, none)
@@ -108,7 +99,7 @@ def test_only_positive_weights_count_and_their_scale_does_not() -> None:
         assert all(torch.equal(found[name], expected[name]) for name in params), odd
 
 
-def test_extremes_stay_finite() -> None:
+def test_extremes_stay_finite():
     params = {name: value.float() for name, value in gaussians().items()}
     params["scales"][0] = torch.tensor([1e-8, 1e3, 1.0]).log()
     params["quats"][1] = 0
@@ -120,7 +111,7 @@ def test_extremes_stay_finite() -> None:
     assert float(found["opacities"].sigmoid().max()) <= 0.99 + 1e-6
 
 
-def test_groups_that_overflow_or_vanish_are_unchanged() -> None:
+def test_groups_that_overflow_or_vanish_are_unchanged():
     params = gaussians()
     params["scales"][0], params["scales"][6] = torch.tensor([0.0, 400.0, 0.0]), -500.0
     params["quats"][0] = torch.tensor([1.0, 0, 0, 0]).double()
@@ -132,19 +123,19 @@ def test_groups_that_overflow_or_vanish_are_unchanged() -> None:
     assert not torch.equal(found["means"][1], params["means"][3])
 
 
-def neighbours(params: dict[str, Tensor], indices: list[list[int]] | Tensor, least_variance: float = 0.0) -> Tensor:
+def neighbours(params, indices, least_variance=0.0):
     rows = torch.arange(len(params["means"]))[:, None]
     return overlap(params["means"], entries_of(params), rows, torch.as_tensor(indices), least_variance)
 
 
-def of_widths(means: list[list[float]], widths: list[list[float]], turn: list[float]) -> dict[str, Tensor]:
+def of_widths(means, widths, turn):
     values = {"means": means, "scales": widths, "quats": [turn] * len(means)}
     made = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
     return {**made, "scales": made["scales"].log()}
 
 
-def test_overlap_is_that_of_the_formula_and_1_with_itself() -> None:
-    params = gaussians(200)
+def test_overlap_is_that_of_the_formula_and_1_with_itself():
+    params = gaussians(n=200)
     S, means, other = covariance_of(params), params["means"], torch.arange(200).roll(1)
     found = neighbours(params, torch.stack([torch.arange(200), other], dim=1))
     torch.testing.assert_close(found[:, 0], torch.ones(200, dtype=torch.float64))
@@ -160,7 +151,7 @@ def test_overlap_is_that_of_the_formula_and_1_with_itself() -> None:
     torch.testing.assert_close(neighbours(params, other[:, None], 0.3**2)[:, 0], exponent.exp() * ratio)
 
 
-def test_overlap_of_spheres_of_flat_ones_and_of_needles() -> None:
+def test_overlap_of_spheres_of_flat_ones_and_of_needles():
     # Two spheres of width 1 at a distance of 2: exp(-4 / 8).
     spheres = of_widths([[0, 0, 0], [2, 0, 0]], [[1, 1, 1]] * 2, [1, 0, 0, 0])
     assert neighbours(spheres, [[1], [0]]).flatten().tolist() == pytest.approx([math.exp(-0.5)] * 2)
@@ -174,8 +165,8 @@ def test_overlap_of_spheres_of_flat_ones_and_of_needles() -> None:
     assert float(found[:, 1].max()) < 1e-3
 
 
-def test_chunks_of_rows_give_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    params, indices = gaussians(50), torch.randint(50, (50, 4))
+def test_chunks_of_rows_give_the_same_result(monkeypatch):
+    params, indices = gaussians(n=50), torch.randint(50, (50, 4))
     label, weight = torch.arange(50) // 5 * 5, torch.rand(50)
     whole, merged = neighbours(params, indices, 0.01), merge(params, label, weight)
     monkeypatch.setattr("sundae_ns.core.covariance.PAIRS", 30)
@@ -185,13 +176,13 @@ def test_chunks_of_rows_give_the_same_result(monkeypatch: pytest.MonkeyPatch) ->
     assert all(torch.equal(again[name], merged[name]) for name in merged)
 
 
-def test_quaternions_inverts_rotations_also_at_half_turns() -> None:
+def test_quaternions_inverts_rotations_also_at_half_turns():
     turns = torch.cat([torch.eye(4), torch.randn(200, 4), torch.randn(200, 4) * torch.tensor([1e-4, 1, 1, 1])]).double()
     torch.testing.assert_close(rotation_matrices(quaternions(rotation_matrices(turns))), rotation_matrices(turns))
     assert torch.equal(rotation_matrices(torch.zeros(1, 4)), torch.eye(3)[None])
 
 
-def test_scales_and_quaternions_invert_covariances_also_of_equal_axes_needles_and_single_points() -> None:
+def test_scales_and_quaternions_invert_covariances_also_of_equal_axes_needles_and_single_points():
     generator = torch.Generator().manual_seed(0)
     scales = torch.rand(300, 3, generator=generator, dtype=torch.float64).pow(4)
     scales[:20] = 0.3
@@ -209,55 +200,9 @@ def test_scales_and_quaternions_invert_covariances_also_of_equal_axes_needles_an
     torch.testing.assert_close(back, first, rtol=0, atol=1e-14)
 
 
-def test_mean_projected_area_of_spheres_and_discs() -> None:
+def test_mean_projected_area_of_spheres_and_discs():
     found = mean_projected_area(torch.tensor([[2.0, 2, 2], [1, 1, 0], [3, 2, 1]]).double())
     assert float(found[0]) == pytest.approx(4)
     # For a disc it is half the area; the surface of a = 3, b = 2, c = 1 is 48.882.
     assert float(found[1]) == pytest.approx(0.5, rel=0.012)
     assert float(found[2]) == pytest.approx(48.882 / (4 * math.pi), rel=0.012)
-
-
-def trained(n: int = 6) -> tuple[dict[str, Parameter], dict[str, torch.optim.Optimizer]]:
-    params = {name: Parameter(value) for name, value in gaussians(n).items()}
-    optimizers: dict[str, torch.optim.Optimizer] = {name: torch.optim.Adam([value]) for name, value in params.items()}
-    torch.stack([value.square().sum() for value in params.values()]).sum().backward()
-    for optimizer in optimizers.values():
-        optimizer.step()
-    return params, optimizers
-
-
-def test_rewriting_resets_first_moments_of_changed_values_only() -> None:
-    params, optimizers = trained()
-    before = {name: value.detach().clone() for name, value in params.items()}
-    values = {name: value.clone() for name, value in before.items()}
-    values["means"][2] += 1
-    values["opacities"][4] += 1
-    objects, moments = dict(params), {name: dict(optimizers[name].state[params[name]]) for name in params}
-    moments = {name: {k: v.clone() for k, v in entries.items()} for name, entries in moments.items()}
-    rewrite(params, optimizers, values)
-    for name, value in params.items():
-        assert value is objects[name]
-        assert torch.equal(value.detach(), values[name])
-        state, changed = optimizers[name].state[value], values[name] != before[name]
-        assert (state["exp_avg"][changed] == 0).all()
-        assert torch.equal(state["exp_avg"][~changed], moments[name]["exp_avg"][~changed])
-        assert torch.equal(state["exp_avg_sq"], moments[name]["exp_avg_sq"])
-    assert int((params["means"].detach() != before["means"]).sum()) == 3
-
-
-def test_rewriting_before_the_first_step_and_without_an_optimizer() -> None:
-    params = {name: Parameter(value) for name, value in gaussians(6).items()}
-    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items() if name != "features"}
-    values = {name: value.detach() + 1 for name, value in params.items()}
-    rewrite(params, optimizers, values)
-    assert all(torch.equal(params[name].detach(), values[name]) for name in params)
-    assert not any(optimizer.state for optimizer in optimizers.values())
-
-
-def test_rewriting_refuses_wrong_names_and_shapes_and_changes_nothing() -> None:
-    params, optimizers = trained()
-    before = params["means"].detach().clone()
-    for values in ({"means": before + 1, "colour": before}, {"means": before + 1, "scales": before[:2]}):
-        with pytest.raises(DataError, match="one row per Gaussian"):
-            rewrite(params, optimizers, values)
-    assert torch.equal(params["means"].detach(), before)

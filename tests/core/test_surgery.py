@@ -1,38 +1,40 @@
 """Surgery on a field in training: removal, copies, snapshots; complete, and without effect on error."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-from typing import Any
-
 import pytest
 import torch
+from fields import normal_field
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor, nn
+from torch import nn
 from torch.nn import Parameter
-from torch.optim import Adam, Optimizer
+from torch.optim import Adam
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.surgery import check_wiring, grow, keep, module_snapshot, restore, restore_module, snapshot
+from sundae_ns.core.surgery import (
+    check_wiring,
+    grow,
+    keep,
+    module_snapshot,
+    restore,
+    restore_module,
+    rewrite,
+    snapshot,
+)
 
-SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "features_rest": (8, 3), "opacities": (1,), "features": (13,)}
+FIELD = normal_field(20, features=13)
+TRAINED = sorted(FIELD.keys() - {"quats"})
 
 
-def gaussians(n: int = 20, seed: int = 0) -> tuple[dict[str, Parameter], dict[str, Optimizer]]:
-    generator = torch.Generator().manual_seed(seed)
-    params = {name: Parameter(torch.randn(n, *shape, generator=generator)) for name, shape in SHAPES.items()}
+def gaussians(n=20):
+    """A field with frozen rotations, and its optimizers; one of them is that of a network."""
+    params = {name: Parameter(value) for name, value in normal_field(n, features=13).items()}
     params["quats"].requires_grad_(False)
-    optimizers: dict[str, Optimizer] = {
-        name: Adam([{"params": value, "lr": 0.1}], eps=1e-15) for name, value in params.items() if name != "quats"
-    }
-    network = torch.nn.Linear(n, n)
-    optimizers["compensation"] = Adam(network.parameters())
-    return params, optimizers
+    optimizers = {name: Adam([{"params": params[name], "lr": 0.1}], eps=1e-15) for name in TRAINED}
+    return params, {**optimizers, "compensation": Adam(torch.nn.Linear(n, n).parameters())}
 
 
-def train(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], steps: int = 1) -> float:
-    """Steps towards ones; the last loss."""
+def train(params, optimizers, steps=1):
+    """Steps towards ones."""
     for _ in range(steps):
         loss = torch.stack([(value - 1).square().sum() for value in params.values() if value.requires_grad]).sum()
         for optimizer in optimizers.values():
@@ -40,21 +42,17 @@ def train(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], ste
         loss.backward()
         for optimizer in optimizers.values():
             optimizer.step()
-    return loss.item()
 
 
-def some(n: int = 20) -> Tensor:
+def some(n=20):
     return torch.arange(n) % 3 == 0
 
 
-def moments(optimizers: Mapping[str, Optimizer], params: Mapping[str, Tensor], name: str) -> Tensor:
+def moments(optimizers, params, name):
     return optimizers[name].state[params[name]]["exp_avg"]
 
 
-# -------------------------------------------------------------------------------------------------------------- removal
-
-
-def test_training_continues_as_if_only_the_kept_primitives_had_existed() -> None:
+def test_training_continues_as_if_only_the_kept_primitives_had_existed():
     (params, optimizers), (expected, expected_optimizers) = gaussians(), gaussians()
     still_alive = params["means"].exp().sum()
     keep(expected, expected_optimizers, [], some())
@@ -64,17 +62,17 @@ def test_training_continues_as_if_only_the_kept_primitives_had_existed() -> None
     for held, holders in ((params, optimizers), (expected, expected_optimizers)):
         train(held, holders, 3)
     for name, value in params.items():
-        assert value.shape == (7, *SHAPES[name])
+        assert value.shape == (7, *FIELD[name].shape[1:])
         torch.testing.assert_close(value, expected[name])
     assert still_alive.grad_fn is not None  # a live graph of an earlier step does not break training
 
 
-def test_optimizers_hold_the_new_parameters_and_sliced_moments() -> None:
+def test_optimizers_hold_the_new_parameters_and_sliced_moments():
     params, optimizers = gaussians()
-    params = torch.nn.ParameterDict(params)  # type: ignore[assignment]
+    params = torch.nn.ParameterDict(params)
     train(params, optimizers)
     old = dict(params.items())
-    before = {name: moments(optimizers, params, name).clone() for name in SHAPES if name != "quats"}
+    before = {name: moments(optimizers, params, name).clone() for name in TRAINED}
     keep(params, optimizers, [], some())
     for name, value in params.items():
         torch.testing.assert_close(value.data, old[name].data[some()])
@@ -91,9 +89,9 @@ def test_optimizers_hold_the_new_parameters_and_sliced_moments() -> None:
         assert state[value]["exp_avg_sq"].shape == value.shape
 
 
-def test_per_primitive_state_is_sliced_and_other_state_is_unchanged() -> None:
+def test_per_primitive_state_is_sliced_and_other_state_is_unchanged():
     params, optimizers = gaussians()
-    rest: dict[str, Any] = {"other": torch.rand(5), "step": 20, "no": None, "scalar": torch.tensor(20)}
+    rest = {"other": torch.rand(5), "step": 20, "no": None, "scalar": torch.tensor(20)}
     state, alone = {"grad2d": torch.arange(20), **rest}, {"pair": torch.rand(20, 2), **rest}
     network = [p.detach().clone() for p in optimizers["compensation"].param_groups[0]["params"]]
     keep(params, optimizers, [state, alone], some())
@@ -104,7 +102,7 @@ def test_per_primitive_state_is_sliced_and_other_state_is_unchanged() -> None:
         assert torch.equal(value, before)
 
 
-def test_a_one_element_step_of_one_primitive_is_not_sliced() -> None:
+def test_a_one_element_step_of_one_primitive_is_not_sliced():
     params, optimizers = gaussians(1)
     train(params, optimizers)
     step = optimizers["means"].state[params["means"]]["step"] = torch.ones(1)
@@ -121,14 +119,14 @@ def test_a_one_element_step_of_one_primitive_is_not_sliced() -> None:
         (torch.ones(20), "float32"),
     ],
 )
-def test_wrong_masks_are_refused(mask: Tensor, message: str) -> None:
+def test_wrong_masks_are_refused(mask, message):
     params, optimizers = gaussians()
     with pytest.raises(DataError, match=message):
         keep(params, optimizers, [], mask)
 
 
 @pytest.mark.parametrize("fault", ["length", "stale", "two groups"])
-def test_nothing_changes_on_error(fault: str) -> None:
+def test_nothing_changes_on_error(fault):
     params, optimizers = gaussians()
     train(params, optimizers)
     if fault == "length":
@@ -139,7 +137,7 @@ def test_nothing_changes_on_error(fault: str) -> None:
     else:
         optimizers["features"].add_param_group({"params": [Parameter(torch.zeros(3))]})
     objects = dict(params)
-    state: dict[str, Any] = {"grad2d": torch.arange(20)}
+    state = {"grad2d": torch.arange(20)}
     with pytest.raises(DataError, match="'features'"):
         keep(params, optimizers, [state], some())
     with pytest.raises(DataError, match="'features'"):
@@ -150,9 +148,9 @@ def test_nothing_changes_on_error(fault: str) -> None:
 
 
 @pytest.mark.gpu
-def test_a_mask_on_the_cpu_prunes_a_field_on_the_gpu() -> None:
+def test_a_mask_on_the_cpu_prunes_a_field_on_the_gpu():
     params = {name: Parameter(value.detach().cuda()) for name, value in gaussians()[0].items()}
-    optimizers: dict[str, Optimizer] = {name: Adam([value]) for name, value in params.items()}
+    optimizers = {name: Adam([value]) for name, value in params.items()}
     train(params, optimizers)
     keep(params, optimizers, [], some())
     train(params, optimizers)
@@ -160,10 +158,7 @@ def test_a_mask_on_the_cpu_prunes_a_field_on_the_gpu() -> None:
     assert len(params["means"]) == 7
 
 
-# ------------------------------------------------------------------------------------------------------------ snapshots
-
-
-def test_training_continues_from_a_snapshot_bit_for_bit() -> None:
+def test_training_continues_from_a_snapshot_bit_for_bit():
     params, optimizers = gaussians()
     train(params, optimizers, 3)
     saved = snapshot(params, optimizers)
@@ -173,28 +168,28 @@ def test_training_continues_from_a_snapshot_bit_for_bit() -> None:
     train(params, optimizers, 5)
     for _ in range(2):  # a snapshot can be restored more than once
         restore(params, optimizers, saved)
-        for name in SHAPES.keys() & optimizers.keys():
+        for name in TRAINED:
             assert optimizers[name].param_groups[0]["params"] == [params[name]]
             assert list(optimizers[name].state) == [params[name]]
         train(params, optimizers, 4)
         assert all(torch.equal(value, expected[name]) for name, value in params.items())
 
 
-def test_a_snapshot_before_the_first_step_has_no_moments() -> None:
+def test_a_snapshot_before_the_first_step_has_no_moments():
     params, optimizers = gaussians()
     saved = snapshot(params, optimizers)
     train(params, optimizers)
     del optimizers["means"]
     restore(params, optimizers, saved)
-    assert not any(optimizers[name].state for name in SHAPES.keys() & optimizers.keys())
+    assert not any(optimizer.state for name, optimizer in optimizers.items() if name in TRAINED)
     train(params, optimizers)
 
 
-def test_a_network_is_restored_in_place() -> None:
+def test_a_network_is_restored_in_place():
     net = nn.Sequential(nn.Linear(3, 4), nn.Linear(4, 1))
     optimizer = Adam(net.parameters())
 
-    def steps(count: int) -> None:
+    def steps(count):
         for _ in range(count):
             optimizer.zero_grad()
             net(torch.ones(2, 3)).square().sum().backward()
@@ -211,10 +206,7 @@ def test_a_network_is_restored_in_place() -> None:
     assert all(torch.equal(a, b) for a, b in zip(expected, net.parameters()))
 
 
-# --------------------------------------------------------------------------------------------------------------- copies
-
-
-def integral(opacity: float, scale: float, copies: int) -> float:
+def integral(opacity, scale, copies):
     """Integral along a line of the opacity of ``copies`` Gaussians at one place, by the midpoint rule."""
     x = (torch.arange(20_000, dtype=torch.float64) + 0.5) / 20_000 * 24 - 12
     alpha = opacity * torch.exp(-0.5 * (x / scale) ** 2)
@@ -222,7 +214,7 @@ def integral(opacity: float, scale: float, copies: int) -> float:
 
 
 @given(st.floats(0.02, 0.99))
-def test_copies_render_like_the_original(opacity: float) -> None:
+def test_copies_render_like_the_original(opacity):
     params = {
         "means": Parameter(torch.zeros(1, 3, dtype=torch.float64)),
         "scales": Parameter(torch.zeros(1, 3, dtype=torch.float64)),
@@ -237,7 +229,7 @@ def test_copies_render_like_the_original(opacity: float) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 7, 30, 95])
-def test_growing_adds_the_exact_number_upon_the_most_opaque(count: int) -> None:
+def test_growing_adds_the_exact_number_upon_the_most_opaque(count):
     params, optimizers = gaussians(30)
     train(params, optimizers)
     old, before = params["means"].detach().clone(), moments(optimizers, params, "features").clone()
@@ -245,10 +237,40 @@ def test_growing_adds_the_exact_number_upon_the_most_opaque(count: int) -> None:
     grow(params, optimizers, count, 0.005)
     assert {len(value) for value in params.values()} == {30 + count}
     assert all(value.isfinite().all() for value in params.values())
-    for name in SHAPES.keys() & optimizers.keys():
+    for name in TRAINED:
         assert optimizers[name].param_groups[0]["params"] == [params[name]]
         assert moments(optimizers, params, name).shape == params[name].shape
     assert torch.equal(params["means"][:30], old)
     assert torch.equal(params["means"][30:60], old[opaque[: min(count, 30)]])
     assert torch.equal(moments(optimizers, params, "features")[:30], before)
     assert not moments(optimizers, params, "features")[30:].any()
+
+
+@pytest.mark.parametrize("steps", [0, 1])
+def test_rewriting_resets_first_moments_of_changed_values_only(steps):
+    params, optimizers = gaussians()
+    train(params, optimizers, steps)
+    before = {name: value.detach().clone() for name, value in params.items()}
+    values = {name: value.clone() for name, value in before.items()}
+    values["means"][2] += 1
+    values["opacities"][4] += 1
+    values["quats"] += 1  # which no optimizer holds
+    objects, saved = dict(params), snapshot(params, optimizers)
+    rewrite(params, optimizers, values)
+    assert all(params[name] is objects[name] and torch.equal(params[name].data, values[name]) for name in params)
+    for name in TRAINED:
+        assert len(optimizers[name].state) == steps
+        for state in optimizers[name].state.values():
+            old, changed = saved[name], values[name] != before[name]
+            assert not state["exp_avg"][changed].any()
+            assert torch.equal(state["exp_avg"][~changed], old["exp_avg"][~changed])
+            assert torch.equal(state["exp_avg_sq"], old["exp_avg_sq"])
+
+
+def test_rewriting_refuses_wrong_names_and_shapes_and_changes_nothing():
+    params, optimizers = gaussians()
+    before = params["means"].detach().clone()
+    for values in ({"means": before + 1, "colour": before}, {"means": before + 1, "scales": before[:2]}):
+        with pytest.raises(DataError, match="one row per Gaussian"):
+            rewrite(params, optimizers, values)
+    assert torch.equal(params["means"].detach(), before)

@@ -1,7 +1,5 @@
 """The files of a capture: upright images at several sizes, and cameras that see what COLMAP sees."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -29,7 +27,7 @@ PARAMETERS = [50.0, 60.0, 20.0, 15.0, 0.01, -0.02, 0.003, 0.004]
 ORIENTATION, MODEL, FOCAL, EXIF = 0x0112, 0x0110, 0x920A, 0x8769
 
 
-def model(cameras: int = 1) -> Any:
+def model(cameras=1):
     """A reconstruction of four images, and one without a pose."""
     images = []
     for i, number in enumerate((5, 4, 3, 2, 9)):
@@ -43,14 +41,14 @@ def model(cameras: int = 1) -> Any:
     return SimpleNamespace(images=dict(enumerate(images)), cameras=dict(enumerate(stated, start=1)))
 
 
-def transforms(made: Any) -> dict[str, Any]:
+def transforms(made):
     return capture_files.transforms_of(
         made, {image.name: f"IMG {image.name[-9:-4]}.HEIC" for image in made.images.values()}
     )
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_our_cameras_see_what_colmap_sees(tmp_path: Path, cameras: int) -> None:
+def test_our_cameras_see_what_colmap_sees(tmp_path, cameras):
     made = model(cameras)
     meta = transforms(made)
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
@@ -67,7 +65,7 @@ def test_our_cameras_see_what_colmap_sees(tmp_path: Path, cameras: int) -> None:
         assert (float(camera.K[0, 0]), float(camera.K[1, 2])) == (PARAMETERS[0], PARAMETERS[3])
 
 
-def test_frames_name_their_photos_in_order(tmp_path: Path) -> None:
+def test_frames_name_their_photos_in_order(tmp_path):
     meta = transforms(model())
     assert [frame["file_path"] for frame in meta["frames"]] == [f"images/frame_{i:05d}.jpg" for i in (2, 3, 4, 5)]
     assert meta["frames"][0]["original"] == "IMG 00002.HEIC"
@@ -96,19 +94,19 @@ def test_frames_name_their_photos_in_order(tmp_path: Path) -> None:
         ("abc", "defgh", False, "the way from c to d again"),
     ],
 )
-def test_what_to_photograph_again(placed: str, left_out: str, enough: bool, again: str) -> None:
+def test_what_to_photograph_again(placed, left_out, enough, again):
     photos = Placed(tuple(placed), tuple(left_out))
     assert (photos.total, photos.enough) == (len(placed + left_out), enough)
     assert again in photos.again
 
 
-def gradient(width: int = 40, height: int = 24) -> Image.Image:
+def gradient(width=40, height=24):
     """Red grows to the right and green downwards."""
     x, y = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
     return Image.fromarray(np.stack([x, y, np.zeros_like(x)], axis=2).astype(np.uint8))
 
 
-def save(path: Path, image: Image.Image | None = None, focal: float | None = None, **entries: object) -> None:
+def save(path, image=None, focal=None, **entries):
     exif = Image.Exif()
     exif.update({{"orientation": ORIENTATION, "model": MODEL}[name]: value for name, value in entries.items()})
     if focal is not None:
@@ -116,15 +114,15 @@ def save(path: Path, image: Image.Image | None = None, focal: float | None = Non
     (image or gradient()).save(path, exif=exif)
 
 
-def written(folder: Path, out: Path) -> list[Path]:
+def written(folder, out):
     photos = find_photos(folder)
-    done: list[int] = []
+    done = []
     assert [*write_images(photos, out, str, done.append)] == names_of(photos)
     assert sum(done) == len(photos)
     return [out / name for name in names_of(photos)]
 
 
-def test_photos_of_one_camera_share_a_folder(tmp_path: Path) -> None:
+def test_photos_of_one_camera_share_a_folder(tmp_path):
     tall = gradient(24, 40)
     for name, image, entries in (
         ("a.jpg", None, {"model": "Phone", "focal": 4.2}),
@@ -139,7 +137,7 @@ def test_photos_of_one_camera_share_a_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_photos_become_upright(tmp_path: Path, orientation: int) -> None:
+def test_photos_become_upright(tmp_path, orientation):
     turns = [None, "FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM"]
     turns += ["TRANSPOSE", "ROTATE_90", "TRANSVERSE", "ROTATE_270"]
     turn = turns[orientation - 1]
@@ -153,7 +151,7 @@ def test_photos_become_upright(tmp_path: Path, orientation: int) -> None:
         assert np.abs(np.asarray(image, float) - np.asarray(gradient(), float)).mean() < 6
 
 
-def test_files_that_can_stay_are_copied_and_others_saved(tmp_path: Path) -> None:
+def test_files_that_can_stay_are_copied_and_others_saved(tmp_path):
     clear = gradient().convert("RGBA")
     clear.putalpha(100)
     save(tmp_path / "a.jpg")
@@ -174,7 +172,7 @@ def test_files_that_can_stay_are_copied_and_others_saved(tmp_path: Path) -> None
     assert (paths[0].stat().st_mtime_ns, paths[1].exists()) == (before, True), "what is there stays"
 
 
-def test_heic_is_turned_as_its_box_says(tmp_path: Path) -> None:
+def test_heic_is_turned_as_its_box_says(tmp_path):
     if not reads_heif():
         pytest.skip("pillow-heif is not installed")
     exif = Image.Exif()
@@ -187,7 +185,7 @@ def test_heic_is_turned_as_its_box_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["jpg", "png", "webp"])
-def test_pixels_that_cannot_be_decoded(tmp_path: Path, kind: str) -> None:
+def test_pixels_that_cannot_be_decoded(tmp_path, kind):
     for name in "abcd":
         Image.effect_noise((90, 60), 80).convert("RGB").save(tmp_path / f"{name}.{kind}")
     photos, said = find_photos(tmp_path), []
@@ -202,7 +200,7 @@ def test_pixels_that_cannot_be_decoded(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize(("width", "factors"), [(43, [2, 4, 8]), (12800, [2, 4, 8]), (12803, [2, 4, 8, 16])])
-def test_smaller_images(tmp_path: Path, width: int, factors: list[int]) -> None:
+def test_smaller_images(tmp_path, width, factors):
     (tmp_path / "images").mkdir()
     gradient(width, 19).save(tmp_path / "images" / "a.jpg")
     write_smaller(tmp_path / "images", lambda _: None)
@@ -216,17 +214,17 @@ def test_smaller_images(tmp_path: Path, width: int, factors: list[int]) -> None:
 class Raw(nullcontext[Any]):
     """A raw photo, as rawpy opens one; one named odd is stored lying."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path):
         super().__init__(self)
         self.size = (16, 12) if Path(path).stem != "odd" else (12, 16)
         self.sizes = SimpleNamespace(iwidth=16, iheight=12, flip=0 if self.size == (16, 12) else 5)
 
-    def postprocess(self) -> np.ndarray:
+    def postprocess(self):
         return np.asarray(gradient(*self.size))
 
 
-def test_raw_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rawpy", SimpleNamespace(imread=Raw))  # type: ignore[arg-type]
+def test_raw_photos(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rawpy", SimpleNamespace(imread=Raw))
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.CR2").write_bytes(b"II*\0\x10\0\0\0CR\2\0" + bytes(100))
     with Image.open(written(tmp_path, tmp_path / "out")[2]) as image:

@@ -1,10 +1,7 @@
 """The shipped capture, copied without touching other files."""
 
-from __future__ import annotations
-
 import json
 import zipfile
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +13,7 @@ from sundae_ns.data.images import check_image
 TRAIN, TEST, SIDE = 48, 8, 128
 
 
-def test_a_copy_is_a_sound_capture_and_is_replaced(tmp_path: Path) -> None:
+def test_a_copy_is_a_sound_capture_and_is_replaced(tmp_path):
     copy = write_demo_capture(tmp_path / "new" / "folder")
     check_transforms(copy / "transforms.json", splits=("train", "test"))
     meta = json.loads((copy / "transforms.json").read_text())
@@ -36,12 +33,10 @@ def test_a_copy_is_a_sound_capture_and_is_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("left", [0, 1, TRAIN + TEST + 1])
-def test_an_interrupted_copy_has_no_transforms_and_is_made_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: int
-) -> None:
+def test_an_interrupted_copy_has_no_transforms_and_is_made_again(tmp_path, monkeypatch, left):
     read, done = zipfile.ZipFile.read, []
 
-    def until_the_end(self: zipfile.ZipFile, name: str) -> bytes:
+    def until_the_end(self, name):
         done.append(name)
         if len(done) > left:
             raise KeyboardInterrupt

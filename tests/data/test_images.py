@@ -1,11 +1,5 @@
 """Images decoded to sRGB, against Pillow's ImageCms: profiles, types of pixels, colours that are stated otherwise."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from icc_profiles import SPACES, judged, profile
@@ -15,21 +9,21 @@ from sundae_ns.data.images import decoded, opened, reads_heif, to_srgb
 from sundae_ns.data.photos import find_photos, upright
 
 
-def patches(width: int = 192, height: int = 128) -> Image.Image:
+def patches(width=192, height=128):
     """64 fields of colour."""
     levels = np.array([20, 90, 160, 235], np.uint8)
     fields = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(8, 8, 3)
     return Image.fromarray(fields.repeat(height // 8, axis=0).repeat(width // 8, axis=1))
 
 
-def off(image: Image.Image, expected: np.ndarray) -> int:
+def off(image, expected):
     """The largest difference in the middle of the fields; JPEG and HEIC change what lies at their edges."""
     middles = np.abs(np.arange(192) % 24 - 11.5) < 4, np.abs(np.arange(128) % 16 - 7.5) < 4
     difference = np.abs(np.asarray(image.convert("RGB"), int) - expected)
     return int(difference[middles[1]][:, middles[0]].max())
 
 
-KINDS: dict[str, dict[str, Any]] = {
+KINDS = {
     "a.png": {},
     "a.tif": {},
     "a.webp": {"lossless": True},
@@ -40,7 +34,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("name", KINDS)
-def test_a_profile_is_converted_as_imagecms_does(tmp_path: Path, name: str, space: str) -> None:
+def test_a_profile_is_converted_as_imagecms_does(tmp_path, name, space):
     if name == "a.heic" and not reads_heif():
         pytest.skip("pillow-heif is not installed")
     for number in range(3):
@@ -55,7 +49,7 @@ def test_a_profile_is_converted_as_imagecms_does(tmp_path: Path, name: str, spac
         assert off(image, expected) <= 1
 
 
-def test_ten_bits_of_heic(tmp_path: Path) -> None:
+def test_ten_bits_of_heic(tmp_path):
     heif = pytest.importorskip("pillow_heif")
     reads_heif()
     deep = (np.asarray(patches(), np.uint16) * 257).tobytes()
@@ -67,7 +61,7 @@ def test_ten_bits_of_heic(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("transfer", "primaries", "changed"), [(13, 12, True), (16, 9, True), (13, 1, False)])
-def test_colours_of_heic_without_a_profile(tmp_path: Path, transfer: int, primaries: int, changed: bool) -> None:
+def test_colours_of_heic_without_a_profile(tmp_path, transfer, primaries, changed):
     image = patches()
     image.format = "HEIF"
     image.info["nclx_profile"] = {"transfer_characteristics": transfer, "color_primaries": primaries}
@@ -77,7 +71,7 @@ def test_colours_of_heic_without_a_profile(tmp_path: Path, transfer: int, primar
         assert off(converted, judged(patches(), "P3")) <= 10
 
 
-def test_adobe_rgb_by_exif(tmp_path: Path) -> None:
+def test_adobe_rgb_by_exif(tmp_path):
     """Cameras state Adobe RGB by DCF's R03 alone; the photo that is saved states it no more."""
     exif = Image.Exif()
     exif[0x8769] = {0xA001: 0xFFFF, 0xA005: {1: "R03"}}
@@ -92,28 +86,28 @@ def test_adobe_rgb_by_exif(tmp_path: Path) -> None:
     assert off(decoded(tmp_path / "again.jpg"), expected) <= 3
 
 
-def grey16(path: Path) -> None:
+def grey16(path):
     Image.fromarray(np.asarray(patches().convert("L"), np.uint16) * 257).save(path)
 
 
-def palette(path: Path) -> None:
+def palette(path):
     patches().quantize(64).save(path)
 
 
-def with_profile(mode: str, space: str | bytes) -> Callable[[Path], None]:
+def with_profile(mode, space):
     icc = space if isinstance(space, bytes) else profile(space)
     return lambda path: patches().convert(mode).save(path, icc_profile=icc)
 
 
-def _same() -> np.ndarray:
+def _same():
     return np.asarray(patches(), int)
 
 
-def _grey() -> np.ndarray:
+def _grey():
     return np.asarray(patches().convert("L").convert("RGB"), int)
 
 
-TYPES: dict[str, tuple[Callable[[Path], object], str, Callable[[], np.ndarray]]] = {
+TYPES = {
     "16 bits": (grey16, "L", _grey),
     "a palette": (palette, "RGB", _same),
     "grey and alpha": (lambda path: patches().convert("LA").save(path), "RGBA", _grey),
@@ -135,7 +129,7 @@ TYPES: dict[str, tuple[Callable[[Path], object], str, Callable[[], np.ndarray]]]
 
 
 @pytest.mark.parametrize("kind", TYPES)
-def test_types_of_pixels(tmp_path: Path, kind: str) -> None:
+def test_types_of_pixels(tmp_path, kind):
     make, mode, expected = TYPES[kind]
     make(tmp_path / "a.png")
     image = decoded(tmp_path / "a.png")
@@ -143,7 +137,7 @@ def test_types_of_pixels(tmp_path: Path, kind: str) -> None:
     assert off(image, expected()) <= 1
 
 
-def test_srgb_stays_as_it_is(tmp_path: Path) -> None:
+def test_srgb_stays_as_it_is(tmp_path):
     srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     for number in range(3):
         patches().save(tmp_path / f"{number}.jpg", icc_profile=srgb)

@@ -1,10 +1,7 @@
 """What a folder holds: the words of ns-train that read it, or the advice that fits it."""
 
-from __future__ import annotations
-
 import json
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,7 +15,7 @@ from sundae_ns.data.colmap import check_colmap
 from sundae_ns.data.layouts import is_posed, no_model, no_transforms, posed_layout, unused_masks
 
 
-def photos(folder: Path, count: int = 3, size: tuple[int, int] = (20, 16)) -> list[str]:
+def photos(folder, count=3, size=(20, 16)):
     folder.mkdir(parents=True)
     names = [f"{index}.png" for index in range(count)]
     for name in names:
@@ -26,7 +23,7 @@ def photos(folder: Path, count: int = 3, size: tuple[int, int] = (20, 16)) -> li
     return names
 
 
-def model(folder: Path, images: int = 3) -> None:
+def model(folder, images=3):
     write_model(folder, [f"{index}.png" for index in range(images)], (20, 16))
 
 
@@ -42,7 +39,7 @@ def model(folder: Path, images: int = 3) -> None:
         ("sparse/0", ".", ["sparse/0", "--images-path", "."]),
     ],
 )
-def test_a_model_and_its_images(tmp_path: Path, place: str, images: str, words: list[str]) -> None:
+def test_a_model_and_its_images(tmp_path, place, images, words):
     data = tmp_path / "my scene"
     write_model(data / place, photos(data / images), (20, 16))
     assert is_posed(data)
@@ -53,7 +50,7 @@ def test_a_model_and_its_images(tmp_path: Path, place: str, images: str, words: 
 
 
 @pytest.mark.parametrize(("made", "factor"), [([], 1), ([4], 1), ([2], 2), ([2, 4, 8], 4)])
-def test_smaller_images_are_taken_where_there_are_some(tmp_path: Path, made: list[int], factor: int) -> None:
+def test_smaller_images_are_taken_where_there_are_some(tmp_path, made, factor):
     names = photos(tmp_path / "images", 3, (6000, 40))
     write_model(tmp_path / "sparse" / "0", names, (6000, 40))
     for one in made:
@@ -66,7 +63,7 @@ def test_smaller_images_are_taken_where_there_are_some(tmp_path: Path, made: lis
     assert posed_layout(tmp_path) is None, "a transforms.json comes first"
 
 
-def blender(data: Path, **changes: object) -> Path:
+def blender(data, **changes):
     """Write a capture of three splits, as NeRF's synthetic scenes have it."""
     for split in ("train", "val", "test"):
         names = photos(data / split, 2)
@@ -75,7 +72,7 @@ def blender(data: Path, **changes: object) -> Path:
     return data
 
 
-def test_a_capture_of_blender(tmp_path: Path) -> None:
+def test_a_capture_of_blender(tmp_path):
     data = blender(tmp_path / "lego")
     assert is_posed(data)
     layout = posed_layout(data)
@@ -91,7 +88,7 @@ def test_a_capture_of_blender(tmp_path: Path) -> None:
             posed_layout(blender(tmp_path / str(number), frames=frames))
 
 
-def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
+def test_what_cannot_be_read_is_named(tmp_path):
     model(tmp_path / "sparse" / "0", 1)
     with pytest.raises(DataError, match=r"no image 0\.png, which its model sparse/0 states, in images, input"):
         posed_layout(tmp_path)
@@ -100,24 +97,24 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         posed_layout(tmp_path)
 
 
-def _several(data: Path) -> None:
+def _several(data):
     for number, count in ((0, 3), (1, 20), (10, 7)):
         model(data / "sparse" / str(number), count)
 
 
-def _text(data: Path) -> None:
+def _text(data):
     folder = data / "colmap" / "sparse" / "0"
     folder.mkdir(parents=True)
     (folder / "cameras.txt").write_text("1 PINHOLE 20 16 18 18 10 8\n")
     (folder / "images.txt").write_text("1 1 0 0 0 0 0 3 1 a.png\n\n")
 
 
-def _inner(data: Path) -> None:
+def _inner(data):
     (data / "room").mkdir()
     (data / "room" / "transforms.json").write_text("{}")
 
 
-ADVICE: dict[str, tuple[Callable[[Path], object], str]] = {
+ADVICE = {
     "several models": (_several, "add `colmap --colmap-path sparse/1` (the largest of 3 models, with 20 images)"),
     "a model in sparse": (lambda data: model(data / "sparse"), "add `colmap --colmap-path sparse` to ns-train"),
     "a text": (_text, "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
@@ -130,14 +127,14 @@ ADVICE: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("kind", ADVICE)
-def test_advice_fits_what_a_folder_holds(tmp_path: Path, kind: str) -> None:
+def test_advice_fits_what_a_folder_holds(tmp_path, kind):
     make, advice = ADVICE[kind]
     make(tmp_path)
     assert advice in str(no_transforms(tmp_path))
     assert "\n" not in str(no_transforms(tmp_path))
 
 
-def test_a_larger_model_is_named(tmp_path: Path) -> None:
+def test_a_larger_model_is_named(tmp_path):
     assert "(usually sparse/0)" in str(no_model(tmp_path, Path("colmap/sparse/0")))
     _several(tmp_path)
     (tmp_path / "sparse" / "10" / "images.bin").write_bytes(b"\0")
@@ -160,7 +157,7 @@ def test_a_larger_model_is_named(tmp_path: Path) -> None:
         ("x.png", ["x.png", "X.png"], None),
     ],
 )
-def test_the_file_beside_a_missing_one(tmp_path: Path, wanted: str, present: list[str], named: str | None) -> None:
+def test_the_file_beside_a_missing_one(tmp_path, wanted, present, named):
     for name in present:
         (tmp_path / name).touch()
     assert beside(tmp_path / wanted) == ("" if named is None else f" (there is {named})")
@@ -171,7 +168,7 @@ def test_the_file_beside_a_missing_one(tmp_path: Path, wanted: str, present: lis
 
 
 @pytest.mark.parametrize(("name", "fits"), [("my photos (2)", True), ("-a;b&c", True), ("a$(touch P)", False)])
-def test_no_path_ends_a_word_of_a_shell(tmp_path: Path, name: str, fits: bool) -> None:
+def test_no_path_ends_a_word_of_a_shell(tmp_path, name, fits):
     images = tmp_path / name / "images"
     write_model(tmp_path / name / "sparse" / "0", photos(images, 2), (48, 48))
     check_colmap(images.parent / "sparse" / "0", None)  # a viewer reads no image

@@ -1,15 +1,10 @@
 """Folders of photos and their masks: judged by what files hold, in one line, and without waiting for a pipe."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re
 import struct
 import zlib
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 from PIL import Image
@@ -21,9 +16,7 @@ from sundae_ns.data import reconstruct
 from sundae_ns.data.photos import find_photos, left_out, masks_beside, masks_of, photo_of
 
 
-def photo(
-    path: Path, kind: str = "png", mode: str = "RGB", size: tuple[int, int] = (16, 12), orientation: int = 1
-) -> Path:
+def photo(path, kind="png", mode="RGB", size=(16, 12), orientation=1):
     path.parent.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -31,19 +24,19 @@ def photo(
     return path
 
 
-def paths_of(folder: Path) -> list[Path]:
+def paths_of(folder):
     return [photo.path for photo in find_photos(folder)]
 
 
 @pytest.fixture
-def photos(tmp_path: Path) -> Path:
+def photos(tmp_path):
     folder = tmp_path / "photos"
     for index in range(3):
         photo(folder / f"{index}.png")
     return folder
 
 
-def test_photos_of_all_folders_in_the_order_of_their_paths(photos: Path) -> None:
+def test_photos_of_all_folders_in_the_order_of_their_paths(photos):
     photo(photos / "b" / "0.PNG")
     photo(photos / "a.png" / "-c.png")  # a folder is no photo, whatever its name
     for name in (".thumbnails/0.png", "._0.png", "masks/0.png"):
@@ -60,13 +53,13 @@ KINDS |= {"tiff": (".jpg", False), "webp": (".jpg", False), "bmp": (".jpg", Fals
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_suffix_is_that_of_the_contents(tmp_path: Path, kind: str) -> None:
+def test_the_suffix_is_that_of_the_contents(tmp_path, kind):
     for index, name in enumerate(("JPG", "jpeg", "png", "tif", "TIFF", "webp", "bmp")):
         photo(tmp_path / f"{index}.{name}", kind)
     assert {(photo.suffix, photo.as_it_is) for photo in find_photos(tmp_path)} == {KINDS[kind]}
 
 
-def zipped_text(path: Path) -> None:
+def zipped_text(path):
     """A PNG whose text behind the pixels unpacks to 80 MB."""
     Image.new("RGB", (16, 12)).save(path)
     content, text = path.read_bytes(), b"zTXta\0\0" + zlib.compress(bytes(80 << 20), 9)
@@ -74,7 +67,7 @@ def zipped_text(path: Path) -> None:
     path.write_bytes(content[:-12] + chunk + content[-12:])
 
 
-ODD: dict[str, tuple[Callable[[Path], object], str]] = {
+ODD = {
     "a pipe": (os.mkfifo, "it is a pipe or a device"),
     "a raw pipe": (lambda path: os.mkfifo(path.with_suffix(".cr2")), "it is a pipe or a device"),
     "a raw photo of text": (lambda path: path.with_suffix(".cr2").write_text("II*"), "is not a photo"),
@@ -92,10 +85,10 @@ ODD: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("kind", ODD)
-def test_what_is_no_photo_is_left_out_in_one_line(photos: Path, kind: str) -> None:
+def test_what_is_no_photo_is_left_out_in_one_line(photos, kind):
     make, cause = ODD[kind]
     make(photos / "x.png")
-    said: list[str] = []
+    said = []
     assert len(find_photos(photos, said.append)) == 3
     (line,) = said
     assert re.search(rf"^left out: .*x\.(png|cr2).*{cause}[^\n]*$", line)
@@ -104,7 +97,7 @@ def test_what_is_no_photo_is_left_out_in_one_line(photos: Path, kind: str) -> No
         find_photos(photos)
 
 
-def test_half_of_the_photos_must_be_readable(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_half_of_the_photos_must_be_readable(photos, monkeypatch):
     for name in "abc":
         (photos / f"{name}.png").touch()
     assert len(find_photos(photos)) == 3
@@ -112,7 +105,7 @@ def test_half_of_the_photos_must_be_readable(photos: Path, monkeypatch: pytest.M
     with pytest.raises(DataError, match="; 4 of 7 photos cannot be used"):
         find_photos(photos)
 
-    def refuse(path: Path, *_: Any, **__: Any) -> Any:
+    def refuse(path, *_, **__):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
     monkeypatch.setattr(Image, "open", refuse)  # the tests may run as root, who may read everything
@@ -121,14 +114,14 @@ def test_half_of_the_photos_must_be_readable(photos: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize(("count", "cause"), [(0, "holds no photos"), (1, "holds 1 photo, "), (2, "holds 2 photos, ")])
-def test_too_few_photos(photos: Path, count: int, cause: str) -> None:
+def test_too_few_photos(photos, count, cause):
     for path in sorted(photos.iterdir())[count:]:
         path.unlink()
     with pytest.raises(DataError, match=cause):
         find_photos(photos)
 
 
-def test_a_folder_that_is_none(tmp_path: Path) -> None:
+def test_a_folder_that_is_none(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for name, cause in (("pipe", "Not a directory"), ("gone", "No such file")):
         with pytest.raises(DataError, match=f"{name} cannot be read .{cause}"):
@@ -142,14 +135,7 @@ def test_a_folder_that_is_none(tmp_path: Path) -> None:
         (("a.HEIC", "b.heic"), False, "2 .heic left out; install pillow-heif with pip install"),
     ],
 )
-def test_photos_that_are_not_read_are_named(
-    photos: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    names: tuple[str, ...],
-    heif: bool,
-    remark: str,
-) -> None:
+def test_photos_that_are_not_read_are_named(photos, monkeypatch, capsys, names, heif, remark):
     monkeypatch.setattr(module, "reads_heif", lambda: heif)
     monkeypatch.setattr(reconstruct, "check_installed", lambda: None)
     assert left_out(photos) is None
@@ -165,7 +151,7 @@ def test_photos_that_are_not_read_are_named(
         find_photos(photos)
 
 
-def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path: Path) -> None:
+def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path):
     for name, count in (("a", 4), ("b/c", 2), ("masks", 3)):
         for index in range(count):
             (tmp_path / name).mkdir(parents=True, exist_ok=True)
@@ -178,15 +164,13 @@ def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path: Pat
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.jpg.png", "a.png"])
 @pytest.mark.parametrize(("orientation", "size"), [(1, (16, 12)), (6, (12, 16)), (8, (12, 16))])
-def test_the_mask_of_a_photo_has_its_upright_size(
-    tmp_path: Path, name: str, orientation: int, size: tuple[int, int]
-) -> None:
+def test_the_mask_of_a_photo_has_its_upright_size(tmp_path, name, orientation, size):
     path = photo(tmp_path / "photos" / "a.jpg", "jpeg", orientation=orientation)
     mask = photo(tmp_path / "masks" / name, mode="L", size=size)
     assert masks_of([photo_of(path)], mask.parent) == [mask]
 
 
-MASKS: dict[str, tuple[tuple[int, int], int, tuple[str, tuple[int, int]] | None, str]] = {
+MASKS = {
     "none": ((16, 12), 1, None, r"a\.jpg has no mask a\.png in"),
     "another size": ((16, 12), 1, ("L", (8, 6)), "has 8 x 6 px and its photo 16 x 12; scale it"),
     "colours": ((16, 12), 1, ("RGB", (16, 12)), "save it with one channel of 8 bits"),
@@ -197,7 +181,7 @@ MASKS: dict[str, tuple[tuple[int, int], int, tuple[str, tuple[int, int]] | None,
 
 
 @pytest.mark.parametrize("kind", MASKS)
-def test_a_mask_that_does_not_fit_is_refused(tmp_path: Path, kind: str) -> None:
+def test_a_mask_that_does_not_fit_is_refused(tmp_path, kind):
     size, orientation, mask, cause = MASKS[kind]
     path = photo(tmp_path / "a.jpg", "jpeg", size=size, orientation=orientation)
     if mask is not None:

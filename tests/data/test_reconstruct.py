@@ -1,17 +1,12 @@
 """From photos to a capture: each stage continues where a killed process has left it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +18,6 @@ from harness.still_life import write_still_life
 from sundae_ns.core.errors import ConfigError, DataError, StorageError
 from sundae_ns.data import reconstruct
 from sundae_ns.data.capture import check_transforms
-from sundae_ns.data.capture_files import Placed
 from sundae_ns.data.reconstruct import Request, check_installed, find_poses, pycolmap, threads
 from sundae_ns.io import run_folder
 from sundae_ns.io.ply import read_point_cloud
@@ -32,7 +26,7 @@ PHOTOS = 8
 
 
 @pytest.fixture
-def colmap(monkeypatch: pytest.MonkeyPatch) -> FakeColmap:
+def colmap(monkeypatch):
     """A pycolmap with two threads."""
     made = FakeColmap()
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
@@ -42,7 +36,7 @@ def colmap(monkeypatch: pytest.MonkeyPatch) -> FakeColmap:
 
 
 @pytest.fixture
-def photos(tmp_path: Path) -> Path:
+def photos(tmp_path):
     folder = tmp_path / "-my \udcff$(photos)"
     folder.mkdir()
     for index in range(PHOTOS):
@@ -50,25 +44,25 @@ def photos(tmp_path: Path) -> Path:
     return folder
 
 
-def find(photos: Path, warn: Callable[[str], object] = str, **changes: Any) -> tuple[Placed, dict[str, list[int]]]:
+def find(photos, warn=str, **changes):
     """What is placed, and for each stage the number of its parts and how many were done."""
-    stages: dict[str, list[int]] = {}
+    stages = {}
 
     @contextmanager
-    def report(stage: str, total: int) -> Iterator[Callable[[int], None]]:
+    def report(stage, total):
         stages[stage] = [total, 0]
 
-        def advance(count: int) -> None:
+        def advance(count):
             stages[stage][1] += count
 
         yield advance
 
     out = photos.parent / "capture"
-    options: dict[str, Any] = {"capture": out, "matching": "auto", "frames": 20, "masks": None, **changes}
+    options = {"capture": out, "matching": "auto", "frames": 20, "masks": None, **changes}
     return find_poses(Request(photos, **options), report, warn), stages
 
 
-def test_photos_become_a_capture(colmap: FakeColmap, photos: Path) -> None:
+def test_photos_become_a_capture(colmap, photos):
     found, stages = find(photos)
     assert len(found.placed) == PHOTOS
     assert (found.cameras, found.error, found.models, found.masks) == (1, 0.5, (PHOTOS,), None)
@@ -85,7 +79,7 @@ def test_photos_become_a_capture(colmap: FakeColmap, photos: Path) -> None:
 
 
 @pytest.mark.parametrize("stage", ["import", "features", "pairs", "models"])
-def test_a_stage_continues(colmap: FakeColmap, photos: Path, stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stage_continues(colmap, photos, stage, monkeypatch):
     monkeypatch.setattr(reconstruct, "_PAIRS_AT_ONCE", 5)
     colmap.fails = stage
     with pytest.raises(RuntimeError, match="ended early"):
@@ -100,7 +94,7 @@ def test_a_stage_continues(colmap: FakeColmap, photos: Path, stage: str, monkeyp
 
 
 @pytest.mark.parametrize("change", ["a photo more", "another photo", "another way"])
-def test_other_photos_or_options_start_anew(colmap: FakeColmap, photos: Path, change: str) -> None:
+def test_other_photos_or_options_start_anew(colmap, photos, change):
     colmap.fails = "models"
     with pytest.raises(RuntimeError):
         find(photos)
@@ -125,8 +119,8 @@ def test_other_photos_or_options_start_anew(colmap: FakeColmap, photos: Path, ch
     ],
 )
 def test_the_largest_model_is_taken_and_simple_cameras_are_tried_while_photos_are_left_out(
-    colmap: FakeColmap, photos: Path, models: list[int], simple: list[int] | None, placed: tuple[int, ...], tried: int
-) -> None:
+    colmap, photos, models, simple, placed, tried
+):
     colmap.models, colmap.simple = models, simple
     if placed:
         found, _ = find(photos)
@@ -139,7 +133,7 @@ def test_the_largest_model_is_taken_and_simple_cameras_are_tried_while_photos_ar
     assert colmap.calls["models"] == ["OPENCV", "SIMPLE_RADIAL"][:tried]
 
 
-def test_images_that_see_hardly_a_point_have_no_pose(colmap: FakeColmap, photos: Path) -> None:
+def test_images_that_see_hardly_a_point_have_no_pose(colmap, photos):
     colmap.blind = ("c1/frame_00002.jpg",)
     assert find(photos)[0].left_out == ("1.JPG",)
     capture = photos.parent / "capture"
@@ -147,7 +141,7 @@ def test_images_that_see_hardly_a_point_have_no_pose(colmap: FakeColmap, photos:
     assert "frame_00002" not in (capture / "colmap" / "sparse" / "0" / "images.json").read_text()
 
 
-def test_masks_reach_the_capture_beside_a_broken_photo(colmap: FakeColmap, photos: Path, tmp_path: Path) -> None:
+def test_masks_reach_the_capture_beside_a_broken_photo(colmap, photos, tmp_path):
     (tmp_path / "masks").mkdir()
     for index in range(PHOTOS):
         mask = Image.new("L", (16, 12), 255)
@@ -166,7 +160,7 @@ def test_masks_reach_the_capture_beside_a_broken_photo(colmap: FakeColmap, photo
     assert len([*(tmp_path / "capture").glob("masks_[248]/*.png")]) == 18
 
 
-def test_one_process_works_on_a_capture(colmap: FakeColmap, photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_process_works_on_a_capture(colmap, photos, monkeypatch):
     run_folder.reserve(photos.parent / "capture.partial")
     held = dict(run_folder._held)
     monkeypatch.setattr(run_folder, "_held", {})
@@ -176,7 +170,7 @@ def test_one_process_works_on_a_capture(colmap: FakeColmap, photos: Path, monkey
 
 
 @pytest.fixture
-def walk(tmp_path: Path) -> list[str]:
+def walk(tmp_path):
     """A database of 60 images of a walk in a circle: each shares features with its neighbours."""
     module = pytest.importorskip("pycolmap")
     rng = np.random.default_rng(0)
@@ -194,13 +188,13 @@ def walk(tmp_path: Path) -> list[str]:
     return names
 
 
-def pairs_of(work: Path, names: list[str], matching: str, video: bool = False) -> set[tuple[int, int]]:
-    pairs = reconstruct._pairs(work, names, matching, video)  # type: ignore[arg-type]
+def pairs_of(work, names, matching, video=False):
+    pairs = reconstruct._pairs(work, names, matching, video)
     assert len(pairs) == len(set(pairs))
     return {(names.index(a), names.index(b)) for a, b in pairs}
 
 
-def test_pairs_of_a_walk(tmp_path: Path, walk: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pairs_of_a_walk(tmp_path, walk, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     every = pairs_of(tmp_path, walk, "auto")
     assert every == {(a, b) for b in range(60) for a in range(b)}
@@ -216,8 +210,8 @@ def test_pairs_of_a_walk(tmp_path: Path, walk: list[str], monkeypatch: pytest.Mo
     assert len(similar) < 60 * 13
 
 
-def test_a_missing_package_and_a_broken_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
+def test_a_missing_package_and_a_broken_one(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())
     assert pycolmap().logging.minloglevel == 3, "its log is silent"
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     for load in (check_installed, pycolmap):
@@ -231,7 +225,7 @@ def test_a_missing_package_and_a_broken_one(monkeypatch: pytest.MonkeyPatch, tmp
         pycolmap()
 
 
-def test_a_process_that_is_told_to_end_prints_nothing(tmp_path: Path) -> None:
+def test_a_process_that_is_told_to_end_prints_nothing(tmp_path):
     (tmp_path / "pycolmap.py").write_text(
         "import signal, sys\nfrom types import SimpleNamespace as Names\n"
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit('a stack of thirty lines'))\n"
@@ -244,13 +238,13 @@ def test_a_process_that_is_told_to_end_prints_nothing(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
 
 
-def test_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads(monkeypatch):
     for stated, count in (("3", 3), ("0", os.cpu_count()), ("", os.cpu_count()), ("many", os.cpu_count())):
         monkeypatch.setenv("OMP_NUM_THREADS", stated)
         assert threads() == count
 
 
-def test_poses_of_a_still_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_of_a_still_life(tmp_path, monkeypatch):
     """The real COLMAP: where the cameras stand and what they see agree with the scene's own, after a similarity."""
     pytest.importorskip("pycolmap")
     monkeypatch.setenv("OMP_NUM_THREADS", "1")

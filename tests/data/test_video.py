@@ -1,11 +1,6 @@
 """Frames of videos: the sharpest of each stretch, in the colours that the file states, or one line on why not."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
 
 import av
 import cv2
@@ -20,7 +15,7 @@ from sundae_ns.data.video import SUFFIXES, _length, check_video, image_of, is_vi
 PATCHES = [(200, 30, 40), (30, 190, 60), (20, 40, 220), (240, 240, 240), (128, 128, 128), (250, 220, 20)]
 
 
-def patches(width: int = 192, height: int = 64) -> np.ndarray:
+def patches(width=192, height=64):
     """Six fields of colour ``[H, W, 3]``, the upper half darker."""
     image = np.repeat(np.array(PATCHES, np.uint8)[None], height, axis=0).repeat(width // 6, axis=1)
     image[: height // 2] //= 2
@@ -28,20 +23,11 @@ def patches(width: int = 192, height: int = 64) -> np.ndarray:
 
 
 def write_colours(
-    path: Path,
-    images: Sequence[np.ndarray],
-    matrix: int = 2,
-    full: bool = False,
-    *,
-    pixels: str = "yuv420p",
-    codec: str = "libx264",
-    transfer: int = 2,
-    turn: tuple[int, bool] | None = None,
-    interlaced: bool = False,
-) -> None:
+    path, images, matrix=2, full=False, *, pixels="yuv420p", codec="libx264", transfer=2, turn=None, interlaced=False
+):
     """Write a video of images, which are converted and marked by a matrix, a range and a transfer."""
     with av.open(str(path), "w") as container:
-        video: Any = container.add_stream(codec, rate=10)
+        video = container.add_stream(codec, rate=10)
         video.height, video.width = images[0].shape[:2]
         video.pix_fmt = pixels
         video.options = {"crf": "1", "x265-params": "log-level=0:crf=1"}
@@ -60,11 +46,11 @@ def write_colours(
         container.mux(video.encode())
 
 
-def frames_of(folder: Path) -> list[np.ndarray]:
+def frames_of(folder):
     return [cv2.imread(str(path)) for path in sorted(folder.iterdir())]
 
 
-def frames_from(video: Path) -> list[np.ndarray]:
+def frames_from(video):
     """The frames that are written of a short video, ``[H, W, 3]`` RGB."""
     check_video(video)
     write_frames(video, video.with_suffix(""), 99, lambda _: None)
@@ -75,7 +61,7 @@ def frames_from(video: Path) -> list[np.ndarray]:
 @pytest.mark.parametrize(
     ("matrix", "pixels"), [(1, "yuv420p"), (5, "yuv422p"), (6, "yuv420p"), (9, "yuv420p10le"), (9, "yuv444p")]
 )
-def test_colours_are_those_of_the_matrix_and_the_range(tmp_path: Path, matrix: int, pixels: str, full: bool) -> None:
+def test_colours_are_those_of_the_matrix_and_the_range(tmp_path, matrix, pixels, full):
     path = tmp_path / "a.mkv"
     write_colours(path, 5 * [patches()], matrix, full, pixels=pixels)
     with av.open(str(path)) as container:
@@ -89,7 +75,7 @@ def test_colours_are_those_of_the_matrix_and_the_range(tmp_path: Path, matrix: i
 
 
 @pytest.mark.parametrize(("size", "matrix"), [((192, 64), 5), ((1280, 64), 1), ((96, 578), 1), ((96, 576), 5)])
-def test_an_unstated_matrix_goes_by_the_size(tmp_path: Path, size: tuple[int, int], matrix: int) -> None:
+def test_an_unstated_matrix_goes_by_the_size(tmp_path, size, matrix):
     image = np.full((size[1], size[0], 3), (200, 30, 40), np.uint8)
     frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(
         format="yuv444p", dst_colorspace=matrix, dst_color_range=1
@@ -104,7 +90,7 @@ GREY = np.array([0, 0.1, 0.2, 0.38, 0.5, 0.75, 0.9, 1])
 @pytest.mark.parametrize(
     ("transfer", "expected"), [(18, [0, 16, 46, 101, 137, 231, 254, 255]), (16, [0, 5, 29, 101, 180, 254, 255, 255])]
 )
-def test_a_high_dynamic_range_is_rolled_off(tmp_path: Path, transfer: int, expected: list[int]) -> None:
+def test_a_high_dynamic_range_is_rolled_off(tmp_path, transfer, expected):
     """Greys up to 93 cd/m2 are those of sRGB with 203 cd/m2 as white; BT.2020's red is out of sRGB."""
     image = np.zeros((64, 160, 3), np.uint16)
     image[:, :128] = np.repeat(np.round(65535 * GREY), 16)[None, :, None]
@@ -118,7 +104,7 @@ def test_a_high_dynamic_range_is_rolled_off(tmp_path: Path, transfer: int, expec
 
 
 @pytest.mark.parametrize(("degrees", "flip"), [(d, f) for d in (0, 90, 180, -90) for f in (False, True)])
-def test_frames_are_upright(tmp_path: Path, degrees: int, flip: bool) -> None:
+def test_frames_are_upright(tmp_path, degrees, flip):
     write_colours(tmp_path / "a.mp4", 5 * [patches()], 1, pixels="yuv444p", turn=(degrees, flip))
     stored = Image.fromarray(patches()).rotate(degrees, expand=True)
     upright = stored.transpose(Image.Transpose.FLIP_LEFT_RIGHT) if flip else stored
@@ -127,7 +113,7 @@ def test_frames_are_upright(tmp_path: Path, degrees: int, flip: bool) -> None:
     assert np.median(np.abs(frame - np.asarray(upright))) <= 3
 
 
-def test_interlaced_frames_have_no_comb(tmp_path: Path) -> None:
+def test_interlaced_frames_have_no_comb(tmp_path):
     """Fields of 1/20 s apart: a bar moves by 24 pixels between the lines of one and of the other."""
     path, images = tmp_path / "a.mkv", [np.full((64, 288, 3), 40, np.uint8) for _ in range(5)]
     for index, image in enumerate(images):
@@ -141,9 +127,9 @@ def test_interlaced_frames_have_no_comb(tmp_path: Path) -> None:
         assert left < 0.1 * comb
 
 
-def test_the_sharpest_frame_of_each_stretch(tmp_path: Path) -> None:
+def test_the_sharpest_frame_of_each_stretch(tmp_path):
     write_video(tmp_path / "a.mp4", 60)
-    done: list[int] = []
+    done = []
     write_frames(tmp_path / "a.mp4", tmp_path / "frames", 20, done.append)
     found = frames_of(tmp_path / "frames")
     assert len(found) == sum(done) == 20
@@ -153,15 +139,15 @@ def test_the_sharpest_frame_of_each_stretch(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.mkv", "a.mts", "\udcff.mp4"])
-def test_frames_are_counted_where_no_length_is_stated(tmp_path: Path, name: str) -> None:
+def test_frames_are_counted_where_no_length_is_stated(tmp_path, name):
     write_colours(tmp_path / name, 5 * [patches()], 1)
     assert _length(tmp_path / name) == 5
 
 
-def test_all_frames_of_a_short_video_are_there_only_once_they_are_whole(tmp_path: Path) -> None:
+def test_all_frames_of_a_short_video_are_there_only_once_they_are_whole(tmp_path):
     write_video(tmp_path / "a.mp4", 7)
 
-    def stop(count: int) -> None:
+    def stop(count):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -172,7 +158,7 @@ def test_all_frames_of_a_short_video_are_there_only_once_they_are_whole(tmp_path
     assert not (tmp_path / "frames.partial").exists()
 
 
-def test_a_video_by_its_suffix(tmp_path: Path) -> None:
+def test_a_video_by_its_suffix(tmp_path):
     write_video(tmp_path / "A WALK.MP4", 5)
     assert is_video(tmp_path / "A WALK.MP4")
     check_video(tmp_path / "A WALK.MP4")
@@ -181,24 +167,24 @@ def test_a_video_by_its_suffix(tmp_path: Path) -> None:
     assert all(suffix == suffix.lower() and suffix.startswith(".") for suffix in SUFFIXES)
 
 
-def half(path: Path) -> None:
+def half(path):
     write_video(path, 40)
     path.write_bytes(path.read_bytes()[:400])
 
 
-def sound(path: Path) -> None:
+def sound(path):
     with av.open(str(path), "w") as container:
-        track: Any = container.add_stream("aac", rate=44100)
+        track = container.add_stream("aac", rate=44100)
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
         frame.sample_rate = 44100
         container.mux(track.encode(frame))
         container.mux(track.encode())
 
 
-def playlist(text: str) -> Callable[[Path], object]:
+def playlist(text):
     """A text that names a video beside it."""
 
-    def make(path: Path) -> None:
+    def make(path):
         write_video(path.with_name("other.mp4"), 9)
         path.write_text(text.format(path.with_name("other.mp4")))
 
@@ -206,7 +192,7 @@ def playlist(text: str) -> Callable[[Path], object]:
 
 
 UNREADABLE = "is not a video that FFmpeg decodes .*; convert it to .mp4"
-REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
+REFUSED = {
     "text": (lambda path: path.write_text("not a video"), UNREADABLE),
     "empty": (lambda path: path.touch(), UNREADABLE),
     "half": (half, UNREADABLE),
@@ -226,7 +212,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_what_is_no_video(tmp_path: Path, kind: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_video(tmp_path, kind, capfd):
     make, cause = REFUSED[kind]
     make(tmp_path / "x.mp4")
     with pytest.raises(DataError, match=cause) as error:

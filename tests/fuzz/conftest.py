@@ -6,8 +6,6 @@ Each kind of input has one file ``test_<kind>.py``. It takes a valid input made 
     python -m pytest tests/fuzz -k damaged --hypothesis-profile release --hypothesis-seed 0    # 5,000 of each kind
 """
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -19,14 +17,14 @@ from harness.still_life import write_still_life
 
 
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene(tmp_path_factory):
     """A capture with a transforms.json; tests change a copy."""
     out = tmp_path_factory.mktemp("capture") / "scene"
     return write_still_life(out, train_views=VIEWS, test_views=1, width=WIDTH, height=HEIGHT, points=40, samples=1)
 
 
 @pytest.fixture
-def capture(scene: Path, tmp_path: Path) -> Path:
+def capture(scene, tmp_path):
     """A copy of the capture for one test, with a transforms.json and a COLMAP model."""
     copy = Path(shutil.copytree(scene, tmp_path / "scene"))
     write_model(copy / "sparse" / "0", sorted(path.name for path in (copy / "images").iterdir()), SIZE)

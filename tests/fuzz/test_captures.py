@@ -1,7 +1,5 @@
 """Bad captures, loaded by the datamanager of training: transforms.json, COLMAP models, images; and unusual ones."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os
@@ -18,7 +16,6 @@ import numpy as np
 import pytest
 import torch
 from colmap_models import write_model
-from damage import Change as Damage
 from damage import damage
 from hypothesis import HealthCheck, given, settings
 from icc_profiles import judged, profile
@@ -34,13 +31,13 @@ from sundae_ns.plugin.model import SundaeModelConfig
 Change = Callable[[dict[str, Any]], object]
 
 
-def rewrite(data: Path, change: Change) -> None:
+def rewrite(data, change):
     meta = meta_of(data)
     change(meta)
     (data / "transforms.json").write_text(json.dumps(meta), encoding="utf-8")
 
 
-def as_text(data: Path) -> None:
+def as_text(data):
     shutil.rmtree(data / "sparse")
     write_text_model(data / "sparse" / "0", sorted(path.name for path in (data / "images").iterdir()))
 
@@ -58,7 +55,7 @@ many = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, Heal
 @pytest.mark.parametrize("file", FILES)
 @many
 @given(change=damage())
-def test_damaged_files(capture: Path, file: str, change: Damage) -> None:
+def test_damaged_files(capture, file, change):
     path = capture / file
     if path.suffix == ".txt" and not path.exists():
         as_text(capture)
@@ -74,21 +71,21 @@ def test_damaged_files(capture: Path, file: str, change: Damage) -> None:
     path.write_bytes(content)
 
 
-VALUES: tuple[Any, ...] = (
+VALUES = (
     *(None, True, "", "word", "0", [], {}, [[]], 0, -1, 0.5, 1e-300, 1e30, 1e308, float("nan"), float("inf")),
     *(10**400, [float("nan")] * 4, [[0.0] * 4] * 4, "../../x.png", "\0", "ünï cöde.png", [[1, 2], [3]]),
 )
 
 
-def places(value: Any) -> list[tuple[Any, Any]]:
+def places(value):
     """Every container of a parsed file, paired with each of its keys."""
-    keys: Any = value.keys() if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    keys = value.keys() if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
     return [(value, key) for key in keys] + [place for key in keys for place in places(value[key])]
 
 
 @many
 @given(data=st.data(), value=st.sampled_from(VALUES) | st.just("gone"))
-def test_damaged_values_of_transforms(capture: Path, data: st.DataObject, value: Any) -> None:
+def test_damaged_values_of_transforms(capture, data, value):
     content = (capture / "transforms.json").read_text()
     meta = json.loads(content)
     holder, key = data.draw(st.sampled_from(places(meta)))
@@ -100,23 +97,23 @@ def test_damaged_values_of_transforms(capture: Path, data: st.DataObject, value:
     (capture / "transforms.json").write_text(content)
 
 
-def _frame(**changes: Any) -> Change:
+def _frame(**changes):
     return lambda meta: meta["frames"][1].update(changes)
 
 
-def _top(**changes: Any) -> Change:
+def _top(**changes):
     return lambda meta: meta.update(changes)
 
 
-def _pose(row: int, column: int, value: float) -> Change:
+def _pose(row, column, value):
     return lambda meta: meta["frames"][1]["transform_matrix"][row].__setitem__(column, value)
 
 
-def _round(**changes: Any) -> Change:
+def _round(**changes):
     return _top(camera_model="FISHEYE624", distortion_params=[0.0] * 12, **changes)
 
 
-REFUSED: dict[str, tuple[Change, str]] = {
+REFUSED = {
     "NaN in a pose": (_pose(0, 3, float("nan")), r"frame 1 .*transform_matrix is nan; it must be finite"),
     "infinity in a pose": (_pose(2, 1, float("inf")), "frame 1 .*finite"),
     "a pose of zeros": (_frame(transform_matrix=[[0.0] * 4] * 4), "frame 1 .*singular"),
@@ -156,7 +153,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
 }
 
 
-def test_valid_models_are_read(capture: Path) -> None:
+def test_valid_models_are_read(capture):
     assert verdict(lambda: load(capture, colmap=True), bytes_of(capture)) is None
     binary = load(capture, colmap=True)
     as_text(capture)
@@ -174,7 +171,7 @@ def test_valid_models_are_read(capture: Path) -> None:
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
-def test_a_model_cut_short_anywhere_is_refused(tmp_path: Path, file: str, text: bool) -> None:
+def test_a_model_cut_short_anywhere_is_refused(tmp_path, file, text):
     names = [f"{index}.png" for index in range(3)]
     write_text_model(tmp_path, names) if text else write_model(tmp_path, names, SIZE)
     path = tmp_path / f"{file}.{'txt' if text else 'bin'}"
@@ -193,8 +190,8 @@ def test_a_model_cut_short_anywhere_is_refused(tmp_path: Path, file: str, text: 
             check_colmap(tmp_path, None)
 
 
-def _patch(file: str, at: int, layout: str, *values: Any) -> Callable[[Path], object]:
-    def change(model: Path) -> None:
+def _patch(file, at, layout, *values):
+    def change(model):
         data, content = bytearray((model / file).read_bytes()), struct.pack(layout, *values)
         data[at : at + len(content)] = content
         (model / file).write_bytes(data)
@@ -202,17 +199,17 @@ def _patch(file: str, at: int, layout: str, *values: Any) -> Callable[[Path], ob
     return change
 
 
-def _twice(model: Path) -> None:
+def _twice(model):
     camera = (model / "cameras.bin").read_bytes()[8:]
     (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + camera * 2)
 
 
-def _folder(file: str) -> Callable[[Path], object]:
+def _folder(file):
     return lambda model: ((model / file).unlink(missing_ok=True), (model / file).mkdir())
 
 
 _NAME = 8 + 64 + len("frame_00001.png") + 1  # offset of the first image's number of observations
-MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
+MODELS = {
     "2^63 cameras": (_patch("cameras.bin", 0, "<Q", 1 << 63), "is not a complete cameras.bin"),
     "2^40 images": (_patch("images.bin", 0, "<Q", 1 << 40), "is not a complete images.bin"),
     "2^30 observations": (_patch("images.bin", _NAME, "<Q", 1 << 30), "images.bin .*ends .* bytes early"),
@@ -247,17 +244,17 @@ MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-def _text(model: Path, image: str) -> None:
+def _text(model, image):
     as_text(model.parents[1])
     (model / "images.txt").write_text(f"{image}\n\n")
 
 
-def _written(text: str) -> Callable[[Path], object]:
+def _written(text):
     return lambda data: (data / "transforms.json").write_text(text, errors="surrogateescape")
 
 
 TEXTS = ("", "[1, 2]", "[" * 200_000, '{"frames": ' + "9" * 5000 + "}", '{"frames": [', "\udcff")
-FOLDERS: dict[str, tuple[Callable[[Path], object], str]] = {
+FOLDERS = {
     **{f"text {number}": (_written(text), "transforms.json") for number, text in enumerate(TEXTS)},
     "no folder": (shutil.rmtree, "does not exist; give the folder of the capture"),
     "no transforms": (
@@ -268,7 +265,7 @@ FOLDERS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("kind", [*REFUSED, *MODELS, *FOLDERS])
-def test_captures_are_refused_by_name(capture: Path, kind: str) -> None:
+def test_captures_are_refused_by_name(capture, kind):
     change, cause = {**REFUSED, **MODELS, **FOLDERS}[kind]
     size = bytes_of(capture)
     rewrite(capture, change) if kind in REFUSED else change(capture / ("sparse/0" if kind in MODELS else ""))
@@ -277,7 +274,7 @@ def test_captures_are_refused_by_name(capture: Path, kind: str) -> None:
     assert re.search(cause, str(error)), error
 
 
-def bomb(width: int, height: int) -> Callable[[Path], object]:
+def bomb(width, height):
     """Write a PNG whose header claims more pixels than follow."""
     content = b"\x89PNG\r\n\x1a\n"
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
@@ -286,11 +283,11 @@ def bomb(width: int, height: int) -> Callable[[Path], object]:
     return lambda path: path.write_bytes(content)
 
 
-def _saved(kind: str, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Callable[[Path], object]:
+def _saved(kind, size=(WIDTH, HEIGHT)):
     return lambda path: Image.new(kind, size).save(path)
 
 
-IMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
+IMAGES = {
     "floats": (lambda path: Image.new("F", SIZE).save(path, format="TIFF"), "pixels of type F"),
     "one pixel": (_saved("RGB", (1, 1)), "1 x 1 px but its camera says"),
     "empty": (lambda path: path.write_bytes(b""), "cannot identify image file"),
@@ -304,7 +301,7 @@ IMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("which", ["train", "test"])
 @pytest.mark.parametrize("kind", IMAGES)
-def test_images_are_refused_by_name(capture: Path, kind: str, which: str) -> None:
+def test_images_are_refused_by_name(capture, kind, which):
     make, cause = IMAGES[kind]
     name = meta_of(capture)[f"{which}_filenames"][-1]  # nerfstudio opens the first
     make(capture / name)
@@ -316,8 +313,8 @@ def test_images_are_refused_by_name(capture: Path, kind: str, which: str) -> Non
     assert re.search(cause, str(error)), error
 
 
-def _each_image(change: Callable[[Image.Image], Image.Image]) -> Callable[[Path], object]:
-    def make(data: Path) -> None:
+def _each_image(change):
+    def make(data):
         for path in (data / "images").iterdir():
             with Image.open(path) as image:
                 changed = change(image)
@@ -326,12 +323,12 @@ def _each_image(change: Callable[[Image.Image], Image.Image]) -> Callable[[Path]
     return make
 
 
-def _one_pixel(data: Path) -> None:
+def _one_pixel(data):
     _each_image(lambda image: image.resize((1, 1)))(data)
     rewrite(data, _top(w=1, h=1, cx=0.5, cy=0.5))
 
 
-def _masks(data: Path) -> None:
+def _masks(data):
     (data / "masks").mkdir()
     half = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
     half[:, : WIDTH // 2] = 255
@@ -339,14 +336,14 @@ def _masks(data: Path) -> None:
     rewrite(data, lambda meta: [frame.update(mask_path="masks/half.png") for frame in meta["frames"]])
 
 
-def _renamed(data: Path) -> None:
+def _renamed(data):
     for path in list((data / "images").iterdir()):
         path.rename(path.with_name("ünï cöde 像 " + path.name))
     text = (data / "transforms.json").read_text().replace("images/", "images/ünï cöde 像 ")
     (data / "transforms.json").write_text(text, encoding="utf-8")
 
 
-FINE: dict[str, Callable[[Path], object]] = {
+FINE = {
     "unchanged": lambda data: None,
     **{mode: _each_image(lambda image, mode=mode: image.convert(mode)) for mode in ("1", "L", "LA", "P", "RGBA")},
     "one pixel": _one_pixel,
@@ -356,7 +353,7 @@ FINE: dict[str, Callable[[Path], object]] = {
 }
 
 
-def train_a_step(data: Path) -> None:
+def train_a_step(data):
     """Train one step with the head, and evaluate the test views."""
     datamanager = load(data)
     config = SundaeModelConfig(head=HeadConfig(mode="residual", size="tiny"), num_random=50, num_downscales=0)
@@ -383,20 +380,20 @@ def train_a_step(data: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def compiled(scene: Path) -> None:
+def compiled(scene):
     """Compile the CPU rasteriser before its first use under limits of time and memory."""
     train_a_step(scene)
 
 
 @pytest.mark.parametrize(("kind", "folder"), [*zip(FINE, itertools.cycle(("a folder, with spaces", "ünï cöde 像")))])
-def test_unusual_captures_train(compiled: None, capture: Path, kind: str, folder: str) -> None:
+def test_unusual_captures_train(compiled, capture, kind, folder):
     data = capture.rename(capture.with_name(folder))
     FINE[kind](data)
     assert verdict(lambda: train_a_step(data), bytes_of(data)) is None
 
 
 @pytest.mark.parametrize(("made", "factors"), [((), "1"), (("images_2", "images_8"), "1, 2, 8")])
-def test_a_missing_size_is_named_with_what_makes_it(capture: Path, made: tuple[str, ...], factors: str) -> None:
+def test_a_missing_size_is_named_with_what_makes_it(capture, made, factors):
     for name in made:
         (capture / name).mkdir()
     with pytest.raises(DataError) as error:
@@ -405,7 +402,7 @@ def test_a_missing_size_is_named_with_what_makes_it(capture: Path, made: tuple[s
     assert f"give another --downscale-factor ({factors}), or make it with {make}" in str(error.value)
 
 
-def test_training_sees_srgb(capture: Path) -> None:
+def test_training_sees_srgb(capture):
     name = meta_of(capture)["train_filenames"][0]
     with Image.open(capture / name) as image:
         image.load()

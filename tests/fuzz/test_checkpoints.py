@@ -1,15 +1,10 @@
 """Bad checkpoints: damaged files, odd contents, and pickles that would run code."""
 
-from __future__ import annotations
-
 import io
 import os
 import zipfile
-from collections.abc import Callable, Iterator
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -22,12 +17,12 @@ from torch.amp import GradScaler
 from sundae_ns.head.head import HeadConfig
 from sundae_ns.io.formats import read_gaussians
 from sundae_ns.plugin.distributed import Ranks
-from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
+from sundae_ns.plugin.model import SundaeModelConfig
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.plugin.trainer import SundaeTrainer
 
 
-def small_model() -> SundaeModel:
+def small_model():
     points = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
     config = SundaeModelConfig(
         head=HeadConfig(size="tiny", num_features=5), camera_optimizer=CameraOptimizerConfig(mode="off"), sh_degree=1
@@ -39,30 +34,30 @@ def small_model() -> SundaeModel:
 class Pipeline(torch.nn.Module):
     """The part of nerfstudio's pipeline that a checkpoint uses."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self._model = small_model()
         outputs = SimpleNamespace(dataparser_transform=torch.eye(4)[:3], dataparser_scale=1.0)
         self.datamanager = SimpleNamespace(train_dataparser_outputs=outputs)
 
     @property
-    def model(self) -> SundaeModel:
+    def model(self):
         return self._model
 
-    def load_pipeline(self, state: dict[str, Any], step: int) -> None:
+    def load_pipeline(self, state, step):
         self._model.load_state_dict({name.removeprefix("_model."): value for name, value in state.items()})
 
 
 @cache
-def trainer() -> SundaeTrainer:
+def trainer():
     """A trainer with only the attributes that saving and resuming use; shared, because every case loads its state."""
     made = SundaeTrainer.__new__(SundaeTrainer)
     made.ranks = Ranks()
-    made.pipeline = Pipeline()  # type: ignore[assignment]
+    made.pipeline = Pipeline()
     groups = made.pipeline._model.get_param_groups()
     made.optimizers = Optimizers({n: {"optimizer": FusedAdamConfig(), "scheduler": None} for n in groups}, groups)
     made.grad_scaler = GradScaler(enabled=False)
-    made.config = SimpleNamespace(  # type: ignore[assignment]
+    made.config = SimpleNamespace(
         load_dir=None,
         load_step=None,
         load_checkpoint=None,
@@ -74,24 +69,24 @@ def trainer() -> SundaeTrainer:
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def good(tmp_path_factory):
     made = trainer()
     made.checkpoint_dir = tmp_path_factory.mktemp("good")
     made.save_checkpoint(7)
     return (made.checkpoint_dir / "step-000000007.ckpt").read_bytes()
 
 
-def contents(good: bytes) -> dict[str, Any]:
+def contents(good):
     return torch.load(io.BytesIO(good), weights_only=True)
 
 
-def resume(path: Path) -> None:
+def resume(path):
     made = trainer()
     made.config.load_checkpoint = path
     made._load_checkpoint()
 
 
-def test_a_valid_checkpoint_is_read(good: bytes, tmp_path: Path) -> None:
+def test_a_valid_checkpoint_is_read(good, tmp_path):
     path = tmp_path / "a.ckpt"
     path.write_bytes(good)
     assert verdict(lambda: resume(path), len(good)) is None
@@ -99,7 +94,7 @@ def test_a_valid_checkpoint_is_read(good: bytes, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def folder(good: bytes, tmp_path: Path) -> Iterator[Path]:
+def folder(good, tmp_path):
     """The trainer's folder with two checkpoints; the newer one is truncated."""
     (tmp_path / "step-000000007.ckpt").write_bytes(good)
     (tmp_path / "step-000000008.ckpt").write_bytes(good[:-1000])
@@ -109,7 +104,7 @@ def folder(good: bytes, tmp_path: Path) -> Iterator[Path]:
     made.config.load_dir = made.config.load_step = None
 
 
-def test_training_resumes_from_the_newest_complete_checkpoint(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_training_resumes_from_the_newest_complete_checkpoint(folder, capsys):
     made = trainer()
     assert verdict(made._load_checkpoint, 10**6) is None
     assert made._start_step == 8
@@ -117,14 +112,14 @@ def test_training_resumes_from_the_newest_complete_checkpoint(folder: Path, caps
 
 
 @pytest.mark.parametrize("step", [8, 9])
-def test_a_requested_step_is_not_replaced(folder: Path, step: int) -> None:
+def test_a_requested_step_is_not_replaced(folder, step):
     made = trainer()
     made.config.load_step = step
     error = verdict(made._load_checkpoint, 10**6)
     assert f"step-{step:09d}.ckpt" in str(error)
 
 
-def rezipped(good: bytes, change: Callable[[str, bytes], bytes]) -> bytes:
+def rezipped(good, change):
     """The archive with changed entries and valid checksums."""
     out = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(good)) as source, zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as target:
@@ -133,14 +128,14 @@ def rezipped(good: bytes, change: Callable[[str, bytes], bytes]) -> bytes:
     return out.getvalue()
 
 
-def test_tensors_without_their_bytes(good: bytes, tmp_path: Path) -> None:
+def test_tensors_without_their_bytes(good, tmp_path):
     path = tmp_path / "a.ckpt"
     path.write_bytes(rezipped(good, lambda name, data: b"" if "/data/" in name else data))
     assert verdict(lambda: resume(path), path.stat().st_size) is not None
 
 
-def _at(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
-    def change(state: dict[str, Any]) -> None:
+def _at(key, value):
+    def change(state):
         if value is None:
             del state[key]
         else:
@@ -149,24 +144,24 @@ def _at(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
     return change
 
 
-def _extra(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
+def _extra(key, value):
     return lambda state: _at(key, value)(state["pipeline"]["_model._extra_state"])
 
 
-def _running(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
+def _running(key, value):
     return lambda state: _at(key, value)(state["pipeline"]["_model._extra_state"]["running"])
 
 
-def _param(name: str, change: Callable[[torch.Tensor], Any]) -> Callable[[dict[str, Any]], None]:
+def _param(name, change):
     key = f"_model.gauss_params.{name}"
     return lambda state: _at(key, change(state["pipeline"][key]))(state["pipeline"])
 
 
-def _moments(state: dict[str, Any]) -> None:
+def _moments(state):
     state["optimizers"]["means"]["param_groups"].append({"lr": 1.0})
 
 
-ODD: dict[str, Callable[[dict[str, Any]], None]] = {
+ODD = {
     "no optimizers": _at("optimizers", None),
     "optimizers of another field": _moments,
     "generators that are numbers": _at("random", {"python": 1, "numpy": 2, "torch": 3, "cuda": 4}),
@@ -193,7 +188,7 @@ ODD: dict[str, Callable[[dict[str, Any]], None]] = {
 
 
 @pytest.mark.parametrize("kind", ODD)
-def test_odd_contents_are_refused(good: bytes, tmp_path: Path, kind: str) -> None:
+def test_odd_contents_are_refused(good, tmp_path, kind):
     state = contents(good)
     ODD[kind](state)
     path = tmp_path / "a.ckpt"
@@ -205,15 +200,15 @@ def test_odd_contents_are_refused(good: bytes, tmp_path: Path, kind: str) -> Non
 class MakesFolder:
     """Make a folder when unpickled."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         self.path = path
 
-    def __reduce__(self) -> tuple[Any, tuple[str]]:
+    def __reduce__(self):
         return os.mkdir, (str(self.path),)
 
 
 @pytest.mark.parametrize("place", ["pipeline", "optimizers", "random", "schedulers", "scalers"])
-def test_nothing_in_a_checkpoint_is_run(good: bytes, tmp_path: Path, place: str) -> None:
+def test_nothing_in_a_checkpoint_is_run(good, tmp_path, place):
     folder, path = tmp_path / "folder", tmp_path / "a.ckpt"
     state = contents(good)
     state[place] = {**state[place], "extra": MakesFolder(folder)}

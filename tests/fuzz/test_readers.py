@@ -1,7 +1,5 @@
 """Every reader of untrusted files against damage, outside and inside of their checksums and compression."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable
@@ -12,7 +10,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
-from damage import INSIDE, Change, damage
+from damage import INSIDE, damage
 from fields import random_field
 from foreign_files import FOREIGN, small_field, spz
 from hypothesis import HealthCheck, given, settings
@@ -31,7 +29,7 @@ HEADER = b"ply\nformat %s 1.0\nelement vertex %s\n%send_header\n"
 XYZ = b"property float x\nproperty float y\nproperty float z\n"
 
 
-def scene() -> PackedScene:
+def scene():
     generator = torch.Generator().manual_seed(0)
     head = {"net.weight": torch.randn(3, 4, 1, 1, generator=generator), "net.bias": torch.randn(3, generator=generator)}
     cameras = {
@@ -42,30 +40,30 @@ def scene() -> PackedScene:
     return PackedScene(random_field(50, 2, 3), head, cameras, {"model": {"sh_degree": 2}})
 
 
-def unpack(path: Path) -> None:
+def unpack(path):
     gaussians = read_scene(path).gaussians
     assert all(torch.isfinite(value).all() for value in gaussians.values())
     assert len({len(value) for value in gaussians.values()}) == 1
 
 
-def write_cloud(path: Path, text: bool) -> None:
+def write_cloud(path, text):
     rows = np.zeros(30, dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
     rows["x"] = np.linspace(-1, 1, 30)
     PlyData([PlyElement.describe(rows, "vertex")], text=text).write(str(path))
 
 
-def read_cloud(path: Path) -> None:
+def read_cloud(path):
     points, rgb = read_point_cloud(path)
     if torch.isfinite(points).all(dim=1).any():
         from_points(points, rgb.float() / 255, sh_degree=1, num_features=0)
 
 
-def write_checkpoint(path: Path) -> None:
+def write_checkpoint(path):
     state = {f"_model.gauss_params.{name}": value for name, value in small_field(20).items()}
     torch.save({"step": 3, "pipeline": state}, path)
 
 
-READERS: dict[str, tuple[Callable[[Path], Any], Reader]] = {
+READERS = {
     **{
         name: (lambda path, write=write: write(path, small_field(60)), read_gaussian_file)
         for name, write in FOREIGN.items()
@@ -87,11 +85,11 @@ many = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], bytes]:
+def good(tmp_path_factory):
     """Contents of a valid file of :data:`READERS`."""
     folder = tmp_path_factory.mktemp("good")
 
-    def content(name: str) -> bytes:
+    def content(name):
         if not (folder / name).exists():
             READERS[name][0](folder / name)
         return (folder / name).read_bytes()
@@ -100,7 +98,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], bytes]:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_valid_files_are_read(good: Any, tmp_path: Path, name: str) -> None:
+def test_valid_files_are_read(good, tmp_path, name):
     (tmp_path / name).write_bytes(good(name))
     assert verdict(lambda: READERS[name][1](tmp_path / name), len(good(name))) is None
 
@@ -108,7 +106,7 @@ def test_valid_files_are_read(good: Any, tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", READERS)
 @many
 @given(change=damage(), part=st.none() | st.integers(0, 99))
-def test_damaged_files(good: Any, tmp_path: Path, name: str, change: Change, part: int | None) -> None:
+def test_damaged_files(good, tmp_path, name, change, part):
     inside = INSIDE.get(Path(name).suffix) if name != "four.spz" else None
     content = change(good(name)) if part is None or inside is None else inside(good(name), change, part)
     (tmp_path / name).write_bytes(content)
@@ -118,7 +116,7 @@ def test_damaged_files(good: Any, tmp_path: Path, name: str, change: Change, par
 
 
 BINARY = b"binary_little_endian"
-PLYS: dict[str, bytes] = {
+PLYS = {
     "empty": b"",
     "no header": b"\x00" * 100,
     "end_header alone": b"end_header\n" + b"\x00" * 100,
@@ -143,13 +141,13 @@ PLYS: dict[str, bytes] = {
 
 @pytest.mark.parametrize("kind", PLYS)
 @pytest.mark.parametrize("reader", [read_point_cloud, read_gaussians])
-def test_odd_plys_are_refused(reader: Reader, tmp_path: Path, kind: str) -> None:
+def test_odd_plys_are_refused(reader, tmp_path, kind):
     path = tmp_path / "ünï cöde.ply"
     path.write_bytes(PLYS[kind])
     assert verdict(lambda: reader(path), len(PLYS[kind])) is not None
 
 
-PACKS: dict[str, bytes] = {
+PACKS = {
     "empty": b"",
     "magic alone": b"\x89SUNDAE\n",
     "a checkpoint": b"PK\x03\x04" + bytes(200),
@@ -163,14 +161,14 @@ PACKS: dict[str, bytes] = {
 
 
 @pytest.mark.parametrize("kind", PACKS)
-def test_odd_packs_are_refused(kind: str, tmp_path: Path) -> None:
+def test_odd_packs_are_refused(kind, tmp_path):
     path = tmp_path / "ünï cöde.sundae"
     path.write_bytes(PACKS[kind])
     assert isinstance(verdict(lambda: read_scene(path), len(PACKS[kind])), PackError)
 
 
 @pytest.mark.parametrize(("stated", "words"), [(1 << 27, "would unpack to"), (1 << 20, "cannot be decompressed")])
-def test_bombs_are_refused_before_they_unpack(stated: int, words: str, good: Any, tmp_path: Path) -> None:
+def test_bombs_are_refused_before_they_unpack(stated, words, good, tmp_path):
     deflate = zlib.compressobj(9, wbits=-15)
     stream = deflate.compress(bytes(1 << 27)) + deflate.flush()
     meta, body = header_and_body(good("a.sundae"))
@@ -182,7 +180,7 @@ def test_bombs_are_refused_before_they_unpack(stated: int, words: str, good: Any
     assert words in str(error)
 
 
-def test_a_few_constant_planes_cannot_fill_the_memory(tmp_path: Path) -> None:
+def test_a_few_constant_planes_cannot_fill_the_memory(tmp_path):
     """Every section is within its limit, but the field that they describe is not."""
     n, path = 200_000, tmp_path / "a.sundae"
     write_scene(path, PackedScene({k: v[:1].expand(n, *v.shape[1:]) for k, v in scene().gaussians.items()}))
@@ -194,12 +192,12 @@ def test_a_few_constant_planes_cannot_fill_the_memory(tmp_path: Path) -> None:
     assert "would unpack to" in str(verdict(lambda: read_scene(path), len(content)))
 
 
-def test_points_that_are_not_finite_are_dropped(tmp_path: Path) -> None:
+def test_points_that_are_not_finite_are_dropped(tmp_path):
     path = tmp_path / "a.ply"
     rows = b"nan 0 0\n0 inf 0\n1e300 0 0\n1 2 3\n"
     path.write_bytes(HEADER % (b"ascii", b"4", XYZ.replace(b"float", b"double")) + rows)
 
-    def read() -> None:
+    def read():
         points, rgb = read_point_cloud(path)
         gaussians = from_points(points, rgb.float() / 255, sh_degree=0, num_features=0)
         assert torch.equal(gaussians["means"], torch.tensor([[1.0, 2.0, 3.0]]))

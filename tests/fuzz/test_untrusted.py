@@ -3,18 +3,14 @@
 An audit hook of the interpreter records what a reader does (PEP 578).
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os
 import stat
 import sys
 import zipfile
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -40,11 +36,11 @@ PLACES = (
 )
 ACTS = ("os.mkdir", "os.rename", "os.remove", "os.link", "os.symlink", "os.chmod", "os.system", "os.exec", "os.fork")
 ACTS += ("os.posix_spawn", "subprocess.Popen", "socket.connect", "socket.bind", "shutil.unpack_archive")
-recorded: list[str] | None = None
+recorded = None
 """Acts recorded in :func:`watched`; None outside of it, because an audit hook cannot be removed."""
 
 
-def record(event: str, arguments: tuple[Any, ...]) -> None:
+def record(event, arguments):
     if recorded is None:
         return
     if event == "open":
@@ -60,7 +56,7 @@ sys.addaudithook(record)
 
 
 @contextmanager
-def watched() -> Iterator[list[str]]:
+def watched():
     """Yield a list to which the acts of the block are added."""
     global recorded  # noqa: PLW0603
     recorded = []
@@ -70,7 +66,7 @@ def watched() -> Iterator[list[str]]:
         recorded = None
 
 
-def test_the_hook_records_writes_and_no_reads(tmp_path: Path) -> None:
+def test_the_hook_records_writes_and_no_reads(tmp_path):
     with watched() as found:
         (tmp_path / "a").mkdir()
         (tmp_path / "a" / "b").write_text("x")
@@ -78,7 +74,7 @@ def test_the_hook_records_writes_and_no_reads(tmp_path: Path) -> None:
     assert [line.split()[0] for line in found] == ["os.mkdir", "open"]
 
 
-def a_checkpoint(path: Path, place: str) -> None:
+def a_checkpoint(path, place):
     """Write a checkpoint that names ``place`` as a member of its archive, as the target of a link and as a tensor."""
     buffer = io.BytesIO()
     state = {f"_model.gauss_params.{name}": value for name, value in small_field(20).items()}
@@ -91,7 +87,7 @@ def a_checkpoint(path: Path, place: str) -> None:
     path.write_bytes(buffer.getvalue())
 
 
-def a_pack(path: Path, place: str) -> None:
+def a_pack(path, place):
     """Write a packed scene that names ``place`` throughout its header, and as a section, which readers may refuse."""
     about = {"source": {"method": place}, "name": place, "model": {"sh_degree": 1}}
     write_scene(path, PackedScene(small_field(20), meta=about))
@@ -101,12 +97,12 @@ def a_pack(path: Path, place: str) -> None:
     path.write_bytes(container.encode(meta, {**arrays, place: arrays["means/low"]})[0])
 
 
-def a_ply(path: Path, place: str) -> None:
+def a_ply(path, place):
     """Write a .ply that names ``place`` in its comments."""
     write_ply(path, small_field(20), comments=[place, f"TextureFile {place}"])
 
 
-CASES: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], Any]]] = {
+CASES = {
     "a.ckpt": (a_checkpoint, checkpoint.read),
     "b.ckpt": (a_checkpoint, read_gaussians),
     "a.sundae": (a_pack, read_scene),
@@ -116,7 +112,7 @@ CASES: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], Any]]] = {
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("name", CASES)
-def test_nothing_leaves_the_file(tmp_path: Path, name: str, place: str) -> None:
+def test_nothing_leaves_the_file(tmp_path, name, place):
     make, read = CASES[name]
     path = tmp_path / "deep" / "er" / name
     path.parent.mkdir(parents=True)
@@ -127,7 +123,7 @@ def test_nothing_leaves_the_file(tmp_path: Path, name: str, place: str) -> None:
     assert [entry.name for entry in path.parent.iterdir()] == [name]
 
 
-def test_members_of_an_exported_archive_are_plain_names(tmp_path: Path) -> None:
+def test_members_of_an_exported_archive_are_plain_names(tmp_path):
     """A .sog is a zip that other programs unpack."""
     write_for_viewers(tmp_path / "a.sog", small_field(20))
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
@@ -137,7 +133,7 @@ def test_members_of_an_exported_archive_are_plain_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_reading_a_capture_writes_nothing(capture: Path, place: str) -> None:
+def test_reading_a_capture_writes_nothing(capture, place):
     meta = meta_of(capture)
     meta["frames"][0]["file_path"] = meta["ply_file_path"] = place
     (capture / "transforms.json").write_text(json.dumps(meta))

@@ -1,7 +1,5 @@
 """Hard point sets for neighbour searches."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -12,11 +10,11 @@ from torch import Tensor
 Cloud = Callable[[int], Tensor]
 
 
-def _normal(n: int, seed: int = 0) -> Tensor:
+def _normal(n, seed=0):
     return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def _clusters(n: int) -> Tensor:
+def _clusters(n):
     """Clusters of 1e-5 and of 1e-2 beside a background of 1e3."""
     points = _normal(n)
     points[: n // 2] = points[: n // 2] * 1e-5 + 0.5
@@ -25,13 +23,13 @@ def _clusters(n: int) -> Tensor:
     return points
 
 
-def _half_duplicated(n: int) -> Tensor:
+def _half_duplicated(n):
     points = _clusters(n)
     points[torch.randperm(n, generator=torch.Generator().manual_seed(1))[: n // 2]] = points[: n // 2].clone()
     return points
 
 
-def _piles(n: int) -> Tensor:
+def _piles(n):
     """Most points at three spots, one of them the origin with both signs of zero."""
     points = _normal(n)
     points[: n // 3] = 0.0
@@ -41,13 +39,13 @@ def _piles(n: int) -> Tensor:
     return points
 
 
-def _lattice(n: int) -> Tensor:
+def _lattice(n):
     side = int(np.ceil(n ** (1 / 3)))
     cells = torch.cartesian_prod(*[torch.arange(side, dtype=torch.float64)] * 3)
     return cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(2))[:n]]
 
 
-def _sphere(n: int) -> Tensor:
+def _sphere(n):
     """Points at the corners of a cube, with many clones, all equally far from the first point."""
     points = torch.zeros(n, 3, dtype=torch.float64)
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
@@ -55,11 +53,11 @@ def _sphere(n: int) -> Tensor:
     return points
 
 
-def _line(n: int) -> Tensor:
+def _line(n):
     return torch.linspace(-1, 1, n, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
 
 
-CLOUDS: dict[str, Cloud] = {
+CLOUDS = {
     "normal": _normal,
     "clusters": _clusters,
     "half duplicated": _half_duplicated,
@@ -77,6 +75,6 @@ CLOUDS: dict[str, Cloud] = {
 
 
 @pytest.fixture(params=CLOUDS, ids=[name.replace(" ", "-") for name in CLOUDS])
-def cloud(request: pytest.FixtureRequest) -> Cloud:
+def cloud(request):
     """One distribution: maps a number N to its first N points, float64 ``[N, 3]``."""
     return CLOUDS[request.param]

@@ -1,11 +1,8 @@
 """Filters against exact spectra and dense algebra, and their invariances."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.graph import filters
@@ -13,11 +10,11 @@ from sundae_ns.graph.filters import Smoother, high_pass, low_pass, response_magn
 from sundae_ns.graph.graph import NeighborGraph, build_graph
 
 
-def cloud(n: int = 60, seed: int = 0) -> torch.Tensor:
+def cloud(n=60, seed=0):
     return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def random_walk(graph: NeighborGraph) -> torch.Tensor:
+def random_walk(graph):
     """Dense A = D^-1 W; an isolated node is its own neighbour."""
     W = torch.zeros(graph.N, graph.N, dtype=graph.weights.dtype).scatter_add(1, graph.indices, graph.weights)
     W += torch.diag(graph.isolated.to(W.dtype))
@@ -25,7 +22,7 @@ def random_walk(graph: NeighborGraph) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("num_neighbors", [5, 59])
-def test_filters_match_the_exact_spectrum(num_neighbors: int) -> None:
+def test_filters_match_the_exact_spectrum(num_neighbors):
     points = cloud()
     graph = build_graph(points, num_neighbors=num_neighbors, tau=100.0, sigma=0.5)
     eigenvalues, V = torch.linalg.eig(random_walk(graph))
@@ -38,7 +35,7 @@ def test_filters_match_the_exact_spectrum(num_neighbors: int) -> None:
     torch.testing.assert_close(low_pass(graph, points), low.real, rtol=1e-8, atol=1e-8)
 
 
-def test_shapes_dtypes_and_chunks_agree_and_constants_vanish(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shapes_dtypes_and_chunks_agree_and_constants_vanish(monkeypatch):
     graph, x = build_graph(cloud().float(), num_neighbors=6, sigma=10.0), cloud(seed=1)
     whole = high_pass(graph, x)
     assert high_pass(graph, torch.full((60,), 3.7, dtype=torch.float64)).abs().max() == 0
@@ -49,7 +46,7 @@ def test_shapes_dtypes_and_chunks_agree_and_constants_vanish(monkeypatch: pytest
     assert torch.equal(high_pass(graph, x), whole)
 
 
-def test_isolated_nodes_are_nan() -> None:
+def test_isolated_nodes_are_nan():
     points = torch.cat([cloud(), torch.full((1, 3), 1e3, dtype=torch.float64)])
     graph = build_graph(points, num_neighbors=6)
     alone, A = graph.isolated, random_walk(graph)
@@ -59,7 +56,7 @@ def test_isolated_nodes_are_nan() -> None:
     torch.testing.assert_close(low_pass(graph, points)[~alone], (points + A @ points)[~alone])
 
 
-def test_one_node_and_no_node() -> None:
+def test_one_node_and_no_node():
     for n in (0, 1):
         graph = NeighborGraph(torch.zeros(n, 1, dtype=torch.int64), torch.zeros(n, 1), torch.zeros(n), 1.0, 1.0)
         assert high_pass(graph, torch.ones(n, 2)).shape == (n, 2)
@@ -68,7 +65,7 @@ def test_one_node_and_no_node() -> None:
     assert high_pass(bare, torch.ones(1, 2)).isnan().all()
 
 
-def test_float32_far_from_the_origin_keeps_its_digits() -> None:
+def test_float32_far_from_the_origin_keeps_its_digits():
     # Coordinates are exact in float32 at this offset, so float64 has the same field.
     points = (cloud(300) * 64).round() / 64 + 1e5
     exact_graph = build_graph(points, num_neighbors=8, tau=4.0, sigma=0.5)
@@ -84,14 +81,14 @@ def test_float32_far_from_the_origin_keeps_its_digits() -> None:
     assert (naive - exact)[known].abs().max().item() > 1e-3  # measured 2.2e-2, the reason for the difference form
 
 
-def test_wrong_signal_is_refused() -> None:
+def test_wrong_signal_is_refused():
     graph = build_graph(cloud(), num_neighbors=6)
     for shape in ((59, 3), (60, 3, 1), ()):
         with pytest.raises(DataError, match="60 nodes"):
             high_pass(graph, torch.zeros(shape))
 
 
-def test_magnitudes_of_tiny_responses_do_not_vanish() -> None:
+def test_magnitudes_of_tiny_responses_do_not_vanish():
     response = torch.tensor([[1e-30, 0.0], [3e-30, 4e-30], [torch.nan, 0.0]])
     magnitude = response_magnitude(response)
     assert magnitude.dtype == torch.float64
@@ -101,17 +98,14 @@ def test_magnitudes_of_tiny_responses_do_not_vanish() -> None:
     assert response_magnitude(torch.zeros(0, 3)).shape == (0,)
 
 
-# ----------------------------------------------------------------------------------------------------- the smooth part
-
-
-def laplacian(graph: NeighborGraph, strength: float) -> NDArray[np.float64]:
+def laplacian(graph, strength):
     W = torch.zeros(graph.N, graph.N, dtype=torch.float64).scatter_add(1, graph.indices, graph.weights.double())
     W = 0.5 * (W + W.T)
     return (strength / W.sum(1).mean() * (torch.diag(W.sum(1)) - W)).numpy()
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.3, 8.0, 100.0])
-def test_it_solves_its_equation_for_the_known_nodes(strength: float) -> None:
+def test_it_solves_its_equation_for_the_known_nodes(strength):
     graph, signal = build_graph(cloud(), num_neighbors=6), cloud(seed=1).numpy()
     smoother, known = Smoother(graph, strength), np.arange(60) % 3 > 0
     for mask in (np.ones(60, bool), known):  # one after the other: factors of other nodes must not be kept
@@ -123,7 +117,7 @@ def test_it_solves_its_equation_for_the_known_nodes(strength: float) -> None:
         np.testing.assert_allclose((signal - smooth)[mask].sum(axis=0), 0.0, atol=1e-4)
 
 
-def test_a_constant_is_smooth_and_what_changes_from_node_to_node_is_not() -> None:
+def test_a_constant_is_smooth_and_what_changes_from_node_to_node_is_not():
     angle = torch.linspace(0, 2 * torch.pi, 61)[:60]
     ring = torch.stack([angle.cos(), angle.sin(), torch.zeros(60)], dim=1)
     smoother, known = Smoother(build_graph(ring, num_neighbors=4), 8.0), np.ones(60, bool)
@@ -133,7 +127,7 @@ def test_a_constant_is_smooth_and_what_changes_from_node_to_node_is_not() -> Non
     assert np.abs(smoother(fast, known)).max() < 0.1
 
 
-def test_a_node_without_an_edge_keeps_its_value() -> None:
+def test_a_node_without_an_edge_keeps_its_value():
     graph = build_graph(torch.cat([cloud(), torch.tensor([[1e3, 0, 0], [0, 1e3, 0]])]), num_neighbors=6)
     assert graph.isolated.tolist()[-2:] == [True, True]
     known = np.arange(62) < 61

@@ -1,8 +1,5 @@
 """Neighbour search on a GPU against the CPU, and the graph and response built on it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -17,14 +14,14 @@ pytestmark = pytest.mark.gpu
 
 
 @pytest.fixture(autouse=True)
-def kernel_runs() -> None:
+def kernel_runs():
     """Without the kernel, the search on the CPU would be compared with itself."""
     assert neighbors._kernel(torch.device("cuda", torch.cuda.current_device()), torch.float32, 16) is not None
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("n", "k"), [(200_000, 16), (20_000, 32), (2000, 1), (300, 100), (2, 1)])
-def test_same_neighbours(cloud: Callable, dtype: torch.dtype, n: int, k: int) -> None:
+def test_same_neighbours(cloud, dtype, n, k):
     points = cloud(n).to(dtype)
     on_gpu, on_cpu = knn(points.cuda(), k), knn(points, k)
     assert on_gpu.indices.is_cuda
@@ -35,7 +32,7 @@ def test_same_neighbours(cloud: Callable, dtype: torch.dtype, n: int, k: int) ->
     assert torch.equal(on_gpu.indices.cpu()[apart, :-1], on_cpu.indices[apart, :-1])
 
 
-def test_same_tree_as_on_the_cpu(cloud: Callable) -> None:
+def test_same_tree_as_on_the_cpu(cloud):
     points = cloud(50_000).float()
     on_gpu, on_cpu = build_tree(points.cuda()), build_tree(points)
     assert on_gpu.depth == on_cpu.depth
@@ -43,7 +40,7 @@ def test_same_tree_as_on_the_cpu(cloud: Callable) -> None:
         assert torch.equal(getattr(on_gpu, name).cpu(), getattr(on_cpu, name))
 
 
-def test_a_million_clones_of_one_point() -> None:
+def test_a_million_clones_of_one_point():
     found = knn(torch.ones(1_000_000, 3, device="cuda"), 16)
     assert (found.distances == 0).all()
     assert torch.equal(found.indices[20:], torch.arange(16, device="cuda").expand(999_980, -1))
@@ -51,7 +48,7 @@ def test_a_million_clones_of_one_point() -> None:
         assert found.indices[row].tolist() == [other for other in range(17) if other != row]
 
 
-def test_the_same_from_run_to_run(cloud: Callable) -> None:
+def test_the_same_from_run_to_run(cloud):
     points = cloud(100_000).float().cuda()
     first = build_graph(points)
     response = high_pass(first, points)
@@ -63,7 +60,7 @@ def test_the_same_from_run_to_run(cloud: Callable) -> None:
         assert torch.equal(high_pass(again, points).nan_to_num(-1), response.nan_to_num(-1))
 
 
-def test_same_bandwidth_and_close_responses(cloud: Callable) -> None:
+def test_same_bandwidth_and_close_responses(cloud):
     points = cloud(20_000).float()
     on_gpu, on_cpu = build_graph(points.cuda()), build_graph(points)
     assert (on_gpu.tau, on_gpu.sigma) == (on_cpu.tau, on_cpu.sigma)
@@ -77,7 +74,7 @@ def test_same_bandwidth_and_close_responses(cloud: Callable) -> None:
     torch.testing.assert_close(magnitude[0].cpu()[known] / scale, magnitude[1][known] / scale, rtol=1e-4, atol=1e-6)
 
 
-def test_extra_memory_grows_with_the_number_of_points_only() -> None:
+def test_extra_memory_grows_with_the_number_of_points_only():
     peaks = []
     for n in (250_000, 500_000):
         points = torch.rand(n, 3, device="cuda")
@@ -90,7 +87,7 @@ def test_extra_memory_grows_with_the_number_of_points_only() -> None:
     assert peaks[1] < 1.1 * peaks[0]
 
 
-def test_other_streams_and_threads_and_a_search_without_the_kernel_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_streams_and_threads_and_a_search_without_the_kernel_agree(monkeypatch):
     points, stream = torch.rand(100_000, 3, device="cuda"), torch.cuda.Stream()
     expected = knn(points, 8)
     stream.wait_stream(torch.cuda.current_stream())

@@ -1,39 +1,35 @@
 """Edge weights, their width and reach, and the invariances of graph and response on hard point sets."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from sundae_ns.graph import graph
 from sundae_ns.graph.filters import high_pass, response_magnitude
-from sundae_ns.graph.graph import NeighborGraph, build_graph
+from sundae_ns.graph.graph import build_graph
 
 
-def normal(n: int = 120, seed: int = 0) -> Tensor:
+def normal(n=120, seed=0):
     return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def dense(graph: NeighborGraph) -> Tensor:
+def dense(graph):
     W = torch.zeros(graph.N, graph.N, dtype=graph.weights.dtype)
     return W.scatter_add(1, graph.indices, graph.weights)
 
 
-def edges(graph: NeighborGraph) -> int:
+def edges(graph):
     return int((graph.weights > 0).sum())
 
 
-def magnitude(points: Tensor, k: int = 8, **options: float) -> Tensor:
+def magnitude(points, k=8, **options):
     return response_magnitude(high_pass(build_graph(points, num_neighbors=k, **options), points))
 
 
-def check(graph: NeighborGraph, signal: Tensor) -> None:
+def check(graph, signal):
     """Properties of every graph: weights in [0, 1], and a response that is finite exactly for nodes with an edge."""
     assert ((graph.weights >= 0) & (graph.weights <= 1)).all()
     assert (graph.indices != torch.arange(graph.N)[:, None])[graph.weights > 0].all()
@@ -44,7 +40,7 @@ def check(graph: NeighborGraph, signal: Tensor) -> None:
     assert (response.norm(dim=1) <= reach * (1 + 1e-5))[~graph.isolated].all()
 
 
-def test_weights_follow_the_equation_of_the_paper() -> None:
+def test_weights_follow_the_equation_of_the_paper():
     points = normal(40)
     graph = build_graph(points, num_neighbors=39, tau=1.5, sigma=0.6)
     squared = (points[:, None] - points[None]).square().sum(-1)
@@ -55,7 +51,7 @@ def test_weights_follow_the_equation_of_the_paper() -> None:
     assert (graph.tau, graph.sigma) == (1.5, 0.6)
 
 
-def test_the_median_ignores_clones_and_floaters() -> None:
+def test_the_median_ignores_clones_and_floaters():
     points = normal()
     clean = build_graph(points)
     spoiled = build_graph(torch.cat([points, points[:20], torch.full((5, 3), 1e9, dtype=torch.float64)]))
@@ -68,7 +64,7 @@ def test_the_median_ignores_clones_and_floaters() -> None:
 
 
 @pytest.mark.parametrize("sampled", [2**22, 64])
-def test_the_width_is_the_lower_median_of_positive_distances(sampled: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_width_is_the_lower_median_of_positive_distances(sampled, monkeypatch):
     monkeypatch.setattr(graph, "SAMPLED", sampled)
     odd = torch.tensor([1e-40, 1e30, torch.inf, torch.nan])
     values = torch.cat([normal(300).abs().flatten(), torch.zeros(40), odd])
@@ -79,7 +75,7 @@ def test_the_width_is_the_lower_median_of_positive_distances(sampled: int, monke
     assert graph._typical_distance(torch.zeros(3, 2)) == graph._typical_distance(torch.zeros(0, 2)) == 1.0
 
 
-def test_given_values_replace_the_median() -> None:
+def test_given_values_replace_the_median():
     points = normal(20)
     cases = (({"sigma": 2.0}, 36.0, 2.0), ({"sigma": 1e200}, math.inf, 1e200), ({"tau": 0.5}, 0.5, None))
     for options, tau, sigma in cases:
@@ -88,7 +84,7 @@ def test_given_values_replace_the_median() -> None:
         assert sigma is None or found.sigma == sigma
 
 
-def test_symmetries_are_followed() -> None:
+def test_symmetries_are_followed():
     points, order = normal(), torch.randperm(120, generator=torch.Generator().manual_seed(3))
     rotation = torch.linalg.qr(normal(3, seed=5)).Q
     found, shuffled, scaled = build_graph(points), build_graph(points[order]), build_graph(points * 1e-6)
@@ -103,7 +99,7 @@ def test_symmetries_are_followed() -> None:
     assert torch.equal(magnitude(points[order]).nan_to_num(-1), expected[order].nan_to_num(-1))
 
 
-def test_smallest_graphs() -> None:
+def test_smallest_graphs():
     two = build_graph(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]), num_neighbors=1)
     assert two.sigma == 1.0
     torch.testing.assert_close(two.weights, torch.full((2, 1), math.exp(-0.5)))
@@ -115,7 +111,7 @@ def test_smallest_graphs() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_every_hard_cloud(cloud: Callable, dtype: torch.dtype) -> None:
+def test_every_hard_cloud(cloud, dtype):
     points = cloud(1500).to(dtype)
     check(build_graph(points), points)
 
@@ -127,7 +123,7 @@ def test_every_hard_cloud(cloud: Callable, dtype: torch.dtype) -> None:
     st.sampled_from([None, 0.0, 1e-30, 1.0, float("inf")]),
     st.booleans(),
 )
-def test_any_cells_at_any_scale(cells: list, exponent: int, shift: float, tau: float | None, double: bool) -> None:
+def test_any_cells_at_any_scale(cells, exponent, shift, tau, double):
     points = torch.tensor(cells, dtype=torch.float64 if double else torch.float32) * 2.0**exponent + shift
     graph = build_graph(points, num_neighbors=min(4, len(cells) - 1), tau=tau)
     check(graph, points)
@@ -135,25 +131,25 @@ def test_any_cells_at_any_scale(cells: list, exponent: int, shift: float, tau: f
     assert tau != float("inf") or not graph.isolated.any()
 
 
-def test_two_clusters_1e6_apart_are_independent() -> None:
+def test_two_clusters_1e6_apart_are_independent():
     cluster = (torch.randn(300, 3, dtype=torch.float64) * 2**20).round() / 2**20
     found = magnitude(torch.cat([cluster, cluster + 1e6])).nan_to_num(-1)
     assert torch.equal(found, magnitude(cluster).nan_to_num(-1).repeat(2))
 
 
-def test_a_shift_by_1e5_changes_no_bit_of_the_response_in_float32() -> None:
+def test_a_shift_by_1e5_changes_no_bit_of_the_response_in_float32():
     points = (torch.randn(2000, 3) * 64).round() / 64  # exact at this offset
     assert torch.equal(magnitude(points + 1e5).nan_to_num(-1), magnitude(points).nan_to_num(-1))
 
 
-def test_thousands_of_points_at_one_spot_do_not_respond() -> None:
+def test_thousands_of_points_at_one_spot_do_not_respond():
     points = torch.cat([torch.full((5000, 3), 0.1), torch.randn(500, 3)])
     found = magnitude(points, 16)
     assert (found[:5000] == 0).all()
     assert (found[5000:].nan_to_num(1) > 0).all()
 
 
-def test_an_overflowing_distance_and_an_infinite_width_give_no_nan() -> None:
+def test_an_overflowing_distance_and_an_infinite_width_give_no_nan():
     points = torch.cat([torch.randn(20, 3), torch.tensor([[3e38, 3e38, 3e38]])])
     graph = build_graph(points, num_neighbors=6, sigma=float("inf"))
     assert set(graph.weights.unique().tolist()) == {0.0, 1.0}

@@ -1,10 +1,8 @@
 """Neighbour search against all pairs, on the CPU and by the kernel compiled for the CPU: clones, floaters, ties."""
 
-from __future__ import annotations
-
 import ctypes
 import tracemalloc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -14,12 +12,12 @@ from torch import Tensor
 
 from sundae_ns.core.errors import BackendError, ConfigError, DataError
 from sundae_ns.cuda import kernels
-from sundae_ns.cuda.kernels import Argument, Launch
+from sundae_ns.cuda.kernels import Launch
 from sundae_ns.graph import neighbors
 from sundae_ns.graph.neighbors import FILE, KERNEL, LEAF, MAX_NEIGHBORS, build_tree, kernel_options, knn, search_tree
 
 
-def check(points: Tensor, indices: Tensor, distances: Tensor) -> None:
+def check(points, indices, distances):
     """Other points, each once, at the distances of the nearest ones, ascending; of one place the lowest indices."""
     n, k = indices.shape
     x, y, z = (points.double()[:, None] - points.double()[None]).unbind(2)
@@ -37,7 +35,7 @@ def check(points: Tensor, indices: Tensor, distances: Tensor) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("n", "k"), [(700, 16), (130, 3), (40, 39), (2, 1)])
-def test_every_hard_cloud(cloud: Callable, dtype: torch.dtype, n: int, k: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_hard_cloud(cloud, dtype, n, k, monkeypatch):
     points = cloud(n).to(dtype)
     for chunk in (neighbors.CHUNK, 10):
         monkeypatch.setattr(neighbors, "CHUNK", chunk)
@@ -47,13 +45,13 @@ def test_every_hard_cloud(cloud: Callable, dtype: torch.dtype, n: int, k: int, m
 
 
 @given(st.lists(st.integers(0, 2), min_size=2, max_size=40), st.integers(1, 10))
-def test_any_clones(cells: list[int], k: int) -> None:
+def test_any_clones(cells, k):
     points = torch.tensor(cells, dtype=torch.float32)[:, None].expand(-1, 3)
     check(points, *knn(points, min(k, len(cells) - 1)))
 
 
 @pytest.mark.parametrize("reach", [1e18, 1e20, 1e30, 1e38])
-def test_one_far_floater_costs_the_others_no_precision(reach: float) -> None:
+def test_one_far_floater_costs_the_others_no_precision(reach):
     points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
     alone, found = knn(points, 3), knn(torch.cat([points, torch.full((1, 3), reach)]), 3)
     assert torch.equal(found.indices[:50], alone.indices)
@@ -61,8 +59,8 @@ def test_one_far_floater_costs_the_others_no_precision(reach: float) -> None:
 
 
 @pytest.mark.parametrize("place", [torch.zeros, torch.rand])
-def test_memory_and_time_grow_with_points_also_of_clones(place: Callable) -> None:
-    def peak(n: int) -> int:
+def test_memory_and_time_grow_with_points_also_of_clones(place):
+    def peak(n):
         points = place(n, 3)
         tracemalloc.start()
         try:
@@ -85,15 +83,13 @@ def test_memory_and_time_grow_with_points_also_of_clones(place: Callable) -> Non
         (torch.full((5, 3), 1e200, dtype=torch.float64), 2, DataError, "1e.150"),
     ],
 )  # fmt: skip
-def test_wrong_input_is_refused(points: Tensor, k: int, error: type[Exception], words: str) -> None:
+def test_wrong_input_is_refused(points, k, error, words):
     with pytest.raises(error, match=words):
         knn(points, k)
 
 
-def test_without_a_kernel_the_cpu_searches_and_logs_one_line(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def broken(*_: object) -> None:
+def test_without_a_kernel_the_cpu_searches_and_logs_one_line(monkeypatch, caplog):
+    def broken(*_):
         raise BackendError("no compiler on board")
 
     monkeypatch.setattr(neighbors, "Kernel", broken)
@@ -107,9 +103,6 @@ def test_without_a_kernel_the_cpu_searches_and_logs_one_line(
     assert "no compiler on board" in first
     assert f"at most {MAX_NEIGHBORS} neighbours, not {MAX_NEIGHBORS + 1}" in second
     neighbors._kernel.cache_clear()
-
-
-# ----------------------------------------------------------------------------------------------------------- the kernel
 
 
 # The kernel's source with a counter of visited points, and a loop over the threads.
@@ -131,18 +124,18 @@ Compile = Callable[..., Launch]
 
 
 @pytest.fixture(scope="module")
-def compiled(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Compile:
+def compiled(compile_for_cpu):
     """Compiles the kernel for a dtype and a number of neighbours; launches append the number of visited points."""
     visit = "const double dx = points"
     source = kernels.read_source(FILE)
     assert source.count(visit) == 1
     source = SHIM % source.replace(visit, "++visited; " + visit)
 
-    def compile_for(dtype: torch.dtype, k: int, visited: list[int] | None = None) -> Launch:
+    def compile_for(dtype, k, visited=None):
         kernel = compile_for_cpu(source, ["-ffp-contract=off", *kernel_options(dtype, k)[1:]])
         counter = ctypes.c_longlong.in_dll(kernel, "visited")
 
-        def launch(threads: int, arguments: Sequence[Argument]) -> None:
+        def launch(threads, arguments):
             assert all(a.is_contiguous() for a in arguments if isinstance(a, Tensor))
             values = [kernels._as_c(argument, torch.device("cpu")) for argument in arguments]
             counter.value = 0
@@ -157,18 +150,18 @@ def compiled(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Compile:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("n", "k"), [(700, 16), (130, 3), (40, 32)])
-def test_kernel_matches_all_pairs(compiled: Compile, cloud: Callable, dtype: torch.dtype, n: int, k: int) -> None:
+def test_kernel_matches_all_pairs(compiled, cloud, dtype, n, k):
     points = cloud(n).to(dtype)
     check(points, *search_tree(build_tree(points), k, compiled(dtype, k)))
 
 
 @pytest.mark.parametrize("n", [2, 15, 16, 17, 33, 63, 64, 65])
-def test_kernel_on_every_shape_of_small_tree(compiled: Compile, n: int) -> None:
+def test_kernel_on_every_shape_of_small_tree(compiled, n):
     points, k = torch.randn(n, 3), min(3, n - 1)
     check(points, *search_tree(build_tree(points), k, compiled(torch.float32, k)))
 
 
-def test_tree_holds_every_point_once_in_tight_boxes(cloud: Callable) -> None:
+def test_tree_holds_every_point_once_in_tight_boxes(cloud):
     for n in (1, 15, 1000):
         tree = build_tree(cloud(n).float())
         assert torch.equal(tree.order.long().sort().values, torch.arange(n))
@@ -182,16 +175,16 @@ def test_tree_holds_every_point_once_in_tight_boxes(cloud: Callable) -> None:
             assert level < tree.depth or n < 2 * LEAF or LEAF <= end - begin <= 2 * LEAF
 
 
-def test_thousands_of_clones_visit_no_more_points_than_others(compiled: Compile) -> None:
+def test_thousands_of_clones_visit_no_more_points_than_others(compiled):
     # Counts visited points, not seconds. Without the lowest index of each node, every clone would visit all others.
-    visited: list[int] = []
+    visited = []
     for points in (torch.zeros(20_000, 3), torch.randn(20_000, 3)):
         search_tree(build_tree(points), 16, compiled(torch.float32, 16, visited))
     clones, others = (count / 20_000 for count in visited)
     assert clones < 2 * others  # measured 116 and 114 points per query
 
 
-def test_kernel_compiles_for_gpus_from_turing_to_hopper(compile_for_gpu: Callable[..., bytes]) -> None:
+def test_kernel_compiles_for_gpus_from_turing_to_hopper(compile_for_gpu):
     cases = [("sm_75", torch.float32, 16), ("sm_90", torch.float64, 1), ("sm_90", torch.float32, MAX_NEIGHBORS)]
     for architecture, dtype, k in cases:
         assert KERNEL.encode() in compile_for_gpu(FILE, architecture, kernel_options(dtype, k))

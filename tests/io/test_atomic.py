@@ -1,14 +1,11 @@
 """Atomic writes: after any error a file is complete or unchanged."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,7 +22,7 @@ resource = pytest.importorskip("resource", reason="Windows has none")
 
 
 @contextmanager
-def small_disk(limit: int) -> Iterator[None]:
+def small_disk(limit):
     """Limit the size of any file to ``limit`` bytes, like a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -37,10 +34,10 @@ def small_disk(limit: int) -> Iterator[None]:
         signal.signal(signal.SIGXFSZ, before)
 
 
-def test_an_error_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
+def test_an_error_while_writing_leaves_the_old_file(tmp_path):
     write_text(tmp_path / "a.txt", "old")
 
-    def fail() -> None:
+    def fail():
         with replacing(tmp_path / "a.txt") as partial:
             partial.write_text("half")
             assert (tmp_path / "a.txt").read_text() == "old"
@@ -52,8 +49,8 @@ def test_an_error_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
-def test_a_file_is_flushed_before_it_is_renamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    order: list[str] = []
+def test_a_file_is_flushed_before_it_is_renamed(tmp_path, monkeypatch):
+    order = []
     sync, replace = os.fsync, Path.replace
     monkeypatch.setattr(os, "fsync", lambda handle: (order.append("sync"), sync(handle))[1])
     monkeypatch.setattr(Path, "replace", lambda path, to: (order.append("rename"), replace(path, to))[1])
@@ -61,7 +58,7 @@ def test_a_file_is_flushed_before_it_is_renamed(tmp_path: Path, monkeypatch: pyt
     assert order == ["sync", "rename", "sync"]
 
 
-def test_files_that_belong_together_are_written_all_or_none(tmp_path: Path) -> None:
+def test_files_that_belong_together_are_written_all_or_none(tmp_path):
     write_text(tmp_path / "a.txt", "old")
     with small_disk(10_000), pytest.raises(StorageError, match="cannot write .*b.txt"):
         write_files({tmp_path / "a.txt": b"new", tmp_path / "b.txt": b"x" * 10_001})
@@ -71,7 +68,7 @@ def test_files_that_belong_together_are_written_all_or_none(tmp_path: Path) -> N
     assert [(tmp_path / name).read_text() for name in ("a.txt", "b.txt")] == ["new", "x"]
 
 
-def test_what_killed_processes_left_is_removed_and_what_others_write_stays(tmp_path: Path) -> None:
+def test_what_killed_processes_left_is_removed_and_what_others_write_stays(tmp_path):
     path = tmp_path / "[a].txt"
     ready = "import sys, os\nfrom pathlib import Path\nfrom sundae_ns.core.files import replacing\n"
     waits = "with replacing(Path(sys.argv[1])) as f:\n    f.write_text('half')\n    print(f, flush=True)\n    input()\n"
@@ -88,7 +85,7 @@ def test_what_killed_processes_left_is_removed_and_what_others_write_stays(tmp_p
     assert sorted(os.listdir(tmp_path)) == ["[a].txt", longer.name]
 
 
-def test_full_disk(tmp_path: Path) -> None:
+def test_full_disk(tmp_path):
     write_text(tmp_path / "a.ply", "old")
     points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
     gaussians = from_points(points, points, sh_degree=1, num_features=0)
@@ -103,10 +100,8 @@ def test_full_disk(tmp_path: Path) -> None:
     ("number", "reason"),
     [(errno.ENOSPC, "disk is full; make room"), (errno.EROFS, "read-only"), (errno.EACCES, "permission denied")],
 )
-def test_system_errors_become_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reason: str
-) -> None:
-    def refuse(_: int) -> None:
+def test_system_errors_become_one_line(tmp_path, monkeypatch, number, reason):
+    def refuse(_):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "fsync", refuse)
@@ -115,12 +110,12 @@ def test_system_errors_become_one_line(
     assert os.listdir(tmp_path) == []
 
 
-def test_missing_folders_are_made(tmp_path: Path) -> None:
+def test_missing_folders_are_made(tmp_path):
     write_text(tmp_path / "new" / "folder" / "a.txt", "new")
     assert (tmp_path / "new" / "folder" / "a.txt").read_text() == "new"
 
 
-def test_only_errors_that_a_user_can_correct_are_converted() -> None:
+def test_only_errors_that_a_user_can_correct_are_converted():
     with pytest.raises(StorageError, match="^cannot make a: the disk is full; make room$"), writing("cannot make a"):
         raise OSError(errno.ENOSPC, "no space")
     for error in (StorageError("cannot write b: denied"), OSError(errno.EMFILE, "too many open files")):
@@ -129,18 +124,18 @@ def test_only_errors_that_a_user_can_correct_are_converted() -> None:
         assert caught.value is error
 
 
-def test_a_full_disk_is_found_behind_the_error_that_replaces_it(tmp_path: Path) -> None:
+def test_a_full_disk_is_found_behind_the_error_that_replaces_it(tmp_path):
     """torch replaces the error of a failed write by its own when it closes the archive."""
 
     class Full(io.RawIOBase):
-        def write(self, _: object) -> int:
+        def write(self, _):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(StorageError, match="disk is full"), replacing(tmp_path / "a.ckpt"):
         torch.save({"values": torch.zeros(9)}, Full())
 
 
-def test_only_regular_files_are_read(tmp_path: Path) -> None:
+def test_only_regular_files_are_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", Path("/dev/zero")):
         with pytest.raises(OSError, match="it is a pipe or a device, not a file"):
@@ -159,7 +154,7 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
         (DataError("one of ours; mend it"), DataError, "one of ours; mend it"),
     ],
 )
-def test_errors_of_reading_name_the_file(raised: Exception, kind: type[Exception], message: str) -> None:
+def test_errors_of_reading_name_the_file(raised, kind, message):
     with (
         pytest.raises(kind, match=f"^{message}$"),
         reading(Path("a.x"), "a whole x", PackError, remedy="get it again"),
@@ -168,7 +163,7 @@ def test_errors_of_reading_name_the_file(raised: Exception, kind: type[Exception
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp"])
-def test_half_an_image_is_none(tmp_path: Path, name: str) -> None:
+def test_half_an_image_is_none(tmp_path, name):
     write_image(tmp_path / name, Image.new("RGB", (40, 30)))
     before = (tmp_path / name).read_bytes()
     with small_disk(10_000), pytest.raises(StorageError, match="ulimit"):
@@ -177,7 +172,7 @@ def test_half_an_image_is_none(tmp_path: Path, name: str) -> None:
     assert os.listdir(tmp_path) == [name]
 
 
-def test_what_is_damaged_is_put_aside(tmp_path: Path) -> None:
+def test_what_is_damaged_is_put_aside(tmp_path):
     put_aside(tmp_path / "gone")
     for text in ("first", "second"):
         (tmp_path / "a").mkdir()

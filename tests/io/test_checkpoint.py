@@ -1,20 +1,14 @@
 """Checkpoints: those that load, those that are refused in one line, and fields from files of other programs."""
 
-from __future__ import annotations
-
 import pickle
 import re
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from foreign_files import small_field
 from limits import verdict
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
-from torch import Tensor
 
 from sundae_ns.core import gaussians as core_gaussians
 from sundae_ns.core.errors import CheckpointError
@@ -24,8 +18,8 @@ from sundae_ns.io.formats import read_gaussians
 from sundae_ns.io.ply import MODEL_FRAME, write_ply
 
 
-def model_state(n: int = 6, degree: int = 3, **extra: Any) -> dict[str, Any]:
-    state: dict[str, Any] = {f"gauss_params.{name}": value for name, value in small_field(n, degree).items()}
+def model_state(n=6, degree=3, **extra):
+    state = {f"gauss_params.{name}": value for name, value in small_field(n, degree).items()}
     state["gauss_params.features"] = torch.zeros(n, 5)
     state["networks.head.weight"] = torch.zeros(4, 4)
     about = checkpoint.extra_state(
@@ -41,13 +35,13 @@ def model_state(n: int = 6, degree: int = 3, **extra: Any) -> dict[str, Any]:
     return state
 
 
-def check(state: dict[str, Any]) -> None:
+def check(state):
     """The checks of a checkpoint against a model of 6 Gaussians, in the order of loading."""
     checkpoint.check_extra_state(state, 5, "harmonics")
     checkpoint.check_model_state(state, model_state(6))
 
 
-def stock_checkpoint(path: Path, prefix: str = "_model.", n: int = 6) -> dict[str, Tensor]:
+def stock_checkpoint(path, prefix="_model.", n=6):
     """A checkpoint of splatfacto by nerfstudio's trainer, whose scheduler leaves a numpy number in it."""
     params = small_field(n)
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
@@ -68,17 +62,17 @@ def stock_checkpoint(path: Path, prefix: str = "_model.", n: int = 6) -> dict[st
     return params
 
 
-def one_line(error: BaseException) -> bool:
+def one_line(error):
     return isinstance(error, ValueError) and "\n" not in str(error)
 
 
-def test_another_number_of_primitives_fits_but_not_none() -> None:
+def test_another_number_of_primitives_fits_but_not_none():
     check(model_state(9))
     with pytest.raises(CheckpointError, match=r"parameters of \[0\] Gaussians"):
         check(model_state(0))
 
 
-def _without(name: str) -> dict[str, Any]:
+def _without(name):
     return {key: value for key, value in model_state().items() if key != name}
 
 
@@ -111,14 +105,14 @@ def _without(name: str) -> dict[str, Any]:
         (model_state(degree=2), r"features_rest is \[6, 8, 3\].*\[6, 15, 3\]"),
     ],
 )
-def test_a_checkpoint_that_does_not_fit_is_refused(state: dict[str, Any], cause: str) -> None:
+def test_a_checkpoint_that_does_not_fit_is_refused(state, cause):
     with pytest.raises(CheckpointError, match=cause) as caught:
         check(state)
     assert one_line(caught.value)
 
 
 @pytest.mark.parametrize("prefix", ["_model.", "_model.module."])
-def test_stock_checkpoint_with_numpy_numbers(tmp_path: Path, prefix: str) -> None:
+def test_stock_checkpoint_with_numpy_numbers(tmp_path, prefix):
     params = stock_checkpoint(tmp_path / "step-000000001.ckpt", prefix)
     read, in_model_frame = read_gaussians(tmp_path / "step-000000001.ckpt")
     assert in_model_frame
@@ -131,7 +125,7 @@ def test_stock_checkpoint_with_numpy_numbers(tmp_path: Path, prefix: str) -> Non
 SUNDAE = {"method": "sundae", "format": checkpoint.FORMAT}
 
 
-def save_without_harmonics(folder: Path, extra: Any) -> None:
+def save_without_harmonics(folder, extra):
     """A checkpoint of SH degree 0, with the state of a model beside its tensors if any is given."""
     state = {f"_model.gauss_params.{name}": value for name, value in small_field(6).items()}
     state["_model.gauss_params.features_rest"] = state["_model.gauss_params.features_rest"][:, :0]
@@ -150,7 +144,7 @@ def save_without_harmonics(folder: Path, extra: Any) -> None:
         ({**SUNDAE, "encoding": "harmonics"}, False),
     ],
 )
-def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path: Path, extra: Any, logits: bool) -> None:
+def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path, extra, logits):
     """Logits if the model was built at degree 0, harmonics if a search has lowered the degree."""
     save_without_harmonics(tmp_path, extra)
     read, _ = read_gaussians(tmp_path)
@@ -171,7 +165,7 @@ def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path: Path, extra:
         ({**SUNDAE, "encoding": torch.zeros(2)}, "does not say how it stores colours"),
     ],
 )
-def test_a_field_of_another_format_is_refused(tmp_path: Path, extra: Any, cause: str) -> None:
+def test_a_field_of_another_format_is_refused(tmp_path, extra, cause):
     """Its colours could be misread silently."""
     save_without_harmonics(tmp_path, extra)
     with pytest.raises(CheckpointError, match=cause) as caught:
@@ -179,12 +173,10 @@ def test_a_field_of_another_format_is_refused(tmp_path: Path, extra: Any, cause:
     assert one_line(caught.value)
 
 
-def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sanitised: list[int] = []
+def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(tmp_path, monkeypatch):
+    sanitised = []
 
-    def count(params: Any) -> Any:
+    def count(params):
         sanitised.append(len(params["means"]))
         return finite_mask(params)
 
@@ -200,7 +192,7 @@ def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(
 
 
 @pytest.mark.parametrize("inside", [".", "nerfstudio_models"])
-def test_newest_of_a_folder(tmp_path: Path, inside: str) -> None:
+def test_newest_of_a_folder(tmp_path, inside):
     (tmp_path / inside).mkdir(exist_ok=True)
     stock_checkpoint(tmp_path / inside / "step-000000999.ckpt", n=3)
     newest = stock_checkpoint(tmp_path / inside / "step-000029999.ckpt", n=4)
@@ -208,7 +200,7 @@ def test_newest_of_a_folder(tmp_path: Path, inside: str) -> None:
 
 
 @pytest.mark.parametrize(("comments", "in_model_frame"), [((), False), ((MODEL_FRAME,), True)])
-def test_ply(tmp_path: Path, comments: tuple[str, ...], in_model_frame: bool) -> None:
+def test_ply(tmp_path, comments, in_model_frame):
     params = small_field(6)
     write_ply(tmp_path / "a.ply", params, comments=list(comments))
     read, in_frame = read_gaussians(tmp_path / "a.ply")
@@ -218,23 +210,23 @@ def test_ply(tmp_path: Path, comments: tuple[str, ...], in_model_frame: bool) ->
     assert torch.equal(read_gaussians(renamed)[0]["means"], params["means"])
 
 
-def _save(content: object) -> Callable[[Path], object]:
+def _save(content):
     return lambda path: torch.save(content, path)
 
 
-def _laugh(path: Path) -> None:
+def _laugh(path):
     """Lists of 60 levels that hold the one below twice, and one that holds itself."""
-    value: list[Any] = [1]
+    value = [1]
     for _ in range(60):
         value = [value, value]
     value.append(value)
     torch.save({"step": 3, "pipeline": {}, "optimizers": value}, path)
 
 
-def _pickled(*operations: bytes) -> Callable[[Path], object]:
+def _pickled(*operations):
     """An archive of torch whose pickle has these operations, between its frame of a dictionary."""
 
-    def write(path: Path) -> None:
+    def write(path):
         torch.save({}, path)
         with zipfile.ZipFile(path) as source:
             entries = {name: source.read(name) for name in source.namelist()}
@@ -246,7 +238,7 @@ def _pickled(*operations: bytes) -> Callable[[Path], object]:
     return write
 
 
-def _call(name: bytes, arguments: bytes) -> bytes:
+def _call(name, arguments):
     return b"c" + name + b"\n" + arguments + b"R"
 
 
@@ -255,15 +247,15 @@ _TEXT = b"X\x04\x00\x00\x00abcd"
 _HEX = b"X\x03\x00\x00\x00hex"
 
 
-def _key(levels: int) -> bytes:
+def _key(levels):
     """Operations for a dictionary whose key has so many levels: its hash visits the lowest 2^levels times."""
-    key: tuple[Any, ...] = (1,)
+    key = (1,)
     for _ in range(levels):
         key = (key, key)
     return b"}" + pickle.dumps(key, 2)[2:-1] + b"K\x01s"
 
 
-WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
+WRONG = {
     "tuples that hold each other": (_pickled(_key(60)), "tuples in tuples"),
     "lists that hold themselves": (_laugh, "holds no Gaussians"),
     "four gigabytes of bytes": (_pickled(_call(b"builtins\nbytearray", _GIGABYTES)), "more than tensors .*bytearray"),
@@ -292,7 +284,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_a_file_without_a_field_is_refused(tmp_path: Path, wrong: str) -> None:
+def test_a_file_without_a_field_is_refused(tmp_path, wrong):
     make, cause = WRONG[wrong]
     path = tmp_path / "a.ckpt"
     make(path)

@@ -1,9 +1,6 @@
 """``config.yml`` as objects: a configuration of ns-train comes back unchanged, and no code that a file names runs."""
 
-from __future__ import annotations
-
 import copy
-from pathlib import Path
 
 import pytest
 import yaml
@@ -21,7 +18,7 @@ METHODS = sorted(name for name in all_methods if name.startswith("sundae")) + ["
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_saved_configuration_comes_back(tmp_path: Path, method: str) -> None:
+def test_a_saved_configuration_comes_back(tmp_path, method):
     config = copy.deepcopy(all_methods[method])
     config.data = config.pipeline.datamanager.data = tmp_path / "a capture, ünïcode"
     path = tmp_path / "config.yml"
@@ -33,7 +30,7 @@ def test_a_saved_configuration_comes_back(tmp_path: Path, method: str) -> None:
     assert found.pipeline.datamanager.data is found.data
 
 
-def test_options_of_later_versions_have_their_defaults(tmp_path: Path) -> None:
+def test_options_of_later_versions_have_their_defaults(tmp_path):
     path = tmp_path / "config.yml"
     path.write_text("!!python/object:nerfstudio.engine.trainer.TrainerConfig {}")
     found = load_config(path)
@@ -41,7 +38,7 @@ def test_options_of_later_versions_have_their_defaults(tmp_path: Path) -> None:
     assert found.max_num_iterations == TrainerConfig().max_num_iterations
 
 
-def test_a_run_of_an_early_python_3_11_opens(tmp_path: Path) -> None:
+def test_a_run_of_an_early_python_3_11_opens(tmp_path):
     """Before 3.11.4 a member of an enumeration was saved as an attribute of its class."""
     path = tmp_path / "config.yml"
     call = "!!python/object/apply:builtins.getattr [!!python/name:nerfstudio.utils.writer.EventName '', {}]"
@@ -86,7 +83,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_no_code_that_it_names_runs(tmp_path: Path, kind: str) -> None:
+def test_no_code_that_it_names_runs(tmp_path, kind):
     mark, path = tmp_path / "ran", tmp_path / "config.yml"
     path.write_text(HOSTILE[kind].format(mark) if "{}" in HOSTILE[kind] else HOSTILE[kind])
     for read in (load_config, load_run, load_model):
@@ -97,7 +94,7 @@ def test_no_code_that_it_names_runs(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["3", "- 1", "!!python/object:nerfstudio.engine.trainer.TrainerConfig {pipeline: 3}"])
-def test_a_file_that_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_no_run_is_refused(tmp_path, text):
     path = tmp_path / "config.yml"
     path.write_text(text)
     with pytest.raises(CheckpointError):
@@ -113,7 +110,7 @@ def test_a_file_that_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
         load_config(tmp_path)
 
 
-def test_a_capture_that_has_moved_with_its_run_is_found(tmp_path: Path) -> None:
+def test_a_capture_that_has_moved_with_its_run_is_found(tmp_path):
     config = copy.deepcopy(sundae_tiny.config)
     config.output_dir, config.experiment_name, config.timestamp = tmp_path / "here" / "outputs", "e", "t"
     config.pipeline.datamanager.data = tmp_path / "here" / "capture"
@@ -127,7 +124,7 @@ def test_a_capture_that_has_moved_with_its_run_is_found(tmp_path: Path) -> None:
     assert load_config(moved).pipeline.datamanager.data == tmp_path / "here" / "capture", "the error names this one"
 
 
-def test_the_length_of_the_schedule(tmp_path: Path) -> None:
+def test_the_length_of_the_schedule(tmp_path):
     config = copy.deepcopy(sundae_tiny.config)
     config.output_dir, config.experiment_name, config.timestamp = tmp_path, "e", "t"
     config.schedule_length, config.max_num_iterations = 500, 20

@@ -1,15 +1,10 @@
 """Scenes of other programs, .ksplat among them: values against what was written, and refusals in one line."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
 import struct
 import zipfile
-from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +22,6 @@ from foreign_files import (
 )
 from foreign_files import write_splat as write_small_splat
 from limits import verdict
-from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError
@@ -39,11 +33,11 @@ from sundae_ns.io.splat import read_ksplat
 FIELD = small_field()
 
 
-def found(path: Path) -> dict[str, Tensor]:
+def found(path):
     return dict(read_gaussian_file(path)[0].gaussians)
 
 
-def check(values: dict[str, Tensor], tolerances: dict[str, float], truth: dict[str, Tensor] = FIELD) -> None:
+def check(values, tolerances, truth=FIELD):
     """Rotations up to their sign, colours and opacities as they are shown."""
     assert tuple(sorted(values)) == tuple(sorted(SPLAT_NAMES))
     quats = torch.nn.functional.normalize(values["quats"], dim=1)
@@ -55,7 +49,7 @@ def check(values: dict[str, Tensor], tolerances: dict[str, float], truth: dict[s
         torch.testing.assert_close(shown[name], expected[name], rtol=0, atol=tolerance, msg=name)
 
 
-def test_splat(tmp_path: Path) -> None:
+def test_splat(tmp_path):
     write_small_splat(tmp_path / "a.splat", FIELD)
     values = found(tmp_path / "a.splat")
     # Half a level of a byte: 1/510 of colours and opacities, 1/256 of quaternions before they are normalised.
@@ -63,7 +57,7 @@ def test_splat(tmp_path: Path) -> None:
     assert values["features_rest"].shape == (300, 0, 3)
 
 
-def test_ends_of_a_splat_have_a_meaning(tmp_path: Path) -> None:
+def test_ends_of_a_splat_have_a_meaning(tmp_path):
     given = small_field(4)
     given["opacities"][:2] = torch.tensor([[math.inf], [-math.inf]])
     given["scales"][2, 1] = -math.inf
@@ -79,7 +73,7 @@ def test_ends_of_a_splat_have_a_meaning(tmp_path: Path) -> None:
 @pytest.mark.parametrize("n", [1, 256, 257, 300])
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("old", [False, True])
-def test_compressed_ply(tmp_path: Path, n: int, degree: int, old: bool) -> None:
+def test_compressed_ply(tmp_path, n, degree, old):
     given, path = small_field(n, degree), tmp_path / "a.ply"
     write_compressed_ply(path, given, old=old)
     values = found(path)
@@ -88,7 +82,7 @@ def test_compressed_ply(tmp_path: Path, n: int, degree: int, old: bool) -> None:
     check(values, {**tolerances, "features_dc": 0.0021}, given)
 
 
-def test_compressed_ply_as_another_reader_reads_it(tmp_path: Path) -> None:
+def test_compressed_ply_as_another_reader_reads_it(tmp_path):
     gsply = pytest.importorskip("gsply")
     write_compressed_ply(tmp_path / "a.ply", FIELD)
     ours, theirs = found(tmp_path / "a.ply"), gsply.plyread(str(tmp_path / "a.ply"))
@@ -99,20 +93,20 @@ def test_compressed_ply_as_another_reader_reads_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("dtype", "most"), [("u1", 255), ("<u2", 65535), ("<f4", 1), ("<f4", 255)])
-def test_colours_in_place_of_harmonics(tmp_path: Path, dtype: str, most: float) -> None:
+def test_colours_in_place_of_harmonics(tmp_path, dtype, most):
     write_colored_ply(tmp_path / "a.ply", FIELD, dtype, most)
     sanitised, marks = read_gaussian_file(tmp_path / "a.ply")
     check(dict(sanitised.gaussians), {"means": 0, "scales": 0, "quats": 1e-6, "features_dc": 0.002, "opacities": 1e-6})
     assert marks.in_model_frame
 
 
-def test_gsplat(tmp_path: Path) -> None:
+def test_gsplat(tmp_path):
     write_gsplat(tmp_path / "ckpt_6999_rank0.pt", FIELD)
     values = found(tmp_path / "ckpt_6999_rank0.pt")
     assert all(torch.equal(values[name], FIELD[name]) for name in SPLAT_NAMES)
 
 
-def test_the_ranks_of_gsplat_are_one_scene(tmp_path: Path) -> None:
+def test_the_ranks_of_gsplat_are_one_scene(tmp_path):
     """Each GPU writes its own part."""
     for rank in (0, 1, 2, 10):
         part = {name: value[min(rank, 3) :: 4] for name, value in FIELD.items()}
@@ -124,24 +118,24 @@ def test_the_ranks_of_gsplat_are_one_scene(tmp_path: Path) -> None:
 
 
 class Harmful:
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self):
         return (open, ("harm", "w"))
 
 
-def _saved(**splats: object) -> Callable[[Path], None]:
+def _saved(**splats):
     return lambda path: torch.save({"step": 1, "splats": splats}, path)
 
 
-def _cut(name: str, size: int) -> Callable[[Path], None]:
-    def write(path: Path) -> None:
+def _cut(name, size):
+    def write(path):
         FOREIGN[name](path, FIELD)
         path.write_bytes(path.read_bytes()[:size])
 
     return write
 
 
-def _replaced(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
-    def write(path: Path) -> None:
+def _replaced(name, old, new):
+    def write(path):
         FOREIGN[name](path, FIELD)
         content = path.read_bytes()
         assert old in content
@@ -150,7 +144,7 @@ def _replaced(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
     return write
 
 
-DAMAGED: dict[str, tuple[str, Callable[[Path], None], str]] = {
+DAMAGED = {
     "an empty .splat": ("a.splat", lambda path: path.touch(), "0 Gaussians"),
     "half a Gaussian": ("a.splat", _cut("a.splat", 48), "a multiple of element size"),
     "a short compressed .ply": ("a.ply", _cut("a.compressed.ply", 2000), "its header states at least"),
@@ -181,7 +175,7 @@ DAMAGED: dict[str, tuple[str, Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("kind", DAMAGED)
-def test_damaged_files_are_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_damaged_files_are_refused_in_one_line(tmp_path, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
     name, write, message = DAMAGED[kind]
     write(tmp_path / name)
@@ -191,7 +185,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path, monkeypatch: pyte
     assert not (tmp_path / "harm").exists()
 
 
-def unbundled(folder: Path) -> Path:
+def unbundled(folder):
     """A .sog as splat-transform and SuperSplat write it for a web page."""
     write_sog(folder.with_suffix(".sog"), FIELD)
     with zipfile.ZipFile(folder.with_suffix(".sog")) as bundle:
@@ -200,7 +194,7 @@ def unbundled(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["", "meta.json"])
-def test_a_sog_that_is_a_folder(tmp_path: Path, name: str) -> None:
+def test_a_sog_that_is_a_folder(tmp_path, name):
     folder = unbundled(tmp_path / "scene")
     whole, parts = found(tmp_path / "scene.sog"), found(folder / name)
     assert all(torch.equal(parts[each], whole[each]) for each in SPLAT_NAMES)
@@ -216,7 +210,7 @@ def test_a_sog_that_is_a_folder(tmp_path: Path, name: str) -> None:
         ({"scales": {"codebook": [0.0], "files": ["gone.webp"]}}, "cannot be read"),
     ],
 )
-def test_other_folders_are_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+def test_other_folders_are_refused(tmp_path, change, message):
     meta = unbundled(tmp_path / "scene") / "meta.json"
     content = {name: value for name, value in {**json.loads(meta.read_text()), **change}.items() if value is not None}
     meta.write_text(json.dumps(content))
@@ -224,7 +218,7 @@ def test_other_folders_are_refused(tmp_path: Path, change: dict[str, Any], messa
         read_gaussian_file(meta)
 
 
-def test_folders_of_3dgs_name_their_file(tmp_path: Path) -> None:
+def test_folders_of_3dgs_name_their_file(tmp_path):
     last = tmp_path / "point_cloud" / "iteration_30000" / "point_cloud.ply"
     last.parent.mkdir(parents=True)
     last.touch()
@@ -239,7 +233,7 @@ HALF = 2**-10  # relative step of half precision; the largest one of values belo
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_values_of_a_ksplat_are_those_of_the_ply(level: int, degree: int) -> None:
+def test_values_of_a_ksplat_are_those_of_the_ply(level, degree):
     """To make the files again, write ``KSPLAT`` with ``write_ply`` and give it to foreign/ksplat.mjs."""
     values = read_ksplat(ksplat(level, degree))
     assert tuple(sorted(values)) == tuple(sorted(SPLAT_NAMES))
@@ -248,7 +242,7 @@ def test_values_of_a_ksplat_are_those_of_the_ply(level: int, degree: int) -> Non
     truth = {name: value[order] for name, value in KSPLAT.items()}
     truth["features_rest"] = truth["features_rest"][:, : (degree + 1) ** 2 - 1]
 
-    def close(value: Tensor, expected: Tensor, error: float) -> None:
+    def close(value, expected, error):
         torch.testing.assert_close(value, expected, rtol=0, atol=error)
 
     # Half a step of 16 bits in half a unit. All else is rounded down, by a whole step.
@@ -261,7 +255,7 @@ def test_values_of_a_ksplat_are_those_of_the_ply(level: int, degree: int) -> Non
     close(values["features_rest"], truth["features_rest"], (0, HALF / 2, 2 / 255)[level])
 
 
-def changed(path: Path, changes: Iterable[tuple[int, str, float]]) -> Path:
+def changed(path, changes):
     """A copy of level 1 and SH degree 2 with other numbers at some offsets."""
     copy_ksplat(path)
     data = bytearray(path.read_bytes())
@@ -271,7 +265,7 @@ def changed(path: Path, changes: Iterable[tuple[int, str, float]]) -> Path:
     return path
 
 
-HOSTILE_KSPLATS: dict[str, tuple[list[tuple[int, str, float]], str]] = {
+HOSTILE_KSPLATS = {
     "another version": ([(1, "<B", 2)], "version 0.2"),
     "another level": ([(20, "<H", 3)], "level 3"),
     "sections beyond all": ([(4, "<I", 2**32 - 1), (8, "<I", 2**32 - 1)], "buffer"),
@@ -292,7 +286,7 @@ HOSTILE_KSPLATS: dict[str, tuple[list[tuple[int, str, float]], str]] = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE_KSPLATS)
-def test_hostile_ksplats_are_refused_in_one_line(tmp_path: Path, kind: str) -> None:
+def test_hostile_ksplats_are_refused_in_one_line(tmp_path, kind):
     changes, words = HOSTILE_KSPLATS[kind]
     path = changed(tmp_path / "a.ksplat", changes)
     error = verdict(lambda: sn.load(path), path.stat().st_size)
@@ -300,7 +294,7 @@ def test_hostile_ksplats_are_refused_in_one_line(tmp_path: Path, kind: str) -> N
     assert re.search(rf"a\.ksplat is not a complete \.ksplat .*({words})", str(error)), error
 
 
-def test_unstated_bounds_of_a_ksplat_and_ranges_are_those_of_its_viewer(tmp_path: Path) -> None:
+def test_unstated_bounds_of_a_ksplat_and_ranges_are_those_of_its_viewer(tmp_path):
     """It takes SH coefficients in [-1.5, 1.5] and coordinates of 32,767 steps where a header has zeros."""
     data, path = bytearray(ksplat(2, 1).read_bytes()), tmp_path / "a.ksplat"
     struct.pack_into("<2f", data, 36, 0, 0)
@@ -313,7 +307,7 @@ def test_unstated_bounds_of_a_ksplat_and_ranges_are_those_of_its_viewer(tmp_path
     assert torch.equal(after["means"], before["means"])
 
 
-def test_only_used_gaussians_of_a_ksplat_are_read(tmp_path: Path) -> None:
+def test_only_used_gaussians_of_a_ksplat_are_read(tmp_path):
     """A file that was stored while it loaded has room for more."""
     values = read_ksplat(changed(tmp_path / "a.ksplat", [(SECTION, "<I", 3)]))
     whole = read_ksplat(ksplat(1, 2))

@@ -1,7 +1,5 @@
 """Files for other viewers: kinds, round trips of every format, refusals, and splat-transform if it is installed."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import re
@@ -9,8 +7,6 @@ import shutil
 import subprocess
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import hypothesis.strategies as st
 import pytest
@@ -19,7 +15,6 @@ from foreign_files import small_field, write_gsplat
 from hypothesis import HealthCheck, given, settings
 from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import CheckpointError, DataError
@@ -32,7 +27,7 @@ from sundae_ns.io.spz import clamped, fractional_bits
 from sundae_ns.rasterize.reference import harmonic_basis
 
 PROGRAM = shutil.which("splat-transform")
-TOLERANCES: dict[str, dict[str, float]] = {
+TOLERANCES = {
     # Half a step of each format, plus rounding; colours and opacities after activation, codebooks by their worst case.
     ".ply": {},
     ".glb": dict.fromkeys(("means", "scales", "features_rest"), 1e-5) | {"quats": 1e-6, "opacities": 1e-6},
@@ -43,7 +38,7 @@ TOLERANCES: dict[str, dict[str, float]] = {
 }
 
 
-def matched(params: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Tensor]:
+def matched(params, truth):
     """A field in the order of another by the nearest centres, with its rotations' signs and activated opacities."""
     rows = torch.from_numpy(cKDTree(params["means"].numpy()).query(truth["means"].numpy())[1])
     assert len(rows.unique()) == len(truth["means"])
@@ -52,7 +47,7 @@ def matched(params: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Te
     return {**ordered, "quats": ordered["quats"] * signs, "opacities": ordered["opacities"].sigmoid()}
 
 
-def check(params: dict[str, Tensor], truth: dict[str, Tensor], kind: str) -> None:
+def check(params, truth, kind):
     expected = {**truth, "opacities": truth["opacities"].sigmoid()}
     for name, value in matched(params, truth).items():
         tolerance = TOLERANCES[kind].get(name, 0.0) + (1e-6 if TOLERANCES[kind] else 0.0)
@@ -62,7 +57,7 @@ def check(params: dict[str, Tensor], truth: dict[str, Tensor], kind: str) -> Non
 @pytest.mark.parametrize("kind", FORMATS)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(n=st.integers(1, 300), degree=st.integers(0, 3), marks=st.tuples(st.booleans(), st.booleans()))
-def test_what_is_written_is_read(tmp_path: Path, kind: str, n: int, degree: int, marks: tuple[bool, bool]) -> None:
+def test_what_is_written_is_read(tmp_path, kind, n, degree, marks):
     truth, path = small_field(n, degree), tmp_path / f"a{kind}"
     antialiased, in_model_frame = marks
     written = write_for_viewers(path, truth, Marks(antialiased, in_model_frame))
@@ -74,7 +69,7 @@ def test_what_is_written_is_read(tmp_path: Path, kind: str, n: int, degree: int,
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_equal_fields_give_equal_bytes(tmp_path: Path, kind: str) -> None:
+def test_equal_fields_give_equal_bytes(tmp_path, kind):
     for name in ("a", "b"):
         write_for_viewers(tmp_path / f"{name}{kind}", small_field())
     assert (tmp_path / f"a{kind}").read_bytes() == (tmp_path / f"b{kind}").read_bytes()
@@ -85,7 +80,7 @@ def test_equal_fields_give_equal_bytes(tmp_path: Path, kind: str) -> None:
 )
 @pytest.mark.parametrize("kind", [".ply", ".spz", ".sog"])
 @pytest.mark.parametrize(("degree", "antialiased"), [(3, True), (0, False)])
-def test_another_program_reads_the_same_scene(tmp_path: Path, kind: str, degree: int, antialiased: bool) -> None:
+def test_another_program_reads_the_same_scene(tmp_path, kind, degree, antialiased):
     truth, file, back = small_field(300, degree), tmp_path / f"a{kind}", tmp_path / "back.ply"
     write_for_viewers(file, truth, Marks(antialiased))
     subprocess.run([str(PROGRAM), "--quiet", str(file), str(back)], check=True, capture_output=True, timeout=120)
@@ -95,7 +90,7 @@ def test_another_program_reads_the_same_scene(tmp_path: Path, kind: str, degree:
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_primitives_that_are_not_finite_are_dropped(tmp_path: Path, kind: str) -> None:
+def test_primitives_that_are_not_finite_are_dropped(tmp_path, kind):
     gaussians = small_field()
     gaussians["means"][3, 0] = torch.nan
     gaussians["scales"][7, 1] = torch.inf
@@ -105,19 +100,19 @@ def test_primitives_that_are_not_finite_are_dropped(tmp_path: Path, kind: str) -
 
 
 @pytest.mark.parametrize(("kind", "degree"), [(".ply", 4), (".spz", 3), (".sog", 3), (".glb", 3)])
-def test_sh_degree_4_is_cut_to_the_format(tmp_path: Path, kind: str, degree: int) -> None:
+def test_sh_degree_4_is_cut_to_the_format(tmp_path, kind, degree):
     written = write_for_viewers(tmp_path / f"a{kind}", small_field(30, 4))
     assert sh_degree(written["features_rest"]) == degree
 
 
-def test_colours_of_models_of_sh_degree_0(tmp_path: Path) -> None:
+def test_colours_of_models_of_sh_degree_0(tmp_path):
     gaussians = small_field(degree=0)
     write_for_viewers(tmp_path / "a.ply", Gaussians(gaussians, "logits"))
     colors = 0.5 + 0.28209479 * read_ply(tmp_path / "a.ply")["features_dc"]
     torch.testing.assert_close(colors, gaussians["features_dc"].sigmoid(), rtol=0, atol=1e-6)
 
 
-def write_survey(path: Path, far: float) -> Tensor:
+def write_survey(path, far):
     """Write a .ply with centres in double, 50 units around a place far away; returns them."""
     means = far + 50 * torch.rand(300, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     write_ply(path, small_field())
@@ -131,9 +126,7 @@ def write_survey(path: Path, far: float) -> Tensor:
 
 
 @pytest.mark.parametrize("kind", [*FORMATS, ".sundae"])
-def test_survey_coordinates_are_moved_stated_and_kept(
-    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_survey_coordinates_are_moved_stated_and_kept(tmp_path, kind, caplog):
     truth = write_survey(tmp_path / "a.ply", 4e6)
     scene = sn.load(tmp_path / "a.ply")
     assert "lies where float32 is too coarse; its coordinates are less 4000032 " in caplog.text
@@ -153,7 +146,7 @@ def test_survey_coordinates_are_moved_stated_and_kept(
     assert sn.cameras_of(tmp_path / "c.json", back if kind == ".sundae" else scene)[0].center[0] == 4e6 + 1 - offset[0]
 
 
-def test_pruned_rows_of_a_survey_are_its_own_coordinates(tmp_path: Path) -> None:
+def test_pruned_rows_of_a_survey_are_its_own_coordinates(tmp_path):
     truth, mask = write_survey(tmp_path / "a.ply", 5e5), torch.arange(300) < 200
     moved, _ = read_gaussian_file(tmp_path / "a.ply")
     keep_vertices(tmp_path / "a.ply", tmp_path / "b.ply", mask, moved.gaussians.rows(mask))
@@ -164,7 +157,7 @@ def test_pruned_rows_of_a_survey_are_its_own_coordinates(tmp_path: Path) -> None
     assert not in_model_frame
 
 
-def test_up_is_stated_else_by_convention_and_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_up_is_stated_else_by_convention_and_kept(tmp_path, caplog):
     write_ply(tmp_path / "a.ply", small_field(), comments=["Vertical axis: 3 0 4"])
     stated = sn.load(tmp_path / "a.ply")
     assert stated.up == (0.6, 0.0, 0.8)
@@ -187,7 +180,7 @@ def test_up_is_stated_else_by_convention_and_kept(tmp_path: Path, caplog: pytest
 
 @pytest.mark.parametrize("name", ["features_dc", "scales", "opacities"])
 @pytest.mark.parametrize("kind", [*FORMATS, ".sundae"])
-def test_what_cannot_be_loaded_is_not_saved(tmp_path: Path, kind: str, name: str) -> None:
+def test_what_cannot_be_loaded_is_not_saved(tmp_path, kind, name):
     gaussians, path = small_field(), tmp_path / f"a{kind}"
     gaussians[name] *= 1e37
     with suppress(sn.SundaeError):
@@ -195,7 +188,7 @@ def test_what_cannot_be_loaded_is_not_saved(tmp_path: Path, kind: str, name: str
     assert not path.exists() or sn.load(path).num_gaussians == 300
 
 
-def test_upright_rotates_z_to_minus_y(tmp_path: Path) -> None:
+def test_upright_rotates_z_to_minus_y(tmp_path):
     gaussians = small_field()
     gaussians["means"][0] = torch.tensor([1.0, 2.0, 3.0])
     write_for_viewers(tmp_path / "b.ply", gaussians, upright=True)
@@ -211,7 +204,7 @@ def test_upright_rotates_z_to_minus_y(tmp_path: Path) -> None:
 
 
 BAD = {"opacities": torch.zeros(300)}, {"features_rest": torch.zeros(300, 4, 3)}
-REFUSED: list[tuple[str, dict[str, Tensor], type[Exception], str]] = [
+REFUSED = [
     *((f"a{kind}", change, DataError, "has shape") for kind in FORMATS for change in BAD),
     *((f"a{kind}", {"means": torch.full((300, 3), torch.nan)}, DataError, "no Gaussians") for kind in FORMATS[1:]),
     ("a.spz", {"means": torch.full((300, 3), 1e5)}, DataError, "1e+05 from the origin"),
@@ -219,9 +212,7 @@ REFUSED: list[tuple[str, dict[str, Tensor], type[Exception], str]] = [
 
 
 @pytest.mark.parametrize(("name", "change", "failure", "words"), REFUSED)
-def test_refusals_leave_the_older_file(
-    tmp_path: Path, name: str, change: dict[str, Tensor], failure: Any, words: str
-) -> None:
+def test_refusals_leave_the_older_file(tmp_path, name, change, failure, words):
     (tmp_path / name).write_bytes(b"older")
     with pytest.raises(failure, match=re.escape(words)):
         write_for_viewers(tmp_path / name, {**small_field(), **change})
@@ -231,7 +222,7 @@ def test_refusals_leave_the_older_file(
 @pytest.mark.parametrize(
     ("farthest", "bits"), [(0.0, 24), (0.25, 24), (1.0, 22), (2.0, 21), (-2000.0, 12), (2048.0, 11)]
 )
-def test_positions_of_a_spz_get_as_many_bits_as_fit(tmp_path: Path, farthest: float, bits: int) -> None:
+def test_positions_of_a_spz_get_as_many_bits_as_fit(tmp_path, farthest, bits):
     assert fractional_bits(torch.tensor([[0.0, farthest, 0.0]])) == bits
     gaussians = small_field(50)
     gaussians["means"] *= farthest / gaussians["means"].abs().max() or 1e-9
@@ -242,14 +233,14 @@ def test_positions_of_a_spz_get_as_many_bits_as_fit(tmp_path: Path, farthest: fl
     assert (means - gaussians["means"]).abs().max() <= 2.0 ** -(bits + 1) + 1e-7
 
 
-def test_values_beyond_the_range_of_a_spz_are_counted(tmp_path: Path) -> None:
+def test_values_beyond_the_range_of_a_spz_are_counted(tmp_path):
     gaussians = small_field()
     gaussians["scales"][0, 0], gaussians["features_dc"][1, 2], gaussians["features_rest"][2, 0, 0] = 7.0, 4.0, -1.5
     assert clamped(write_for_viewers(tmp_path / "a.spz", gaussians)) == 3
 
 
 @pytest.mark.parametrize("kind", [".spz", ".sog", ".glb"])
-def test_zero_quaternions_become_the_identity(tmp_path: Path, kind: str) -> None:
+def test_zero_quaternions_become_the_identity(tmp_path, kind):
     gaussians = small_field(3)
     gaussians["quats"][:] = torch.tensor([0.0, 1e-30, 0.0, 0.0])
     gaussians["quats"][0] = 0
@@ -260,7 +251,7 @@ def test_zero_quaternions_become_the_identity(tmp_path: Path, kind: str) -> None
     torch.testing.assert_close(quats["quats"][0].abs(), torch.tensor([1.0, 0, 0, 0]), rtol=0, atol=0.006)
 
 
-def test_kinds_follow_from_first_bytes(tmp_path: Path) -> None:
+def test_kinds_follow_from_first_bytes(tmp_path):
     write_scene(tmp_path / "packed.ply", PackedScene(small_field(4)))
     write_ply(tmp_path / "points.sundae", small_field(4))
     for name, content in {"dos.txt": b"ply\r\nformat", "word.ply": b"plywood", "empty.sundae": b""}.items():
@@ -276,7 +267,7 @@ def test_kinds_follow_from_first_bytes(tmp_path: Path) -> None:
     refuse(tmp_path / "word.ply", packed="unpack it", primitives="give a run")
 
 
-def test_bytes_of_fields_and_modules() -> None:
+def test_bytes_of_fields_and_modules():
     params = {"means": torch.zeros(10, 3), "features": torch.zeros(10, 13)}
     assert bytes_of(params) == bytes_of({name: value.half() for name, value in params.items()}) == 10 * 16 * 4
     a, b = torch.nn.Linear(3, 3, bias=False), torch.nn.Linear(3, 3, bias=False)

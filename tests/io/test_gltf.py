@@ -1,12 +1,9 @@
 """Gaussians in .glb files: exact, upright, and of other programs."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
 import struct
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +12,6 @@ import pytest
 import torch
 from foreign_files import small_field, spz
 from limits import verdict
-from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError
@@ -28,20 +24,20 @@ THEIRS = Path(__file__).parent / "foreign" / "splat_transform.glb"
 Document = dict[str, Any]
 
 
-def parts(path: Path) -> tuple[Document, bytes]:
+def parts(path):
     data = path.read_bytes()
     (length,) = struct.unpack("<I", data[12:16])
     return json.loads(data[20 : 20 + length]), data[28 + length :]
 
 
-def put(path: Path, document: object, binary: bytes) -> None:
+def put(path, document, binary):
     text = document if isinstance(document, bytes) else json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
-def close(found: dict[str, Tensor], truth: dict[str, Tensor], tolerance: float = 1e-5) -> None:
+def close(found, truth, tolerance=1e-5):
     for name in SPLAT_NAMES:
         a, b = found[name], truth[name]
         if name == "quats":
@@ -50,7 +46,7 @@ def close(found: dict[str, Tensor], truth: dict[str, Tensor], tolerance: float =
 
 
 @pytest.mark.parametrize("in_model_frame", [False, True])
-def test_up_is_plus_y(tmp_path: Path, in_model_frame: bool) -> None:
+def test_up_is_plus_y(tmp_path, in_model_frame):
     """A point above the origin: along z in the model, along -y elsewhere."""
     gaussians = small_field(3, 0)
     gaussians["means"] = torch.tensor(
@@ -65,7 +61,7 @@ def test_up_is_plus_y(tmp_path: Path, in_model_frame: bool) -> None:
     assert accessor["max"] == means.max(axis=0).tolist()
 
 
-def test_names_and_types_are_those_of_the_extension(tmp_path: Path) -> None:
+def test_names_and_types_are_those_of_the_extension(tmp_path):
     gaussians = small_field(4, 3)
     write_glb(tmp_path / "a.glb", gaussians)
     document, binary = parts(tmp_path / "a.glb")
@@ -85,7 +81,7 @@ def test_names_and_types_are_those_of_the_extension(tmp_path: Path) -> None:
     assert document["buffers"][0]["byteLength"] == len(binary)
 
 
-def test_a_file_of_another_program() -> None:
+def test_a_file_of_another_program():
     found = read_glb(THEIRS)
     means = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(found[0]["means"].float(), means)
@@ -94,7 +90,7 @@ def test_a_file_of_another_program() -> None:
     assert sn.load(THEIRS).num_gaussians == 5
 
 
-def test_what_another_program_wrote_is_written_alike(tmp_path: Path) -> None:
+def test_what_another_program_wrote_is_written_alike(tmp_path):
     found = read_glb(THEIRS)
     write_glb(tmp_path / "a.glb", found[0])
     (ours, data), (document, truth) = parts(tmp_path / "a.glb"), parts(THEIRS)
@@ -113,7 +109,7 @@ def test_what_another_program_wrote_is_written_alike(tmp_path: Path) -> None:
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-def test_nodes_place_gaussians(tmp_path: Path) -> None:
+def test_nodes_place_gaussians(tmp_path):
     """A node that turns, moves and scales, below another one; and two meshes."""
     gaussians = small_field(50, 1)
     write_glb(tmp_path / "a.glb", gaussians)
@@ -137,7 +133,7 @@ def test_nodes_place_gaussians(tmp_path: Path) -> None:
     torch.testing.assert_close(still, plain.gaussians["means"] - torch.tensor([0.0, 3.0, 0.0]))
 
 
-def test_integers_are_normalised(tmp_path: Path) -> None:
+def test_integers_are_normalised(tmp_path):
     gaussians = small_field(4, 0)
     write_glb(tmp_path / "a.glb", gaussians)
     document, binary = parts(tmp_path / "a.glb")
@@ -155,34 +151,34 @@ def test_integers_are_normalised(tmp_path: Path) -> None:
     close(read_glb(tmp_path / "b.glb")[0], read_glb(tmp_path / "a.glb")[0], 2e-4)
 
 
-def _in(name: str, **values: object) -> Callable[[Document], None]:
-    def change(document: Document) -> None:
+def _in(name, **values):
+    def change(document):
         document[name][0].update(values)
 
     return change
 
 
-def _splat(document: Document) -> Document:
-    return document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]  # type: ignore[no-any-return]
+def _splat(document):
+    return document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]
 
 
-def _hidden(document: Document) -> None:
+def _hidden(document):
     document["nodes"] = [{"mesh": 0, "children": [1]}, {"extensions": {"KHR_node_visibility": {"visible": False}}}]
     document["nodes"][1]["children"] = [2]
     document["nodes"].append({"mesh": 0})
 
 
-def _no_scenes(document: Document) -> None:
+def _no_scenes(document):
     del document["scenes"], document["scene"]
     document["nodes"] = [{"mesh": 0}, {"children": [0], "translation": [0, 5, 0]}]
 
 
-def _twice(document: Document) -> None:
+def _twice(document):
     document.update(nodes=[{"mesh": 0}, {"mesh": 0, "translation": [1, 0, 0]}], scenes=[{"nodes": [0, 1]}])
 
 
 FAR = [5e5 + 1 / 8, 30, -4e6 + 1 / 16]
-UNUSUAL: dict[str, tuple[Callable[[Document], object], list[list[float]]]] = {
+UNUSUAL = {
     "no scenes: all nodes that are no child": (_no_scenes, [[0, 5, 0]]),
     "a hidden node, whose children are hidden": (_hidden, [[0, 0, 0]]),
     "survey coordinates": (_in("nodes", translation=FAR), [FAR]),
@@ -191,7 +187,7 @@ UNUSUAL: dict[str, tuple[Callable[[Document], object], list[list[float]]]] = {
 
 
 @pytest.mark.parametrize("kind", UNUSUAL)
-def test_places_of_unusual_scenes(tmp_path: Path, kind: str) -> None:
+def test_places_of_unusual_scenes(tmp_path, kind):
     write_glb(tmp_path / "a.glb", small_field(9, 1))
     document, binary = parts(tmp_path / "a.glb")
     plain = read_glb(tmp_path / "a.glb")[0]["means"]
@@ -202,7 +198,7 @@ def test_places_of_unusual_scenes(tmp_path: Path, kind: str) -> None:
     torch.testing.assert_close(read_glb(tmp_path / "a.glb")[0]["means"], expected, rtol=0, atol=1e-9)
 
 
-def added(document: Document, binary: bytes, values: np.ndarray, component: int, **accessor: object) -> bytes:
+def added(document, binary, values, component, **accessor):
     """The buffer with values ``[N, C]``, of which the last accessor tells."""
     kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
     view = {"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes}
@@ -213,7 +209,7 @@ def added(document: Document, binary: bytes, values: np.ndarray, component: int,
     return binary + values.tobytes()
 
 
-def test_instances_are_nodes_of_their_own(tmp_path: Path) -> None:
+def test_instances_are_nodes_of_their_own(tmp_path):
     """Each shows what a node with its translation, rotation and scale shows."""
     write_glb(tmp_path / "a.glb", small_field(20, 2))
     document, binary = parts(tmp_path / "a.glb")
@@ -239,7 +235,7 @@ def test_instances_are_nodes_of_their_own(tmp_path: Path) -> None:
     close(instances, separate)
 
 
-def test_a_spz_inside(tmp_path: Path) -> None:
+def test_a_spz_inside(tmp_path):
     field = small_field(30, 1)
     content = spz(field, 2, antialiased=True)
     (tmp_path / "a.spz").write_bytes(content)
@@ -257,12 +253,12 @@ def test_a_spz_inside(tmp_path: Path) -> None:
     torch.testing.assert_close(found["opacities"], read_spz(tmp_path / "a.spz")[0]["opacities"])
 
 
-def _splats(**values: object) -> Callable[[Document], None]:
+def _splats(**values):
     return lambda document: _splat(document).update(values)
 
 
-def _primitives(count: int, nodes: int = 1) -> Callable[[Document], None]:
-    def change(document: Document) -> None:
+def _primitives(count, nodes=1):
+    def change(document):
         document["meshes"][0]["primitives"] *= count
         document["nodes"] = [{"mesh": 0}] * nodes
         document["scenes"] = [{"nodes": list(range(nodes))}]
@@ -270,19 +266,19 @@ def _primitives(count: int, nodes: int = 1) -> Callable[[Document], None]:
     return change
 
 
-def _chain(document: Document) -> None:
+def _chain(document):
     document["nodes"] = [{"children": [i + 1]} for i in range(200_000)] + [{"mesh": 0}]
 
 
-def _without(document: Document) -> None:
+def _without(document):
     del document["meshes"][0]["primitives"][0]["attributes"][f"{EXTENSION}:SCALE"]
 
 
-def _mesh(document: Document) -> None:
+def _mesh(document):
     document["meshes"][0]["primitives"][0]["extensions"] = {}
 
 
-HOSTILE: dict[str, tuple[Callable[[Document], object], str]] = {
+HOSTILE = {
     "no Gaussians": (_mesh, f"no mesh of its scene has {EXTENSION}"),
     "no widths": (_without, "SCALE"),
     "another kernel": (_splats(kernel="box"), "of another kernel"),
@@ -321,7 +317,7 @@ HOSTILE: dict[str, tuple[Callable[[Document], object], str]] = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_hostile_files_are_refused_in_one_line(tmp_path: Path, kind: str) -> None:
+def test_hostile_files_are_refused_in_one_line(tmp_path, kind):
     write_glb(tmp_path / "a.glb", small_field(4, 1))
     document, binary = parts(tmp_path / "a.glb")
     change, words = HOSTILE[kind]
@@ -343,13 +339,13 @@ def test_hostile_files_are_refused_in_one_line(tmp_path: Path, kind: str) -> Non
         (b"{}", "not that of"),
     ],
 )
-def test_odd_documents_are_refused_in_one_line(tmp_path: Path, text: bytes, words: str) -> None:
+def test_odd_documents_are_refused_in_one_line(tmp_path, text, words):
     put(tmp_path / "a.glb", text, b"")
     error = verdict(lambda: sn.load(tmp_path / "a.glb"), len(text))
     assert re.search(words, str(error)), error
 
 
-def test_accessors_that_share_their_bytes_are_refused_before_they_grow(tmp_path: Path) -> None:
+def test_accessors_that_share_their_bytes_are_refused_before_they_grow(tmp_path):
     """A byte is a number of 59 attributes of a Gaussian."""
     write_glb(tmp_path / "a.glb", small_field(4, 3))
     document, _ = parts(tmp_path / "a.glb")
@@ -361,7 +357,7 @@ def test_accessors_that_share_their_bytes_are_refused_before_they_grow(tmp_path:
     assert "would unpack to" in str(error) or "none is finite" in str(error)
 
 
-def test_a_field_that_does_not_fit(tmp_path: Path) -> None:
+def test_a_field_that_does_not_fit(tmp_path):
     with pytest.raises(DataError, match="up to 3"):
         write_glb(tmp_path / "a.glb", small_field(4, 4))
     with pytest.raises(DataError, match="no Gaussians"):

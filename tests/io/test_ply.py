@@ -1,20 +1,14 @@
 """The .ply of Gaussians and of points: layout, what other programs write, and refusals in one line."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 import types
-from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from foreign_files import small_field
-from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from sundae_ns.core.errors import DataError
@@ -35,20 +29,20 @@ XYZ = np.array([[0.5, -1.25, 2.0], [3.0, 4.0, -5.5]], np.float32)
 RGB = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
 
 
-def write_rows(path: Path, columns: dict[str, NDArray[Any]], **options: Any) -> None:
+def write_rows(path, columns, **options):
     rows = np.empty(len(next(iter(columns.values()))), [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         rows[name] = column
     PlyData([PlyElement.describe(rows, "vertex")], **options).write(str(path))
 
 
-def rows_of(path: Path) -> NDArray[Any]:
+def rows_of(path):
     return np.asarray(PlyData.read(str(path), mmap=False)["vertex"].data)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 @pytest.mark.parametrize("n", [0, 1, 50])
-def test_round_trip_is_exact(tmp_path: Path, n: int, degree: int) -> None:
+def test_round_trip_is_exact(tmp_path, n, degree):
     params = small_field(n, degree)
     given = {name: torch.nn.Parameter(value.double()) for name, value in params.items()}
     write_ply(tmp_path / "a.ply", {**given, "features": torch.zeros(n, 13)})
@@ -60,7 +54,7 @@ def test_round_trip_is_exact(tmp_path: Path, n: int, degree: int) -> None:
         assert torch.equal(back[name], value), name
 
 
-def test_same_vertices_as_nerfstudio_exports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_same_vertices_as_nerfstudio_exports(tmp_path, monkeypatch):
     # The exporter needs open3d for meshes only, and open3d cannot be imported on every machine.
     monkeypatch.setitem(sys.modules, "open3d", types.ModuleType("open3d"))
     monkeypatch.delitem(sys.modules, "nerfstudio.scripts.exporter", raising=False)
@@ -68,7 +62,7 @@ def test_same_vertices_as_nerfstudio_exports(tmp_path: Path, monkeypatch: pytest
 
     exporter = importlib.import_module("nerfstudio.scripts.exporter")
     params = small_field(9, 3)
-    model: Any = SplatfactoModel.__new__(SplatfactoModel)
+    model = SplatfactoModel.__new__(SplatfactoModel)
     torch.nn.Module.__init__(model)
     model.gauss_params = torch.nn.ParameterDict(params)
     model.config = SimpleNamespace(sh_degree=3)
@@ -85,7 +79,7 @@ def test_same_vertices_as_nerfstudio_exports(tmp_path: Path, monkeypatch: pytest
     assert ply_marks(tmp_path / "ours.ply") == Marks()
 
 
-def _big_endian_doubles(path: Path) -> None:
+def _big_endian_doubles(path):
     rows = rows_of(path)
     columns = {name: rows[name].astype(">f8") for name in sorted(rows.dtype.names or (), reverse=True)}
     write_rows(
@@ -93,8 +87,8 @@ def _big_endian_doubles(path: Path) -> None:
     )
 
 
-def _header(old: bytes, new: bytes, newline: bytes = b"\n") -> Callable[[Path], object]:
-    def change(path: Path) -> None:
+def _header(old, new, newline=b"\n"):
+    def change(path):
         header, end, rows = path.read_bytes().partition(b"end_header\n")
         assert old in header + end
         path.write_bytes((header + end).replace(old, new, 1).replace(b"\n", newline) + rows + bytes(9))
@@ -102,20 +96,20 @@ def _header(old: bytes, new: bytes, newline: bytes = b"\n") -> Callable[[Path], 
     return change
 
 
-def _text(path: Path) -> None:
+def _text(path):
     data = PlyData.read(str(path), mmap=False)
     data.text = True
     data.write(str(path))
 
 
-def _faces(path: Path) -> None:
+def _faces(path):
     corners = np.empty(2, [("vertex_indices", "O")])
     corners["vertex_indices"] = [np.arange(3, dtype=np.int32)] * 2
     PlyData([PlyElement.describe(rows_of(path), "vertex"), PlyElement.describe(corners, "face")]).write(str(path))
 
 
 COMMENT = "comment Küche, 東京, end_header\n".encode() + b"comment \xff\xe9\nelement"
-SAME: dict[str, Callable[[Path], object]] = {
+SAME = {
     "more properties, doubles, another order": _big_endian_doubles,
     "text": _text,
     "text of old Macs": lambda path: (_text(path), path.write_bytes(path.read_bytes().replace(b"\n", b"\r"))),
@@ -132,7 +126,7 @@ SAME: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("form", SAME)
-def test_other_forms_are_the_same_gaussians(tmp_path: Path, form: str) -> None:
+def test_other_forms_are_the_same_gaussians(tmp_path, form):
     params, path = small_field(9), tmp_path / "a.ply"
     write_ply(path, params)
     SAME[form](path)
@@ -141,7 +135,7 @@ def test_other_forms_are_the_same_gaussians(tmp_path: Path, form: str) -> None:
     assert torch.equal(read_point_cloud(path)[0], params["means"])
 
 
-def test_the_filter_of_mip_splatting_is_fused_and_never_stale(tmp_path: Path) -> None:
+def test_the_filter_of_mip_splatting_is_fused_and_never_stale(tmp_path):
     """As its ``get_scaling_with_3D_filter`` and ``get_opacity_with_3D_filter``."""
     params, path, n = small_field(9), tmp_path / "a.ply", 9
     write_ply(path, params)
@@ -162,7 +156,7 @@ def test_the_filter_of_mip_splatting_is_fused_and_never_stale(tmp_path: Path) ->
     assert rows_of(tmp_path / "merged.ply")["filter_3D"].tolist() == [0] * 4
 
 
-def test_2dgs_is_flat_and_opacities_of_bytes_are_shares(tmp_path: Path) -> None:
+def test_2dgs_is_flat_and_opacities_of_bytes_are_shares(tmp_path):
     params, path = small_field(5), tmp_path / "a.ply"
     write_ply(path, params)
     _without("scale_2")(path)
@@ -203,23 +197,23 @@ def test_2dgs_is_flat_and_opacities_of_bytes_are_shares(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_marks_of_a_header(tmp_path: Path, comments: list[str], marks: Marks) -> None:
+def test_marks_of_a_header(tmp_path, comments, marks):
     write_ply(tmp_path / "a.ply", small_field(3), comments=comments)
     assert ply_marks(tmp_path / "a.ply") == marks
 
 
-def _without(*names: str) -> Callable[[Path], object]:
-    def write(path: Path) -> None:
+def _without(*names):
+    def write(path):
         rows = rows_of(path)
         write_rows(path, {name: rows[name] for name in rows.dtype.names or () if name not in names})
 
     return write
 
 
-def _with(*names: str, without: str = "") -> Callable[[Path], object]:
+def _with(*names, without=""):
     """With further properties, and without those of a prefix."""
 
-    def write(path: Path) -> None:
+    def write(path):
         rows = rows_of(path)
         columns = {name: rows[name] for name in rows.dtype.names or () if not without or not name.startswith(without)}
         write_rows(path, {**columns, **dict.fromkeys(names, np.zeros(len(rows), "f4"))})
@@ -227,14 +221,14 @@ def _with(*names: str, without: str = "") -> Callable[[Path], object]:
     return write
 
 
-def _lists(path: Path) -> None:
+def _lists(path):
     rows = rows_of(path)
     corners = np.empty(len(rows), "O")
     corners[:] = [np.arange(3, dtype=np.int32)] * len(rows)
     write_rows(path, {**{name: rows[name] for name in rows.dtype.names or ()}, "corners": corners})
 
 
-WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
+WRONG = {
     "gone": (lambda path: path.unlink(), "cannot be read"),
     "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
     "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-5]), "not a complete"),
@@ -271,7 +265,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_wrong_files_are_refused_in_one_line(tmp_path: Path, wrong: str) -> None:
+def test_wrong_files_are_refused_in_one_line(tmp_path, wrong):
     change, cause = WRONG[wrong]
     path = tmp_path / "a.ply"
     write_ply(path, small_field(7))
@@ -281,12 +275,7 @@ def test_wrong_files_are_refused_in_one_line(tmp_path: Path, wrong: str) -> None
     assert "\n" not in str(caught.value)
 
 
-# -------------------------------------------------------------------------------------------------------------- points
-
-
-def points_and_colors(
-    path: Path, colors: NDArray[Any] | None, names: str = "red green blue", **options: Any
-) -> tuple[list[Any], list[Any]]:
+def points_and_colors(path, colors, names="red green blue", **options):
     """What is read of a .ply of ``XYZ`` with these colours."""
     columns = {} if colors is None else dict(zip(names.split(), colors.T, strict=True))
     write_rows(path, {**dict(zip("xyz", XYZ.T, strict=True)), **columns}, **options)
@@ -303,7 +292,7 @@ def points_and_colors(
         *(("f4", 1), ("f4", 255), ("f8", 255), ("f4", 65535), ("f8", 1)),
     ],
 )
-def test_colours_of_all_ranges(tmp_path: Path, dtype: str, white: int, text: bool) -> None:
+def test_colours_of_all_ranges(tmp_path, dtype, white, text):
     colors = RGB / 255 * white
     given = (colors if dtype[0] == "f" else colors.round()).astype(dtype)
     assert points_and_colors(tmp_path / "a.ply", given, text=text) == (XYZ.tolist(), RGB.tolist())
@@ -311,11 +300,11 @@ def test_colours_of_all_ranges(tmp_path: Path, dtype: str, white: int, text: boo
 
 @pytest.mark.parametrize("names", ["r g b", "diffuse_red diffuse_green diffuse_blue", "Red Green Blue", "R G B"])
 @pytest.mark.parametrize("dtype", ["u1", "f4"])
-def test_colours_of_other_names(tmp_path: Path, names: str, dtype: str) -> None:
+def test_colours_of_other_names(tmp_path, names, dtype):
     assert points_and_colors(tmp_path / "a.ply", RGB.astype(dtype), names)[1] == RGB.tolist()
 
 
-def test_other_colours(tmp_path: Path) -> None:
+def test_other_colours(tmp_path):
     path = tmp_path / "a.ply"
     harmonics = ((RGB / 255 - 0.5) / 0.28209479177387814).astype("f4")
     assert points_and_colors(path, harmonics, "f_dc_0 f_dc_1 f_dc_2")[1] == RGB.tolist()
@@ -324,13 +313,13 @@ def test_other_colours(tmp_path: Path) -> None:
     assert points_and_colors(path, None) == (XYZ.tolist(), [[128] * 3] * 2)
 
 
-def test_precise_positions(tmp_path: Path) -> None:
+def test_precise_positions(tmp_path):
     far = [5_412_330.123, 1e-9, -4e6 - 0.1]
     write_rows(tmp_path / "a.ply", {name: np.array([value]) for name, value in zip("xyz", far, strict=True)})
     assert read_point_cloud(tmp_path / "a.ply", precise=True)[0].tolist() == [far]
 
 
-def test_files_without_points_are_refused(tmp_path: Path) -> None:
+def test_files_without_points_are_refused(tmp_path):
     with pytest.raises(DataError, match="cannot be read"):
         read_point_cloud(tmp_path / "gone.ply")
     write_rows(tmp_path / "a.ply", {"x": np.zeros(2), "y": np.zeros(2)})

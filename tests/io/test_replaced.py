@@ -1,12 +1,8 @@
 """Reading a run while its training replaces the checkpoint."""
 
-from __future__ import annotations
-
 import shutil
 import threading
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -24,7 +20,7 @@ N = 20
 class Training:
     """A run whose checkpoint is replaced as the trainer does it: the next one appears, then the others go."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.run, self.step, self.models = folder / "run", 0, folder / "run" / "nerfstudio_models"
         self.models.mkdir(parents=True)
         (self.run / "config.yml").write_text("pipeline:\n  model: {}\n")
@@ -33,7 +29,7 @@ class Training:
         torch.save({"step": 0, "pipeline": state}, self.whole)
         self.save()
 
-    def save(self) -> None:
+    def save(self):
         self.step += 1
         partial = shutil.copy(self.whole, self.models / "partial")
         new = Path(partial).replace(self.models / f"step-{self.step:09d}.ckpt")
@@ -43,17 +39,17 @@ class Training:
 
 
 @pytest.fixture
-def training(tmp_path: Path) -> Training:
+def training(tmp_path):
     return Training(tmp_path)
 
 
-def exported(run: Path) -> None:
+def exported(run):
     with pytest.raises(SystemExit) as end:
         main(["export", str(run), "-o", str(run.parent / "a.ply"), "--overwrite"])
     assert not end.value.code
 
 
-READERS: dict[str, Callable[[Path], object]] = {
+READERS = {
     "load": sn.load,
     "read_gaussians": read_gaussians,
     "export": exported,
@@ -62,14 +58,12 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("lost", ["listed", "checked"])
 @pytest.mark.parametrize("reader", READERS)
-def test_a_checkpoint_may_go_between_any_two_steps_of_a_read(
-    training: Training, monkeypatch: pytest.MonkeyPatch, reader: str, lost: str
-) -> None:
+def test_a_checkpoint_may_go_between_any_two_steps_of_a_read(training, monkeypatch, reader, lost):
     module, name = {"listed": (checkpoint, "checkpoints"), "checked": (torch, "load")}[lost]
     original, after = getattr(module, name), lost == "listed"
-    replaced: list[bool] = []
+    replaced = []
 
-    def replacing(*arguments: Any, **options: Any) -> Any:
+    def replacing(*arguments, **options):
         found = original(*arguments, **options) if after else None
         if len(replaced) < 2:
             replaced.append(True)
@@ -81,10 +75,10 @@ def test_a_checkpoint_may_go_between_any_two_steps_of_a_read(
     assert replaced
 
 
-def test_every_read_beside_a_training_that_saves_all_the_time_succeeds(training: Training) -> None:
+def test_every_read_beside_a_training_that_saves_all_the_time_succeeds(training):
     done = threading.Event()
 
-    def save() -> None:
+    def save():
         while not done.is_set():
             training.save()
 
@@ -98,7 +92,7 @@ def test_every_read_beside_a_training_that_saves_all_the_time_succeeds(training:
         thread.join()
 
 
-def test_a_run_without_a_whole_checkpoint_is_refused_at_once(training: Training) -> None:
+def test_a_run_without_a_whole_checkpoint_is_refused_at_once(training):
     (newest,) = training.models.iterdir()
     newest.write_bytes(b"half")
     (training.models / "step-000000009.ckpt").symlink_to("nowhere")

@@ -1,11 +1,8 @@
 """The folder of a run: one process trains in it, and damaged records of prunes do not end a training."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +14,7 @@ HOLDER = "import sys, time; from pathlib import Path; from sundae_ns.io.run_fold
 HOLDER += "reserve(Path(sys.argv[1])); print(flush=True); time.sleep(600)"
 
 
-def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path: Path) -> None:
+def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path):
     run = tmp_path / "run"
     folder = run / "nerfstudio_models"
     folder.mkdir(parents=True)
@@ -30,7 +27,7 @@ def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path: Path) -> 
     assert find_config(tmp_path / "gone") is None
 
 
-def test_earlier_records_are_kept_and_a_damaged_file_is_renamed(tmp_path: Path) -> None:
+def test_earlier_records_are_kept_and_a_damaged_file_is_renamed(tmp_path):
     path = tmp_path / "prune.json"
     assert prunes_before(path, 5) == []
     path.write_text('[{"step": 3, "before": 9}, {"step": 7}]')
@@ -43,7 +40,7 @@ def test_earlier_records_are_kept_and_a_damaged_file_is_renamed(tmp_path: Path) 
         assert (tmp_path / "prune.damaged.json").read_text() == text
 
 
-def test_records_of_a_finished_run_are_read_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_records_of_a_finished_run_are_read_whole_or_not_at_all(tmp_path):
     assert prunes_of(tmp_path) == []
     (tmp_path / "prune.json").write_text('[{"before": 9, "after": 3}]')
     assert prunes_of(tmp_path) == [{"before": 9, "after": 3}]
@@ -53,7 +50,7 @@ def test_records_of_a_finished_run_are_read_whole_or_not_at_all(tmp_path: Path) 
         assert (tmp_path / "prune.json").read_text() == text
 
 
-def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path: Path) -> None:
+def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):
     run = tmp_path / "runs" / "a"
     other = subprocess.Popen([sys.executable, "-c", HOLDER, run], stdout=subprocess.PIPE)
     try:
@@ -78,11 +75,11 @@ def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path: Path) -> None:
     ]
 
 
-def test_runs_of_the_same_second_have_different_names() -> None:
+def test_runs_of_the_same_second_have_different_names():
     assert len({new_name() for _ in range(100)}) == 100
 
 
-def test_parts_of_a_run(tmp_path: Path) -> None:
+def test_parts_of_a_run(tmp_path):
     (tmp_path / "config.yml").touch()
     (tmp_path / "a.ply").touch()
     assert files_of(tmp_path) == files_of(tmp_path / "config.yml")
@@ -90,7 +87,7 @@ def test_parts_of_a_run(tmp_path: Path) -> None:
     assert files_of(tmp_path / "a.ply") == [tmp_path / "a.ply"]
 
 
-def test_records_follow_a_resumed_run(tmp_path: Path) -> None:
+def test_records_follow_a_resumed_run(tmp_path):
     old = tmp_path / "old"
     old.mkdir()
     take_records(old, tmp_path / "none", 9)  # there are none

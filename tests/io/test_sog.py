@@ -1,14 +1,10 @@
 """Files of .sog, decoded by the format's public description."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
 import zipfile
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from limits import verdict
-from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.io.coordinates import scene_order
@@ -27,7 +21,7 @@ from sundae_ns.io.sog import codebook, kmeans, palette, write_sog
 from sundae_ns.scene.initialization import from_points
 
 
-def gaussians(n: int = 150, degree: int = 3) -> dict[str, Tensor]:
+def gaussians(n=150, degree=3):
     generator = torch.Generator().manual_seed(0)
     points = 4 * torch.rand(n, 3, generator=generator) - 2
     made = from_points(points, points / 4 + 0.5, sh_degree=degree, num_features=3, generator=generator)
@@ -40,12 +34,12 @@ def gaussians(n: int = 150, degree: int = 3) -> dict[str, Tensor]:
     return made
 
 
-def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
+def read(path):
     """``meta.json``, and the Gaussians as sections 3.1 to 3.5 of the description decode them."""
     with zipfile.ZipFile(path) as bundle:
         meta = json.loads(bundle.read("meta.json"))
 
-        def pixels(entry: str, number: int = 0) -> NDArray[np.int64]:
+        def pixels(entry, number=0):
             with bundle.open(meta[entry]["files"][number]) as file:
                 return np.asarray(Image.open(file).convert("RGBA"), dtype=np.int64)
 
@@ -79,7 +73,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_values_come_back(tmp_path: Path, degree: int) -> None:
+def test_values_come_back(tmp_path, degree):
     truth = gaussians(degree=degree)
     write_sog(tmp_path / "a.sog", truth)
     meta, found = read(tmp_path / "a.sog")
@@ -101,7 +95,7 @@ def test_values_come_back(tmp_path: Path, degree: int) -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 64, 65])
-def test_few_equal_primitives(tmp_path: Path, n: int) -> None:
+def test_few_equal_primitives(tmp_path, n):
     truth = {name: value[:1].expand(n, *value.shape[1:]) for name, value in gaussians().items()}
     write_sog(tmp_path / "a.sog", truth)
     _, found = read(tmp_path / "a.sog")
@@ -111,7 +105,7 @@ def test_few_equal_primitives(tmp_path: Path, n: int) -> None:
 
 
 @given(st.lists(st.floats(-1e6, 1e6, width=32), min_size=1, max_size=600))
-def test_codes_index_the_nearest_number(values: list[float]) -> None:
+def test_codes_index_the_nearest_number(values):
     given_values = np.array(values, np.float32)
     numbers, codes = codebook(given_values)
     assert numbers.shape == (256,)
@@ -121,7 +115,7 @@ def test_codes_index_the_nearest_number(values: list[float]) -> None:
     assert (chosen <= distance.min(axis=1) + 1e-6 * np.abs(given_values).max()).all()
 
 
-def test_the_codebook_is_better_than_equal_steps() -> None:
+def test_the_codebook_is_better_than_equal_steps():
     values = np.random.default_rng(0).laplace(size=20_000).astype(np.float32)
     numbers, codes = codebook(values)
     step = np.ptp(values) / 255
@@ -129,13 +123,13 @@ def test_the_codebook_is_better_than_equal_steps() -> None:
     assert ((numbers[codes] - values) ** 2).mean() < 0.5 * ((equal - values) ** 2).mean()
 
 
-def test_a_centre_without_rows_is_unchanged() -> None:
+def test_a_centre_without_rows_is_unchanged():
     rows = torch.full((50, 2), 3.0).double()
     centres = kmeans(rows, 4, torch.Generator().manual_seed(0))
     assert torch.equal(centres, rows[:4])
 
 
-def test_a_palette_of_two_levels() -> None:
+def test_a_palette_of_two_levels():
     generator = np.random.default_rng(0)
     centres = generator.normal(size=(40, 9)).astype(np.float32)
     rows = centres[generator.integers(40, size=3000)] + 0.01 * generator.normal(size=(3000, 9)).astype(np.float32)
@@ -148,12 +142,12 @@ def test_a_palette_of_two_levels() -> None:
     assert np.array_equal(same[each], rows)
 
 
-def entries(path: Path) -> dict[str, bytes]:
+def entries(path):
     with zipfile.ZipFile(path) as bundle:
         return {name: bundle.read(name) for name in bundle.namelist()}
 
 
-def zipped(content: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
+def zipped(content, method=zipfile.ZIP_STORED):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", method) as bundle:
         for name, data in content.items():
@@ -162,13 +156,13 @@ def zipped(content: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes
 
 
 @pytest.fixture(scope="module")
-def bundled(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def bundled(tmp_path_factory):
     path = tmp_path_factory.mktemp("sog") / "a.sog"
     write_sog(path, gaussians())
     return entries(path)
 
 
-FORMS: dict[str, Callable[[dict[str, bytes]], bytes]] = {
+FORMS = {
     "in a folder": lambda files: zipped({f"garden/{name}": data for name, data in files.items()}),
     "deflated": lambda files: zipped(files, zipfile.ZIP_DEFLATED),
     "in a zip": lambda files: zipped({"readme.txt": b"", "__MACOSX/._a.sog": b"", "b/a.sog": zipped(files)}),
@@ -177,14 +171,14 @@ FORMS: dict[str, Callable[[dict[str, bytes]], bytes]] = {
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("suffix", [".sog", ".zip"])
-def test_other_forms_of_a_bundle(tmp_path: Path, bundled: dict[str, bytes], form: str, suffix: str) -> None:
+def test_other_forms_of_a_bundle(tmp_path, bundled, form, suffix):
     (tmp_path / "a.sog").write_bytes(zipped(bundled))
     (tmp_path / f"b{suffix}").write_bytes(FORMS[form](bundled))
     truth, found = (read_gaussian_file(tmp_path / name)[0].gaussians for name in ("a.sog", f"b{suffix}"))
     assert all(torch.equal(found[name], truth[name]) for name in truth)
 
 
-def test_survey_coordinates_are_read_in_double(tmp_path: Path, bundled: dict[str, bytes]) -> None:
+def test_survey_coordinates_are_read_in_double(tmp_path, bundled):
     """In float32 they have steps of a quarter there."""
     low, high = (np.log1p(np.array([end, end, end])).tolist() for end in (4e6, 4e6 + 10))
     files = ["means_l.webp", "means_u.webp"]
@@ -194,13 +188,13 @@ def test_survey_coordinates_are_read_in_double(tmp_path: Path, bundled: dict[str
     assert np.ptp(means[:, 0].numpy()) == pytest.approx(10, abs=0.01)
 
 
-def webp(width: int, height: int, **options: Any) -> bytes:
+def webp(width, height, **options):
     image = io.BytesIO()
     Image.new("RGBA", (width, height), (1, 2, 3, 252)).save(image, "WEBP", **options)
     return image.getvalue()
 
 
-def _lie(content: bytes, name: bytes, size: int) -> bytes:
+def _lie(content, name, size):
     """A bundle that states another size of an entry."""
     data = bytearray(content)
     for mark, at, header in ((b"PK\x03\x04", 22, 30), (b"PK\x01\x02", 24, 46)):
@@ -214,26 +208,26 @@ def _lie(content: bytes, name: bytes, size: int) -> bytes:
 Make = Callable[[dict[str, bytes]], bytes]
 
 
-def _meta(**changes: Any) -> Make:
+def _meta(**changes):
     return lambda files: zipped(files | {"meta.json": json.dumps(json.loads(files["meta.json"]) | changes).encode()})
 
 
-def _with(name: str, content: bytes) -> Make:
+def _with(name, content):
     return lambda files: zipped(files | {name: content})
 
 
-def _bomb(method: int) -> Make:
+def _bomb(method):
     return lambda files: _lie(zipped({**files, "means_l.webp": bytes(1 << 28)}, method), b"means_l.webp", 1000)
 
 
-def _all(side: int, **changes: Any) -> Make:
+def _all(side, **changes):
     """All images but those of harmonics are equal ones of these sides."""
     names = ("means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp")
     return lambda files: _meta(**changes)(files | dict.fromkeys(names, webp(side, side, lossless=True)))
 
 
 SCALES, MEANS = ["scales.webp"], ["means_l.webp", "means_u.webp"]
-HOSTILE: dict[str, tuple[Make, str]] = {
+HOSTILE = {
     "a lossy image": (_with("means_l.webp", webp(13, 13, quality=80)), "no lossless WebP"),
     "lossy colours beside alphas": (_with("sh0.webp", webp(13, 13, quality=80, alpha_quality=50)), "no lossless WebP"),
     "no image": (_with("means_l.webp", b"RIFF"), "no lossless WebP"),
@@ -259,7 +253,7 @@ HOSTILE: dict[str, tuple[Make, str]] = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_hostile_bundles(tmp_path: Path, bundled: dict[str, bytes], kind: str) -> None:
+def test_hostile_bundles(tmp_path, bundled, kind):
     make, words = HOSTILE[kind]
     path = tmp_path / "a.sog"
     path.write_bytes(make(bundled))
@@ -269,7 +263,7 @@ def test_hostile_bundles(tmp_path: Path, bundled: dict[str, bytes], kind: str) -
 
 
 @pytest.mark.parametrize("name", ["", "lod-meta.json"])
-def test_a_streamed_folder_is_named(tmp_path: Path, name: str) -> None:
+def test_a_streamed_folder_is_named(tmp_path, name):
     (tmp_path / "lod-meta.json").write_text("{}")
     with pytest.raises(DataError, match="it is streamed SOG; give the meta.json of one of its folders"):
         read_gaussian_file(tmp_path / name)

@@ -1,11 +1,7 @@
 """Files of .spz of every version, made by the specification: values, stated axes, and sizes that lie."""
 
-from __future__ import annotations
-
 import gzip
 import struct
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -21,7 +17,7 @@ from sundae_ns.rasterize.reference import harmonic_basis
 
 
 @pytest.mark.parametrize(("version", "degree"), [(1, 3), (2, 0), (3, 4), (4, 1), (4, 0)])
-def test_values_of_every_version(tmp_path: Path, version: int, degree: int) -> None:
+def test_values_of_every_version(tmp_path, version, degree):
     truth = small_field(200, degree)
     (tmp_path / "a.spz").write_bytes(spz(truth, version, antialiased=degree == 4))
     found, antialiased = read_spz(tmp_path / "a.spz")
@@ -45,7 +41,7 @@ AXES = {"LDB": 1, "RUB": 4, "RDF": 6, "LUF": 7, "RUF": 8, "RBD": 10, "RFU": 16}
 
 @pytest.mark.parametrize("axes", AXES)
 @pytest.mark.parametrize("version", [3, 4])
-def test_stated_axes_are_turned_to_those_of_a_ply(tmp_path: Path, version: int, axes: str) -> None:
+def test_stated_axes_are_turned_to_those_of_a_ply(tmp_path, version, axes):
     """Each Gaussian is where it was to the right, down and forward, and shows the same colours from there."""
     truth = small_field(50, 3)
     (tmp_path / "a.spz").write_bytes(spz(truth, version))
@@ -69,18 +65,18 @@ def test_stated_axes_are_turned_to_those_of_a_ply(tmp_path: Path, version: int, 
     torch.testing.assert_close(*colors, rtol=0, atol=1e-5)
 
 
-def _bomb(size: int) -> bytes:
+def _bomb(size):
     return zstandard.ZstdCompressor(level=1).compress(bytes(size))
 
 
-def _with_stream(content: bytes, frame: bytes) -> bytes:
+def _with_stream(content, frame):
     """The positions are another frame, which the table states as the right one."""
     stored = struct.unpack_from("<Q", content, 32)[0]
     return content[:32] + struct.pack("<Q", len(frame)) + content[40:128] + frame + content[128 + stored :]
 
 
 FIELD = small_field(100, 1)
-HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
+HOSTILE = {
     "a second member": (lambda: spz(FIELD, 3) + gzip.compress(bytes(1 << 27)), "unpacks to far more"),
     "a long end": (lambda: gzip.compress(gzip.decompress(spz(FIELD, 3)) + bytes(1 << 27)), "unpacks to far more"),
     "a frame of 256 MB": (lambda: _with_stream(spz(FIELD, 4), _bomb(1 << 28)), "has not the 900 bytes"),
@@ -100,7 +96,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_hostile_files(tmp_path: Path, kind: str) -> None:
+def test_hostile_files(tmp_path, kind):
     make, words = HOSTILE[kind]
     (tmp_path / "a.spz").write_bytes(make())
     error = verdict(lambda: sn.load(tmp_path / "a.spz"), (tmp_path / "a.spz").stat().st_size)

@@ -1,10 +1,7 @@
 """Transformed fields give the same images from transformed cameras; survey coordinates; which way is up."""
 
-from __future__ import annotations
-
 import pytest
 import torch
-from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.io.coordinates import recentred, rotate_spherical_harmonics, similarity, upward
@@ -16,20 +13,20 @@ SCALE = 1.7
 SIZE = 24
 
 
-def rotation(seed: int = 1) -> Tensor:
+def rotation(seed=1):
     generator = torch.Generator().manual_seed(seed)
     q, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
     return q * q.det()
 
 
-def transform() -> Tensor:
+def transform():
     return torch.cat([rotation(), torch.tensor([[0.4], [-1.1], [0.7]], dtype=torch.float64)], dim=1)
 
 
-def gaussians(degree: int = 3, n: int = 60) -> dict[str, Tensor]:
+def gaussians(degree=3, n=60):
     generator = torch.Generator().manual_seed(2)
 
-    def normal(*shape: int) -> Tensor:
+    def normal(*shape):
         return torch.randn(n, *shape, generator=generator, dtype=torch.float64)
 
     return {
@@ -43,14 +40,14 @@ def gaussians(degree: int = 3, n: int = 60) -> dict[str, Tensor]:
     }
 
 
-def camera() -> Tensor:
+def camera():
     camera = torch.eye(4, dtype=torch.float64)
     camera[:3, :3] = rotation(3)
     camera[:3, 3] = torch.tensor([0.1, -0.2, 3.0])
     return camera
 
 
-def moved_camera() -> Tensor:
+def moved_camera():
     """World-to-camera of the transformed camera; its coordinates are ``SCALE`` times as large."""
     cam, (turn, shift) = camera(), transform().split([3, 1], dim=1)
     moved = cam.clone()
@@ -59,7 +56,7 @@ def moved_camera() -> Tensor:
     return moved
 
 
-def image(params: dict[str, Tensor], camera: Tensor) -> tuple[Tensor, Tensor]:
+def image(params, camera):
     backend = select_backend("reference", "cpu")
     K = torch.tensor([[30.0, 0.0, SIZE / 2], [0.0, 30.0, SIZE / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
     center = -camera[:3, :3].T @ camera[:3, 3]
@@ -73,7 +70,7 @@ def image(params: dict[str, Tensor], camera: Tensor) -> tuple[Tensor, Tensor]:
     return rendered.colors, rendered.depth
 
 
-def test_transformed_field_and_camera_give_the_same_image() -> None:
+def test_transformed_field_and_camera_give_the_same_image():
     params = gaussians()
     colors, depth = image(params, camera())
     moved_colors, moved_depth = image(similarity(params, transform(), SCALE), moved_camera())
@@ -83,7 +80,7 @@ def test_transformed_field_and_camera_give_the_same_image() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_rotated_harmonics_are_the_rotated_function(degree: int) -> None:
+def test_rotated_harmonics_are_the_rotated_function(degree):
     rest = gaussians(degree, n=4)["features_rest"]
     degree_0 = torch.zeros(4, 1, 3, dtype=torch.float64)
     directions = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=1)
@@ -96,7 +93,7 @@ def test_rotated_harmonics_are_the_rotated_function(degree: int) -> None:
 
 
 @pytest.mark.parametrize("far", [5e5, -4e6, 3e12])
-def test_survey_coordinates_are_moved_without_loss(far: float) -> None:
+def test_survey_coordinates_are_moved_without_loss(far):
     means = far + 50 * torch.rand(100, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     means[3, 1] = torch.nan
     moved, offset = recentred(means)
@@ -112,7 +109,7 @@ def test_survey_coordinates_are_moved_without_loss(far: float) -> None:
 @pytest.mark.parametrize(
     "means", [torch.rand(50, 3) + 9, torch.full((5, 3), 9e9), torch.zeros(0, 3), torch.rand(9, 3) / 0]
 )
-def test_other_coordinates_stay(means: Tensor) -> None:
+def test_other_coordinates_stay(means):
     moved, offset = recentred(means.double())
     assert offset is None
     assert torch.equal(moved, means)
@@ -121,7 +118,7 @@ def test_other_coordinates_stay(means: Tensor) -> None:
 Y_DOWN, Z, Y = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
 
 
-def ground(up: tuple[float, float, float], share: float) -> Tensor:
+def ground(up, share):
     """Centres of which a share lies on the ground, and the others up to half its width above it."""
     axis = torch.nn.functional.normalize(torch.tensor(up), dim=0)
     side = torch.nn.functional.normalize(torch.linalg.cross(axis, torch.tensor([1.0, 0.2, 0.3])), dim=0)
@@ -143,9 +140,7 @@ def ground(up: tuple[float, float, float], share: float) -> Tensor:
         (Z, 0.0, Y_DOWN),
     ],
 )
-def test_up_is_that_of_the_ground_else_by_convention(
-    up: tuple[float, float, float], share: float, found: tuple[float, float, float]
-) -> None:
+def test_up_is_that_of_the_ground_else_by_convention(up, share, found):
     direction, shown = upward(ground(up, share), Y_DOWN)
     assert torch.tensor(direction) @ torch.nn.functional.normalize(torch.tensor(found), dim=0) > 0.998
     assert shown == (up == found)

@@ -1,17 +1,14 @@
 """What counts as a floater in front of a camera."""
 
-from __future__ import annotations
-
 import pytest
 import torch
-from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.pruning.floaters import FREE, near_cameras
 
 
-def scene() -> tuple[Tensor, Tensor]:
+def scene():
     """Eight cameras on a circle of radius 4, and 2,000 points in a ball of radius 1: at least 3 from each of them."""
     angle = torch.arange(8) * torch.pi / 4
     eyes = torch.stack([4 * angle.cos(), 4 * angle.sin(), 0 * angle], dim=1)
@@ -19,7 +16,7 @@ def scene() -> tuple[Tensor, Tensor]:
     return eyes, points
 
 
-def test_a_primitive_is_a_floater_where_the_points_say_that_nothing_is() -> None:
+def test_a_primitive_is_a_floater_where_the_points_say_that_nothing_is():
     eyes, points = scene()
     nearest = torch.cdist(points, eyes).amin(dim=1).sort().values[19]  # a hundredth of them is nearer
     towards = torch.tensor([-1.0, 0, 0])
@@ -28,7 +25,7 @@ def test_a_primitive_is_a_floater_where_the_points_say_that_nothing_is() -> None
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e6])
-def test_the_unit_of_length_does_not_matter(scale: float) -> None:
+def test_the_unit_of_length_does_not_matter(scale):
     eyes, points = scene()
     means = 3 * torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) + 1
     found = near_cameras(means, eyes, points)
@@ -36,7 +33,7 @@ def test_the_unit_of_length_does_not_matter(scale: float) -> None:
     assert torch.equal(near_cameras(scale * means, scale * eyes, scale * points), found)
 
 
-def test_a_few_wrong_points_do_not_hide_floaters_and_nan_does_not_count() -> None:
+def test_a_few_wrong_points_do_not_hide_floaters_and_nan_does_not_count():
     eyes, points = scene()
     means = eyes[:1] - torch.tensor([[1.0, 0, 0]])
     points[:8] = eyes + 1e-3  # matched wrongly, in front of each lens
@@ -44,7 +41,7 @@ def test_a_few_wrong_points_do_not_hide_floaters_and_nan_does_not_count() -> Non
     assert near_cameras(means, eyes, points).all()
 
 
-def test_what_sparse_points_show_near_a_camera_is_no_floater() -> None:
+def test_what_sparse_points_show_near_a_camera_is_no_floater():
     """A few photos of a flower beside the path: so few of the points that they do not say how near the scene comes."""
     eyes, points = scene()
     means = eyes[0] - torch.tensor([[0.5, 0, 0], [0.5, 0.05, 0], [0.5, 0.0, 1.2]])
@@ -53,7 +50,7 @@ def test_what_sparse_points_show_near_a_camera_is_no_floater() -> None:
         assert near_cameras(means, eyes, points).tolist() == floats
 
 
-def test_without_points_or_cameras_nothing_floats() -> None:
+def test_without_points_or_cameras_nothing_floats():
     eyes, points = scene()
     for one, other in ((eyes[:0], points), (eyes, points[:0]), (eyes, points * torch.nan)):
         assert not near_cameras(eyes, one, other).any()
@@ -61,7 +58,7 @@ def test_without_points_or_cameras_nothing_floats() -> None:
 
 
 @pytest.mark.parametrize(("rows", "removed"), [(0, 0), (5, 5), (6, 0)])
-def test_more_floaters_than_there_can_be_stay(rows: int, removed: int) -> None:
+def test_more_floaters_than_there_can_be_stay(rows, removed):
     params = {"means": Parameter(torch.arange(300.0).reshape(100, 3))}
     assert Pruner(params, {}).drop(torch.arange(100) < rows, at_most=0.05) == removed
     assert params["means"][:, 0].tolist() == [3 * row for row in range(removed, 100)]

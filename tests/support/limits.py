@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import signal
 import tracemalloc
@@ -9,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sundae_ns.core.errors import SundaeError
+from sundae_ns.core.errors import DataError, SundaeError
 
 SECONDS = 5
 """Limit of one case, in CPU time, so that other work on the machine does not count."""
@@ -53,3 +54,10 @@ def verdict(reader: Callable[[], Any], size: int) -> SundaeError | None:
         causes = [error.__cause__, error.__context__]
         assert not any(isinstance(cause, MemoryError) or "allocate memory" in str(cause) for cause in causes)
     return error
+
+
+def refused(read: Callable[[Path], Any], path: Path, words: str = "", kind: type[SundaeError] = DataError) -> None:
+    """Assert that a file is refused within the limits, in one line that has words (a pattern)."""
+    error = verdict(lambda: read(path), path.stat().st_size if path.is_file() else 0)
+    assert isinstance(error, kind), error
+    assert re.search(words, str(error)), error

@@ -1,9 +1,6 @@
 """A codec rounds to the values that a reader decodes, bit for bit, also for values to which it was not fitted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +9,6 @@ from fields import random_field
 from hard_values import drifted, hard_values
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from sundae_ns.core.errors import PackError
 from sundae_ns.io.pack import codecs as codecs_module
@@ -27,7 +23,7 @@ hard = given(
 
 
 @hard
-def test_weights(kind: str, n: int, seed: int) -> None:
+def test_weights(kind, n, seed):
     x, share = hard_values(kind, n, 18, seed).reshape(n, 2, 3, 3), 2.0 ** -(seed % 9)
     codec = HeadCodec({"w": quantize.weight_steps(torch.from_numpy(x), share)}, {"w": torch.tensor([1.0, 2.0**0.25])})
     for y in (x, drifted(x, seed)):
@@ -39,7 +35,7 @@ def test_weights(kind: str, n: int, seed: int) -> None:
         assert torch.equal(codec.rounded("w", torch.from_numpy(y)), found)
 
 
-def scene(n: int = 700) -> PackedScene:
+def scene(n=700):
     g = torch.Generator().manual_seed(1)
     head = {"a.weight": torch.randn(4, 3, 3, 3, generator=g), "a.bias": torch.randn(4, generator=g)}
     return PackedScene(random_field(n), head)
@@ -55,7 +51,7 @@ def scene(n: int = 700) -> PackedScene:
         PackConfig(head_step=0.01, feature_step=0.001),
     ],
 )
-def test_a_file_holds_the_values_rounded_in_training(tmp_path: Path, config: PackConfig) -> None:
+def test_a_file_holds_the_values_rounded_in_training(tmp_path, config):
     fitted, codecs = fit_scene(scene(), config)
     g = torch.Generator().manual_seed(1)
     moved = {name: value + 0.02 * torch.randn(value.shape, generator=g) for name, value in fitted.gaussians.items()}
@@ -73,20 +69,20 @@ def test_a_file_holds_the_values_rounded_in_training(tmp_path: Path, config: Pac
         assert torch.equal(value, rounded_head[name]), name
 
 
-def without(name: str) -> PackedScene:
+def without(name):
     whole = scene()
     return PackedScene({key: value for key, value in whole.gaussians.items() if key != name}, whole.head)
 
 
 @pytest.mark.parametrize("other", [scene(650), without("features"), PackedScene(scene().gaussians)])
-def test_codecs_of_another_scene_are_refused(tmp_path: Path, other: PackedScene) -> None:
+def test_codecs_of_another_scene_are_refused(tmp_path, other):
     _, codecs = fit_scene(scene())
     with pytest.raises(PackError, match="another scene"):
         write_fitted(tmp_path / "a.sundae", other, codecs)
     assert not list(tmp_path.iterdir())
 
 
-def test_other_steps_keep_grids_and_bases(tmp_path: Path) -> None:
+def test_other_steps_keep_grids_and_bases(tmp_path):
     """Of a scene that has moved since, whose own bases would be others."""
     present = PackConfig(block=100, position_bits=11, head_step=0.1)
     fitted, codecs = fit_scene(scene(), present)
@@ -115,7 +111,7 @@ def test_other_steps_keep_grids_and_bases(tmp_path: Path) -> None:
     assert all(torch.equal(found[name], shown[name]) for name in other.gaussians)
 
 
-def test_steps_that_are_too_fine_for_a_row_become_larger() -> None:
+def test_steps_that_are_too_fine_for_a_row_become_larger():
     rows = hard_values("normal", 50, 3, 0)
     codec = quantize.fit_transform(rows, 0.01)
     rows[7] = 1e5
@@ -124,11 +120,11 @@ def test_steps_that_are_too_fine_for_a_row_become_larger() -> None:
     assert np.abs(finer.rounded(torch.from_numpy(rows)).numpy() - rows).max() < 0.1
 
 
-def drifted_tensor(values: Tensor) -> Tensor:
+def drifted_tensor(values):
     return torch.from_numpy(drifted(values.flatten(1).numpy(), 0)).reshape(values.shape)
 
 
-def test_larger_steps_of_the_head_are_fewer_bytes(tmp_path: Path) -> None:
+def test_larger_steps_of_the_head_are_fewer_bytes(tmp_path):
     big = {"a.weight": torch.randn(64, 64, 3, 3, generator=torch.Generator().manual_seed(0))}
     whole = PackedScene(scene().gaussians, big)
     sizes = {}
@@ -143,7 +139,7 @@ def test_larger_steps_of_the_head_are_fewer_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.gpu
-def test_rounding_is_the_same_on_a_gpu() -> None:
+def test_rounding_is_the_same_on_a_gpu():
     """Levels are equal; values differ in the last bits, because a GPU rounds roots, quotients and sums differently."""
     fitted, codecs = fit_scene(scene(), PackConfig(feature_step=0.3))
     cuda = torch.device("cuda")
@@ -155,11 +151,11 @@ def test_rounding_is_the_same_on_a_gpu() -> None:
         torch.testing.assert_close(head[name].cpu(), value, rtol=1e-6, atol=0, msg=name)
 
 
-def _moved(tensors: dict[str, Tensor], device: torch.device) -> dict[str, Tensor]:
+def _moved(tensors, device):
     return {name: value.to(device) for name, value in tensors.items()}
 
 
-def test_weights_that_show_less_are_coarser_at_the_same_total_error() -> None:
+def test_weights_that_show_less_are_coarser_at_the_same_total_error():
     g = torch.Generator().manual_seed(0)
     head = {name: torch.randn(8, 8, 3, 3, generator=g) for name in ("a.weight", "b.weight")}
     shown = {name: torch.rand(8, 8, generator=g, dtype=torch.float64) + 0.5 for name in head}
@@ -179,7 +175,7 @@ def test_weights_that_show_less_are_coarser_at_the_same_total_error() -> None:
     assert share[1] == pytest.approx(8 * share[0], rel=0.25)
 
 
-def test_no_step_is_larger_than_half_of_the_largest_weight() -> None:
+def test_no_step_is_larger_than_half_of_the_largest_weight():
     """Weights behind an output layer of zeros seem useless, but training will need them."""
     head = {"a.weight": torch.randn(4, 4, 3, 3), "out.weight": torch.full((4, 4, 1, 1), 1e-6)}
     shown = {"a.weight": torch.full((4, 4), 1e-12).double(), "out.weight": torch.ones(4, 4).double()}
@@ -190,7 +186,7 @@ def test_no_step_is_larger_than_half_of_the_largest_weight() -> None:
 
 
 @pytest.mark.parametrize("seen", [[], ["b.weight"]], ids=["nothing", "the last layer"])
-def test_a_head_that_does_nothing_yet_is_packed(tmp_path: Path, seen: list[str]) -> None:
+def test_a_head_that_does_nothing_yet_is_packed(tmp_path, seen):
     """The last layer of a head starts at zero, so no feature and no other weight shows."""
     g = torch.Generator().manual_seed(0)
     head = {name: torch.randn(8, 8, 3, 3, generator=g) for name in ("a.weight", "b.weight")}
@@ -209,13 +205,13 @@ def test_a_head_that_does_nothing_yet_is_packed(tmp_path: Path, seen: list[str])
         assert ((found.head[name] - value).abs() <= 0.6 * most / 2).all()
 
 
-def estimated_scene(n: int = 5000) -> PackedScene:
+def estimated_scene(n=5000):
     g = torch.Generator().manual_seed(1)
     return PackedScene(random_field(n), {"a.weight": torch.randn(32, 32, 3, 3, generator=g), "a.bias": torch.zeros(32)})
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 4.0])
-def test_the_estimate_is_near_the_size(tmp_path: Path, factor: float) -> None:
+def test_the_estimate_is_near_the_size(tmp_path, factor):
     options = {name: factor * getattr(PackConfig(), name) for name in ("scale_step", "harmonics_step", "feature_step")}
     fitted, codecs = fit_scene(estimated_scene(), replace(PackConfig(), **options))
     found = estimated_bits(codecs, fitted.gaussians, fitted.head)
@@ -225,7 +221,7 @@ def test_the_estimate_is_near_the_size(tmp_path: Path, factor: float) -> None:
         assert 0.8 < float(bits) / (8 * sections[f"{name}/levels"]) < 1.4, name
 
 
-def test_steps_against_the_gradient_make_a_smaller_file(tmp_path: Path) -> None:
+def test_steps_against_the_gradient_make_a_smaller_file(tmp_path):
     fitted, codecs = fit_scene(estimated_scene(), PackConfig())
     before = write_fitted(tmp_path / "a.sundae", fitted, codecs)
     leaves = {
@@ -242,12 +238,12 @@ def test_steps_against_the_gradient_make_a_smaller_file(tmp_path: Path) -> None:
         assert after.sections[f"{name}/levels"] < 0.999 * before.sections[f"{name}/levels"], name
 
 
-def test_one_primitive_and_no_head() -> None:
+def test_one_primitive_and_no_head():
     fitted, codecs = fit_scene(PackedScene(random_field(1)))
     assert all(torch.isfinite(bits) for bits in estimated_bits(codecs, fitted.gaussians, {}).values())
 
 
-def test_runs_pay_for_their_mean_and_for_deviations() -> None:
+def test_runs_pay_for_their_mean_and_for_deviations():
     """Equal levels are cheaper than different ones, and still cheaper near zero."""
     equal, different = torch.full((67, 2), 9.0), 9.0 * torch.randn(67, 2, generator=torch.Generator().manual_seed(0))
     sizes = [float(codecs_module._of_rows(levels)) for levels in (0.0 * equal, equal / 9, equal, different)]

@@ -1,7 +1,5 @@
 """The entropy coder: every number comes back, sizes are near the entropy, and no stream breaks the decoder."""
 
-from __future__ import annotations
-
 import hashlib
 from contextlib import suppress
 
@@ -9,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from sundae_ns.io.coordinates import interleave
 from sundae_ns.io.pack import entropy
@@ -17,7 +14,7 @@ from sundae_ns.io.pack import entropy
 LARGEST = entropy.LARGEST
 
 
-def levels_of(n: int, width: int, seed: int) -> NDArray[np.int32]:
+def levels_of(n, width, seed):
     """Numbers of every size, some of them the largest."""
     rng = np.random.default_rng(seed)
     found = np.rint(rng.laplace(size=(n, width)) * 10 ** rng.uniform(-1, 6, width)).astype(np.int32)
@@ -25,7 +22,7 @@ def levels_of(n: int, width: int, seed: int) -> NDArray[np.int32]:
     return found.clip(-LARGEST, LARGEST)
 
 
-def cells_of(n: int, bits: int, block: int, seed: int) -> NDArray[np.uint64]:
+def cells_of(n, bits, block, seed):
     """Morton codes, sorted in each block."""
     codes = interleave(np.random.default_rng(seed).integers(0, 2**bits, (n, 3)).astype(np.uint64))
     for start in range(0, n, block):
@@ -34,21 +31,21 @@ def cells_of(n: int, bits: int, block: int, seed: int) -> NDArray[np.uint64]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled() -> None:
+def compiled():
     """Compile first, because hypothesis watches the time."""
     entropy.encode_levels(np.zeros((1, 1), np.int32), entropy.neighbours_of(np.zeros((1, 3)), 1))
     entropy.encode_gaps(np.zeros(1, np.uint64), 1, 4)
 
 
 @given(st.integers(1, 300), st.integers(1, 6), st.integers(0, 2**16))
-def test_numbers_come_back(n: int, width: int, seed: int) -> None:
+def test_numbers_come_back(n, width, seed):
     levels = levels_of(n, width, seed)
     near = entropy.neighbours_of(np.random.default_rng(seed).integers(0, 99, (n, 3)), 1 + seed % 50)
     assert np.array_equal(entropy.decode_levels(entropy.encode_levels(levels, near), width, near), levels)
 
 
 @given(st.integers(1, 300), st.integers(4, 16), st.integers(0, 2**16))
-def test_codes_of_cells_come_back(n: int, bits: int, seed: int) -> None:
+def test_codes_of_cells_come_back(n, bits, seed):
     block = 16 + seed % 100
     codes = cells_of(n, bits, block, seed)
     codes[0] = 0
@@ -57,13 +54,13 @@ def test_codes_of_cells_come_back(n: int, bits: int, seed: int) -> None:
     assert np.array_equal(entropy.decode_gaps(stream, n, block, bits), codes)
 
 
-def test_no_rows() -> None:
+def test_no_rows():
     near = entropy.predecessors(0)
     assert entropy.decode_levels(entropy.encode_levels(np.zeros((0, 1), np.int32), near), 1, near).shape == (0, 1)
 
 
 @pytest.mark.parametrize("scale", [0.02, 0.3, 4.0, 300.0])
-def test_sizes_are_near_the_entropy(scale: float) -> None:
+def test_sizes_are_near_the_entropy(scale):
     levels = np.rint(np.random.default_rng(0).laplace(size=(20_000, 2)) * scale).astype(np.int32)
     _, counts = np.unique(levels, return_counts=True)
     entropy_of = -np.sum(counts / counts.sum() * np.log2(counts / counts.sum()))
@@ -71,7 +68,7 @@ def test_sizes_are_near_the_entropy(scale: float) -> None:
     assert 8 * len(stream) < (1.03 * entropy_of + 0.02) * levels.size
 
 
-def test_contexts_use_neighbours() -> None:
+def test_contexts_use_neighbours():
     """Numbers like those of the neighbours cost less than without neighbours."""
     rng = np.random.default_rng(0)
     cells = rng.integers(0, 64, (4000, 3)).astype(np.uint64)
@@ -82,7 +79,7 @@ def test_contexts_use_neighbours() -> None:
     assert len(entropy.encode_levels(levels, near)) < 0.7 * len(alone)
 
 
-def test_neighbours_are_the_nearest_of_the_window() -> None:
+def test_neighbours_are_the_nearest_of_the_window():
     rng = np.random.default_rng(0)
     cells, block = rng.integers(0, 1000, (500, 3)), 200
     near = entropy.neighbours_of(cells, block)
@@ -94,7 +91,7 @@ def test_neighbours_are_the_nearest_of_the_window() -> None:
         assert np.array_equal(((cells[found] - cells[i]) ** 2).sum(axis=1), np.sort(distances)[: len(found)])
 
 
-def test_the_numbers_of_the_format() -> None:
+def test_the_numbers_of_the_format():
     """Tables come from exponentials, whose last bits differ between machines; the rounded numbers must not."""
     digest = hashlib.sha256()
     for table in (entropy._SQUASH, entropy._STRETCH, entropy._RATES):
@@ -108,7 +105,7 @@ def test_the_numbers_of_the_format() -> None:
 
 
 @given(st.binary(max_size=60), st.integers(1, 40))
-def test_other_streams_are_refused_or_within_the_limits(content: bytes, n: int) -> None:
+def test_other_streams_are_refused_or_within_the_limits(content, n):
     stream = np.frombuffer(content, np.uint8)
     with suppress(ValueError):
         assert np.abs(entropy.decode_levels(stream, 3, entropy.predecessors(n))).max() <= LARGEST
@@ -119,7 +116,7 @@ def test_other_streams_are_refused_or_within_the_limits(content: bytes, n: int) 
         assert (codes[1:] >= codes[:-1])[inner].all()
 
 
-def test_a_stream_of_more_or_fewer_numbers_is_refused() -> None:
+def test_a_stream_of_more_or_fewer_numbers_is_refused():
     levels = np.random.default_rng(0).integers(-1000, 1000, (100, 2)).astype(np.int32)
     stream = entropy.encode_levels(levels, entropy.predecessors(100))
     for other, count in ((np.append(stream, np.uint8(0)), 100), (stream, 80), (stream, 120)):

@@ -1,13 +1,9 @@
 """Limits of options, headers and sections: values at each limit are accepted, values just beyond it are refused."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +17,7 @@ from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
 
 Json = dict[str, Any]
-LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {
+LIMITS = {
     # below the minimum, minimum, maximum, above the maximum
     "position_bits": (3, 4, 16, 17),
     "block": (15, 16, 1 << 20, (1 << 20) + 1),
@@ -31,7 +27,7 @@ LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {
 }
 
 
-def scene() -> PackedScene:
+def scene():
     g = torch.Generator().manual_seed(1)
     head = {"a.weight": torch.randn(4, 3, 3, 3, generator=g), "a.bias": torch.randn(4, generator=g)}
     cameras = {
@@ -43,7 +39,7 @@ def scene() -> PackedScene:
 
 
 @pytest.mark.parametrize("name", LIMITS)
-def test_options_are_accepted_up_to_their_limits(tmp_path: Path, name: str) -> None:
+def test_options_are_accepted_up_to_their_limits(tmp_path, name):
     below, least, most, above = LIMITS[name]
     for value in (below, above):
         with pytest.raises(ConfigError, match=name.replace("_", "-")):
@@ -60,7 +56,7 @@ def test_options_are_accepted_up_to_their_limits(tmp_path: Path, name: str) -> N
         assert (sizes[0] < sizes[1]) == name.endswith("bits")
 
 
-def restated(path: Path, change: Callable[[Json], None]) -> None:
+def restated(path, change):
     """Change the header of a file and keep its checksum valid."""
     content = path.read_bytes()
     (length,) = struct.unpack("<I", content[12:16])
@@ -72,14 +68,14 @@ def restated(path: Path, change: Callable[[Json], None]) -> None:
     )
 
 
-def resectioned(path: Path, name: str, array: Any) -> None:
+def resectioned(path, name, array):
     """Replace a section of a file and keep all checksums valid."""
     header = container.read_header(path)
     meta = {key: value for key, value in header.meta.items() if key != "sections"}
     path.write_bytes(container.encode(meta, {**container.read_sections(path, header), name: array})[0])
 
 
-SECTIONS: dict[str, tuple[str, Any]] = {
+SECTIONS = {
     "an image without width": ("cameras/sizes", np.array([[64, 48], [0, 24]], np.uint32)),
     "a focal length of 0": ("cameras/intrinsics", np.array([[0, 1, 0, 0], [1, 1, 0, 0]], np.float64)),
     "a focal length beyond float32": ("cameras/intrinsics", np.array([[1, 1, 0, 0], [1, 1e300, 0, 0]], np.float64)),
@@ -103,7 +99,7 @@ SECTIONS: dict[str, tuple[str, Any]] = {
 
 
 @pytest.mark.parametrize("case", SECTIONS)
-def test_sections_beyond_the_limits_are_refused(tmp_path: Path, case: str) -> None:
+def test_sections_beyond_the_limits_are_refused(tmp_path, case):
     path = tmp_path / "a.sundae"
     write_scene(path, scene())
     name, array = SECTIONS[case]
@@ -113,7 +109,7 @@ def test_sections_beyond_the_limits_are_refused(tmp_path: Path, case: str) -> No
         read_scene(path)
 
 
-def test_sections_at_the_limits_are_read(tmp_path: Path) -> None:
+def test_sections_at_the_limits_are_read(tmp_path):
     path = tmp_path / "a.sundae"
     write_scene(path, scene())
     resectioned(path, "cameras/sizes", np.array([[16384, 1], [1, 16384]], np.uint32))
@@ -123,7 +119,7 @@ def test_sections_at_the_limits_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["means/gaps", "quats/levels", "features_rest/levels", "head/levels"])
-def test_a_stream_of_other_numbers_is_refused(tmp_path: Path, name: str) -> None:
+def test_a_stream_of_other_numbers_is_refused(tmp_path, name):
     path = tmp_path / "a.sundae"
     for stream in (
         np.zeros(0, np.uint8),
@@ -148,7 +144,7 @@ def test_a_stream_of_other_numbers_is_refused(tmp_path: Path, name: str) -> None
         ([4, 3, 10], False),
     ],
 )
-def test_shapes_of_the_head(tmp_path: Path, shape: list[int], fits: bool) -> None:
+def test_shapes_of_the_head(tmp_path, shape, fits):
     path = tmp_path / "a.sundae"
     write_scene(path, scene())
     restated(path, lambda meta: meta["attributes"]["head"].update(tensors=[["a.bias", [4]], ["a.weight", shape]]))
@@ -159,7 +155,7 @@ def test_shapes_of_the_head(tmp_path: Path, shape: list[int], fits: bool) -> Non
             read_scene(path)
 
 
-def test_cameras_that_readers_refuse_are_not_written(tmp_path: Path) -> None:
+def test_cameras_that_readers_refuse_are_not_written(tmp_path):
     cameras = scene().cameras
     assert cameras is not None
     cameras["intrinsics"][0, 0] = -50.0
@@ -167,12 +163,12 @@ def test_cameras_that_readers_refuse_are_not_written(tmp_path: Path) -> None:
         write_scene(tmp_path / "a.sundae", replace(scene(), cameras=cameras))
 
 
-def test_whole_numbers_may_be_written_as_real_ones(tmp_path: Path) -> None:
+def test_whole_numbers_may_be_written_as_real_ones(tmp_path):
     path = tmp_path / "a.sundae"
     write_scene(path, scene())
     truth = read_scene(path)
 
-    def real(meta: Json) -> None:
+    def real(meta):
         meta["primitives"] = float(meta["primitives"])
         for about in meta["attributes"].values():
             about |= {key: float(about[key]) for key in ("bits", "block", "width", "weights") if key in about}
@@ -188,7 +184,7 @@ def test_whole_numbers_may_be_written_as_real_ones(tmp_path: Path) -> None:
     assert all(torch.equal(found.head[name], value) for name, value in truth.head.items())
 
 
-def test_a_header_too_long_for_readers_is_not_written(tmp_path: Path) -> None:
+def test_a_header_too_long_for_readers_is_not_written(tmp_path):
     path = tmp_path / "a.sundae"
     meta = {"name": "x" * container.MAX_HEADER}
     with pytest.raises(PackError, match="the header takes"):
@@ -196,7 +192,7 @@ def test_a_header_too_long_for_readers_is_not_written(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_removed_after_its_header_was_read_is_reported(tmp_path: Path) -> None:
+def test_a_file_removed_after_its_header_was_read_is_reported(tmp_path):
     path = tmp_path / "a.sundae"
     write_scene(path, scene())
     header = container.read_header(path)
@@ -205,7 +201,7 @@ def test_a_file_removed_after_its_header_was_read_is_reported(tmp_path: Path) ->
         container.read_sections(path, header)
 
 
-def test_a_head_that_compresses_too_well_is_padded(tmp_path: Path) -> None:
+def test_a_head_that_compresses_too_well_is_padded(tmp_path):
     path = tmp_path / "a.sundae"
     head = {"a.weight": torch.zeros(1000, 3500)}
     report = write_scene(path, PackedScene(scene().gaussians, head))
@@ -215,7 +211,7 @@ def test_a_head_that_compresses_too_well_is_padded(tmp_path: Path) -> None:
     assert torch.equal(read_scene(path).head["a.weight"], head["a.weight"])
 
 
-def test_a_nan_in_the_header_is_not_written(tmp_path: Path) -> None:
+def test_a_nan_in_the_header_is_not_written(tmp_path):
     """Readers refuse a header with NaN."""
     with pytest.raises(ValueError, match="JSON"):
         write_scene(tmp_path / "a.sundae", replace(scene(), meta={"scale": float("nan")}))

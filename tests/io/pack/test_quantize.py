@@ -1,30 +1,26 @@
 """Error bounds of every attribute, for ordinary and extreme values."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 from hard_values import KINDS, drifted, hard_values
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.io import coordinates
 from sundae_ns.io.pack import entropy, quantize
-from sundae_ns.io.pack.container import Floats
 
 hard = given(st.sampled_from(KINDS), st.integers(1, 700), st.integers(0, 2**16))
 
 
-def ulp(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def ulp(x):
     """Unit in the last place of float32: the rounding of the result and of a product before it."""
     return np.spacing(np.abs(x).astype(np.float32)).astype(np.float64)
 
 
 @hard
-def test_separate_inverts_interleave(kind: str, n: int, seed: int) -> None:
+def test_separate_inverts_interleave(kind, n, seed):
     cells = np.random.default_rng(seed).integers(0, 2**coordinates.MAX_BITS, (n, 3)).astype(np.uint64)
     codes = coordinates.interleave(cells)
     for axis in range(3):
@@ -32,7 +28,7 @@ def test_separate_inverts_interleave(kind: str, n: int, seed: int) -> None:
     assert sorted(coordinates.scene_order(hard_values(kind, n, 3, seed))) == list(range(n))
 
 
-def test_scene_order_keeps_neighbours_together_despite_a_far_primitive() -> None:
+def test_scene_order_keeps_neighbours_together_despite_a_far_primitive():
     means = np.random.default_rng(0).random((4096, 3)).astype(np.float32)
     means[7] = 1e6
     ordered = np.delete(means, 7, axis=0)[coordinates.scene_order(np.delete(means, 7, axis=0))]
@@ -43,7 +39,7 @@ def test_scene_order_keeps_neighbours_together_despite_a_far_primitive() -> None
 
 
 @hard
-def test_positions(kind: str, n: int, seed: int) -> None:
+def test_positions(kind, n, seed):
     bits, size = 4 + seed % 13, 16 + seed % 200
     x = hard_values(kind, n, 3, seed)
     x = x[coordinates.scene_order(x)]
@@ -58,7 +54,7 @@ def test_positions(kind: str, n: int, seed: int) -> None:
     assert (packed.codes < np.uint64(1 << 3 * bits)).all()
 
 
-def test_a_far_primitive_does_not_increase_the_error_of_others() -> None:
+def test_a_far_primitive_does_not_increase_the_error_of_others():
     x = np.random.default_rng(0).random((5000, 3)).astype(np.float32)
     x[3] = 1e6
     packed, order = quantize.quantize_positions(x[coordinates.scene_order(x)], 16, 1024)
@@ -67,21 +63,21 @@ def test_a_far_primitive_does_not_increase_the_error_of_others() -> None:
     assert np.quantile(np.abs(found - truth).max(axis=1), 0.79) < 1 / 65535 / 2 + 1e-7
 
 
-def angles(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def angles(a, b):
     """Angles between rotations, radians, exact for small ones too."""
     a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (a, b))
     near = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
     return 4 * np.arcsin(np.minimum(near / 2, 1))
 
 
-def through_rotations(q: Floats, step: float) -> Floats:
+def through_rotations(q, step):
     """Quaternions after a round trip, of axes turned for the smallest rotation."""
     turned, _ = quantize.aligned(q, np.zeros((len(q), 3), np.float32))
     _, levels, _ = quantize.Rotations(step).encode(turned)
     return quantize.rotations_at(torch.from_numpy(levels), step).numpy()
 
 
-def hard_quaternions(n: int, seed: int, length: float) -> Floats:
+def hard_quaternions(n, seed, length):
     rng = np.random.default_rng(seed)
     q = rng.normal(size=(n, 4))
     q[rng.random(n) < 0.2] = rng.choice([-0.5, 0.5], size=4)  # corners, where all four are the largest
@@ -89,7 +85,7 @@ def hard_quaternions(n: int, seed: int, length: float) -> Floats:
     return (q * length).astype(np.float32)
 
 
-def covariances(q: Floats, scales: Floats) -> NDArray[np.float64]:
+def covariances(q, scales):
     """Covariances ``[N, 3, 3]`` of ellipsoids with these rotations and log-scales."""
     unit = q.astype(np.float64) / np.linalg.norm(q.astype(np.float64), axis=1, keepdims=True)
     root = rotation_matrices(torch.from_numpy(unit)).numpy() * np.exp(scales.astype(np.float64))[:, None]
@@ -97,7 +93,7 @@ def covariances(q: Floats, scales: Floats) -> NDArray[np.float64]:
 
 
 @given(st.integers(1, 300), st.integers(0, 2**16), st.sampled_from([1e-15, 1.0, 1e15]))
-def test_aligned_ellipsoids_are_the_same(n: int, seed: int, length: float) -> None:
+def test_aligned_ellipsoids_are_the_same(n, seed, length):
     q, scales = hard_quaternions(n, seed, length), hard_values("normal", n, 3, seed)
     turned, moved = quantize.aligned(q, scales)
     assert np.allclose(covariances(turned, moved), covariances(q, scales), rtol=1e-4, atol=1e-5)
@@ -106,7 +102,7 @@ def test_aligned_ellipsoids_are_the_same(n: int, seed: int, length: float) -> No
 
 
 @given(st.integers(1, 500), st.integers(0, 2**16), st.sampled_from([1e-4, 0.008, 0.1, 1.0]))
-def test_rotations(n: int, seed: int, step: float) -> None:
+def test_rotations(n, seed, step):
     q = hard_quaternions(n, seed, 1.0)
     turned, _ = quantize.aligned(q, np.zeros((n, 3), np.float32))
     found = through_rotations(q, step)
@@ -116,7 +112,7 @@ def test_rotations(n: int, seed: int, step: float) -> None:
         assert angles(turned.astype(np.float64), found.astype(np.float64)).max() <= quantize.rotation_bound(step) + 2e-6
 
 
-def test_the_bound_of_rotations_is_nearly_reached() -> None:
+def test_the_bound_of_rotations_is_nearly_reached():
     rng = np.random.default_rng(0)
     q = rng.normal(size=(300_000, 4)).astype(np.float32)
     turned, _ = quantize.aligned(q, np.zeros((len(q), 3), np.float32))
@@ -124,12 +120,12 @@ def test_the_bound_of_rotations_is_nearly_reached() -> None:
     assert 0.85 * quantize.rotation_bound(0.01) < worst <= quantize.rotation_bound(0.01)
 
 
-def test_a_quaternion_of_length_zero_is_the_identity() -> None:
+def test_a_quaternion_of_length_zero_is_the_identity():
     assert np.array_equal(through_rotations(np.zeros((2, 4), np.float32), 0.01), [[1, 0, 0, 0]] * 2)
 
 
 @hard
-def test_weights(kind: str, n: int, seed: int) -> None:
+def test_weights(kind, n, seed):
     x = hard_values(kind, n, 18, seed).reshape(n, 2, 3, 3)
     steps = quantize.weight_steps(torch.from_numpy(x), 1 / 127)[:, None]
     found = quantize.weights_at(quantize.weight_levels(torch.from_numpy(x), steps), steps)
@@ -139,7 +135,7 @@ def test_weights(kind: str, n: int, seed: int) -> None:
 
 
 @hard
-def test_transform(kind: str, n: int, seed: int) -> None:
+def test_transform(kind, n, seed):
     x = hard_values(kind, n, 9, seed)
     codec = quantize.fit_transform(x, 0.03)
     for values in (drifted(x, seed), x):  # rounding is what a reader decodes, bit for bit
@@ -157,7 +153,7 @@ def test_transform(kind: str, n: int, seed: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["normal", "outliers"])
-def test_a_transform_decorrelates_columns(kind: str) -> None:
+def test_a_transform_decorrelates_columns(kind):
     rng = np.random.default_rng(0)
     x = np.repeat(hard_values(kind, 2000, 3, 0), 3, axis=1) + 0.001 * rng.normal(size=(2000, 9)).astype(np.float32)
     x = x.astype(np.float32)
@@ -167,14 +163,14 @@ def test_a_transform_decorrelates_columns(kind: str) -> None:
     assert (zeros[:3] < 0.2).all()
 
 
-def test_rows_of_zeros_stay_exact() -> None:
+def test_rows_of_zeros_stay_exact():
     x = hard_values("normal", 200, 9, 0) + 1
     x[::2] = 0
     codec = quantize.fit_transform(x, 0.03, centred=False)
     assert not codec.rounded(torch.from_numpy(x))[::2].any()
 
 
-def test_a_form_makes_errors_that_show_smaller() -> None:
+def test_a_form_makes_errors_that_show_smaller():
     """At as many bits: less than half of the errors by the form, and larger errors in its least direction."""
     rng = np.random.default_rng(0)
     x = rng.normal(size=(4000, 6)).astype(np.float32)

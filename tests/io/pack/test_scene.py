@@ -1,17 +1,13 @@
 """Packed scenes: round trip, error bounds, sizes and refusals."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from fields import random_field
-from torch import Tensor
 
 from sundae_ns.core.errors import PackError
 from sundae_ns.io.pack import container, quantize
@@ -20,12 +16,12 @@ from sundae_ns.io.pack.container import read_header
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
 
 
-def head() -> dict[str, Tensor]:
+def head():
     g = torch.Generator().manual_seed(1)
     return {"net.a.weight": torch.randn(4, 3, 3, 3, generator=g), "net.a.bias": torch.randn(4, generator=g)}
 
 
-def cameras(n: int = 3) -> dict[str, Tensor]:
+def cameras(n=3):
     return {
         "poses": torch.eye(4)[:3].repeat(n, 1, 1),
         "intrinsics": torch.tensor([[500.25, 501.5, 319.5, 239.5]]).double().repeat(n, 1),
@@ -33,7 +29,7 @@ def cameras(n: int = 3) -> dict[str, Tensor]:
     }
 
 
-def matched(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Tensor]:
+def matched(found, truth):
     """``found`` in the order of ``truth``, by the nearest centre."""
     nearest = torch.cdist(truth["means"], found["means"]).argmin(dim=1)
     assert len(nearest.unique()) == len(nearest)
@@ -41,7 +37,7 @@ def matched(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Ten
 
 
 @pytest.mark.parametrize("config", [PackConfig(), PackConfig(head_step=0.005, position_bits=16)])
-def test_everything_is_decoded_within_the_stated_bounds(tmp_path: Path, config: PackConfig) -> None:
+def test_everything_is_decoded_within_the_stated_bounds(tmp_path, config):
     path, truth = tmp_path / "a.sundae", random_field()
     meta = {"model": {"sh_degree": 2}, "name": "überall"}
     write_scene(path, PackedScene(truth, head(), cameras(), meta), config)
@@ -78,7 +74,7 @@ def test_everything_is_decoded_within_the_stated_bounds(tmp_path: Path, config: 
 
 @pytest.mark.parametrize("n", [1, 2, 17])
 @pytest.mark.parametrize(("degree", "features"), [(0, 0), (3, 13), (4, 1)])
-def test_small_fields(tmp_path: Path, n: int, degree: int, features: int) -> None:
+def test_small_fields(tmp_path, n, degree, features):
     truth = random_field(n, degree, features)
     report = write_scene(tmp_path / "a.sundae", PackedScene(truth))
     scene = read_scene(tmp_path / "a.sundae")
@@ -88,7 +84,7 @@ def test_small_fields(tmp_path: Path, n: int, degree: int, features: int) -> Non
     assert sum(report.bits.values()) * n / 8 == pytest.approx(report.bytes)
 
 
-def test_constant_attributes_are_exact(tmp_path: Path) -> None:
+def test_constant_attributes_are_exact(tmp_path):
     one = random_field(1)
     truth = {name: value.repeat(40, *([1] * (value.ndim - 1))) for name, value in one.items()}
     write_scene(tmp_path / "a.sundae", PackedScene(truth))
@@ -97,7 +93,7 @@ def test_constant_attributes_are_exact(tmp_path: Path) -> None:
         assert torch.equal(found[name], truth[name]), name
 
 
-def test_a_scene_that_compresses_too_well_is_padded(tmp_path: Path) -> None:
+def test_a_scene_that_compresses_too_well_is_padded(tmp_path):
     path = tmp_path / "a.sundae"
     one = random_field(1, 3, 13)
     truth = {name: value.expand(60_000, *value.shape[1:]) for name, value in one.items()}
@@ -109,7 +105,7 @@ def test_a_scene_that_compresses_too_well_is_padded(tmp_path: Path) -> None:
     assert torch.equal(read_scene(path).gaussians["means"], truth["means"])
 
 
-def test_packing_takes_few_bytes(tmp_path: Path) -> None:
+def test_packing_takes_few_bytes(tmp_path):
     """This field takes 25 bytes per Gaussian instead of 272."""
     g = torch.Generator().manual_seed(0)
     truth = random_field(20_000, 3, 9)
@@ -122,23 +118,23 @@ def test_packing_takes_few_bytes(tmp_path: Path) -> None:
     assert sum(report.bits.values()) / 8 < 26
 
 
-def test_packing_is_deterministic(tmp_path: Path) -> None:
+def test_packing_is_deterministic(tmp_path):
     for name in ("a", "b"):
         write_scene(tmp_path / name, PackedScene(random_field(), head(), cameras()))
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def _with(**changes: Tensor) -> PackedScene:
+def _with(**changes):
     return PackedScene(random_field() | changes)
 
 
-def _spoiled(name: str, value: float) -> PackedScene:
+def _spoiled(name, value):
     broken = random_field()
     broken[name][5, 1] = value
     return PackedScene(broken)
 
 
-UNPACKABLE: list[tuple[PackedScene, str]] = [
+UNPACKABLE = [
     *((_spoiled(*at), "1 of 600 Gaussians are not finite") for at in (("means", torch.nan), ("features", torch.inf))),
     (_spoiled("quats", -torch.inf), "1 of 600 Gaussians are not finite"),
     (PackedScene(random_field(0)), "no Gaussians"),
@@ -153,13 +149,13 @@ UNPACKABLE: list[tuple[PackedScene, str]] = [
 
 
 @pytest.mark.parametrize(("scene", "words"), UNPACKABLE)
-def test_scenes_that_cannot_be_packed_are_refused(tmp_path: Path, scene: PackedScene, words: str) -> None:
+def test_scenes_that_cannot_be_packed_are_refused(tmp_path, scene, words):
     with pytest.raises(PackError, match=words):
         write_scene(tmp_path / "a.sundae", scene)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_byte_too_many_is_refused(tmp_path: Path) -> None:
+def test_a_byte_too_many_is_refused(tmp_path):
     path = tmp_path / "a.sundae"
     write_scene(path, PackedScene(random_field(40, 1, 1)))
     path.write_bytes(path.read_bytes() + b"\0")
@@ -167,7 +163,7 @@ def test_a_byte_too_many_is_refused(tmp_path: Path) -> None:
         read_scene(path)
 
 
-def test_another_version_has_an_error_of_its_own(tmp_path: Path) -> None:
+def test_another_version_has_an_error_of_its_own(tmp_path):
     path = tmp_path / "a.sundae"
     write_scene(path, PackedScene(random_field(20)))
     content = bytearray(path.read_bytes())
@@ -180,7 +176,7 @@ def test_another_version_has_an_error_of_its_own(tmp_path: Path) -> None:
         read_scene(tmp_path / "b.sundae")
 
 
-def test_the_file_follows_its_documentation(tmp_path: Path) -> None:
+def test_the_file_follows_its_documentation(tmp_path):
     """Decode a section by ``docs/formats.md``, without the package's reader."""
     path = tmp_path / "a.sundae"
     write_scene(path, PackedScene(random_field()))

@@ -1,10 +1,8 @@
 """The description of the format, and the checks by it."""
 
-from __future__ import annotations
-
 import json
 import time
-from typing import Any, get_args, get_type_hints
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -45,11 +43,11 @@ VALID = {"container": CONTAINER, "header": HEADER, "model": MODEL}
 
 
 @pytest.mark.parametrize("schema", SCHEMAS)
-def test_valid_values_pass(schema: str) -> None:
+def test_valid_values_pass(schema):
     assert fault(VALID[schema], FORMAT[schema]) is None
 
 
-WRONG: list[tuple[str, str, Any]] = [
+WRONG = [
     ("header", "primitives", 0),
     ("header", "primitives", 2.5),
     ("header", "source", []),
@@ -91,7 +89,7 @@ WRONG: list[tuple[str, str, Any]] = [
 
 
 @pytest.mark.parametrize(("schema", "place", "value"), WRONG)
-def test_the_first_wrong_place_is_named(schema: str, place: str, value: Any) -> None:
+def test_the_first_wrong_place_is_named(schema, place, value):
     changed = json.loads(json.dumps(VALID[schema]))
     *front, last = (int(key) if key.isdigit() else key for key in place.split("."))
     inner = changed
@@ -103,7 +101,7 @@ def test_the_first_wrong_place_is_named(schema: str, place: str, value: Any) -> 
     assert found.startswith(f"x.{place}")
 
 
-def test_names_are_unique_and_heads_have_no_other_option() -> None:
+def test_names_are_unique_and_heads_have_no_other_option():
     twice = [["a", [2, 2]], ["a", [2]]]
     header = {**HEADER, "attributes": {**ATTRIBUTES, "head": {**ATTRIBUTES["head"], "tensors": twice}}}
     assert fault(header, FORMAT["header"]) == "attributes.head.tensors"
@@ -113,7 +111,7 @@ def test_names_are_unique_and_heads_have_no_other_option() -> None:
     assert fault({key: value for key, value in MODEL.items() if key != "sh_degree"}, FORMAT["model"]) == "sh_degree"
 
 
-def test_the_format_lists_what_the_code_knows() -> None:
+def test_the_format_lists_what_the_code_knows():
     model = FORMAT["model"]["properties"]
     kinds = get_type_hints(HeadConfig)
     for name in ("size", "precision"):
@@ -125,7 +123,7 @@ def test_the_format_lists_what_the_code_knows() -> None:
     assert widths == [3 * ((degree + 1) ** 2 - 1) for degree in range(1, MAX_SH_DEGREE + 1)]
 
 
-def test_headers_are_json_of_utf8_with_numbers_of_float64() -> None:
+def test_headers_are_json_of_utf8_with_numbers_of_float64():
     assert parsed(b' {"a": [1, 2.5, 1E2]}\n') == {"a": [1, 2.5, 100.0]}
     deepest = LIMITS["depth"]
     assert parsed(b"[" * deepest + b"]" * deepest)
@@ -149,7 +147,7 @@ def test_headers_are_json_of_utf8_with_numbers_of_float64() -> None:
             parsed(text)
 
 
-def test_sections_have_shape_and_range() -> None:
+def test_sections_have_shape_and_range():
     section = {"dtype": "<f4", "shape": ["rows", 2], "minimum": [0, -1], "maximum": 10}
     array = np.array([[0, -1], [10, 10]], np.float32)
     assert fits(array, section, {"rows": 2})
@@ -165,7 +163,7 @@ def test_sections_have_shape_and_range() -> None:
     assert not in_range(np.array([np.inf], np.float32), {})
 
 
-def test_a_million_counts_take_little_time() -> None:
+def test_a_million_counts_take_little_time():
     started = time.perf_counter()
     assert fault({"sections": [{**SECTION, "parts": [1] * 10**6}]}, FORMAT["container"]) is None
     assert fault({"sections": [{**SECTION, "parts": [1] * 10**6 + [-1]}]}, FORMAT["container"]) == "sections.0.parts"

@@ -1,7 +1,5 @@
 """Camera poses between the conventions of nerfstudio and of the rasteriser, against the inverse of the pose."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -9,7 +7,7 @@ from sundae_ns.core.camera import world_to_camera, world_to_camera_floats
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_both_functions_invert_the_pose_with_y_and_z_flipped(seed: int) -> None:
+def test_both_functions_invert_the_pose_with_y_and_z_flipped(seed):
     generator = torch.Generator().manual_seed(seed)
     rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
     centre = 10 * torch.randn(3, 1, generator=generator).double()
