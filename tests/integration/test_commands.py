@@ -1,4 +1,4 @@
-"""nerfstudio's own commands on a finished run."""
+"""nerfstudio's own commands and viewer on a finished run."""
 
 import json
 import math
@@ -8,6 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from models import as_the_viewer
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils import colormaps
+from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerElement
 from PIL import Image
 
 from sundae_ns.core.errors import DataError
@@ -21,10 +29,9 @@ def test_ns_eval(tiny, call_here, tmp_path):
     assert result["method_name"] == "sundae-tiny"
     assert result["checkpoint"].endswith(f"step-{tiny.steps - 1:09d}.ckpt")
     found = result["results"]
-    for name in ("psnr", "psnr_base"):
-        assert 10 < found[name] < 60
-    for name in ("ssim", "ssim_base"):
-        assert 0 < found[name] < 1
+    for suffix in ("", "_base"):
+        assert 10 < found[f"psnr{suffix}"] < 60
+        assert 0 < found[f"ssim{suffix}"] < 1
     assert found["psnr"] != found["psnr_base"]
     (prune,) = json.loads((tiny.folder / "prune.json").read_text())
     assert found["gaussian_count"] == prune["after"]
@@ -33,7 +40,7 @@ def test_ns_eval(tiny, call_here, tmp_path):
 
 def test_a_copied_run_is_evaluated_by_its_own_checkpoint(tiny, call_here, tmp_path):
     """The original is still there, with another checkpoint."""
-    copy = Path(shutil.copytree(tiny.folder, tmp_path / "copy"))
+    copy = shutil.copytree(tiny.folder, tmp_path / "copy")
     for path in (copy / "nerfstudio_models").iterdir():
         if path.name != f"step-{2 * tiny.save_every:09d}.ckpt":
             path.unlink()
@@ -46,63 +53,59 @@ def test_a_copied_run_is_evaluated_by_its_own_checkpoint(tiny, call_here, tmp_pa
     assert ours["configurations"][0]["mean"]["psnr"] == pytest.approx(result["results"]["psnr"], abs=1e-5)
 
 
-def pictures(folder):
-    return [np.asarray(Image.open(path)) for path in sorted(folder.glob("*.png"))]
+@pytest.fixture
+def render(tiny, call_here, tmp_path):
+    """Run ``ns-render``; returns its images."""
+
+    def images(kind, *words):
+        out = tmp_path / "out"
+        usual = ("--load-config", tiny.config, "--output-path", out, "--output-format", "images")
+        call_here("ns-render", kind, *usual, "--image-format", "png", *words)
+        return [np.asarray(Image.open(path)) for path in sorted(out.glob("*.png"))]
+
+    return images
 
 
-def test_ns_render_interpolate(tiny, call_here, tmp_path):
+@pytest.fixture
+def render_path(render, tmp_path):
+    """Run ``ns-render`` on a camera path of two poses."""
+
+    def images(**options):
+        pose = torch.eye(4)
+        pose[2, 3] = 1.0
+        turned = pose.clone()
+        turned[:2, :2] = torch.tensor([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
+        poses = [{"camera_to_world": m.flatten().tolist(), "fov": 70, "aspect": 1} for m in (pose, turned)]
+        path = {"camera_type": "perspective", "render_height": 31, "render_width": 45, "seconds": 1}
+        (tmp_path / "path.json").write_text(json.dumps({**path, "camera_path": poses, **options}))
+        return render("camera-path", "--camera-path-filename", tmp_path / "path.json")
+
+    return images
+
+
+def test_ns_render_interpolate(render):
     names = ("rgb", "base_rgb", "depth", "accumulation", "features", "response", "background")
-    call_here(
-        *("ns-render", "interpolate", "--load-config", tiny.config, "--output-path", tmp_path / "out"),
-        *("--output-format", "images", "--image-format", "png", "--interpolation-steps", 2),
-        *("--rendered-output-names", *names),
-    )
-    frames = pictures(tmp_path / "out")
+    frames = render("interpolate", "--interpolation-steps", 2, "--rendered-output-names", *names)
     assert len(frames) == 4
     assert all(frame.shape == (48, len(names) * 48, 3) for frame in frames)
     rgb = frames[0][:, :48].astype(float)
     assert rgb.std() > 5
     assert np.abs(rgb - frames[-1][:, :48]).mean() > 1
-    # The head changes the picture a little, not the scene.
+    # The head changes the image a little, not the scene.
     assert 0 < np.abs(rgb - frames[0][:, 48:96]).mean() < 30
 
 
-def test_ns_render_camera_path(tiny, call_here, tmp_path):
-    pose = torch.eye(4)
-    pose[2, 3] = 1.0
-    turned = pose.clone()
-    turned[:2, :2] = torch.tensor([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
-    path = {
-        "camera_type": "perspective",
-        "render_height": 31,
-        "render_width": 45,
-        "seconds": 1,
-        "camera_path": [{"camera_to_world": m.flatten().tolist(), "fov": 70, "aspect": 1} for m in (pose, turned)],
-    }
-    (tmp_path / "path.json").write_text(json.dumps(path))
-    call_here(
-        *("ns-render", "camera-path", "--load-config", tiny.config, "--output-path", tmp_path / "out"),
-        *("--output-format", "images", "--image-format", "png", "--camera-path-filename", tmp_path / "path.json"),
-    )
-    frames = pictures(tmp_path / "out")
+def test_ns_render_camera_path(render_path):
+    frames = render_path()
     assert [frame.shape for frame in frames] == [(31, 45, 3)] * 2
     assert not np.array_equal(*frames)
 
 
 @pytest.mark.parametrize("kind", ["equirectangular", "fisheye", "vr180", "omnidirectional"])
-def test_other_projections_of_a_camera_path_are_refused(tiny, call_here, tmp_path, kind):
-    pose = torch.eye(4).flatten().tolist()
-    path = {
-        **{"camera_type": kind, "render_height": 32, "render_width": 64, "seconds": 1},
-        "camera_path": [{"camera_to_world": pose, "fov": 70, "aspect": 1}],
-    }
-    (tmp_path / "path.json").write_text(json.dumps(path))
+def test_other_projections_of_a_camera_path_are_refused(render_path, tmp_path, kind):
     with pytest.raises(DataError, match="only perspective images can be drawn; set camera_type to perspective"):
-        call_here(
-            *("ns-render", "camera-path", "--load-config", tiny.config, "--output-path", tmp_path / "out"),
-            *("--output-format", "images", "--camera-path-filename", tmp_path / "path.json"),
-        )
-    assert not list((tmp_path / "out").glob("*.jpg"))
+        render_path(camera_type=kind)
+    assert not list((tmp_path / "out").glob("*.png"))
 
 
 def test_ns_export(tiny, exported):
@@ -111,3 +114,71 @@ def test_ns_export(tiny, exported):
     state = torch.load(tiny.checkpoint(tiny.steps - 1), map_location="cpu")["pipeline"]
     for name in SPLAT_NAMES:
         assert torch.equal(found[name], state[f"_model.gauss_params.{name}"]), name
+
+
+# ---------------------------------------------------------------------------------------- the viewer, without a browser
+
+
+@pytest.fixture(scope="module")
+def pipeline(tiny):
+    return eval_setup(tiny.config, test_mode="inference")[1]
+
+
+def camera(pipeline, height, aspect):
+    """A test camera at another size, as the viewer makes it."""
+    known = pipeline.datamanager.eval_dataset.cameras[0:1]
+    lens = {"fx": 1.2 * height, "fy": 1.2 * height, "cx": int(height * aspect) / 2, "cy": height / 2}
+    return Cameras(known.camera_to_worlds, **lens).to(pipeline.device)
+
+
+@pytest.mark.parametrize(("height", "aspect"), [(30, 1.0), (31, 1.7), (75, 0.6)])
+@torch.no_grad()
+def test_every_output_becomes_an_image(pipeline, height, aspect):
+    assert isinstance(pipeline.model, SplatfactoModel)
+    pipeline.model.set_background(torch.tensor([0.1, 0.2, 0.3], device=pipeline.device))
+    outputs = pipeline.model.get_outputs_for_camera(camera(pipeline, height, aspect), obb_box=None)
+    assert list(outputs)[0] == "rgb"
+    for name, value in outputs.items():
+        for normalize in (False, True):
+            shown = colormaps.apply_colormap(value, colormaps.ColormapOptions(normalize=normalize))
+            assert shown.shape == (height, int(height * aspect), 3), name
+            assert torch.isfinite(shown).all(), name
+    for name in ("rgb", "base_rgb", "features", "response", "depth"):
+        assert outputs[name].std() > 0, name
+
+
+@torch.no_grad()
+def test_check_box_switches_the_head_off(pipeline):
+    # As nerfstudio's control panel finds them.
+    controls = [control for _, control in parse_object(pipeline.model, ViewerElement, "Custom Elements")]
+    (box,) = [control for control in controls if isinstance(control, ViewerCheckbox) and "compensation" in control.name]
+    cam = camera(pipeline, 40, 1.0)
+    on = pipeline.model.get_outputs_for_camera(cam)
+    box.value = False
+    off = as_the_viewer(lambda: pipeline.model.get_outputs_for_camera(cam))
+    evaluated = pipeline.model.get_outputs_for_camera(cam)
+    box.value = True
+    assert torch.equal(off["rgb"], off["base_rgb"])
+    assert not torch.equal(on["rgb"], on["base_rgb"])
+    assert set(on) == set(off)
+    # What a viewer shows must not change what the trainer measures.
+    assert torch.equal(evaluated["rgb"], on["rgb"])
+
+
+def listening(port):
+    """Addresses at which something listens on a port, as Linux tells them: hexadecimal, 0100007F is 127.0.0.1."""
+    tables = [path for path in (Path("/proc/net/tcp"), Path("/proc/net/tcp6")) if path.exists()]
+    rows = [line.split() for path in tables for line in path.read_text().splitlines()[1:]]
+    sockets = [row[1].split(":") for row in rows if row[3] == "0A"]
+    return {address for address, number in sockets if int(number, 16) == port}
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="looks where Linux lists sockets")
+def test_the_viewer_listens_where_the_user_asked_and_nowhere_else(tiny, trainer_of, tmp_path):
+    (tmp_path / "tiny/sundae-tiny/now").mkdir(parents=True)  # ns-train has written config.yml there by then
+    assert ViewerConfig().websocket_host == "0.0.0.0", "README says so"
+    server = trainer_of(vis="viewer", **{"viewer.websocket_host": "127.0.0.1"}).viewer_state.viser_server
+    try:
+        assert listening(server.get_port()) == {"0100007F"}
+    finally:
+        server.stop()

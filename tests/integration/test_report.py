@@ -1,10 +1,13 @@
-"""``sundae report`` on the tiny run, and on a run of stock splatfacto with the same Gaussians."""
+"""Finished runs opened and measured, and ``sundae report`` on the tiny run and on stock splatfacto of its Gaussians."""
 
 import base64
 import copy
 import csv
 import json
+import os
 import re
+import shutil
+from functools import partial
 from io import BytesIO
 
 import numpy as np
@@ -16,9 +19,13 @@ from csv_rows import read_rows
 from nerfstudio.configs.method_configs import method_configs
 from PIL import Image
 
+from sundae_ns.core.errors import CheckpointError, DataError
 from sundae_ns.core.metrics import flip_available, quality_of
+from sundae_ns.io import checkpoint
 from sundae_ns.io.pack.packed_scene import write_scene
+from sundae_ns.plugin import finished_runs
 from sundae_ns.plugin.finished_runs import load_model, load_run
+from sundae_ns.report.measure import compensation, frame_times, measure_scene, sizes
 from sundae_ns.report.measured import COLUMNS
 from sundae_ns.scene.packing import contents_of
 from sundae_ns.scene.render import render_view
@@ -26,7 +33,7 @@ from sundae_ns.scene.render import render_view
 
 @pytest.fixture(scope="module")
 def stock(tiny, tmp_path_factory):
-    """A run of splatfacto as nerfstudio writes it, with the field of the tiny run: it cannot train without CUDA."""
+    """A run of splatfacto as nerfstudio writes it, with the Gaussians of the tiny run: it cannot train without CUDA."""
     config = copy.deepcopy(method_configs["splatfacto"])
     config.data = config.pipeline.datamanager.data = tiny.scene
     config.experiment_name = "stock"
@@ -36,9 +43,8 @@ def stock(tiny, tmp_path_factory):
     state = torch.load(tiny.checkpoint(tiny.steps - 1), map_location="cpu")["pipeline"]
     gaussians = {key: value for key, value in state.items() if "gauss_params" in key and not key.endswith(".features")}
     rest = gaussians["_model.gauss_params.features_rest"]
-    gaussians["_model.gauss_params.features_rest"] = torch.cat(
-        [rest, rest.new_zeros(len(rest), 15 - rest.shape[1], 3)], 1
-    )
+    more = rest.new_zeros(len(rest), 15 - rest.shape[1], 3)
+    gaussians["_model.gauss_params.features_rest"] = torch.cat([rest, more], 1)
     torch.save({"step": 6999, "pipeline": gaussians}, folder / "nerfstudio_models" / "step-000006999.ckpt")
     return folder
 
@@ -48,6 +54,119 @@ def report(tiny, stock, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
     assert run("report", tiny.folder, stock / "config.yml", "-o", out, "--warmup", 0, "--repeats", 1) == 0
     return out
+
+
+@pytest.fixture
+def opened(tiny):
+    return load_model(tiny.config)
+
+
+@pytest.fixture
+def copied(tiny, tmp_path):
+    return shutil.copytree(tiny.folder, tmp_path / "run")
+
+
+# ----------------------------------------------------------------------------------------------------------- open a run
+
+
+def test_a_run_opens_while_its_training_replaces_the_checkpoint(tiny, copied, monkeypatch):
+    newest = checkpoint.newest_whole(copied)[0]
+
+    def unlink():
+        newest.unlink(missing_ok=True)
+        return torch.device("cpu")
+
+    monkeypatch.setattr(finished_runs, "fastest_device", unlink)
+    assert load_model(copied).steps == tiny.steps  # it reads the capture for seconds after it has found the checkpoint
+
+
+def test_a_capture_that_has_moved_is_found_or_named(tiny, tmp_path):
+    """Found where it stands as before as seen from the run, and otherwise by --data."""
+    root = os.path.commonpath([tiny.scene, tiny.folder])
+    run = shutil.copytree(tiny.folder, tmp_path / tiny.folder.relative_to(root))
+    capture = tmp_path / tiny.scene.relative_to(root)
+    config, lost = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader), tmp_path / "gone"
+    config.output_dir = lost / config.output_dir.relative_to(root)
+    config.data = config.pipeline.datamanager.data = lost / tiny.scene.relative_to(root)
+    (run / "config.yml").write_text(yaml.dump(config))
+    with pytest.raises(DataError, match=f"the capture {lost}.* is missing; give its folder with --data"):
+        load_model(run)
+    assert load_model(run, data=tiny.scene).capture == tiny.scene
+    shutil.copytree(tiny.scene, capture)
+    assert load_model(run).capture == capture
+
+
+def test_the_share_kept_is_the_product_over_all_prunes(tiny, opened, copied):
+    assert opened.kept == pytest.approx(tiny.keep_ratio, abs=0.01)  # a whole number of Gaussians
+    prunes = [{"before": 200, "after": 50, "seconds": 1.0}, {"before": 80, "after": 40, "seconds": 0.5}]
+    (copied / "prune.json").write_text(json.dumps(prunes))
+    found = load_model(copied)
+    assert (found.kept, found.prune_s) == (0.125, 1.5)
+    (copied / "prune.json").unlink()
+    found = load_model(copied)
+    assert (found.kept, found.prune_s) == (None, None)
+
+
+def test_a_run_that_is_not_there(tmp_path):
+    with pytest.raises(CheckpointError, match="does not exist"):
+        load_model(tmp_path / "config.yml")
+
+
+# -------------------------------------------------------------------------------------------------------------- measure
+
+
+def test_figures_of_a_run(opened):
+    model, cameras, truths = opened.model, opened.cameras, opened.truths
+    assert [truth.shape[:2] for truth in truths] == [(int(c.height), int(c.width)) for c in cameras]
+    assert all(0 <= truth.min() <= truth.max() <= 1 for truth in truths)
+    times = frame_times(model, cameras[0], warmup=0, repeats=1)
+    assert min(times.frame, times.splat, times.head) > 0
+    floats = sum(value.numel() for value in model.gauss_params.values())
+    head = sum(value.numel() * value.element_size() for value in model.head.parameters())
+    assert sizes(model)[:2] == (4 * floats, head)
+    assert measure_scene(opened, label="", warmup=0, repeats=1).bytes_head > 0
+    # Before the head is enabled there is none to time, and it has no bytes.
+    model.state.head_starts_at = 10**9
+    assert frame_times(model, cameras[0], warmup=0, repeats=1).head == 0
+    figures = measure_scene(opened, label="", warmup=0, repeats=1)
+    assert figures.bytes_head == 0
+    assert figures.bytes_total == figures.full.bytes
+
+
+@torch.no_grad()
+def test_the_head_is_timed_at_the_size_at_which_it_runs(opened):
+    model, whole, seen = opened.model, tuple(opened.truths[0].shape[:2]), []
+    model.head.register_forward_pre_hook(lambda _, arguments: seen.append(tuple(arguments[0].shape[:2])))
+
+    def sizes_seen(render):
+        seen.clear()
+        render()
+        return set(seen)
+
+    # Frames of other scales are corrected at the trained one, thumbnails not at all.
+    for factor, expected in ((1.0, {whole}), (0.875, {whole}), (0.5, {whole}), (2.0, {whole}), (0.25, set())):
+        camera = copy.deepcopy(opened.cameras[0])
+        camera.rescale_output_resolution(factor)
+        assert sizes_seen(partial(model.get_outputs_for_camera, camera)) == expected
+        assert sizes_seen(partial(frame_times, model, camera, warmup=0, repeats=1)) == expected
+    assert frame_times(model, camera, warmup=0, repeats=1).head == 0
+
+
+def test_the_head_is_disabled_inside_a_block(opened):
+    def corrected():
+        shown = opened.model.get_outputs_for_camera(opened.cameras[0])
+        return not torch.equal(shown["rgb"], shown["base_rgb"])
+
+    assert corrected()
+    with torch.no_grad(), compensation(opened.model, on=False):
+        assert not corrected()
+    assert corrected()
+    with pytest.raises(ZeroDivisionError), compensation(opened.model, on=False):
+        raise ZeroDivisionError
+    assert corrected()
+
+
+# ----------------------------------------------------------------------------------------------------------- the report
 
 
 def test_rows_are_of_the_runs(report, tiny):
@@ -69,10 +188,9 @@ def test_rows_are_of_the_runs(report, tiny):
 
 def test_the_page_shows_the_views_with_their_figures(report, tiny):
     text = (report / "report.html").read_text(encoding="utf-8")
-    ours, theirs = json.loads((report / "report.json").read_text())
+    rows = json.loads((report / "report.json").read_text())
     cards = re.findall("<article.*?</article>", text, re.DOTALL)
-    views = [(run, index) for run in (ours, theirs) for index in range(3)]
-    assert len(cards) == len(views)
+    views = [(row, index) for row in rows for index in range(3)]
     photographs = sorted((tiny.scene / "images").iterdir())
     for card, (row, index) in zip(cards, views, strict=True):
         for way in row["configurations"]:
@@ -93,35 +211,29 @@ def test_the_page_shows_the_views_with_their_figures(report, tiny):
 def test_the_page_of_many_views_is_limited(tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sundae_ns.report.report_page.MOST_VIEWS", 2)
     assert run("report", tiny.folder, "-o", tmp_path / "out", "--repeats", 0) == 0
-    said, page = " ".join(capsys.readouterr().out.split()), tmp_path / "out" / "report.html"
-    assert "MB, 2 of 3 views" in said
-    assert "2 of 3 test views" in page.read_text(encoding="utf-8")
+    assert "MB, 2 of 3 views" in " ".join(capsys.readouterr().out.split())
+    assert "2 of 3 test views" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
-def test_times_come_with_the_error_of_the_same_rendering(report, tiny):
+def test_times_come_with_the_error_of_the_same_rendering(report, opened):
     ours, theirs = json.loads((report / "report.json").read_text())
     assert [way["name"] for way in ours["configurations"]] == ["head on", "head off"]
     assert [way["name"] for way in theirs["configurations"]] == ["head off"]
-    opened = load_model(tiny.folder)
     model = opened.model
-    with_head = model.render_settings(training=False)
+    with_head, camera = model.render_settings(training=False), model.camera_of(opened.cameras[1])
     for way, settings in zip(ours["configurations"], (with_head, with_head.without_head()), strict=True):
         assert way["ms"] > 0
         with torch.no_grad():
-            images, _ = render_view(
-                model.source, model.camera_of(opened.cameras[1]), model._get_background_color(), settings
-            )
-        expected = quality_of(images["rgb"], opened.truths[1])
-        found = way["views"][1]
+            images, _ = render_view(model.source, camera, model._get_background_color(), settings)
+        expected, found = quality_of(images["rgb"], opened.truths[1]), way["views"][1]
         assert (found["psnr"], found["ssim"]) == (pytest.approx(expected.psnr), pytest.approx(expected.ssim))
         assert (found["flip"] is not None) == flip_available()
     without = sum(4 * value.numel() for name, value in model.gauss_params.items() if name != "features")
     assert ours["configurations"][1]["bytes"] == without
 
 
-def test_nerfstudios_own_evaluation_agrees(report, tiny):
+def test_nerfstudios_own_evaluation_agrees(report, opened):
     ours, _ = json.loads((report / "report.json").read_text())
-    opened = load_model(tiny.folder)
     with torch.no_grad():
         outputs = opened.model.get_outputs_for_camera(opened.cameras[2])
         theirs, _ = opened.model.get_image_metrics_and_images(outputs, {"image": opened.truths[2]})
@@ -131,9 +243,8 @@ def test_nerfstudios_own_evaluation_agrees(report, tiny):
 
 
 def one_line(capsys):
-    lines = [line for line in capsys.readouterr().err.strip().splitlines() if line.startswith("sundae: ")]
-    assert len(lines) == 1
-    return lines[0]
+    (line,) = [line for line in capsys.readouterr().err.strip().splitlines() if line.startswith("sundae: ")]
+    return line
 
 
 def test_errors_are_one_line(tiny, tmp_path, capsys):
@@ -158,26 +269,23 @@ def test_a_run_that_cannot_be_opened_does_not_lose_the_others(tiny, tmp_path, ca
     paths = (tmp_path / "nowhere", tiny.folder, tiny.scene)
     assert run("report", *paths, "-o", tmp_path / "out", "--repeats", 0) == 1
     assert len(read_rows(tmp_path / "out" / "report.csv")) == 1
-    said, page = capsys.readouterr().out, (tmp_path / "out" / "report.md").read_text()
+    said, page = " ".join(capsys.readouterr().out.split()), (tmp_path / "out" / "report.md").read_text()
     for text in ("does not exist", "is no run"):
-        assert text in " ".join(said.split())
+        assert text in said
         assert text in page
 
 
 def test_a_packed_scene_counts_the_bytes_of_its_file(report, tiny, tmp_path, capsys):
     packed = tmp_path / "tiny.sundae"
-    with torch.no_grad():
-        write_scene(packed, contents_of(load_run(tiny.folder)))
-    assert run("report", packed, "-o", tmp_path / "out", "--repeats", 0) == 2
+    write_scene(packed, contents_of(load_run(tiny.folder)))
+    words = ("report", packed, "-o", tmp_path / "out", "--repeats", 0)
+    assert run(*words) == 2
     assert "give the capture with --data" in one_line(capsys)
-    assert run("report", packed, "-o", tmp_path / "out", "--repeats", 0, "--data", tiny.scene) == 0
-    (row,) = read_rows(tmp_path / "out" / "report.csv")
+    assert run(*words, "--data", tiny.scene) == 0
+    (row,), before = read_rows(tmp_path / "out" / "report.csv"), read_rows(report / "report.csv")[0]
     assert row.ms_frame is row.ms_splat is None, "nothing was timed"
-    before = read_rows(report / "report.csv")[0]
     assert row.bytes_total == packed.stat().st_size < before.bytes_total
     assert (row.method, row.variant, row.steps) == ("sundae-tiny", "tiny.sundae", tiny.steps)
     assert (row.primitives, row.seed, row.keep_ratio) == (before.primitives, None, None)
-    assert before.psnr is not None
-    assert before.psnr_base is not None
     assert row.psnr == pytest.approx(before.psnr, abs=0.15)
     assert row.psnr_base == pytest.approx(before.psnr_base, abs=0.15)
