@@ -22,48 +22,41 @@ from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sundae_ns.core.camera import Camera as Camera
-    from sundae_ns.core.errors import SundaeError as SundaeError
-    from sundae_ns.core.metrics import Quality as Quality
-    from sundae_ns.plugin.distill import distill as distill
-    from sundae_ns.pruning.rule import PruneRule as PruneRule
-    from sundae_ns.scene.cameras import cameras_of as cameras_of
-    from sundae_ns.scene.load_save import load as load
-    from sundae_ns.scene.load_save import save as save
-    from sundae_ns.scene.page import show as show
-    from sundae_ns.scene.prune_scene import crop as crop
-    from sundae_ns.scene.prune_scene import prune as prune
-    from sundae_ns.scene.prune_scene import remove_floaters as remove_floaters
-    from sundae_ns.scene.scene import Rendering as Rendering
-    from sundae_ns.scene.scene import Scene as Scene
-    from sundae_ns.scene.scene import measure as measure
-    from sundae_ns.scene.scene import render as render
-    from sundae_ns.scene.virtual_cameras import virtual_cameras as virtual_cameras
+    from sundae_ns.core.camera import Camera
+    from sundae_ns.core.errors import SundaeError
+    from sundae_ns.core.metrics import Quality
+    from sundae_ns.plugin.distill import distill
+    from sundae_ns.pruning.rule import PruneRule
+    from sundae_ns.scene.cameras import cameras_of
+    from sundae_ns.scene.compose import merge, transform
+    from sundae_ns.scene.load_save import load, save
+    from sundae_ns.scene.page import show
+    from sundae_ns.scene.prune_scene import crop, prune, remove_floaters
+    from sundae_ns.scene.scene import Rendering, Scene, measure, render
+    from sundae_ns.scene.virtual_cameras import virtual_cameras
 
 __version__ = "0.2.0"
 
-_HOMES = {
-    "Camera": "sundae_ns.core.camera",
-    "PruneRule": "sundae_ns.pruning.rule",
-    "Quality": "sundae_ns.core.metrics",
-    "Rendering": "sundae_ns.scene.scene",
-    "Scene": "sundae_ns.scene.scene",
-    "SundaeError": "sundae_ns.core.errors",
-    "cameras_of": "sundae_ns.scene.cameras",
-    "crop": "sundae_ns.scene.prune_scene",
-    "distill": "sundae_ns.plugin.distill",
-    "load": "sundae_ns.scene.load_save",
-    "measure": "sundae_ns.scene.scene",
-    "prune": "sundae_ns.scene.prune_scene",
-    "remove_floaters": "sundae_ns.scene.prune_scene",
-    "render": "sundae_ns.scene.scene",
-    "save": "sundae_ns.scene.load_save",
-    "show": "sundae_ns.scene.page",
-    "virtual_cameras": "sundae_ns.scene.virtual_cameras",
+_MODULES = {
+    "core.camera": "Camera",
+    "core.errors": "SundaeError",
+    "core.metrics": "Quality",
+    "plugin.distill": "distill",
+    "pruning.rule": "PruneRule",
+    "scene.cameras": "cameras_of",
+    "scene.compose": "merge transform",
+    "scene.load_save": "load save",
+    "scene.page": "show",
+    "scene.prune_scene": "crop prune remove_floaters",
+    "scene.scene": "Rendering Scene measure render",
+    "scene.virtual_cameras": "virtual_cameras",
 }
+_HOMES = {name: f"sundae_ns.{module}" for module, names in _MODULES.items() for name in names.split()}
 """Public names and the modules that hold them."""
 
-__all__ = [*_HOMES]  # noqa: PLE0604
+__all__ = ["Camera", "PruneRule", "Quality", "Rendering", "Scene", "SundaeError", "cameras_of", "crop", "distill"]
+__all__ += ["load", "measure", "merge", "prune", "remove_floaters", "render", "save", "show", "transform"]
+__all__ += ["virtual_cameras"]
 
 
 def __getattr__(name: str) -> Any:

@@ -22,7 +22,7 @@ from sundae_ns.io.formats import kind_of
 from sundae_ns.io.ply import has_own_columns
 from sundae_ns.scene.cameras import cameras_of
 from sundae_ns.scene.load_save import load, packed_file
-from sundae_ns.scene.prune_scene import crop_mask, floater_mask, kept
+from sundae_ns.scene.prune_scene import crop_mask, floater_mask
 from sundae_ns.scene.scene import Scene
 from sundae_ns.scene.virtual_cameras import VIEWS
 
@@ -50,7 +50,7 @@ class Cleaning:
             mask = crop_mask(scene, self.crop[:3], self.crop[3:])
             print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
         if self.remove_floaters:
-            floats = floater_mask(kept(scene, mask), cameras, console=Console(stderr=True))
+            floats = floater_mask(scene[mask], cameras, console=Console(stderr=True))
             mask[mask.clone()] = ~floats
             rule = "" if cameras else ", by their neighbours alone: no camera of the photographs is known"
             print(f"removed {int(floats.sum()):,} floaters of {len(floats):,} Gaussians{rule}", file=sys.stderr)
@@ -60,7 +60,7 @@ class Cleaning:
 
     def cleaned(self, scene: Scene) -> Scene:
         """The scene without what :meth:`mask` cuts, by the cameras stored with it."""
-        return kept(scene, self.mask(scene, scene.cameras)) if self.chosen else scene
+        return scene[self.mask(scene, scene.cameras)] if self.chosen else scene
 
 
 def open_run(run: Path, **options: Any) -> Scene:

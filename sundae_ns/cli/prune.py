@@ -16,7 +16,7 @@ from sundae_ns.pruning.rule import PruneRule, ScoreName
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene import prune_scene as pruning
 from sundae_ns.scene.load_save import SUFFIXES, load_with_mask, save
-from sundae_ns.scene.prune_scene import kept, within
+from sundae_ns.scene.prune_scene import within
 from sundae_ns.scene.virtual_cameras import virtual_cameras
 
 
@@ -72,7 +72,7 @@ def prune(
         given = chosen_cameras(scene, cameras, num_cameras) if looks_around or cleaning.remove_floaters else ()
         if cleaning.chosen:
             clean = cleaning.mask(scene, given)
-            scene = kept(scene, clean)
+            scene = scene[clean]
         warn_if_few(count, scene.num_gaussians)
         if looks_around:
             used = given or virtual_cameras(scene, num_cameras, seed=rule.seed)

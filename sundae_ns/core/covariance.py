@@ -102,13 +102,9 @@ def mean_projected_area(scales: Tensor) -> Tensor:
 def overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor, least_variance: float = 0.0) -> Tensor:
     """Bhattacharyya coefficient of Gaussians with others, in [0, 1]; 1 for equal ones, 0 where it overflows.
 
-    ``exp(-(d^T S^-1 d) / 8) (|A| |B|)^(1/4) / |S|^(1/2)`` with ``S = (A + B) / 2`` (Bhattacharyya, 1943).
-
-    Args:
-        means: ``[N, 3]``; the result has their dtype.
-        entries: of the covariances, by :func:`entries_of` ``[N, 6]``.
-        first, second: indices ``[P]``, or of a Gaussian ``[P, 1]`` and of its neighbours ``[P, K]``; as the result.
-        least_variance: added to all axes; without it, parallel flat Gaussians would not overlap however close they are.
+    ``exp(-(d^T S^-1 d) / 8) (|A| |B|)^(1/4) / |S|^(1/2)`` with ``S = (A + B) / 2`` (Bhattacharyya, 1943). ``entries``
+    are by :func:`entries_of`; ``first`` and ``second`` are indices ``[P]``, or ``[P, 1]`` and ``[P, K]`` of neighbours.
+    Without ``least_variance``, added to all axes, parallel flat Gaussians would not overlap however close they are.
     """
     first, second = first.to(means.device), second.to(means.device)
     entries = entries + least_variance * entries.new_tensor([1, 1, 1, 0, 0, 0])

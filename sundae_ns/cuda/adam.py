@@ -33,12 +33,9 @@ class Update(NamedTuple):
 
 @torch.no_grad()
 def adam_step(groups: Sequence[tuple[Mapping[str, Any], Sequence[Update]]], rates: Tensor, skip: Tensor | None) -> None:
-    """A step of ``torch.optim.Adam`` with ``fused``, but for rates in memory and any number of optimizers.
+    """A step of ``torch.optim.Adam`` with ``fused``, but for rates in memory ``[G]`` and any number of optimizers.
 
-    Args:
-        groups: options of each group of parameters, as the optimizer holds them, and its updates.
-        rates: learning rates of the groups ``[G]``.
-        skip: not 0 to change nothing, float ``[]``; None for 0.
+    ``groups`` are options of each group as the optimizer holds them, and its updates; ``skip`` as for :func:`adam`.
     """
     steps = [update.step for _, updates in groups for update in updates]
     torch._foreach_add_(steps, 1)
@@ -68,15 +65,8 @@ def adam_step(groups: Sequence[tuple[Mapping[str, Any], Sequence[Update]]], rate
 def adam(update: Update, rate: Tensor, skip: Tensor | None, *, betas: tuple[float, float], eps: float) -> None:
     """Update a parameter in place (Kingma & Ba 2015), as ``torch.optim.Adam`` does without weight decay.
 
-    Args:
-        update: on a CUDA device, contiguous, fewer than 2^31 numbers; ``step`` is the number of this update, from 1 on.
-        rate: learning rate ``[]``.
-        skip: not 0 to change nothing ``[]``; None for 0.
-        betas: decay rates of both means.
-        eps: added to the root of the mean of squares.
-
-    Raises:
-        BackendError: the kernel cannot be compiled or loaded.
+    ``update`` is on a CUDA device, contiguous, of fewer than 2^31 numbers; its ``step`` counts from 1. ``rate`` ``[]``
+    is the learning rate; ``skip`` ``[]`` is not 0 to change nothing. ``BackendError`` if the kernel cannot be loaded.
     """
     launch = load_kernels("adam.cu", ("adam",), OPTIONS, update.value.device, _THREADS)["adam"]
     logs = [math.log(beta) if beta > 0 else -math.inf for beta in betas]

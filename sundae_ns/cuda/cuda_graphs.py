@@ -62,20 +62,11 @@ def _side_stream(device: torch.device) -> torch.cuda.Stream:
 def record(
     run: Callable[[], _Result], device: torch.device, share_memory_with: torch.cuda.CUDAGraph | None = None
 ) -> tuple[torch.cuda.CUDAGraph, _Result]:
-    """Record the GPU work of ``run`` without executing it.
+    """Record the GPU work of ``run`` without executing it: the graph, and tensors that each replay writes.
 
-    Args:
-        run: must have run before (:func:`warm_up`), must not wait for the GPU, and must read only memory that stays in
-            place.
-        device: CUDA device.
-        share_memory_with: a graph whose memory pool this one reuses; they must be replayed in this order.
-
-    Returns:
-        The graph, and the result of ``run``: tensors that each replay writes.
-
-    Raises:
-        BackendError: the work cannot be recorded. Nothing was executed, and later work is not affected.
-        torch.cuda.OutOfMemoryError: the device has too little memory for the results.
+    ``run`` has run before (:func:`warm_up`), does not wait for the GPU, and reads only memory that stays in place.
+    Graphs that share memory must be replayed in their order. ``BackendError`` if the work cannot be recorded; nothing
+    was executed then, and later work is not affected.
     """
     graph = torch.cuda.CUDAGraph()
     # A training loop beside a viewer may allocate meanwhile: record this thread's work only.

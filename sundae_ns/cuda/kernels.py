@@ -34,15 +34,9 @@ def read_source(file: str) -> str:
 
 
 def compile_cubin(file: str, architecture: str, options: Sequence[str] = ()) -> bytes:
-    """Compile a file of ``sundae_ns/csrc`` to machine code. Needs no device.
+    """Compile a file of ``sundae_ns/csrc`` to machine code, for example ``sm_90``. Needs no device.
 
-    Args:
-        file: its name; kernels are ``extern "C"``.
-        architecture: such as ``sm_90`` for compute capability 9.0.
-        options: further compiler options.
-
-    Raises:
-        BackendError: NVRTC is missing, or the source does not compile.
+    ``BackendError`` if NVRTC is missing, or the source does not compile.
     """
     nvrtc = _library("nvrtc")
     nvrtc.nvrtcGetErrorString.restype = c_char_p
@@ -87,15 +81,10 @@ class Kernel:
             _check(self._driver, self._driver.cuModuleGetFunction(byref(self._function), module, name.encode()))
 
     def __call__(self, threads: int, arguments: Sequence[Argument]) -> None:
-        """Launch the kernel on the current stream.
+        """Launch at least this many threads on the current stream; ``BackendError`` if the driver refuses.
 
-        Args:
-            threads: number of threads, rounded up to whole blocks.
-            arguments: tensors on the kernel's device, passed as pointers to their first element, without strides; None
-                as a null pointer; integers as C ints, floats as doubles.
-
-        Raises:
-            BackendError: a tensor is on another device, or the driver refuses the launch.
+        Tensors, on the kernel's device, are passed as pointers to their first element, None as a null pointer, integers
+        as C ints, floats as doubles.
         """
         values = [_as_c(argument, self._device) for argument in arguments]
         pointers = (c_void_p * len(values))(*(ctypes.addressof(value) for value in values))

@@ -46,22 +46,13 @@ def fused_correlations(
     inverses: tuple[float, float],
     least_variance: float,
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """A function that correlates the patches of one image with those of other images.
+    """A function that correlates the patches of one image with those of other images ``[H', W']``.
 
-    Args:
-        kernels: returned by :func:`sweep_kernels`.
-        patches: of the image, on the device of the kernels.
-        others: grey values of the other images, at least one, ``[H', W']`` each.
-        maps: projections into the other images ``[len(others), 3, 4]``: a pixel ``(x, y)`` at inverse depth d projects
-            to the homogeneous ``map @ (x, y, 1, d)``.
-        inverses: lowest and highest inverse depth.
-        least_variance: lower limit for the variance of a patch of another image.
-
-    Returns:
-        For ``facing``, dot products of a normal and the points at depth 1 behind the pixel centres ``[H, W]``, and
-        inverse distances ``s`` ``[S]``: the highest correlation over the other images, for planes
-        ``normal . X = 1 / s``, float32 ``[S, H, W]``. It is -1 where no other image contains the projected pixel, and
-        where the inverse depth is outside the limits.
+    ``maps`` are projections into the others ``[V, 3, 4]``: a pixel ``(x, y)`` at inverse depth d projects to the
+    homogeneous ``map @ (x, y, 1, d)``. ``inverses`` are the lowest and highest inverse depth, ``least_variance`` limits
+    that of a patch. For ``facing``, dot products of a normal and the points at depth 1 behind the pixel centres ``[H,
+    W]``, and inverse distances ``s`` ``[S]``, the function returns the highest correlation over the others, for planes
+    ``normal . X = 1 / s``, float32 ``[S, H, W]``; -1 outside of the images or of the limits.
     """
     ends = list(accumulate(image.numel() for image in others))
     starts = [(end - image.numel(), *image.shape) for end, image in zip(ends, others)]

@@ -21,23 +21,13 @@ CHUNK_ELEMENTS = 2**21
 
 
 def high_pass(graph: NeighborGraph, signal: Tensor) -> Tensor:
-    """Response of the high-pass filter, ``(I - A) x`` in the form ``sum_j A_ij (x_i - x_j)``.
+    """Response of the high-pass filter ``[N, ...]``, ``(I - A) x`` in the form ``sum_j A_ij (x_i - x_j)``.
 
     Differences are taken before the sum: the form ``x_i - sum_j A_ij x_j`` loses digits in float32 if the signal has a
     large offset, as in a scene far from the origin.
 
     The response of a node without neighbours is undefined (row i of A is 0 / 0), so it is NaN. With 0, floaters would
-    look like the smoothest part of the field and fill the low end of a band selection.
-
-    Args:
-        graph: the graph, N nodes.
-        signal: one or D values per node, floating, on the graph's device ``[N]`` or ``[N, D]``.
-
-    Returns:
-        Response with the shape and dtype of ``signal``; NaN for nodes without neighbours.
-
-    Raises:
-        DataError: the signal does not have one row per node.
+    look like the smoothest part of the field and fill the low end of a band selection. ``DataError`` for other rows.
     """
     if signal.ndim not in (1, 2) or signal.shape[0] != graph.N:
         raise DataError(f"signal has shape {list(signal.shape)} on a graph of {graph.N} nodes: pass [N] or [N, D]")
@@ -97,15 +87,7 @@ class Smoother:
         self._known: NDArray[np.bool_] | None = None
 
     def __call__(self, signal: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """The smooth part.
-
-        Args:
-            signal: D values for each node; those of unknown nodes are not read ``[N, D]``.
-            known: nodes with a value ``[N]``.
-
-        Returns:
-            A value for each node, also for unknown ones ``[N, D]``.
-        """
+        """The smooth part of a signal ``[N, D]``, read where a node is known, bool ``[N]``; a value for every node."""
         if self._known is None or (known != self._known).any():  # factors are kept, as few calls change the nodes
             # Unknown values have a small weight: one without a path to a known value would have no equation.
             self._solve = splu((_diagonal(np.maximum(known, 1e-9)) + self._laplacian).tocsc()).solve

@@ -81,11 +81,7 @@ def knn(points: Tensor, k: int) -> Neighbors:
 def _search_host(
     coordinates: NDArray[np.float64], k: int, dtype: DTypeLike
 ) -> tuple[NDArray[np.int64], NDArray[np.floating]]:
-    """Indices and ascending distances ``[N, k]`` of the neighbours of points ``[N, 3]``.
-
-    A k-d tree cannot separate points at one position: among a million clones each search would visit all of them. So
-    the tree holds each position once, and positions are expanded to their points afterwards.
-    """
+    """Indices and ascending distances ``[N, k]`` of the neighbours of points ``[N, 3]``."""
     from scipy.spatial import cKDTree  # takes half a second, also in commands that search nothing
 
     n = len(coordinates)
@@ -150,14 +146,8 @@ def load_kernel(device: torch.device, dtype: torch.dtype, k: int) -> Kernel:
 def search_tree(tree: BoxTree, k: int, launch: Launch) -> tuple[Tensor, Tensor]:
     """The ``k`` nearest neighbours of every point of the tree, ordered by squared distance and then by index.
 
-    Args:
-        tree: the points.
-        k: number of neighbours, 1 to :data:`MAX_NEIGHBORS` and less than N.
-        launch: runs the kernel compiled with :func:`kernel_options` for the tree's dtype and ``k``.
-
-    Returns:
-        Indices, int64 ``[N, k]``, and ascending distances in scene units, dtype of the tree ``[N, k]``; rows are in the
-        original order of the points.
+    ``launch`` runs the kernel compiled with :func:`kernel_options`. Indices, int64, and distances in scene units, both
+    ``[N, k]``, are in the original order of the points.
     """
     n = len(tree.points)
     indices = torch.empty(n, k, dtype=torch.int64, device=tree.points.device)
@@ -183,16 +173,10 @@ class BoxTree:
 
 
 def build_tree(points: Tensor) -> BoxTree:
-    """Build the tree.
+    """Build the tree of finite points, float32 or float64 ``[N, 3]``, on their device; 130 bytes of scratch a point.
 
     Each level sorts all points at once, by segment and by rank along the segment's widest axis. Equal coordinates are
     ranked by index, so the result is the same in every run and on every device.
-
-    Args:
-        points: finite positions, float32 or float64, at least one ``[N, 3]``.
-
-    Returns:
-        The tree, with the dtype and device of the points. Scratch memory is about 130 bytes per point in float32.
     """
     n = len(points)
     depth = max(0, (n // LEAF).bit_length() - 1)

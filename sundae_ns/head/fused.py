@@ -32,13 +32,8 @@ MOST_WORKERS = 2**17  # Threads that sum a gradient over the pixels; fewer leave
 def compensated(net: UNet, residual: bool, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
     """The compensated image of a network without gradients; see :meth:`CompensationHead.forward`.
 
-    All images are float32 on CUDA. Pixels of ``splatted`` and ``alpha`` may have a stride, rows must be adjacent.
-
-    Args:
-        dtype: of the arithmetic, bfloat16.
-
-    Raises:
-        BackendError: the kernels cannot be compiled or loaded.
+    All images are float32 on CUDA, the arithmetic has ``dtype``, bfloat16. Pixels of ``splatted`` and ``alpha`` may
+    have a stride, rows must be adjacent. ``BackendError`` if the kernels cannot be compiled or loaded.
     """
     launches = head_kernels(base.device, dtype, head_options(net, residual))
     folded = fold_pixels(net, residual, splatted, alpha, dtype, launches)
@@ -240,12 +235,8 @@ def network_backward(
 ) -> tuple[Tensor, list[Tensor]]:
     """Gradients of :func:`network`, with the weights and the tape of the forward pass.
 
-    Args:
-        gradient: gradient of the last 3 x 3 convolution's result with its bias ``[1, width, h, w]``, channels last.
-
-    Returns:
-        The gradients of the folded input ``[1, C, h, w]``, channels last, and of weight and bias of each 3 x 3
-        convolution in turn, float32.
+    ``gradient`` is that of the last 3 x 3 convolution's result with its bias ``[1, width, h, w]``. Returns those of the
+    folded input ``[1, C, h, w]``, both channels last, and of weight and bias of each convolution in turn, float32.
     """
     levels = len(net.encoder)
     widths = [conv.out_channels for conv in convolutions(net)]

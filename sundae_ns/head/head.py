@@ -185,17 +185,11 @@ class CompensationHead(nn.Module):
 
 
 def training_crop(width: int, height: int, max_pixels: int, seed: int, *, mirror: bool = False) -> Crop | None:
-    """A random window with the image's aspect ratio, or None to train on the whole image, not mirrored.
+    """A random window with the image's aspect ratio, pixels, or None to train on the whole image, not mirrored.
 
-    Positions are drawn from beyond the edges too and moved back inside, because uniform ones would rarely include the
-    pixels next to the edges.
-
-    Args:
-        width: image width in pixels.
-        height: image height in pixels.
-        max_pixels: largest number of pixels of a window; 0 for no limit.
-        seed: the window is a function of it, so that a resumed run uses the same windows.
-        mirror: whether one of two windows is mirrored.
+    It has at most ``max_pixels``; 0 for no limit. Positions are drawn from beyond the edges too and moved back inside,
+    because uniform ones would rarely include the pixels next to the edges. The window is a function of the seed, so
+    that a resumed run uses the same windows; with ``mirror`` one of two is mirrored.
     """
     whole = max_pixels == 0 or width * height <= max_pixels
     if whole and not mirror:
@@ -218,13 +212,7 @@ class ScalePlan(NamedTuple):
 
 
 def plan(focal: float, trained: tuple[float, float] | None, pixels: int) -> ScalePlan:
-    """Plan the compensation of an image.
-
-    Args:
-        focal: focal length of the image, pixels.
-        trained: shortest and longest focal length of the training images; None if unknown.
-        pixels: number of pixels of the image.
-    """
+    """Plan the compensation of an image of ``pixels`` and a focal length, by the shortest and longest of training."""
     if trained is None:
         return ScalePlan(1.0, 1.0)
     nearest = min(max(focal, trained[0]), trained[1])

@@ -93,8 +93,5 @@ class UNet(nn.Module):
 
 
 def _dense(grad: Tensor | None) -> Tensor | None:
-    """The gradient of a part of concatenated channels as a tensor of its own.
-
-    A CPU takes three times as long to differentiate the upsampling from a slice.
-    """
+    """The gradient of some channels as a tensor of its own: upsampling by a slice takes a CPU three times as long."""
     return None if grad is None else grad.contiguous(memory_format=torch.channels_last)

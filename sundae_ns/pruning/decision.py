@@ -62,23 +62,11 @@ def decide(
     contribution: Tensor | None = None,
     graph: NeighborGraph | None = None,
 ) -> Decision:
-    """Decide which Gaussians of a field to keep.
+    """Decide which Gaussians of a field to keep: exactly ``count``, or all finite ones if they are fewer.
 
-    Gaussians with a NaN, or an infinite parameter without a meaning, are dropped first (``gaussians.sanitise``); of the
-    others exactly ``count`` stay. If that is all of them, nothing is scored. In a field of at most ``num_neighbors``
-    Gaussians each is a neighbour of all others within reach.
-
-    Args:
-        params: the field, N Gaussians.
-        rule: how to score, select and merge.
-        count: number of Gaussians to keep, at least 1; all finite Gaussians are kept if they are fewer.
-        contribution: blending weights, summed over the training views, any device ``[N]``; see
-            :func:`sundae_ns.scene.render.contribution`. Needed if ``rule.uses_contribution``.
-        graph: :func:`gaussian_graph` of the finite Gaussians by the same rule; built if not given and needed.
-
-    Raises:
-        ConfigError: an option is invalid, or a contribution is needed and not given.
-        DataError: no Gaussian is finite, or the contribution does not have one value per Gaussian.
+    Gaussians without a meaning go first (``gaussians.sanitise``); if all others stay, nothing is scored. A rule that
+    ``uses_contribution`` needs one ``[N]``, by :func:`sundae_ns.scene.render.contribution`; ``graph`` is built if not
+    given. ``ConfigError`` for an invalid option or without a contribution, ``DataError`` if no Gaussian is finite.
     """
     rule.validate()
     sanitised = sanitise(params)
@@ -146,15 +134,11 @@ class Pruner:
         return num_gaussians(self.params)
 
     def drop_nonfinite(self) -> int:
-        """Remove the Gaussians with a NaN, or an infinite parameter without a meaning; clamp the others (``sanitise``).
+        """Remove Gaussians that are not finite, clamp others (``sanitise``); returns how many went.
+
+        ``DataError`` if all would.
 
         Call it before the contribution, which renders the field: one NaN spreads over the image.
-
-        Returns:
-            Number of removed Gaussians.
-
-        Raises:
-            DataError: no Gaussian is finite; the field is unchanged.
         """
         sanitised = sanitise(self.params)
         if not sanitised.gaussians.num_gaussians:

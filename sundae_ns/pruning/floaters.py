@@ -29,15 +29,9 @@ def _distances(points: Tensor, others: Tensor, nth: int = 1) -> Tensor:
 
 @torch.no_grad()
 def near_cameras(means: Tensor, eyes: Tensor, points: Tensor) -> Tensor:
-    """True for Gaussians that float in front of a camera, bool ``[N]``.
+    """True for Gaussians ``[N, 3]`` that float in front of a camera, bool ``[N]``; never without points or cameras.
 
-    Args:
-        means: centres ``[N, 3]``, world units.
-        eyes: positions of the training cameras ``[V, 3]``.
-        points: sparse points of the scene ``[P, 3]``.
-
-    Returns:
-        False everywhere without points or cameras.
+    ``eyes`` ``[V, 3]`` are of the training cameras, ``points`` ``[P, 3]`` the sparse ones of the scene; world units.
     """
     finite = points[points.isfinite().all(dim=1)].to(means)
     if not len(finite) or not len(eyes):

@@ -33,20 +33,10 @@ MOST_HOPS = 64  # most edges between a dropped Gaussian and its kept one; keep r
 
 @torch.no_grad()
 def gaussian_graph(params: Mapping[str, Tensor], rule: PruneRule) -> NeighborGraph:
-    """Neighbour graph of a field, with the weights that the rule asks for.
+    """Neighbour graph of a finite field, with the weights that the rule asks for (docs/method.md, "The graph").
 
-    With ``centres``, as in the paper, weights fall with distance. ``appearance`` multiplies them by the overlap of the
-    two Gaussians (Bhattacharyya) and by ``exp(-|c_i - c_j|^2 / (2 s^2))`` for their colours, s being the root mean
-    square difference over all edges. As in a bilateral filter, Gaussians on two sides of an image edge are hardly
-    neighbours.
-
-    A field of at most ``num_neighbors`` Gaussians has the graph of all pairs within reach.
-
-    Args:
-        params: the field, all finite, N Gaussians.
-
-    Raises:
-        DataError: only one Gaussian, or positions that are not finite.
+    As in a bilateral filter, Gaussians on two sides of an image edge are hardly neighbours by ``appearance``. A field
+    of at most ``num_neighbors`` Gaussians has the graph of all pairs within reach. ``DataError`` for a single Gaussian.
     """
     params = as_gaussians(params).as_harmonics()
     means = params["means"].detach()
@@ -79,16 +69,8 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
     Two groups of weights w and w' cost ``w w' / (w + w') (1 - overlap + |c - c'|^2)``: with the Bhattacharyya
     coefficient of their Gaussians as overlap, how much their images change if one of the same moments replaces both
     (Ward, 1963). A round merges pairs that cost less than any other pair of either group, the cheapest half of these.
-
-    Args:
-        params: the field, all finite, N Gaussians.
-        graph: its edges are the pairs, whatever their weights.
-        weight: of each Gaussian, such as its summed blending weight, not negative ``[N]``.
-        count: number of groups, 1 to N.
-
-    Returns:
-        Labels as :func:`sundae_ns.core.merging.merge` takes them, int64, on the graph's device ``[N]``: the index
-        of a member, in each merge that of the heavier group; -1 for Gaussians that are dropped.
+    ``weight`` ``[N]`` is not negative. Labels ``[N]`` are as :func:`sundae_ns.core.merging.merge` takes them: the index
+    of a member, in each merge that of the heavier group; -1 for Gaussians that are dropped.
     """
     device, n = graph.indices.device, graph.N
     values = as_gaussians(params).as_harmonics()
@@ -191,21 +173,14 @@ def _cheapest_of_both(pairs: tuple[Tensor, Tensor], cost: Tensor, n: int) -> Ten
 
 @torch.no_grad()
 def voronoi_labels(graph: NeighborGraph, mask: Tensor) -> Tensor:
-    """Voronoi label of each Gaussian: the index of the nearest kept Gaussian along the edges of the graph.
+    """Voronoi label of each Gaussian: the index of the nearest Gaussian under ``mask`` along edges, int64 ``[N]``.
 
-    The length of an edge is ``-log W_ij``, so edges between Gaussians of different appearance are long if the graph
-    weights by appearance. All edges are relaxed at once, hop by hop (Bellman and Ford). Among equally near kept
-    Gaussians the one found in fewer hops wins, then the one over the earlier neighbour.
+    The length of an edge is ``-log W_ij``. All edges are relaxed at once, hop by hop (Bellman and Ford). Among equally
+    near kept Gaussians the one found in fewer hops wins, then the one over the earlier neighbour.
 
     Edges are followed from a Gaussian to its neighbours. Gaussians that reach no kept one so follow edges in both
-    directions: a thousand clones share the same few neighbours, and all of these may be dropped.
-
-    Args:
-        mask: True for Gaussians to keep, bool, any device ``[N]``.
-
-    Returns:
-        Labels, int64, on the graph's device ``[N]``: its own index for a kept Gaussian; -1 for Gaussians that are
-        connected to no kept one.
+    directions: a thousand clones share the same few neighbours, and all of these may be dropped. Gaussians that are
+    connected to no kept one have the label -1.
     """
     device = graph.weights.device
     mask = mask.to(device)
@@ -266,19 +241,10 @@ def _label_either_way(graph: NeighborGraph, label: Tensor, distance: Tensor) -> 
 def merged(
     params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, weight: Tensor, labels: Tensor | None = None
 ) -> dict[str, Tensor]:
-    """Merge the Gaussians of each Voronoi cell of the graph into its kept one; see :func:`voronoi_labels`, and
-    :func:`sundae_ns.core.merging.merge` for the result.
+    """Merge the dropped Gaussians of a finite field into those under ``mask`` (:func:`sundae_ns.core.merging.merge`).
 
-    A field that stores logits averages colours, not logits.
-
-    Args:
-        params: the field, all finite, N Gaussians.
-        mask: True for Gaussians to keep, bool ``[N]``.
-        weight: weight of each Gaussian in the merge, its summed blending weight over the training views ``[N]``.
-        labels: of groups that take the place of the Voronoi cells, int64 ``[N]``; -1 for Gaussians that are dropped.
-
-    Returns:
-        Parameters of the kept Gaussians ``[M, ...]``.
+    ``weight`` ``[N]`` is the summed blending weight. Groups are ``labels``, int64 ``[N]``, -1 for what is dropped; by
+    default the cells of :func:`voronoi_labels`. A field that stores logits averages colours, not logits.
     """
     labels = voronoi_labels(graph, mask) if labels is None else labels
     if as_gaussians(params).encoding == "harmonics":

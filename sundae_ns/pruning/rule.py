@@ -95,12 +95,9 @@ def band_rule(rule: PruneRule, gamma: float) -> PruneRule:
 
 
 def kept_count(share: float, n: int) -> int:
-    """Number of ``n`` Gaussians that a prune to a share keeps: ``round(share * n)``, at least 1.
+    """``round(share * n)`` of ``n`` Gaussians, at least 1: the one place that turns a share into a count.
 
-    The one place that turns a share into a count.
-
-    Raises:
-        ConfigError: the share is not in (0, 1].
+    ``ConfigError`` for a share that is not in (0, 1].
     """
     if not 0 < share <= 1:
         raise ConfigError(f"keep_ratio is {share}: use a share in (0, 1], 0.1 to keep a tenth")

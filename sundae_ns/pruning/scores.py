@@ -20,20 +20,12 @@ from sundae_ns.pruning.rule import PruneRule
 def score(
     params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph | None, contribution: Tensor | None
 ) -> Tensor:
-    """Score of each Gaussian by the rule, float64 ``[N]``.
+    """Score of each Gaussian of a finite field by the rule, float64 ``[N]``; NaN for a response without neighbours.
 
     The response enters as the norm ``|f_i| = sqrt(pi_i)``. Its ranking is that of ``pi_i``, and sampling in proportion
     to the norm gives the least expected error (Chen et al., "Fast Resampling of Three-Dimensional Point Clouds via
-    Graphs", 2018). Without neighbours it is NaN, which every selection ranks last.
-
-    Args:
-        params: the field, all finite, N Gaussians.
-        graph: graph of the field, for the response; built if not given.
-        contribution: blending weights ``[N]``, for the score of that name.
-
-    Raises:
-        ConfigError: the score needs a contribution that is not given.
-        DataError: a function returns another shape.
+    Graphs", 2018). ``contribution`` is ``[N]``; ``ConfigError`` if it is needed and missing, ``DataError`` if a
+    function as score returns another shape.
     """
     if callable(rule.score):
         values = rule.score(params)
@@ -51,17 +43,9 @@ def score(
 
 @torch.no_grad()
 def response(params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph | None = None) -> Tensor:
-    """Squared norm of the high-pass response of the rule's signal, pi of the paper.
+    """Squared norm of the high-pass response of the rule's signal, pi of the paper, float64 ``[N]``.
 
-    Args:
-        params: the field, all finite, N Gaussians.
-        graph: graph of the field; built if not given.
-
-    Returns:
-        float64 on the field's device ``[N]``; NaN for Gaussians without neighbours.
-
-    Raises:
-        DataError: only one Gaussian, or positions that are not finite.
+    NaN for Gaussians without neighbours. ``DataError`` for a single Gaussian, or positions that are not finite.
     """
     graph = gaussian_graph(params, rule) if graph is None else graph
     signal = attribute_signal(params) if rule.signal == "attributes" else params["means"].detach()
@@ -81,11 +65,7 @@ def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
 
 
 def _standardise(values: Tensor) -> Tensor:
-    """Centre ``[N, C]`` on its medians and divide by the median norm; a constant group becomes 0.
-
-    A few floaters or saturated colours would dominate a mean or a variance, but not a median. If more than half of the
-    rows are equal, the median norm is 0 and the mean of the norms replaces it.
-    """
+    """Centre ``[N, C]`` on medians, which floaters do not move, and divide by the median norm, else the mean norm."""
     centred = values - values.median(dim=0).values
     norms = torch.linalg.vector_norm(centred, dim=1, dtype=torch.float64)
     spread = norms.median() or norms.mean()
@@ -94,18 +74,11 @@ def _standardise(values: Tensor) -> Tensor:
 
 @torch.no_grad()
 def pixel_detail(image: Tensor, cells: float) -> Tensor:
-    """Local deviation of an image from its mean over a cell, as weights of the pixels.
+    """Local deviation of an image ``[H, W, C]`` from its mean over a cell, as weights of mean 1 ``[H, W]``.
 
     A Gaussian covers a cell of about ``H W / cells`` pixels, and the deviation within a window of that size is the
     detail that it cannot show. The squared error of n cells is least if their density is proportional to the gradient
     (minimise ``int |grad f|^2 / density``), and in a smooth image the deviation is proportional to the gradient.
-
-    Args:
-        image: colours in [0, 1], any device ``[H, W, C]``.
-        cells: number of cells, positive.
-
-    Returns:
-        Weights of the pixels, positive with mean 1 ``[H, W]``; all 1 for a flat image.
     """
     height, width = image.shape[:2]
     side = round((height * width / max(cells, 1.0)) ** 0.5)

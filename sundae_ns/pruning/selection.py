@@ -21,17 +21,10 @@ LEAST_SHARE = 1e-200  # least score of a systematic sample, as a share of the la
 
 
 def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
-    """Select the ``round(gamma * count)`` highest magnitudes, and the lowest for the rest.
+    """Select the ``round(gamma * count)`` highest magnitudes, and the lowest for the rest; the ends never overlap.
 
-    The paper's rule (paragraph "Controlling bandwidth with gamma"). The two ends never overlap. NaN magnitudes, those
-    of isolated Gaussians, belong to neither end.
-
-    Args:
-        count: number of Gaussians to keep, 1 to N.
-        gamma: share of the high end, in [0, 1].
-
-    Raises:
-        DataError: ``count`` is not in 1 to N.
+    The paper's rule (paragraph "Controlling bandwidth with gamma"). NaN magnitudes, those of isolated Gaussians, belong
+    to neither end. ``DataError`` for a ``count`` that is not in 1 to N.
     """
     values = as_scores(magnitude, count)
     mask = torch.zeros(len(values), dtype=torch.bool)
@@ -68,25 +61,13 @@ def neighbor_order(points: Tensor) -> Tensor:
 
 
 def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Tensor:
-    """Draw one Gaussian in each stretch of an order over which the inclusion probabilities sum to one.
+    """Draw one Gaussian in each stretch of an order ``[N]`` over which the inclusion probabilities sum to one.
 
     Systematic sampling with unequal probabilities (Madow, 1949): probabilities are summed along the order, and a
-    Gaussian is selected whenever the sum passes ``u + j``, with one random u for all j. Each Gaussian is selected
-    with probability ``min(1, c s_i)``, and any stretch of the order keeps its expected number, rounded up or down.
-
-    Infinite scores are selected first, then positive ones. Scores that are NaN or at most 0 are drawn uniformly, after
-    all others.
-
-    Args:
-        score: scores ``[N]``.
-        count: number of Gaussians to keep, 1 to N.
-        order: permutation of the Gaussians, int64 ``[N]``.
-
-    Returns:
-        Mask with ``count`` True entries, bool, on the device of the scores ``[N]``.
-
-    Raises:
-        DataError: ``count`` is not in 1 to N, or shapes do not fit.
+    Gaussian is selected whenever the sum passes ``u + j``, with one random u for all j. Each Gaussian is selected with
+    probability ``min(1, c s_i)``, and any stretch of the order keeps its expected number, rounded up or down. Infinite
+    scores are selected first, then positive ones. Scores that are NaN or at most 0 are drawn uniformly, after all
+    others. The mask, bool ``[N]``, has ``count`` entries; ``DataError`` unless that is 1 to N.
     """
     if order.shape != score.shape:
         raise DataError(f"scores have shape {list(score.shape)} and their order {list(order.shape)}: pass [N] and [N]")

@@ -84,13 +84,8 @@ def late_outputs(
 ) -> LazyOutputs:
     """All outputs but the background; ``depth``, ``features`` and ``response`` are computed on access.
 
-    ``features`` shows principal components as colours, ``response`` the response of the visible Gaussians.
-
-    Args:
-        images: ``rgb``, ``base_rgb`` and ``accumulation`` of the Gaussians ``drawn``, those under ``mask``.
-        gaussians: all Gaussians. Both are kept, so their mappings must not change.
-        settings: without a head, the image of features is black.
-        values: gives the response of all Gaussians, in [0, 1] ``[N]``, or None.
+    ``images`` are of the Gaussians ``drawn``, those under ``mask``; mappings of these and of all must not change.
+    ``features`` shows principal components as colours, ``response`` the ``values`` of the visible Gaussians ``[N]``.
     """
     alpha = images["accumulation"]
 

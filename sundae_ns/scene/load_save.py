@@ -124,10 +124,7 @@ def packed_file(path: Path) -> tuple[Scene, bytes]:
 
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> dict[str, Tensor]:
     """Write base colours in a format of other viewers; returns the written Gaussians. See :func:`save`."""
-    offset = None
-    if not scene.in_model_frame and "frame" in scene.meta:  # that of survey coordinates, which load() made
-        offset = tuple(-row[3] for row in scene.meta["frame"]["transform"][:3])
-    marks = Marks(scene.antialiased, scene.in_model_frame, scene.up, offset)
+    marks = Marks(scene.antialiased, scene.in_model_frame, scene.up, scene.offset)
     return formats.write_for_viewers(path, scene.gaussians, marks, upright=upright)
 
 

@@ -18,13 +18,11 @@ def optimise(
     first: int = 0,
     on_step: Callable[[int], object] | None = None,
 ) -> bool:
-    """Train, with learning rates that are a function of the step, so that a resumed training repeats them.
+    """Take steps, with learning rates that are a function of the step, so that a resumed training repeats them.
 
-    Args:
-        step: takes step ``i``: its loss, gradients and updates.
-        optimizers: by name. The present rates are the initial ones, unless a group holds ``initial_lr``.
-        factor: of the initial rate of an optimizer (by name) at a step; ``first`` steps were taken before.
-        on_step: called with the number of steps taken; False stops, and :func:`optimise` returns False.
+    ``factor`` is of the initial rate of an optimizer (by name) at a step: the present one, unless a group holds
+    ``initial_lr``; ``first`` steps were taken before. ``on_step`` gets the number of steps taken; False stops, and is
+    returned.
     """
     groups = [(name, group) for name, optimizer in optimizers.items() for group in optimizer.param_groups]
     for _, group in groups:

@@ -273,7 +273,7 @@ def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
     >>> sn.crop(scene, (0, 0, 0), (1, 1, 2)).num_gaussians
     200
     """
-    return kept(scene, crop_mask(scene, low, high))
+    return scene[crop_mask(scene, low, high)]
 
 
 def remove_floaters(scene: Scene, *, cameras: Camera | Iterable[Camera] | None = None) -> Scene:
@@ -293,12 +293,7 @@ def remove_floaters(scene: Scene, *, cameras: Camera | Iterable[Camera] | None =
     >>> sn.remove_floaters(sn.Scene(gaussians)).num_gaussians < 2001
     True
     """
-    return kept(scene, ~floater_mask(scene, scene.cameras if cameras is None else usable_cameras(cameras)))
-
-
-def kept(scene: Scene, mask: Tensor) -> Scene:
-    """The scene with the Gaussians under a mask, bool ``[N]``."""
-    return dataclasses.replace(scene, gaussians=scene.gaussians.rows(mask))
+    return scene[~floater_mask(scene, scene.cameras if cameras is None else usable_cameras(cameras))]
 
 
 def within(mask: Tensor | None, inner: Tensor) -> Tensor:

@@ -185,11 +185,8 @@ def render_view(
 ) -> tuple[dict[str, Any], Rasterization]:
     """The images of one view over a background ``[3]``: Gaussians, one splatting pass, and the head.
 
-    An image of another scale than the head was trained at is rendered at the trained scale too, and gets the resized
-    correction (:mod:`sundae_ns.head.head`).
-
-    Returns:
-        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result.
+    They are ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, beside the rasteriser's result.
+    One of another scale than the head was trained at gets the resized correction of that (:mod:`sundae_ns.head.head`).
     """
     head = settings.head
     primitives = source.primitives(camera, settings, features=head is not None)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, one_line
-from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians, checked
+from sundae_ns.core.gaussians import FEATURES, MAX_SH_DEGREE, Gaussians, checked, rgb_to_sh, sh_to_rgb
 from sundae_ns.core.metrics import Quality, evaluate
 from sundae_ns.core.values import AnyArray, floats, numbers, positions, usual_defaults, whole
 from sundae_ns.cuda.kernels import naming_full_memory
@@ -99,10 +99,97 @@ class Scene:
         colors = colors.to(points.device)
         return cls(Gaussians(from_points(points, colors, sh_degree=sh_degree, num_features=0)))
 
+    @classmethod
+    @usual_defaults()
+    def from_arrays(
+        cls, means: AnyArray, scales: AnyArray, quats: AnyArray, opacities: AnyArray, colors: AnyArray
+    ) -> Scene:
+        """A scene of given Gaussians, as gsplat's ``rasterization`` takes them; lists, arrays or tensors.
+
+        Args:
+            means: centres ``[N, 3]``, world units.
+            scales: standard deviations along the axes ``[N, 3]``, world units.
+            quats: rotations as wxyz quaternions of any length ``[N, 4]``.
+            opacities: in [0, 1] ``[N]``.
+            colors: uint8, or in [0, 1] ``[N, 3]``; or coefficients of spherical harmonics ``[N, (degree + 1)^2, 3]``.
+
+        Raises:
+            DataError: shapes or values do not fit, or there are no Gaussians.
+
+        >>> import numpy as np, sundae_ns as sn
+        >>> sn.Scene.from_arrays(np.eye(3), np.full((3, 3), 0.1), np.eye(3, 4), np.full(3, 0.5), np.eye(3)).opacities
+        tensor([0.5000, 0.5000, 0.5000])
+        """
+        harmonics = floats(colors, "colors", colors=np.ndim(colors) == 2)
+        harmonics = rgb_to_sh(harmonics)[:, None] if harmonics.ndim == 2 else harmonics
+        if harmonics.ndim != 3:
+            raise DataError(f"colors has shape {list(harmonics.shape)}; it must be [N, 3] or [N, (degree + 1)^2, 3]")
+        deviations, alphas = floats(scales, "scales"), floats(opacities, "opacities")
+        if bool((deviations < 0).any()) or bool(((alphas - 0.5).abs() > 0.5).any()):
+            raise DataError("scales are negative or opacities beyond [0, 1]; give neither logarithms nor logits")
+        params = {"means": means, "scales": deviations.log(), "quats": quats, "opacities": alphas.logit().view(-1, 1)}
+        return cls(Gaussians({**params, "features_dc": harmonics[:, 0], "features_rest": harmonics[:, 1:]}))
+
     @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians N."""
+        """Number of Gaussians N, also ``len(scene)``."""
         return self.gaussians.num_gaussians
+
+    def __len__(self) -> int:
+        return self.num_gaussians
+
+    def __getitem__(self, rows: slice | AnyArray) -> Scene:
+        """The scene with some of its Gaussians: ``scene[scene.opacities > 0.1]``; everything else stays, head included.
+
+        ``rows`` is a mask, bool ``[N]``, a slice, or indices ``[M]``; an array, a list or a tensor on any device.
+        ``DataError`` for anything else, and for no Gaussians.
+        """
+        n = len(self)
+        index = np.arange(n)[rows] if isinstance(rows, slice) else rows
+        index = index if isinstance(index, Tensor) else torch.from_numpy(np.array(index))
+        fits = index.dtype == torch.bool and index.shape == (n,)
+        if index.dtype in (torch.int32, torch.int64) and index.ndim == 1 and index.numel():
+            low, high = (int(limit) for limit in index.aminmax())
+            fits = -n <= low <= high < n
+        if not fits:
+            kind = f"{str(index.dtype).removeprefix('torch.')} {list(index.shape)}"
+            raise DataError(f"rows are {kind}; give a slice, a mask, bool [{n}], or indices [M] from 0 to {n - 1}")
+        return dataclasses.replace(self, gaussians=self.gaussians.rows(index.to(self.device)))
+
+    @property
+    def means(self) -> Tensor:
+        """Centres, world units ``[N, 3]``."""
+        return self.gaussians["means"]
+
+    @property
+    def scales(self) -> Tensor:
+        """Standard deviations along the axes, world units ``[N, 3]``; ``scene.gaussians`` has their logarithms."""
+        return self.gaussians["scales"].exp()
+
+    @property
+    def quats(self) -> Tensor:
+        """Rotations of the axes as wxyz quaternions of unit length ``[N, 4]``."""
+        return torch.nn.functional.normalize(self.gaussians["quats"], dim=1)
+
+    @property
+    def opacities(self) -> Tensor:
+        """Opacities at the centres, in [0, 1] ``[N]``; ``scene.gaussians`` has their logits."""
+        return self.gaussians["opacities"].sigmoid().squeeze(1)
+
+    @property
+    def colors(self) -> Tensor:
+        """Mean colours over all directions, those of SH degree 0, clamped to [0, 1] ``[N, 3]``."""
+        return sh_to_rgb(self.gaussians.as_harmonics()["features_dc"]).clamp(0, 1)
+
+    @property
+    def offset(self) -> Direction | None:
+        """What opening a file subtracted from survey coordinates, and what writing one adds; None for nothing."""
+        frame = {} if self.in_model_frame else self.meta.get("frame", {})
+        rows = np.array(frame.get("transform", np.zeros((3, 4))), np.float64)[:3]
+        if frame.get("scale") != 1 or not np.array_equal(rows[:, :3], np.eye(3)):
+            return None
+        x, y, z = (-rows[:, 3]).tolist()
+        return x, y, z
 
     @property
     def device(self) -> torch.device:

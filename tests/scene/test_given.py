@@ -34,6 +34,17 @@ def scene(**values: Any) -> sn.Scene:
     return sn.Scene({**random_field(9, degree=1), **values})  # type: ignore[arg-type]
 
 
+def arrays(**values: Any) -> sn.Scene:
+    given = {"means": POINTS, "scales": POINTS, "quats": EYE[[0] * 100], "opacities": POINTS[:, 0], "colors": POINTS}
+    return sn.Scene.from_arrays(**{**given, **values})
+
+
+def survey(offset: tuple[float, float, float]) -> sn.Scene:
+    """A scene as opened from a file of survey coordinates."""
+    rows = [[*(float(i == j) for j in range(3)), -value] for i, value in enumerate(offset)]
+    return dataclasses.replace(SCENE, meta={"frame": {"transform": rows, "scale": 1.0}})
+
+
 def look_at(*points: Any, **options: Any) -> sn.Camera:
     return sn.Camera.look_at(*points, **options)
 
@@ -147,6 +158,21 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "no image": (lambda: sn.measure(SCENE, 5, [CAMERA]), "image 0 has values from 5 to 5"),  # type: ignore[arg-type]
     "gone": (lambda: sn.measure(SCENE, ["gone.png"], [CAMERA]), "gone.png"),
     "few": (lambda: sn.measure(SCENE, [image()] * 2, [CAMERA]), "2 images do not fit 1 views"),
+    "mask": (lambda: SCENE[np.ones(99, bool)], r"rows are bool \[99\]; give a slice, a mask, bool \[100\]"),
+    "bytes as rows": (lambda: SCENE[np.ones(100, np.uint8)], "rows are uint8"),
+    "one row": (lambda: SCENE[3], r"rows are int64 \[\]"),  # type: ignore[index]
+    "beyond": (lambda: SCENE[[0, 100]], "from 0 to 99"),
+    "no rows": (lambda: SCENE[5:5], r"rows are int64 \[0\]"),
+    "logits": (lambda: arrays(opacities=np.full(100, 2.0)), "give neither logarithms nor logits"),
+    "logarithms": (lambda: arrays(scales=np.log(POINTS)), "give neither logarithms nor logits"),
+    "channels": (lambda: arrays(colors=POINTS[:, 0]), r"colors has shape \[100\]; it must be"),
+    "no scenes": (lambda: sn.merge([]), "merge found no scenes"),
+    "paths": (lambda: sn.merge(["a.ply"]), "merge found no scenes"),  # type: ignore[list-item]
+    "kinds": (lambda: sn.merge([SCENE, dataclasses.replace(SCENE, antialiased=True)]), "train or export all alike"),
+    "surveys": (lambda: sn.merge([SCENE, survey((5, 0, 0))]), "some scenes have survey coordinates"),
+    "mirror": (lambda: sn.transform(SCENE, np.diag([1, 1, -1])), "rotation is no rotation"),
+    "no quaternion": (lambda: sn.transform(SCENE, [0, 0, 0, 0]), "rotation is no rotation"),
+    "scale": (lambda: sn.transform(SCENE, scale=0), "scale is 0"),
     "box": (lambda: sn.crop(SCENE, 0, 1), "a corner of the box is not made of 3 finite numbers"),
 }
 

@@ -1,0 +1,131 @@
+"""A scene in other coordinates, and several scenes as one."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import torch
+from torch.nn.functional import pad
+
+from sundae_ns.core.camera import Camera
+from sundae_ns.core.covariance import rotation_matrices
+from sundae_ns.core.errors import ConfigError, DataError
+from sundae_ns.core.gaussians import FEATURES, Gaussians
+from sundae_ns.core.values import AnyArray, numbers
+from sundae_ns.head.head import CompensationHead
+from sundae_ns.io.coordinates import similarity
+from sundae_ns.scene.scene import Scene, unit
+
+
+def transform(
+    scene: Scene, rotation: AnyArray | None = None, scale: float = 1.0, translation: AnyArray = (0.0, 0.0, 0.0)
+) -> Scene:
+    """The scene moved by ``x -> scale * R x + translation``: Gaussians with their harmonics, cameras, start view, up.
+
+    A head stays, because moved cameras see the same images. ``cameras_of(path, scene)`` follows a run; a file of survey
+    coordinates is moved in these.
+
+    Args:
+        scene: to move; it does not change.
+        rotation: R as a matrix ``[3, 3]`` or a wxyz quaternion ``[4]``; none by default.
+        scale: factor of all lengths.
+        translation: world units ``[3]``.
+
+    Raises:
+        ConfigError: the matrix is no rotation, or mirrors; the scale is not positive.
+
+    >>> import sundae_ns as sn
+    >>> scene = sn.Scene.from_points([[1, 0, 0]], [[0.5, 0.5, 0.5]])
+    >>> sn.transform(scene, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], 2.0, (0, 0, 5)).means
+    tensor([[0., 2., 5.]])
+    """
+    turn = torch.eye(3, dtype=torch.float64) if rotation is None else numbers(rotation, "rotation", (3, 3), (4,))
+    if turn.ndim == 1 and bool(turn.any()):
+        turn = rotation_matrices(turn[None])[0]
+    if turn.ndim == 1 or float((turn.mT @ turn - torch.eye(3)).abs().max()) > 1e-3 or float(turn.det()) < 0:
+        raise ConfigError("rotation is no rotation; give a matrix of unit axes at right angles, or a wxyz quaternion")
+    if not float(numbers(scale, "scale", ())) > 0:
+        raise ConfigError(f"scale is {scale}; give a positive number")
+    shift, meta = numbers(translation, "translation", (3,)), dict(scene.meta)
+    if scene.offset is not None:
+        offset = torch.tensor(scene.offset, dtype=torch.float64)
+        # What is near the origin stays there, for the digits of float32.
+        offset, shift = scale * turn @ offset + shift, torch.zeros(3, dtype=torch.float64)
+        meta["frame"] = {"transform": torch.cat([torch.eye(3), -offset[:, None]], dim=1).tolist(), "scale": 1.0}
+    elif "frame" in meta:
+        stated = torch.tensor(meta["frame"]["transform"], dtype=torch.float64)[:3]
+        size = scale * meta["frame"]["scale"]
+        stated = torch.cat([turn @ stated[:, :3], turn @ stated[:, 3:] + shift[:, None] / size], dim=1)
+        meta["frame"] = {"transform": stated.tolist(), "scale": size}
+    placed = torch.cat([turn, shift[:, None] / scale], dim=1)
+    moved = similarity({**scene.gaussians, "means": scene.means.double()}, placed, float(scale))
+    moved["means"] = moved["means"].to(scene.means)
+    inverse = torch.cat([scale * placed, torch.eye(4, dtype=torch.float64)[3:]]).inverse()
+    sizes = torch.tensor([[scale]] * 3 + [[1.0]], dtype=torch.float64)  # of what a camera sees
+
+    def seen(camera: Camera) -> Camera:
+        return camera._replace(viewmat=(sizes * camera.viewmat.double() @ inverse).to(camera.viewmat))
+
+    return dataclasses.replace(
+        scene,
+        gaussians=scene.gaussians.replaced(moved),
+        cameras=tuple(map(seen, scene.cameras)),
+        start=scene.start and seen(scene.start),
+        up=scene.up and unit(turn @ numbers(scene.up, "up", (3,))),
+        in_model_frame=False,
+        meta=meta,
+    )
+
+
+def merge(scenes: Iterable[Scene]) -> Scene:
+    """Several scenes as one, in the order given: their Gaussians and stored cameras.
+
+    All else is that of the first scene: device, background, start view, coordinates. Those of
+    others are not changed (:func:`transform` does it), except for survey coordinates, which fit. Missing SH degrees are
+    zero. A head stays if all scenes have the same one, as parts of a scene do.
+
+    Args:
+        scenes: at least one; they do not change.
+
+    Raises:
+        DataError: there is no scene, or heads, antialiasing, or the kinds of coordinates differ.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3))
+    >>> len(sn.merge([scene, sn.transform(scene, translation=(2, 0, 0))]))
+    100
+    """
+    scenes = list(scenes)
+    if not scenes or not all(isinstance(scene, Scene) for scene in scenes):
+        raise DataError("merge found no scenes; give a list of them")
+    first, encodings = scenes[0], {scene.gaussians.encoding for scene in scenes}
+    if not all(_same(first.head, scene.head) for scene in scenes):
+        raise DataError("one head cannot correct scenes of others; give dataclasses.replace(scene, head=None) of each")
+    if len({scene.antialiased for scene in scenes}) > 1:
+        raise DataError("opacities of antialiased scenes mean less than those of others; train or export all alike")
+    if len({scene.offset is None for scene in scenes}) > 1:
+        raise DataError("some scenes have survey coordinates and others not; give dataclasses.replace(scene, meta={})")
+    degree, joined = max(scene.gaussians.sh_degree for scene in scenes), []
+    for scene in scenes:
+        if scene.offset is not None and first.offset is not None and scene.offset != first.offset:
+            apart = numbers(scene.offset, "offset", (3,)) - numbers(first.offset, "offset", (3,))
+            scene = transform(dataclasses.replace(scene, meta={}), translation=apart)
+        gaussians = (scene.gaussians if len(encodings) == 1 else scene.gaussians.as_harmonics()).to(first.device)
+        missing = (0, 0, 0, (degree + 1) ** 2 - 1 - gaussians["features_rest"].shape[1])
+        joined.append((gaussians.replaced({"features_rest": pad(gaussians["features_rest"], missing)}), scene.cameras))
+    names = [name for name in first.gaussians if name != FEATURES or first.head is not None]
+    params = {name: torch.cat([gaussians[name] for gaussians, _ in joined]) for name in names}
+    return dataclasses.replace(
+        first,
+        gaussians=Gaussians(params, joined[0][0].encoding),
+        cameras=tuple(dict.fromkeys(camera for _, cameras in joined for camera in cameras)),  # parts share theirs
+        up=first.up or next((scene.up for scene in scenes if scene.up), None),
+    )
+
+
+def _same(head: CompensationHead | None, other: CompensationHead | None) -> bool:
+    if head is None or other is None or head is other:
+        return head is other
+    pairs = zip(head.state_dict().values(), other.state_dict().values())
+    return head.config == other.config and all(torch.equal(value.cpu(), same.cpu()) for value, same in pairs)
