@@ -12,11 +12,10 @@ import pytest
 import torch
 from damage import INSIDE, damage
 from fields import random_field
-from foreign_files import FOREIGN, small_field, spz
+from foreign_files import FOREIGN, small_field, spz, write_columns
 from hypothesis import HealthCheck, given, settings
 from limits import verdict
 from packed_scenes import header_and_body, resealed, sealed
-from plyfile import PlyData, PlyElement
 
 from sundae_ns.core.errors import PackError
 from sundae_ns.io.formats import read_gaussian_file, read_gaussians, write_for_viewers
@@ -47,9 +46,8 @@ def unpack(path):
 
 
 def write_cloud(path, text):
-    rows = np.zeros(30, dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
-    rows["x"] = np.linspace(-1, 1, 30)
-    PlyData([PlyElement.describe(rows, "vertex")], text=text).write(str(path))
+    columns = dict.fromkeys("xyz", np.linspace(-1, 1, 30, dtype=np.float32))
+    write_columns(path, columns | dict.fromkeys(("red", "green", "blue"), np.zeros(30, np.uint8)), text=text)
 
 
 def read_cloud(path):

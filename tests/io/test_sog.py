@@ -9,29 +9,24 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from documents import GONE, put
+from fields import assert_close
+from foreign_files import small_field
 from hypothesis import given
 from hypothesis import strategies as st
-from limits import verdict
+from limits import refused
 from PIL import Image
 
-from sundae_ns.core.errors import DataError
+import sundae_ns as sn
 from sundae_ns.io.coordinates import scene_order
 from sundae_ns.io.formats import read_gaussian_file
 from sundae_ns.io.sog import codebook, kmeans, palette, write_sog
-from sundae_ns.scene.initialization import from_points
 
 
 def gaussians(n=150, degree=3):
-    generator = torch.Generator().manual_seed(0)
-    points = 4 * torch.rand(n, 3, generator=generator) - 2
-    made = from_points(points, points / 4 + 0.5, sh_degree=degree, num_features=3, generator=generator)
-    made["quats"] = torch.randn(n, 4, generator=generator)
-    made["scales"] = -5 + torch.randn(n, 3, generator=generator)
-    made["features_dc"] = torch.randn(n, 3, generator=generator)
-    made["features_rest"] = 0.1 * torch.randn(made["features_rest"].shape, generator=generator)
-    made["opacities"] = 2 * torch.randn(n, 1, generator=generator)
-    made["opacities"][:3] = -20  # opacity level 0: colours must survive
-    return made
+    field = small_field(n, degree)
+    field["opacities"][:3] = -20  # level 0: colours must survive
+    return field
 
 
 def read(path):
@@ -209,7 +204,12 @@ Make = Callable[[dict[str, bytes]], bytes]
 
 
 def _meta(**changes):
-    return lambda files: zipped(files | {"meta.json": json.dumps(json.loads(files["meta.json"]) | changes).encode()})
+    def make(files):
+        document = json.loads(files["meta.json"])
+        put(document, changes)
+        return zipped(files | {"meta.json": json.dumps(document).encode()})
+
+    return make
 
 
 def _with(name, content):
@@ -248,6 +248,8 @@ HOSTILE = {
     "a short codebook": (_meta(scales={"codebook": [0.0], "files": SCALES}), "out of bounds"),
     "a codebook of pairs": (_meta(scales={"codebook": [[0.0, 1.0]] * 256, "files": SCALES}), "scales has shape"),
     "NaN for a bound": (_meta(means={"mins": [math.nan] * 3, "maxs": [1] * 3, "files": MEANS}), "none is finite"),
+    "the first version": (_meta(version=GONE), "has version 1 of the format; convert it with"),
+    "another version": (_meta(version=3), "has version 3 of the format"),
     "no SH degree": (_meta(shN={"bands": 9, "codebook": [0], "files": []}), "99 SH coefficients"),
 }
 
@@ -255,15 +257,35 @@ HOSTILE = {
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_hostile_bundles(tmp_path, bundled, kind):
     make, words = HOSTILE[kind]
-    path = tmp_path / "a.sog"
-    path.write_bytes(make(bundled))
-    error = verdict(lambda: read_gaussian_file(path), path.stat().st_size)
-    assert isinstance(error, DataError)
-    assert words in str(error)
+    (tmp_path / "a.sog").write_bytes(make(bundled))
+    refused(read_gaussian_file, tmp_path / "a.sog", words)
+
+
+def unbundled(folder, files):
+    """A .sog as splat-transform and SuperSplat write it for a web page."""
+    folder.mkdir()
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+def test_a_folder_is_read_as_its_bundle(tmp_path, bundled):
+    (tmp_path / "a.sog").write_bytes(zipped(bundled))
+    folder = unbundled(tmp_path / "a", bundled)
+    whole = read_gaussian_file(tmp_path / "a.sog")[0].gaussians
+    for path in (folder, folder / "meta.json"):
+        assert_close(sn.load(path).gaussians, whole, {"quats": 1e-6, "opacities": 1e-6})
+
+
+@pytest.mark.parametrize(("file", "words"), [("../x.webp", "x.webp lies elsewhere"), ("gone.webp", "cannot be read")])
+def test_a_folder_has_all_its_files(tmp_path, bundled, file, words):
+    meta = json.loads(bundled["meta.json"])
+    meta["scales"]["files"] = [file]
+    folder = unbundled(tmp_path / "a", bundled | {"meta.json": json.dumps(meta).encode()})
+    refused(read_gaussian_file, folder / "meta.json", words)
 
 
 @pytest.mark.parametrize("name", ["", "lod-meta.json"])
 def test_a_streamed_folder_is_named(tmp_path, name):
     (tmp_path / "lod-meta.json").write_text("{}")
-    with pytest.raises(DataError, match="it is streamed SOG; give the meta.json of one of its folders"):
-        read_gaussian_file(tmp_path / name)
+    refused(read_gaussian_file, tmp_path / name, "it is streamed SOG; give the meta.json of one of its folders")

@@ -1,4 +1,4 @@
-"""Parsed JSON, changed by dotted paths."""
+"""Nested dictionaries and lists, changed by paths such as ``nodes/0/scale``."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ GONE = object()
 
 
 def put(document: Any, changes: Mapping[str, Any]) -> None:
-    """Set values of a document; ``{"nodes.0.scale": [1, 2, 1]}`` names one by keys and indices."""
+    """Set values by their paths; a function makes a value of the one before."""
     for path, value in changes.items():
-        *outer, last = (int(key) if key.isdigit() else key for key in path.split("."))
+        *outer, last = (int(key) if key.isdigit() else key for key in path.split("/"))
         inner = reduce(getitem, outer, document)
         if value is GONE:
             del inner[last]
         else:
-            inner[last] = value
+            inner[last] = value(inner[last]) if callable(value) else value

@@ -1,9 +1,13 @@
-"""Random fields: one whose values are spread like those of a trained one, and one of normal values."""
+"""Random fields, like trained ones or of normal values, and the comparison of two."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn.functional import normalize
 
 
 def random_field(n: int = 600, degree: int = 2, features: int = 5, seed: int = 0) -> dict[str, Tensor]:
@@ -41,3 +45,24 @@ def normal_field(
     n, dtype = (n, dtype) if means is None else (len(means), means.dtype)
     made = {name: torch.randn(n, *shape, generator=generator).to(dtype) for name, shape in shapes.items()}
     return made if means is None else {**made, "means": means}
+
+
+def matched(found: Mapping[str, Tensor], truth: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The Gaussians that were found, in the order of the true ones, by the nearest centres."""
+    rows = torch.from_numpy(cKDTree(found["means"].numpy()).query(truth["means"].numpy())[1])
+    assert len(rows.unique()) == len(truth["means"])
+    return {name: value[rows] for name, value in found.items()}
+
+
+def assert_close(found: Mapping[str, Tensor], truth: Mapping[str, Tensor], tolerances: Mapping[str, float]) -> None:
+    """Compare fields in any order: opacities as shares, rotations up to length and sign."""
+    assert set(tolerances) <= set(found) == set(truth)
+    for name, value in matched(found, truth).items():
+        expected = truth[name]
+        if name == "opacities":
+            value, expected = value.sigmoid(), expected.sigmoid()
+        elif name == "quats":
+            value, expected = normalize(value), normalize(expected)
+            value = value * (value * expected).sum(dim=1, keepdim=True).sign()
+        tolerance = tolerances.get(name, 0.0)
+        torch.testing.assert_close(value, expected, rtol=0, atol=tolerance, msg=lambda text, n=name: f"{n}: {text}")
