@@ -1,4 +1,4 @@
-"""Rewrite the tables of README.md and docs/*.md from benchmarks/results.
+"""Rewrite the tables of README.md and docs/*.md from benchmarks/results, and the list of the library's docstrings.
 
     python benchmarks/tables.py            # rewrite every table between its markers
     python benchmarks/tables.py quality    # print one table
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import inspect
 import json
 import re
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import sundae_ns as sn
 from harness.results import spread
 from sundae_ns.core.tables import number, table
 
@@ -323,7 +325,48 @@ def prune() -> list[str]:
     return table(["capture, kept", *PRUNES.values()], made)
 
 
-MAKERS = quality, speed, training_time, packing, formats, packed_headline, equal_quality, multi_gpu, prune, trials
+def library() -> list[str]:
+    """The public names: a line with the signature and the first sentences of the docstring, then those of members."""
+    lines = []
+    for name in sn.__all__:
+        value = getattr(sn, name)
+        lines.append(f"- `sn.{_signature(name, value)}`: {_first(value)}")
+        members = vars(value).items() if value in (sn.Camera, sn.Scene) else ()
+        for member, held in members:
+            held = getattr(held, "__func__", held)  # of a class method
+            if isinstance(held, property):
+                lines.append(f"  - `{name}.{member}`: {_first(held)}")
+            elif inspect.isfunction(held) and held.__doc__ and (member[0] != "_" or member == "__getitem__"):
+                lines.append(f"  - `{name}.{_signature(member, held)}`: {_first(held)}")
+    return lines
+
+
+def _signature(name: str, value: Any) -> str:
+    if isinstance(value, type) and value is not sn.PruneRule:  # which callers do not make by hand
+        return name
+    parameters = re.sub(r"(: |-> )'([^']+)'", r"\1\2", str(inspect.signature(value)))
+    return name + re.sub(r"\((self|cls)(, )?", "(", parameters, count=1)
+
+
+def _first(value: Any) -> str:
+    """The first paragraph of a docstring in one line, code in single backticks."""
+    paragraph = (inspect.getdoc(value) or "").partition("\n\n")[0]
+    return re.sub(r":\w+:`[.~]?([^`]+)`", r"`\1`", " ".join(paragraph.split())).replace("``", "`")
+
+
+MAKERS = (
+    quality,
+    speed,
+    training_time,
+    packing,
+    formats,
+    packed_headline,
+    equal_quality,
+    multi_gpu,
+    prune,
+    trials,
+    library,
+)
 TABLES: dict[str, Callable[[], list[str]]] = {make.__name__.replace("_", "-"): make for make in MAKERS}
 
 
