@@ -68,20 +68,19 @@ def _coded(coder, stream, chance, bit):  # type: ignore[no-untyped-def]
 
 @compiled
 def _chances(contexts, decisions):  # type: ignore[no-untyped-def]
-    """Chances in all contexts, counts of their decisions, weights of the mix, places of contexts, and scratch."""
-    model = np.full(contexts * _NODES, _EVEN, np.int32)
-    counts = np.zeros(contexts * _NODES, np.uint8)
+    """Chances in all contexts, 16 bits above the count of their decisions, weights of the mix, places, and scratch."""
+    model = np.full(contexts * _NODES, _EVEN << 7, np.int32)
     weights = np.full((decisions * _NODES, CONTEXTS), 0x5000, np.int32)
-    return model, counts, weights, np.zeros(CONTEXTS, np.int64), np.zeros(CONTEXTS, np.int64)
+    return model, weights, np.zeros(CONTEXTS, np.int64), np.zeros(CONTEXTS, np.int64)
 
 
 @inlined
 def _decided(coder, stream, chances, row, node, bit):  # type: ignore[no-untyped-def]
     """Code the decision ``node`` with the mix of its chances in the contexts at ``places``, and adapt them."""
-    model, counts, weights, places, scores = chances
+    model, weights, places, scores = chances
     total = 0
     for c in range(CONTEXTS):
-        scores[c] = _STRETCH[model[places[c] + node] >> 4]
+        scores[c] = _STRETCH[model[places[c] + node] >> 11]
         total += scores[c] * weights[row, c]
     chance = _SQUASH[min(max(total >> 16, -2047), 2047) + 2047]
     bit = _coded(coder, stream, chance << 4, bit)
@@ -89,11 +88,10 @@ def _decided(coder, stream, chances, row, node, bit):  # type: ignore[no-untyped
     for c in range(CONTEXTS):
         weights[row, c] = min(max(weights[row, c] + ((scores[c] * error + 0x8000) >> 16), -(1 << 19)), 1 << 19)
         place = places[c] + node
-        count = counts[place]
-        moved = model[place] + ((((bit * 65535 - model[place]) >> 3) * _RATES[count]) >> 13)
-        model[place] = min(max(moved, 16), 65519)
-        if count < 127:
-            counts[place] = count + 1
+        count = model[place] & 127
+        chance = model[place] >> 7
+        moved = chance + ((((bit * 65535 - chance) >> 3) * _RATES[count]) >> 13)
+        model[place] = min(max(moved, 16), 65519) << 7 | min(count + 1, 127)
     return bit
 
 
@@ -151,7 +149,7 @@ def _run(levels, near, stream, coder, reading):  # type: ignore[no-untyped-def]
     n, width = levels.shape
     each = 63 + _CLASSES * _CLASSES
     chances = _chances(width * each, width)
-    places = chances[3]
+    places = chances[2]
     for i in range(n):
         total = 0
         for k in range(width):
@@ -197,7 +195,7 @@ def _search(cells, block, near):  # type: ignore[no-untyped-def]
 def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-untyped-def]
     """Code ascending Morton codes ``[N]``: the number of digits of each difference, and its digits."""
     chances = _chances(1 + 3 * 64, 1)
-    places = chances[3]
+    places = chances[2]
     last, before, average = 0, 0, 0
     for i in range(len(codes)):
         gap, digits = 0, 0
