@@ -12,7 +12,7 @@ import pytest
 import torch
 from damage import INSIDE, damage
 from fields import random_field
-from foreign_files import FOREIGN, small_field, spz, write_columns
+from foreign_files import FOREIGN, small_field, spz, write_checkpoint, write_columns
 from hypothesis import HealthCheck, given, settings
 from limits import verdict
 from packed_scenes import header_and_body, resealed, sealed
@@ -56,11 +56,6 @@ def read_cloud(path):
         from_points(points, rgb.float() / 255, sh_degree=1, num_features=0)
 
 
-def write_checkpoint(path):
-    state = {f"_model.gauss_params.{name}": value for name, value in small_field(20).items()}
-    torch.save({"step": 3, "pipeline": state}, path)
-
-
 READERS = {
     **{
         name: (lambda path, write=write: write(path, small_field(60)), read_gaussian_file)
@@ -75,7 +70,7 @@ READERS = {
     "field.ply": (lambda path: FOREIGN["plain.ply"](path, small_field(20)), read_gaussians),
     "cloud.ply": (lambda path: write_cloud(path, text=False), read_cloud),
     "text.ply": (lambda path: write_cloud(path, text=True), read_cloud),
-    "a.ckpt": (write_checkpoint, read_gaussians),
+    "a.ckpt": (lambda path: write_checkpoint(path, small_field(20)), read_gaussians),
     "a.sundae": (lambda path: write_scene(path, scene()), unpack),
 }
 """Files by their names: a writer, and the reader that must survive them."""

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from foreign_files import small_field
+from foreign_files import small_field, write_checkpoint
 from limits import verdict
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from packed_scenes import resection
 from small_captures import meta_of
 
 from sundae_ns.io import checkpoint
@@ -77,8 +78,7 @@ def test_the_hook_records_writes_and_no_reads(tmp_path):
 def a_checkpoint(path, place):
     """Write a checkpoint that names ``place`` as a member of its archive, as the target of a link and as a tensor."""
     buffer = io.BytesIO()
-    state = {f"_model.gauss_params.{name}": value for name, value in small_field(20).items()}
-    torch.save({"step": 3, "pipeline": state | {place: torch.zeros(2)}}, buffer)
+    write_checkpoint(buffer, small_field(20), {place: torch.zeros(2)})
     with zipfile.ZipFile(buffer, "a", zipfile.ZIP_STORED) as archive:
         archive.writestr(place, b"outside")
         link = zipfile.ZipInfo("archive/link")
@@ -91,10 +91,7 @@ def a_pack(path, place):
     """Write a packed scene that names ``place`` throughout its header, and as a section, which readers may refuse."""
     about = {"source": {"method": place}, "name": place, "model": {"sh_degree": 1}}
     write_scene(path, PackedScene(small_field(20), meta=about))
-    header = container.read_header(path)
-    meta = {name: value for name, value in header.meta.items() if name != "sections"}
-    arrays = container.read_sections(path, header)
-    path.write_bytes(container.encode(meta, {**arrays, place: arrays["means/low"]})[0])
+    resection(path, place, container.read_sections(path, container.read_header(path))["means/low"])
 
 
 def a_ply(path, place):

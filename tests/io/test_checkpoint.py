@@ -1,21 +1,26 @@
-"""Checkpoints: those that load, those that are refused in one line, and fields from files of other programs."""
+"""Checkpoints: those that load, those that are refused in one line, and those that a training replaces meanwhile."""
 
 import pickle
-import re
+import shutil
+import threading
 import zipfile
+from pathlib import Path
 
 import pytest
 import torch
-from foreign_files import small_field
-from limits import verdict
+from command_line import run as run_command
+from foreign_files import small_field, write_checkpoint
+from limits import refused
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
+import sundae_ns as sn
 from sundae_ns.core import gaussians as core_gaussians
 from sundae_ns.core.errors import CheckpointError
 from sundae_ns.core.gaussians import SPLAT_NAMES, finite_mask, sh_to_rgb
 from sundae_ns.io import checkpoint
 from sundae_ns.io.formats import read_gaussians
-from sundae_ns.io.ply import MODEL_FRAME, write_ply
+
+FIELD = small_field(6)
 
 
 def model_state(n=6, degree=3, **extra):
@@ -39,37 +44,6 @@ def check(state):
     """The checks of a checkpoint against a model of 6 Gaussians, in the order of loading."""
     checkpoint.check_extra_state(state, 5, "harmonics")
     checkpoint.check_model_state(state, model_state(6))
-
-
-def stock_checkpoint(path, prefix="_model.", n=6):
-    """A checkpoint of splatfacto by nerfstudio's trainer, whose scheduler leaves a numpy number in it."""
-    params = small_field(n)
-    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
-    config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
-    scheduler = config.setup().get_scheduler(optimizer, lr_init=1.6e-4)
-    optimizer.step()
-    scheduler.step()
-    torch.save(
-        {
-            "step": 1,
-            "pipeline": {f"{prefix}gauss_params.{name}": value for name, value in params.items()},
-            "optimizers": {"means": optimizer.state_dict()},
-            "schedulers": {"means": scheduler.state_dict()},
-            "scalers": {},
-        },
-        path,
-    )
-    return params
-
-
-def one_line(error):
-    return isinstance(error, ValueError) and "\n" not in str(error)
-
-
-def test_another_number_of_primitives_fits_but_not_none():
-    check(model_state(9))
-    with pytest.raises(CheckpointError, match=r"parameters of \[0\] Gaussians"):
-        check(model_state(0))
 
 
 def _without(name):
@@ -103,74 +77,62 @@ def _without(name):
             r"networks.head.weight is \[8, 4\].*\[4, 4\].*--pipeline.model.head.size",
         ),
         (model_state(degree=2), r"features_rest is \[6, 8, 3\].*\[6, 15, 3\]"),
+        (model_state(0), r"parameters of \[0\] Gaussians"),
     ],
 )
 def test_a_checkpoint_that_does_not_fit_is_refused(state, cause):
+    check(model_state(9))  # another number of Gaussians fits
     with pytest.raises(CheckpointError, match=cause) as caught:
         check(state)
-    assert one_line(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("prefix", ["_model.", "_model.module."])
-def test_stock_checkpoint_with_numpy_numbers(tmp_path, prefix):
-    params = stock_checkpoint(tmp_path / "step-000000001.ckpt", prefix)
-    read, in_model_frame = read_gaussians(tmp_path / "step-000000001.ckpt")
+def test_a_checkpoint_of_splatfacto_has_numpy_numbers(tmp_path, prefix):
+    """nerfstudio's scheduler leaves one in it."""
+    path, optimizer = tmp_path / "step-000000001.ckpt", torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1e-4)
+    config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
+    scheduler = config.setup().get_scheduler(optimizer, lr_init=1.6e-4)
+    optimizer.step()
+    scheduler.step()
+    state = {f"{prefix}gauss_params.{name}": value for name, value in FIELD.items()}
+    write_checkpoint(path, {}, state, schedulers={"means": scheduler.state_dict()})
+    read, in_model_frame = read_gaussians(path)
     assert in_model_frame
     assert tuple(read) == SPLAT_NAMES
-    assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
+    assert all(torch.equal(read[name], FIELD[name]) for name in SPLAT_NAMES)
     with pytest.raises(Exception, match="[Ww]eights.only"):  # numpy is allowed for one file only
-        torch.load(tmp_path / "step-000000001.ckpt", weights_only=True)
+        torch.load(path, weights_only=True)
 
 
-SUNDAE = {"method": "sundae", "format": checkpoint.FORMAT}
-
-
-def save_without_harmonics(folder, extra):
-    """A checkpoint of SH degree 0, with the state of a model beside its tensors if any is given."""
-    state = {f"_model.gauss_params.{name}": value for name, value in small_field(6).items()}
-    state["_model.gauss_params.features_rest"] = state["_model.gauss_params.features_rest"][:, :0]
-    if extra is not None:
-        state["_model._extra_state"] = extra
-    torch.save({"step": 1, "pipeline": state}, folder / "step-000000001.ckpt")
+OURS = {"method": "sundae", "format": checkpoint.FORMAT}
+UNKNOWN = "does not say how it stores colours"
 
 
 @pytest.mark.parametrize(
-    ("extra", "logits"),
+    ("extra", "stored"),
     [
-        (None, True),
-        ({}, True),
-        ({"method": "other"}, True),
-        ({**SUNDAE, "encoding": "logits"}, True),
-        ({**SUNDAE, "encoding": "harmonics"}, False),
-    ],
-)
-def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path, extra, logits):
-    """Logits if the model was built at degree 0, harmonics if a search has lowered the degree."""
-    save_without_harmonics(tmp_path, extra)
-    read, _ = read_gaussians(tmp_path)
-    stored = small_field(6)["features_dc"]
-    expected = sh_to_rgb(read["features_dc"]).logit() if logits else read["features_dc"]
-    torch.testing.assert_close(expected, stored)
-
-
-@pytest.mark.parametrize(
-    ("extra", "cause"),
-    [
+        (None, "logits"),
+        ({}, "logits"),
+        ({"method": "other"}, "logits"),
+        ({**OURS, "encoding": "logits"}, "logits"),
+        ({**OURS, "encoding": "harmonics"}, "harmonics"),
         (
             {"method": "sundae", "format": 1, "logits": True},
             "format 1, this version reads 2; use the version that wrote",
         ),
-        (SUNDAE, "does not say how it stores colours"),
-        ({**SUNDAE, "encoding": "words"}, "does not say how it stores colours"),
-        ({**SUNDAE, "encoding": torch.zeros(2)}, "does not say how it stores colours"),
+        *((extra, UNKNOWN) for extra in (OURS, {**OURS, "encoding": "words"}, {**OURS, "encoding": torch.zeros(2)})),
     ],
 )
-def test_a_field_of_another_format_is_refused(tmp_path, extra, cause):
-    """Its colours could be misread silently."""
-    save_without_harmonics(tmp_path, extra)
-    with pytest.raises(CheckpointError, match=cause) as caught:
-        read_gaussians(tmp_path)
-    assert one_line(caught.value)
+def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path, extra, stored):
+    """Logits if the model was built at degree 0, harmonics if a search has lowered the degree; no others in silence."""
+    field, path = {**FIELD, "features_rest": FIELD["features_rest"][:, :0]}, tmp_path / "step-000000001.ckpt"
+    write_checkpoint(path, field, {} if extra is None else {"_model._extra_state": extra})
+    if stored in ("logits", "harmonics"):
+        colors = read_gaussians(path)[0]["features_dc"]
+        torch.testing.assert_close(sh_to_rgb(colors).logit() if stored == "logits" else colors, FIELD["features_dc"])
+    else:
+        refused(read_gaussians, path, stored, CheckpointError)
 
 
 def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(tmp_path, monkeypatch):
@@ -181,36 +143,22 @@ def test_a_field_is_mended_once_and_one_without_a_meaning_is_refused(tmp_path, m
         return finite_mask(params)
 
     monkeypatch.setattr(core_gaussians, "finite_mask", count)
-    stored = stock_checkpoint(tmp_path / "step-000000001.ckpt", n=4)
-    assert torch.equal(read_gaussians(tmp_path)[0]["means"], stored["means"])
-    assert sanitised == [4]
-    loaded = checkpoint.read(tmp_path / "step-000000001.ckpt")
-    loaded["pipeline"]["_model.gauss_params.means"].fill_(torch.nan)
-    torch.save(loaded, tmp_path / "step-000000002.ckpt")
-    with pytest.raises(CheckpointError, match=r"has 4 Gaussians, and none is finite"):
-        read_gaussians(tmp_path)
+    write_checkpoint(tmp_path / "step-000000001.ckpt", FIELD)
+    assert torch.equal(read_gaussians(tmp_path)[0]["means"], FIELD["means"])
+    assert sanitised == [6]
+    write_checkpoint(tmp_path / "step-000000002.ckpt", {**FIELD, "means": torch.full((6, 3), torch.nan)})
+    refused(read_gaussians, tmp_path, "has 6 Gaussians, and none is finite", CheckpointError)
 
 
 @pytest.mark.parametrize("inside", [".", "nerfstudio_models"])
 def test_newest_of_a_folder(tmp_path, inside):
     (tmp_path / inside).mkdir(exist_ok=True)
-    stock_checkpoint(tmp_path / inside / "step-000000999.ckpt", n=3)
-    newest = stock_checkpoint(tmp_path / inside / "step-000029999.ckpt", n=4)
-    assert torch.equal(read_gaussians(tmp_path)[0]["means"], newest["means"])
+    write_checkpoint(tmp_path / inside / "step-000000999.ckpt", small_field(3))
+    write_checkpoint(tmp_path / inside / "step-000029999.ckpt", FIELD)
+    assert torch.equal(read_gaussians(tmp_path)[0]["means"], FIELD["means"])
 
 
-@pytest.mark.parametrize(("comments", "in_model_frame"), [((), False), ((MODEL_FRAME,), True)])
-def test_ply(tmp_path, comments, in_model_frame):
-    params = small_field(6)
-    write_ply(tmp_path / "a.ply", params, comments=list(comments))
-    read, in_frame = read_gaussians(tmp_path / "a.ply")
-    assert in_frame is in_model_frame
-    assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
-    renamed = (tmp_path / "a.ply").rename(tmp_path / "cloud")
-    assert torch.equal(read_gaussians(renamed)[0]["means"], params["means"])
-
-
-def _save(content):
+def _saved(content):
     return lambda path: torch.save(content, path)
 
 
@@ -274,20 +222,92 @@ WRONG = {
     "empty folder": (lambda path: path.mkdir(), "holds no checkpoint"),
     "no checkpoint": (lambda path: path.write_text("hello"), "is not a nerfstudio checkpoint"),
     "empty file": (lambda path: path.write_bytes(b""), "is not a nerfstudio checkpoint"),
-    "only tensors": (_save({"weight": torch.zeros(2)}), "it holds no model"),
-    "no step": (_save({"pipeline": {"_model.field.weight": torch.zeros(2)}}), "after which step it was saved"),
-    "a step of words": (_save({"step": "3", "pipeline": {}}), "after which step it was saved"),
-    "a number for a name": (_save({"step": 3, "pipeline": {3: torch.zeros(2)}}), "it holds no model"),
-    "a list": (_save([1, 2]), "is not a nerfstudio checkpoint"),
-    "another method": (_save({"step": 3, "pipeline": {"_model.field.weight": torch.zeros(2)}}), "holds no Gaussians"),
+    "only tensors": (_saved({"weight": torch.zeros(2)}), "it holds no model"),
+    "no step": (_saved({"pipeline": {"_model.field.weight": torch.zeros(2)}}), "after which step it was saved"),
+    "a step of words": (_saved({"step": "3", "pipeline": {}}), "after which step it was saved"),
+    "a number for a name": (_saved({"step": 3, "pipeline": {3: torch.zeros(2)}}), "it holds no model"),
+    "a list": (_saved([1, 2]), "is not a nerfstudio checkpoint"),
+    "another method": (_saved({"step": 3, "pipeline": {"_model.field.weight": torch.zeros(2)}}), "holds no Gaussians"),
 }
 
 
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_file_without_a_field_is_refused(tmp_path, wrong):
-    make, cause = WRONG[wrong]
-    path = tmp_path / "a.ckpt"
-    make(path)
-    error = verdict(lambda: read_gaussians(path), path.stat().st_size if path.is_file() else 0)
-    assert isinstance(error, CheckpointError)
-    assert re.search(cause, str(error)), error
+    make, words = WRONG[wrong]
+    make(tmp_path / "a.ckpt")
+    refused(read_gaussians, tmp_path / "a.ckpt", words, CheckpointError)
+
+
+class Training:
+    """A run whose checkpoint is replaced as the trainer does it: the next one appears, then the others go."""
+
+    def __init__(self, folder):
+        self.run, self.step, self.whole = folder / "run", 0, folder / "whole"
+        self.models = self.run / "nerfstudio_models"
+        self.models.mkdir(parents=True)
+        (self.run / "config.yml").write_text("pipeline:\n  model: {}\n")
+        write_checkpoint(self.whole, FIELD)
+        self.save()
+
+    def save(self):
+        self.step += 1
+        new = Path(shutil.copy(self.whole, self.models / "partial")).replace(self.models / f"step-{self.step:09d}.ckpt")
+        for other in self.models.glob("step-*"):
+            if other != new:
+                other.unlink()
+
+
+@pytest.fixture
+def training(tmp_path):
+    return Training(tmp_path)
+
+
+READERS = {
+    "load": sn.load,
+    "read_gaussians": read_gaussians,
+    "export": lambda run: run_command("export", run, "-o", run.parent / "a.ply", "--overwrite"),
+}
+
+
+@pytest.mark.parametrize("lost", ["listed", "checked"])
+@pytest.mark.parametrize("reader", READERS)
+def test_a_checkpoint_may_go_between_any_two_steps_of_a_read(training, monkeypatch, reader, lost):
+    module, name = {"listed": (checkpoint, "checkpoints"), "checked": (torch, "load")}[lost]
+    original, after = getattr(module, name), lost == "listed"
+    replaced = []
+
+    def replacing(*arguments, **options):
+        found = original(*arguments, **options) if after else None
+        if len(replaced) < 2:
+            replaced.append(True)
+            training.save()
+        return found if after else original(*arguments, **options)
+
+    monkeypatch.setattr(module, name, replacing)
+    assert READERS[reader](training.run) != 2
+    assert replaced
+
+
+def test_every_read_beside_a_training_that_saves_all_the_time_succeeds(training):
+    done = threading.Event()
+
+    def save():
+        while not done.is_set():
+            training.save()
+
+    thread = threading.Thread(target=save)
+    thread.start()
+    try:
+        while training.step < 50:
+            assert sn.load(training.run).num_gaussians == 6
+    finally:
+        done.set()
+        thread.join()
+
+
+def test_a_run_without_a_whole_checkpoint_is_refused_at_once(training):
+    (newest,) = training.models.iterdir()
+    newest.write_bytes(b"half")
+    (training.models / "step-000000009.ckpt").symlink_to("nowhere")
+    with pytest.raises(CheckpointError, match=r"step-000000009.ckpt is not whole \(No such file.*; step-000000001"):
+        sn.load(training.run)

@@ -7,6 +7,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -140,6 +141,14 @@ def write_gsplat(path: Path, gaussians: Mapping[str, Tensor], **others: object) 
         "shN": gaussians["features_rest"],
     }
     torch.save({"step": 6999, "splats": splats, **others}, path)
+
+
+def write_checkpoint(
+    path: Path, gaussians: Mapping[str, Tensor], extra: Mapping[str, Any] = MappingProxyType({}), **others: object
+) -> None:
+    """As nerfstudio's trainer after its first step; ``extra`` is further state of the pipeline."""
+    state = {f"_model.gauss_params.{name}": value for name, value in gaussians.items()}
+    torch.save({"step": 1, "pipeline": state | dict(extra), **others}, path)
 
 
 def spz(

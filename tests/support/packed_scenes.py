@@ -11,9 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from documents import put
+from fields import random_field
 from torch import Tensor
 
 from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.io.pack import container
 from sundae_ns.io.pack.codecs import Sensitivity
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
@@ -171,3 +174,29 @@ def resealed(meta: dict[str, Any], body: bytes) -> bytes:
         end = offset + sum(section["parts"])
         section["sha256"], offset = hashlib.sha256(body[offset:end]).hexdigest(), end
     return sealed(meta, body)
+
+
+def full_scene(n: int = 600, degree: int = 2, features: int = 5, meta: dict[str, Any] | None = None) -> PackedScene:
+    """A random field with a head of one layer and two cameras."""
+    generator = torch.Generator().manual_seed(1)
+    head = {"a.weight": torch.randn(4, 3, 3, 3, generator=generator), "a.bias": torch.randn(4, generator=generator)}
+    cameras = {
+        "poses": torch.eye(4)[:3].repeat(2, 1, 1),
+        "intrinsics": torch.tensor([[50.25, 51.5, 31.5, 24.0]]).double().repeat(2, 1),
+        "sizes": torch.tensor([[64, 48], [32, 24]]),
+    }
+    return PackedScene(random_field(n, degree, features), head, cameras, meta or {})
+
+
+def restate(path: Path, changes: Mapping[str, Any]) -> None:
+    """Change values of the header by their paths; checksums stay valid."""
+    meta, body = header_and_body(path.read_bytes())
+    put(meta, changes)
+    path.write_bytes(sealed(meta, body))
+
+
+def resection(path: Path, name: str, array: Any) -> None:
+    """Replace or add a section; checksums stay valid."""
+    header = container.read_header(path)
+    meta = {key: value for key, value in header.meta.items() if key != "sections"}
+    path.write_bytes(container.encode(meta, {**container.read_sections(path, header), name: array})[0])
