@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,8 +15,17 @@ from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, Sanitised, sanitise
 from sundae_ns.io import checkpoint
 from sundae_ns.io.coordinates import Direction, recentred, similarity, upward
 from sundae_ns.io.gltf import read_glb, write_glb
-from sundae_ns.io.ply import MAX_SH_DEGREE, Marks, check_gaussians, comments_of, ply_marks, read_ply, write_ply
-from sundae_ns.io.sog import METAS, read_sog, write_sog
+from sundae_ns.io.ply import (
+    MAX_SH_DEGREE,
+    UNMARKED,
+    Marks,
+    check_gaussians,
+    comments_of,
+    ply_marks,
+    read_ply,
+    write_ply,
+)
+from sundae_ns.io.sog import METAS, read_sog, write_sog, write_streamed
 from sundae_ns.io.splat import read_gsplat, read_ksplat, read_splat
 from sundae_ns.io.spz import read_spz, write_spz
 
@@ -36,6 +45,8 @@ _UNREAD = {
     ".pth": "is a checkpoint of another trainer; give its .ply, such as point_cloud/iteration_*/point_cloud.ply",
 }
 _READERS: dict[Kind | None, Callable[[Path], Any]] = {"spz": read_spz, "sog": read_sog, "glb": read_glb}
+_WRITERS: dict[str, Callable[..., None]] = {".spz": write_spz, ".sog": write_sog, ".glb": write_glb}
+_WRITERS[".ply"] = lambda path, gaussians, marks: write_ply(path, gaussians, comments=comments_of(marks))
 _READERS |= {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}
 # In nerfstudio and in gsplat's trainer, z points up; in a 3DGS .ply, -y does.
 _MODEL_UP, _PLY_UP = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
@@ -96,20 +107,15 @@ def refuse(path: Path, *, packed: str | None = None, primitives: str | None = No
 
 
 def read_gaussian_file(path: Path) -> tuple[Sanitised, Marks]:
-    """Read a file of Gaussians of any program. Nothing in it is executed.
+    """Read a file of Gaussians of any program, and what it states of them. Nothing in it is executed.
 
-    Returns:
-        The Gaussians that have a meaning, with finite values, float32 on the CPU, and what was clamped or dropped; and
-        what the file states of them.
-
-    Raises:
-        DataError: the file is missing, damaged, of another kind, or has no finite Gaussian.
+    The Gaussians that have a meaning get finite values, float32 on the CPU. ``DataError`` if the file is missing,
+    damaged, of another kind, or has no finite Gaussian.
     """
     kind = kind_of_gaussians(path)
     read = _READERS[kind](path) if kind in _READERS else (read_ply(path), ply_marks(path))
-    params, *stated = read if isinstance(read, tuple) else (read,)
+    params, marks = read if isinstance(read, tuple) else (read, UNMARKED)
     params["means"], offset = recentred(params["means"])
-    marks = stated[0] if stated and isinstance(stated[0], Marks) else Marks(*stated)
     if offset is not None:
         _log.warning("%s lies where float32 is too coarse; its coordinates are less %.10g %.10g %.10g", path, *offset)
         x, y, z = map(sum, zip(offset, marks.offset or (0.0, 0.0, 0.0), strict=True))
@@ -141,13 +147,9 @@ def usable(params: Mapping[str, Tensor], path: Path, failure: type[SundaeError] 
 def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
     """Read a checkpoint, the newest of a folder, a packed scene without its head, or a file of Gaussians.
 
-    Returns:
-        Finite Gaussians without features, float32 on the CPU (centres of survey coordinates are float64), colours as
-        harmonics; and whether coordinates are those of nerfstudio's model, not of a capture.
-
-    Raises:
-        CheckpointError: there is no such file, it holds no Gaussians, or has another format.
-        PackError: the packed scene is damaged.
+    Returns finite Gaussians without features, float32 on the CPU (centres of survey coordinates are float64), colours
+    as harmonics; and whether coordinates are those of nerfstudio's model, not of a capture. ``CheckpointError`` for no
+    such file, no Gaussians, or another format; ``PackError`` for a damaged pack.
     """
     wanted = "give a .ckpt file, the folder of them, or a .ply"
     if not path.exists():
@@ -183,39 +185,38 @@ def read_gaussians(path: Path) -> tuple[dict[str, Tensor], bool]:
 def write_for_viewers(
     path: Path, params: Mapping[str, Tensor], marks: Marks | None = None, *, upright: bool = False
 ) -> dict[str, Tensor]:
-    """Write Gaussians in the format of the file's suffix, one of :data:`FORMATS`, atomically.
+    """Write Gaussians in the format of the file's suffix, one of :data:`FORMATS`, atomically; its folder must exist.
 
-    Drops Gaussians without a meaning (``gaussians.sanitise``), and SH coefficients above the format's degree.
-
-    Args:
-        path: its folder must exist.
-        params: see :mod:`sundae_ns.core.gaussians`. A :class:`Gaussians` says how it stores colours.
-        marks: what the file states of the scene, as far as its format can; None for nothing.
-        upright: rotate from nerfstudio's axes to those of a 3DGS .ply, which viewers show upright; a .glb always is.
-
-    Returns:
-        The Gaussians of the file, on the CPU, before its format rounds them.
-
-    Raises:
-        DataError: wrong shapes, or the format cannot store the Gaussians.
-        StorageError: the disk is full or not writable.
+    Drops Gaussians without a meaning (``gaussians.sanitise``), and SH coefficients above the format's degree. ``marks``
+    are stated as far as the format can. ``upright`` rotates from nerfstudio's axes to those of a 3DGS .ply, which
+    viewers show upright; a .glb always is. Returns the Gaussians of the file, on the CPU, before its format rounds
+    them. ``DataError`` for wrong shapes or what the format cannot store; ``StorageError`` if the disk is full or not
+    writable.
     """
-    check_gaussians(params)
-    marks, sanitised = marks or Marks(), sanitise(params).gaussians
-    gaussians = {name: value.detach().cpu() for name, value in sanitised.as_harmonics().items()}
     kind = path.suffix.lower()
+    gaussians, marks = _for_viewers(params, kind, marks or UNMARKED, upright)
+    if kind == ".spz" and marks.offset is not None:
+        _log.warning("%s cannot hold the offset of its coordinates; a .ply, .sog or .glb can", path)
+    _WRITERS[kind](path, gaussians, marks)
+    return gaussians
+
+
+def write_levels(folder: Path, levels: Iterable[Mapping[str, Tensor]], marks: Marks, *, upright: bool = False) -> None:
+    """Write levels of detail, the full one first, as streamed SOG; all else as :func:`write_for_viewers`."""
+    written = [_for_viewers(level, ".sog", marks, upright) for level in levels]
+    write_streamed(folder, [gaussians for gaussians, _ in written], written[0][1])
+
+
+def _for_viewers(
+    params: Mapping[str, Tensor], kind: str, marks: Marks, upright: bool
+) -> tuple[dict[str, Tensor], Marks]:
+    """The Gaussians of a file of a kind, on the CPU, and its marks."""
+    check_gaussians(params)
+    gaussians = {name: value.detach().cpu() for name, value in sanitise(params).gaussians.as_harmonics().items()}
     if upright and kind != ".glb":
         gaussians = similarity(gaussians, _UPRIGHT, 1.0)
         x, y, z = (_UPRIGHT[:, :3] @ torch.tensor(marks.up or _MODEL_UP)).tolist()
         marks = marks._replace(in_model_frame=False, up=(x, y, z))
-    if kind == ".ply":
-        write_ply(path, gaussians, comments=comments_of(marks))
-        return gaussians
-    gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
-    if kind == ".glb":
-        write_glb(path, gaussians, antialiased=marks.antialiased, in_model_frame=marks.in_model_frame)
-    elif kind == ".sog":
-        write_sog(path, gaussians, antialiased=marks.antialiased, up=marks.up or ())
-    else:
-        write_spz(path, gaussians, antialiased=marks.antialiased)
-    return gaussians
+    if kind != ".ply":
+        gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
+    return gaussians, marks

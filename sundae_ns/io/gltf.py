@@ -8,6 +8,8 @@ The document has a node, a mesh and a Gaussian of points. Its attributes are flo
 and after the extension's name ROTATION (unit quaternions xyzw), SCALE (widths), OPACITY, and SH_DEGREE_l_COEF_n; and
 COLOR_0 in bytes, for programs without the extension. Values are exact. three.js, PlayCanvas and Babylon.js read them.
 
+``asset.extras.sundae_ns``, which other programs ignore, keeps the marks of the scene (``Marks``), such as an offset.
+
 In glTF +y points up. A scene of nerfstudio's model, where z does, is turned to that and says so, and is turned back
 when it is read. Other scenes have no known axes; like ``splat-transform`` this module takes the file's -y as up, as in
 most .ply files, and turns them about z.
@@ -32,7 +34,7 @@ from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SH_C0, sh_degree
 from sundae_ns.io.budget import afford, afford_gaussians, parsed_json
 from sundae_ns.io.coordinates import similarity
-from sundae_ns.io.ply import LEAST_OPACITY, MAX_SH_DEGREE, check_gaussians, checked
+from sundae_ns.io.ply import LEAST_OPACITY, MAX_SH_DEGREE, UNMARKED, Marks, check_gaussians, checked, vector
 from sundae_ns.io.spz import decoded
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -49,7 +51,7 @@ _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _FROM_MODEL = torch.tensor([[-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])  # its own inverse
 _FROM_PLY = torch.tensor([[-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])  # its own inverse
 Transforms = NDArray[np.float64]
-_OURS, _MODEL_FRAME, _ANTIALIASED = "sundae_ns", "modelFrame", "antialiased"
+_OURS, _MARKS = "sundae_ns", ("antialiased", "modelFrame", "up", "offset")  # extras of the asset, in the order of Marks
 
 
 def semantics(degree: int) -> list[str]:
@@ -57,14 +59,9 @@ def semantics(degree: int) -> list[str]:
     return [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{n}" for d in range(1, degree + 1) for n in range(2 * d + 1)]
 
 
-def write_glb(
-    path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False, in_model_frame: bool = False
-) -> None:
-    """Write the base colours of Gaussians that ``ply.checked`` accepts as a .glb, atomically.
-
-    ``in_model_frame`` says that they are in the coordinates of nerfstudio's model.
-    """
-    gaussians = similarity(checked(path, params), _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0)
+def write_glb(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED) -> None:
+    """Write the base colours of Gaussians that ``ply.checked`` accepts as a .glb, atomically."""
+    gaussians = similarity(checked(path, params), _FROM_MODEL if marks.in_model_frame else _FROM_PLY, 1.0)
     opacities = gaussians["opacities"].sigmoid()
     colors = torch.cat([SH_C0 * gaussians["features_dc"] + 0.5, opacities], dim=1).clamp(0, 1)
     attributes = {
@@ -77,20 +74,7 @@ def write_glb(
     }
     rest = gaussians["features_rest"].unbind(dim=1)
     attributes |= dict(zip(semantics(sh_degree(gaussians["features_rest"])), rest, strict=True))
-    marks = {_MODEL_FRAME: in_model_frame, _ANTIALIASED: antialiased}
-    document, binary = _document(attributes, {name: True for name, applies in marks.items() if applies})
-    chunks: list[bytes | bytearray] = [
-        _CHUNK.pack(len(document), _JSON),
-        document,
-        _CHUNK.pack(len(binary), _BINARY),
-        binary,
-    ]
-    with replacing(path) as partial, partial.open("wb") as file:
-        file.writelines([_HEADER.pack(b"glTF", 2, _HEADER.size + sum(map(len, chunks))), *chunks])
-
-
-def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tuple[bytes, bytearray]:
-    """The JSON and the buffer of a file with one primitive of these attributes."""
+    stated = {name: value for name, value in zip(_MARKS, marks, strict=True) if value}
     accessors: list[dict[str, Any]] = []
     buffer_views: list[dict[str, int]] = []
     buffer = bytearray()
@@ -110,7 +94,7 @@ def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tu
     indices = {name: i for i, name in enumerate(attributes)}
     primitive = {"attributes": indices, "mode": 0, "extensions": {EXTENSION: look}}  # 0 stands for points
     document = {
-        "asset": {"version": "2.0", "generator": "sundae_ns", **({"extras": {_OURS: marks}} if marks else {})},
+        "asset": {"version": "2.0", "generator": "sundae_ns", **({"extras": {_OURS: stated}} if stated else {})},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -121,13 +105,16 @@ def _document(attributes: Mapping[str, Tensor], marks: Mapping[str, bool]) -> tu
         "buffers": [{"byteLength": len(buffer)}],
     }
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    return text + b" " * (-len(text) % 4), buffer
+    text += b" " * (-len(text) % 4)
+    chunks: list[bytes | bytearray] = [_CHUNK.pack(len(text), _JSON), text, _CHUNK.pack(len(buffer), _BINARY), buffer]
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.writelines([_HEADER.pack(b"glTF", 2, _HEADER.size + sum(map(len, chunks))), *chunks])
 
 
-def read_glb(path: Path) -> tuple[dict[str, Tensor], bool, bool]:
+def read_glb(path: Path) -> tuple[dict[str, Tensor], Marks]:
     """The Gaussians of a .glb of any program, without meshes and cameras beside them. No code in it runs.
 
-    Their means are float64, because nodes may move them far. Then the marks of :func:`write_glb`, as its options.
+    Their means are float64, because nodes may move them far.
     """
     with reading(path, "a complete .glb with Gaussians", remedy="export it again, or as .ply"):
         try:
@@ -135,12 +122,13 @@ def read_glb(path: Path) -> tuple[dict[str, Tensor], bool, bool]:
             for name in document.get("extensionsRequired", []):
                 if name not in _KNOWN:
                     raise ValueError(f"it requires {name}, which is not known here")
-            marks = document["asset"].get("extras", {}).get(_OURS, {})
-            antialiased, in_model_frame = (marks.get(name) is True for name in (_ANTIALIASED, _MODEL_FRAME))
+            stated = [document["asset"].get("extras", {}).get(_OURS, {}).get(name) for name in _MARKS]
+            antialiased, in_model_frame = (value is True for value in stated[:2])
+            up, offset = (vector(" ".join(map(str, value or ()))) for value in stated[2:])
             parts, unpacked = [], 0
             for primitive, transforms in _primitives(document, binary):
                 gaussians, marked = _read_primitive(document, binary, primitive)
-                antialiased |= marked
+                antialiased |= marked.antialiased
                 unpacked += _READ + len(transforms) * (_PLACE + sum(value.nbytes for value in gaussians.values()))
                 afford(unpacked, path.stat().st_size)
                 parts += [_placed(gaussians, part) for part in np.split(transforms, range(1000, len(transforms), 1000))]
@@ -151,7 +139,8 @@ def read_glb(path: Path) -> tuple[dict[str, Tensor], bool, bool]:
         if len({part["features_rest"].shape[1] for part in parts}) > 1:
             raise ValueError("its Gaussians have different SH degrees")
         params = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-        return similarity(params, _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0), antialiased, in_model_frame
+        marks = Marks(antialiased, in_model_frame, up, offset)
+        return similarity(params, _FROM_MODEL if in_model_frame else _FROM_PLY, 1.0), marks
 
 
 def _chunks(path: Path) -> tuple[dict[str, Any], memoryview]:
@@ -241,7 +230,7 @@ def _transforms(parts: Mapping[str, NDArray[Any]]) -> Transforms:
 
 def _read_primitive(
     document: Mapping[str, Any], binary: memoryview, primitive: Mapping[str, Any]
-) -> tuple[dict[str, Tensor], bool]:
+) -> tuple[dict[str, Tensor], Marks]:
     """The Gaussians of a primitive in its own coordinates, and whether they are marked as antialiased."""
     extension = primitive["extensions"][EXTENSION]
     compressed = extension.get("extensions", {})
@@ -271,7 +260,7 @@ def _read_primitive(
         "opacities": torch.logit(values(f"{EXTENSION}:OPACITY"), eps=LEAST_OPACITY),
     }
     check_gaussians(params, ValueError)
-    return params, False
+    return params, UNMARKED
 
 
 def _placed(gaussians: Mapping[str, Tensor], transforms: Transforms) -> dict[str, Tensor]:

@@ -89,6 +89,9 @@ class Marks(NamedTuple):
     offset: Direction | None = None  # subtracted from coordinates that float32 is too coarse for
 
 
+UNMARKED = Marks()
+
+
 def check_gaussians(params: Mapping[str, Tensor], failure: type[Exception] = DataError) -> None:
     """Raise a ``failure`` unless there are all of ``SPLAT_NAMES``, in their shapes."""
     if missing := [name for name in SPLAT_NAMES if name not in params]:
@@ -131,17 +134,11 @@ def _table(params: Mapping[str, Tensor]) -> tuple[list[str], NDArray[np.float32]
 
 
 def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[str] = ()) -> None:
-    """Write the base colours of Gaussians as a 3DGS .ply, atomically.
+    """Write the base colours of Gaussians as a 3DGS .ply, atomically, in a folder that exists.
 
-    Args:
-        path: the file; its folder must exist.
-        params: see :mod:`sundae_ns.core.gaussians`. ``features`` are not written. Values that are not finite are
-            written unchanged: drop such Gaussians first (``finite_mask``), because viewers do not.
-        comments: lines for the header (:func:`comments_of`).
-
-    Raises:
-        DataError: a parameter is missing or has the wrong shape.
-        StorageError: the disk is full or not writable.
+    ``features`` are not written. Values that are not finite are written unchanged: drop such Gaussians first
+    (``finite_mask``), because viewers do not. ``comments`` are lines for the header (:func:`comments_of`).
+    ``DataError`` for a missing parameter or a wrong shape; ``StorageError`` if the disk is full or not writable.
     """
     check_gaussians(params)
     names, table = _table(params)
@@ -302,13 +299,10 @@ def _columns(rows: Any, names: Sequence[str], dtype: type[np.floating[Any]] = np
 def read_ply(path: Path) -> dict[str, Tensor]:
     """Read a 3DGS .ply, with SH coefficients or with colours, or a compressed one; ignores other properties.
 
-    Returns:
-        Gaussians by the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU; centres of a file
-        with doubles are float64. The SH degree follows from the number of ``f_rest_*``; without any, ``features_rest``
-        is ``[N, 0, 3]``. Values may be infinite, such as the logit of an opacity of 1; see ``gaussians.sanitise``.
-
-    Raises:
-        DataError: the file is missing, not a .ply, truncated, or does not hold Gaussians.
+    Returns Gaussians by the names of :data:`sundae_ns.core.gaussians.SPLAT_NAMES`, float32 on the CPU; centres of a
+    file with doubles are float64. The SH degree follows from the number of ``f_rest_*``; without any, ``features_rest``
+    is ``[N, 0, 3]``. Values may be infinite, such as the logit of an opacity of 1; see ``gaussians.sanitise``.
+    ``DataError`` if the file is missing, not a .ply, truncated, or does not hold Gaussians.
     """
     file = _Ply(path)
     rows = file.rows()
@@ -411,16 +405,11 @@ def from_smallest_three(others: NDArray[Any], largest: NDArray[Any]) -> NDArray[
 
 
 def read_point_cloud(path: Path, *, precise: bool = False) -> tuple[Tensor, Tensor]:
-    """Read the points and colours of a .ply, binary or ascii.
+    """Read the points and colours of a .ply, binary or ascii: ``[N, 3]`` float32, or ``precise`` float64, and uint8.
 
-    Args:
-        path: vertices with ``x y z`` and, optionally, colours under a name in use: ``red green blue``, ``r g b``,
-            ``diffuse_red ...``, or ``f_dc_0 ...`` of Gaussians. Integers of 8 or 16 bits, floats to 1, 255 or 65,535.
-        precise: positions as float64.
-
-    Returns:
-        Positions ``[N, 3]`` float32 and colours ``[N, 3]`` uint8, on the CPU; points without a colour are mid-grey.
-        ``DataError`` if the file is missing, not a .ply, truncated, or its vertices have no position.
+    Vertices have ``x y z`` and, optionally, colours under a name in use: ``red green blue``, ``r g b``, ``diffuse_red
+    ...``, or ``f_dc_0 ...`` of Gaussians; integers of 8 or 16 bits, floats to 1, 255 or 65,535. Points without a colour
+    are mid-grey. ``DataError`` if the file is missing, not a .ply, truncated, or its vertices have no position.
     """
     rows = _Ply(path).rows()
     names = {name.lower(): name for name in rows.dtype.names or ()}

@@ -11,14 +11,27 @@ Written from the format's public description, because no maintained Python packa
     shN_centroids.webp         the palette: 64 rows of SH coefficients of degrees 1 to 3 in a row of pixels
 
 Codebooks are k-means in one dimension. With more Gaussians than palette rows, these are centres of a two-level
-k-means. Coordinates are those of a .ply, as in files of ``splat-transform``.
+k-means. Coordinates are those of a .ply, as in files of ``splat-transform``. Own entries of ``meta.json``, which other
+programs ignore: ``up``, and ``offset``, what was subtracted from coordinates too large for float32.
+
+Streamed SOG, version 1: a folder of levels of detail, the full one first, in chunks that are folders of the above.
+
+    lod-meta.json              {"version": 1, "count", "counts" of each level, "lodLevels", "filenames", "tree"}
+    LEVEL_CHUNK-HASH/          meta.json and images; ``filenames`` lists the former. Readers take any other name
+
+The tree cuts space at medians. Each node has its ``bound`` {"min", "max"}, which holds its Gaussians to three standard
+deviations, and ``children`` or ``lods``: {"LEVEL": {"file", "offset", "count"}}, its rows of a chunk by the chunk's
+index in ``filenames``. An ``environment`` of other programs is a chunk that belongs to every level.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import math
+import re
+import shutil
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -31,30 +44,90 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sundae_ns.core.covariance import entries_of
 from sundae_ns.core.errors import DataError, reading, regular
-from sundae_ns.core.files import replacing
+from sundae_ns.core.files import replacing, write_files, write_text
 from sundae_ns.io.budget import afford, afford_gaussians, parsed_json, read_exactly
 from sundae_ns.io.coordinates import scene_order
-from sundae_ns.io.ply import Marks, check_gaussians, checked, from_smallest_three, vector
+from sundae_ns.io.ply import UNMARKED, Marks, check_gaussians, checked, from_smallest_three, vector
 
 META, STREAMED = METAS = ("meta.json", "lod-meta.json")
-_LEVELS_OF_DETAIL = "it is streamed SOG; give the meta.json of one of its folders, or the file that it was made of"
 MAX_PALETTE = 1 << 16  # palette rows that two bytes can index
 _ROW_ENTRIES = 64  # palette rows in a row of the palette's image
 _COARSE = 256  # coarse cells of a large palette
 _LEVELS = 65535  # highest level of a position, in two bytes
 _FIRST_MODE = 252  # alpha of a rotation without its first component; the next values stand for the other components
+_LEAF, _CHUNK = 1 << 14, 1 << 18  # most Gaussians of the full level in a leaf, and of a chunk of several leaves
+_ASSET = {"generator": "sundae-ns"}
+_OWN_CHUNK = re.compile(r"\d+_\d+-[0-9a-f]{16}")
+Entry = Callable[[str], bytes]  # the content of a file by its name beside the first one
 
 
-def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False, up: Sequence[float] = ()) -> None:
+def write_sog(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED) -> None:
     """Write the base colours of Gaussians that ``ply.checked`` accepts as a .sog, atomically, in another order."""
-    from PIL import Image
-
     gaussians = checked(path, params)
     order = scene_order(gaussians["means"].numpy())
-    arrays = {name: value.numpy()[order] for name, value in gaussians.items()}
-    n = len(order)
+    with replacing(path) as unfinished, zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as bundle:
+        for name, content in _encoded({name: value.numpy()[order] for name, value in gaussians.items()}, marks).items():
+            bundle.writestr(zipfile.ZipInfo(name), content)  # with a fixed date: equal scenes give equal bytes
 
+
+def write_streamed(folder: Path, levels: Sequence[Mapping[str, Tensor]], marks: Marks = UNMARKED) -> None:
+    """Write levels of detail, the full one first, as streamed SOG; each level as for :func:`write_sog`.
+
+    An earlier ``lod-meta.json`` in the folder is valid until the new one is complete; then its chunks are removed.
+    """
+    arrays: list[dict[str, NDArray[np.float32]]] = []
+    for params in levels:
+        gaussians = checked(folder / STREAMED, params)
+        order = scene_order(gaussians["means"].numpy())
+        reach = 3 * entries_of(gaussians)[:, :3].sqrt().float()
+        gaussians |= {"min": gaussians["means"] - reach, "max": gaussians["means"] + reach}
+        arrays.append({name: value.numpy()[order] for name, value in gaussians.items()})
+    chunks: list[tuple[int, list[NDArray[np.int64]]]] = []  # levels, and the rows of each leaf
+    newest: dict[int, int] = {}  # chunk of a level that is not full
+
+    def placed(level: int, rows: NDArray[np.int64]) -> dict[str, int]:
+        if level not in newest or sum(map(len, chunks[newest[level]][1])) + len(rows) > _CHUNK:
+            newest[level] = len(chunks)
+            chunks.append((level, []))
+        leaves = chunks[newest[level]][1]
+        leaves.append(rows)
+        return {"file": newest[level], "offset": sum(map(len, leaves[:-1])), "count": len(rows)}
+
+    def node(rows: list[NDArray[np.int64]]) -> dict[str, Any]:
+        each = list(zip(arrays, rows, strict=True))
+        low, high = (np.concatenate([level[end][some] for level, some in each]) for end in ("min", "max"))
+        bound = {"min": low.min(axis=0).tolist(), "max": high.max(axis=0).tolist()}
+        centres = arrays[0]["means"][rows[0]]
+        axis = np.ptp(centres, axis=0).argmax()
+        below = [level["means"][some, axis] < np.median(centres[:, axis]) for level, some in each]
+        if len(centres) <= _LEAF or not below[0].any():
+            return {"bound": bound, "lods": {str(i): placed(i, some) for i, some in enumerate(rows) if len(some)}}
+        halves = ([some[low == half] for some, low in zip(rows, below, strict=True)] for half in (True, False))
+        return {"bound": bound, "children": [node(half) for half in halves]}
+
+    counts = [len(level["means"]) for level in arrays]
+    tree = node([np.arange(count) for count in counts])
+    names: list[str] = []
+    for level, leaves in chunks:
+        rows = np.concatenate(leaves)
+        contents = _encoded({name: value[rows] for name, value in arrays[level].items()}, marks)
+        digest = hashlib.sha256(b"".join(contents.values())).hexdigest()[:16]
+        names.append(f"{level}_{sum(name.startswith(f'{level}_') for name in names)}-{digest}/{META}")
+        write_files({folder / Path(names[-1]).with_name(name): content for name, content in contents.items()})
+    meta = {"version": 1, "asset": _ASSET, "count": sum(counts), "counts": counts, "lodLevels": len(counts)}
+    write_text(folder / STREAMED, json.dumps({**meta, "filenames": names, "tree": tree}))
+    for other in folder.iterdir():
+        if _OWN_CHUNK.fullmatch(other.name) and f"{other.name}/{META}" not in names:
+            shutil.rmtree(other)
+
+
+def _encoded(arrays: Mapping[str, NDArray[np.float32]], marks: Marks) -> dict[str, bytes]:
+    """The contents of the files of a .sog by their names, with Gaussians in the order of the arrays."""
+    from PIL import Image
+
+    n = len(arrays["means"])
     bent = np.sign(arrays["means"]) * np.log1p(np.abs(arrays["means"].astype(np.float64)))
     low, high = bent.min(axis=0), bent.max(axis=0)
     levels = np.rint((bent - low) / np.where(high > low, high - low, 1.0) * _LEVELS).astype(np.uint16)
@@ -70,11 +143,11 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
     }
     meta: dict[str, Any] = {
         "version": 2,
-        "asset": {"generator": "sundae-ns"},
+        "asset": _ASSET,
         "count": n,
-        "antialias": antialiased,
-        **({"model": "antialiased"} if antialiased else {}),  # what splat-transform reads
-        **({"up": list(up)} if up else {}),  # which only this program reads
+        "antialias": marks.antialiased,
+        **({"model": "antialiased"} if marks.antialiased else {}),  # what splat-transform reads
+        **{name: list(value) for name in ("up", "offset") if (value := getattr(marks, name))},
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_values.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
@@ -91,57 +164,88 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
         files = ["shN_centroids.webp", "shN_labels.webp"]
         bands = math.isqrt(coefficients + 1) - 1
         meta["shN"] = {"count": len(rows), "bands": bands, "codebook": values.tolist(), "files": files}
-    with replacing(path) as unfinished, zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as bundle:
-        # ZipInfo has a fixed date, so that equal scenes give equal bytes.
-        bundle.writestr(zipfile.ZipInfo(META), json.dumps(meta))
-        for name, pixels in images.items():
-            image = io.BytesIO()
-            # exact: keep colours where alpha, here the opacity, is 0.
-            Image.fromarray(pixels).save(image, "WEBP", lossless=True, exact=True)
-            bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), image.getvalue())
+    contents = {META: json.dumps(meta).encode()}
+    for name, pixels in images.items():
+        image = io.BytesIO()
+        # exact: keep colours where alpha, here the opacity, is 0.
+        Image.fromarray(pixels).save(image, "WEBP", lossless=True, exact=True)
+        contents[f"{name}.webp"] = image.getvalue()
+    return contents
 
 
 def read_sog(path: Path) -> tuple[dict[str, Tensor], Marks]:
-    """Read a bundled .sog, a .zip of one or of its folder, or a folder of images or the ``meta.json`` in it.
+    """Read a .sog, a .zip of one or of its folder, or a folder of images or the ``meta.json`` in it; or streamed SOG.
 
-    Returns Gaussians as of ``ply.read_ply``, their means in float64, and what it states of them.
+    Returns Gaussians as of ``ply.read_ply``, their means in float64, and what it states of them. Of streamed SOG, which
+    may be a .zip too, these are the finest level and the environment.
     """
     with reading(path, "a complete .sog"), ExitStack() as stack:
         if path.is_dir() or path.name in METAS:
             folder = path if path.is_dir() else path.parent
-            if path.name == STREAMED or not (folder / META).exists():
-                raise ValueError(_LEVELS_OF_DETAIL)
-            size = sum(file.stat().st_size for file in folder.glob("*.webp"))
-            entry: Callable[[str], bytes] = partial(_file_entry, folder)
+            streamed = path.name != META and (path.name == STREAMED or (folder / STREAMED).exists())
+            size = sum(file.stat().st_size for file in folder.rglob("*.webp"))
+            entry: Entry = partial(_file_entry, folder)
         else:
             size = regular(path).stat().st_size
-            entry = _bundled(stack.enter_context(zipfile.ZipFile(path)), size)
-        meta = parsed_json(entry(META))
-        if (version := meta.get("version", 1)) != 2:
-            raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
-        antialiased = bool(meta.get("antialias")) or meta.get("model") == "antialiased"
-        marks = Marks(antialiased, up=vector(" ".join(map(str, meta.get("up", ())))))
-        return _decoded(entry, meta, size), marks
+            entry, streamed = _bundled(stack.enter_context(zipfile.ZipFile(path)), size)
+        return (_finest_level if streamed else _scene)(path, entry, size)
+
+
+def _scene(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Marks]:
+    meta = parsed_json(entry(META))
+    if (version := meta.get("version", 1)) != 2:
+        raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
+    up, offset = (vector(" ".join(map(str, meta.get(name, ())))) for name in ("up", "offset"))
+    antialiased = bool(meta.get("antialias")) or meta.get("model") == "antialiased"
+    return _decoded(entry, meta, size), Marks(antialiased, up=up, offset=offset)
+
+
+def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Marks]:
+    meta = parsed_json(entry(STREAMED))
+    files, nodes = dict[str, list[tuple[int, int]]](), [meta["tree"]]
+    while nodes:
+        node = nodes.pop()
+        nodes += node.get("children", ())
+        if levels := node.get("lods"):
+            finest = levels[min(levels, key=int)]
+            files.setdefault(meta["filenames"][finest["file"]], []).append((finest["offset"], finest["count"]))
+    if "environment" in meta:
+        files[meta["environment"]] = []
+    parts, marks, unpacked = list[dict[str, Tensor]](), Marks(), 0
+    for file, leaves in files.items():
+        part, marks = _scene(path, lambda name, file=file: entry(file.removesuffix(META) + name), size)  # type: ignore[misc]
+        unpacked += sum(value.nbytes for value in part.values())
+        afford(unpacked, size)
+        rows = torch.full((len(part["means"]),), not leaves)
+        for offset, count in leaves:
+            if not 0 <= offset <= offset + count <= len(rows) or bool(rows[offset : offset + count].any()):
+                raise ValueError(f"leaves share Gaussians of {file}, or it has fewer")
+            rows[offset : offset + count] = True
+        parts.append({name: value[rows] for name, value in part.items()})
+    most = max(part["features_rest"].shape[1] for part in parts)
+    for part in parts:
+        lacking = most - part["features_rest"].shape[1]
+        part["features_rest"] = torch.nn.functional.pad(part["features_rest"], (0, 0, 0, lacking))
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}, marks
 
 
 def _file_entry(folder: Path, name: str) -> bytes:
-    if Path(name).name != name:
+    if Path(name).is_absolute() or ".." in Path(name).parts:
         raise ValueError(f"{name} lies elsewhere")
     return regular(folder / name).read_bytes()
 
 
-def _bundled(bundle: zipfile.ZipFile, size: int, *, inner: bool = False) -> Callable[[str], bytes]:
-    """What reads an entry beside the ``meta.json`` of a zip, which may be in a folder or in another zip."""
+def _bundled(bundle: zipfile.ZipFile, size: int, *, inner: bool = False) -> tuple[Entry, bool]:
+    """What reads an entry of a zip, whose files may be in a folder or in another zip; and whether it is streamed."""
     names = {name: PurePosixPath(name).name for name in bundle.namelist()}
-    found = [name for name, last in names.items() if last == META]
+    streamed = STREAMED in names.values()
+    found = [name for name, last in names.items() if last == (STREAMED if streamed else META)]
     scenes = [name for name, last in names.items() if last.endswith(".sog") and not last.startswith(".")]
-    if STREAMED in names.values():
-        raise ValueError(_LEVELS_OF_DETAIL)
     if len(scenes) == 1 and not found and not inner:
         return _bundled(zipfile.ZipFile(io.BytesIO(_zip_entry(bundle, size, "", scenes[0]))), size, inner=True)
     if len(found) != 1:
         raise ValueError(f"it holds {len(found)} {META} and {len(scenes)} .sog, not one of them")
-    return partial(_zip_entry, bundle, size, found[0].removesuffix(META))
+    return partial(_zip_entry, bundle, size, found[0].removesuffix(STREAMED if streamed else META)), streamed
 
 
 def _zip_entry(bundle: zipfile.ZipFile, size: int, folder: str, name: str) -> bytes:
@@ -154,8 +258,8 @@ def _zip_entry(bundle: zipfile.ZipFile, size: int, folder: str, name: str) -> by
         return read_exactly(file, info.file_size)  # to inflate no more than it states
 
 
-def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any], size: int) -> dict[str, Tensor]:
-    """Gaussians from the files by their names, which have ``size`` bytes; the inverse of :func:`write_sog`."""
+def _decoded(file: Entry, meta: Mapping[str, Any], size: int) -> dict[str, Tensor]:
+    """Gaussians from the files by their names, which have ``size`` bytes; the inverse of :func:`_encoded`."""
     n, coefficients = int(meta["count"]), (int(meta["shN"]["bands"]) + 1) ** 2 - 1 if "shN" in meta else 0
     afford_gaussians(n, coefficients, size)
 

@@ -36,7 +36,7 @@ from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.budget import afford_gaussians, read_exactly
 from sundae_ns.io.coordinates import similarity
-from sundae_ns.io.ply import LEAST_OPACITY, checked, from_smallest_three
+from sundae_ns.io.ply import LEAST_OPACITY, UNMARKED, Marks, checked, from_smallest_three
 
 _AXES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LBD", "RBD", "LBU", "RBU", "LFD", "RFD", "LFU", "RFU")
 _OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
@@ -57,7 +57,7 @@ def fractional_bits(means: Tensor) -> int:
     raise DataError(f"a Gaussian is {farthest:.3g} from the origin, too far for a .spz; write a .sog or .ply")
 
 
-def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
+def write_spz(path: Path, params: Mapping[str, Tensor], marks: Marks = UNMARKED) -> None:
     """Write the base colours of Gaussians that ``ply.checked`` accepts as a .spz, atomically."""
     from gsply import GSData
     from gsply.spz import write_spz as write
@@ -72,17 +72,17 @@ def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
         write(partial, data, version=3, fractional_bits=bits)  # more programs read version 3 than 4
         # gsply 0.4 has no option for the flag of antialiasing, in byte 14.
         raw = bytearray(gzip.decompress(partial.read_bytes()))
-        raw[14] |= antialiased
+        raw[14] |= marks.antialiased
         partial.write_bytes(gzip.compress(bytes(raw), mtime=0))
 
 
-def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
+def read_spz(path: Path) -> tuple[dict[str, Tensor], Marks]:
     """Read a .spz of version 1 to 4: Gaussians as of ``ply.read_ply``, and whether they are marked as antialiased."""
     with reading(path, "a complete .spz"):
         return decoded(regular(path).read_bytes(), "RDF")
 
 
-def decoded(content: bytes, axes: str) -> tuple[dict[str, Tensor], bool]:
+def decoded(content: bytes, axes: str) -> tuple[dict[str, Tensor], Marks]:
     """As :func:`read_spz`, of the bytes of a file, in these axes if it states its own. Raises many kinds of errors."""
     packed = content[:2] == b"\x1f\x8b"
     stream = io.BytesIO(content) if not packed else gzip.GzipFile(fileobj=io.BytesIO(content))
@@ -126,7 +126,7 @@ def decoded(content: bytes, axes: str) -> tuple[dict[str, Tensor], bool]:
     if flags & 2 and (stated := _stated_axes(memoryview(extensions))):
         turn = [[float((a == b) - (a == _OPPOSITE[b])) for a in stated] for b in axes]
         params = similarity(params, torch.tensor([[*row, 0.0] for row in turn]), 1.0)
-    return params, bool(flags & 1)
+    return params, Marks(bool(flags & 1))
 
 
 def _streams(content: bytes, sizes: list[int]) -> tuple[list[bytes], bytes]:

@@ -76,11 +76,8 @@ def check_ranges(options: Any) -> None:
 def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, images: bool = True) -> None:
     """Check a capture, a folder or a ``transforms.json``, in nerfstudio's or COLMAP's layout before it is parsed.
 
-    ``images`` says whether they will be needed beside the cameras of the ``splits``.
-
-    Raises:
-        ConfigError: an option of the parser is out of its range.
-        DataError: the first thing that cannot be used, and where it stands.
+    ``images`` says whether they will be needed beside the cameras of the ``splits``. ``ConfigError`` for an option of
+    the parser out of its range; ``DataError`` names the first thing that cannot be used, and where it stands.
     """
     check_ranges(parser)
     if not data.exists():
@@ -374,10 +371,8 @@ class CarefulColmapParser(_Placed, ColmapDataParser):
 def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None = None) -> None:
     """Refuse or warn of poses and lenses of the cameras ``[N]`` of training images ``names``, in any units.
 
-    ``points`` of the scene ``[M, 3]`` have the same coordinates.
-
-    Raises:
-        DataError: a projection is none of a lens, an axis is mirrored, or a focal length belongs to no lens.
+    ``points`` of the scene ``[M, 3]`` have the same coordinates. ``DataError`` if a projection is none of a lens, an
+    axis is mirrored, or a focal length belongs to no lens.
     """
     kinds = cameras.camera_type.flatten()
     ratios = (cameras.fx / cameras.width.clamp_min(1)).flatten()

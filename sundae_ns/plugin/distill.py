@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -41,6 +41,8 @@ from sundae_ns.train.step import StepInputs, StepLosses, training_step
 
 STEPS = {"cpu": 3000, "cuda": 8000}  # Steps by the device
 SIDES = {"cpu": 128, "cuda": 512}  # Sides of the images by the device, pixels
+LEVELS = (0.5, 0.25, 0.1)  # Shares of the levels of detail below the full one
+LEVEL_STEPS = {"cpu": 300, "cuda": 4000}  # Steps of each by the device
 CAMERAS, HELD_OUT = 256, 16  # Virtual cameras that the steps begin from, and most held-out cameras
 
 
@@ -296,3 +298,24 @@ def distill(
     made = Distillation(scene, keep=keep, count=count, cameras=cameras, steps=steps, seed=seed, head=head, size=size)
     made.train(lambda *_: True)
     return made.result()
+
+
+def levels_of(
+    scene: Scene,
+    cameras: Sequence[Camera] = (),
+    *,
+    after_step: Callable[[int, int], bool] = lambda *_: True,
+    progress: bool = False,
+) -> Iterator[tuple[Scene, float]]:
+    """The levels of detail below a scene, :data:`LEVELS`, and the PSNR of each on held-out cameras, dB.
+
+    Each is pruned from the scene and trained on the images of its base colours; arguments as for :func:`distill`.
+    """
+    side, plain = by_device(SIDES, scene.device), dataclasses.replace(scene, head=None)
+    cameras = [camera.zoomed(min(1.0, side / max(camera.width, camera.height))) for camera in cameras]
+    cameras = cameras or virtual_cameras(plain, CAMERAS, size=side)
+    steps = by_device(LEVEL_STEPS, scene.device)
+    for share in LEVELS:
+        made = Distillation(plain, keep=share, cameras=cameras, steps=steps, head=False, progress=progress)
+        made.train(after_step)
+        yield made.result(), made.quality()

@@ -87,17 +87,12 @@ class Opened:
 def load_model(path: Path, data: Path | None = None, *, split: Literal["test", "val"] = "test") -> Opened:
     """Open a finished scene as a model, with its test views. No code in its files runs, and they are only read.
 
-    A run of splatfacto becomes a model of ours without a head: one code path renders and times all methods.
-
-    Args:
-        path: folder of a run of sundae or splatfacto, its ``config.yml``, or a packed scene.
-        data: the capture, if it has moved; a packed scene needs it.
-        split: ``val`` opens a run to train on: without test views, and in the state of its checkpoint.
-
-    Raises:
-        CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
-        DataError: the capture is missing, or cannot be used, or has no test views.
-        PackError: the packed scene is damaged, or has impossible values.
+    ``path`` is the folder of a run of sundae or splatfacto, its ``config.yml``, or a packed scene; ``data`` the
+    capture, if it has moved, which a packed scene needs. A run of splatfacto becomes a model of ours without a head:
+    one code path renders and times all methods. ``split="val"`` opens a run to train on: without test views, and in the
+    state of its checkpoint. ``CheckpointError`` for no such run, one of another method, or without a whole checkpoint;
+    ``DataError`` for a missing or unusable capture, or no test views; ``PackError`` for a damaged pack, or impossible
+    values.
     """
     if kind_of(path) == "packed":
         opened = _open_packed(path, data)

@@ -59,13 +59,10 @@ def finetune(
 ) -> tuple[PackedScene, Codecs]:
     """Train the Gaussians and head of a run with the rounding of its pack in the loop. The run is only read.
 
-    Args:
-        run, data: as in :func:`load_model`, with its errors, and a ``CheckpointError`` if the run still densifies.
-        scene: the same run, from ``scene.packing.contents_of``; the trained one and its codecs are returned.
-        config: bits of the pack.
-        steps: number of steps, at least 1.
-        rate: added to the loss for each bit per stored number.
-        progress: called after each step with its loss ``[]``, which the next step overwrites.
+    ``scene`` is the same run, from ``scene.packing.contents_of``; the trained one and its codecs are returned.
+    ``config`` has the bits of the pack, ``rate`` is added to the loss for each bit per stored number. ``progress`` gets
+    the loss ``[]`` of each step, which the next one overwrites. Errors are those of :func:`load_model`, and a
+    ``CheckpointError`` if the run still densifies, a ``ConfigError`` for fewer steps than 1.
     """
     if steps < 1:
         raise ConfigError(f"a fine-tune of {steps} steps changes nothing; give 1 or more")

@@ -24,11 +24,9 @@ def rasterize(inputs: Inputs, *, backend: Backend) -> Rasterization:
     """Splat N Gaussians into one pinhole camera (EWA splatting, front-to-back blending; Kerbl et al. 2023).
 
     Differentiable with respect to the Gaussians, and to ``camera.viewmat`` except under gsplat; not to ``camera.K``.
-
-    Raises:
-        DataError: A tensor has the wrong shape, dtype or device, or the image is empty.
-        MemoryExhaustedError: On a CPU, the image or its lists need more memory than there is, or without gradients the
-            image has more Gaussians than that of any real scene.
+    ``DataError`` for a tensor of a wrong shape, dtype or device, and for an empty image; ``MemoryExhaustedError`` if,
+    on a CPU, the image or its lists need more memory than there is, or without gradients it has more Gaussians than any
+    real one.
     """
     _check(inputs)
     if inputs.means.device.type == "cpu":
@@ -42,17 +40,9 @@ def rasterize(inputs: Inputs, *, backend: Backend) -> Rasterization:
 def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: Backend) -> Tensor:
     """Splat N Gaussians into V cameras of one size; for many small images, whose launches would take most of the time.
 
-    Args:
-        inputs: As for :func:`rasterize`, but with colours for each camera ``[V, N, C]``. Of its camera only the size is
-            read; it has neither depth nor ``absgrad``.
-        viewmats, Ks: Of each camera ``[V, 4, 4]`` and ``[V, 3, 3]``.
-        backend: From :func:`select_backend`.
-
-    Returns:
-        Blended colours ``[V, H, W, C]``, those of :func:`rasterize` up to rounding.
-
-    Raises:
-        DataError: As :func:`rasterize`, or there is no camera.
+    ``inputs`` and errors are as for :func:`rasterize`, but with colours for each camera ``[V, N, C]``. Of its camera
+    only the size is read; ``viewmats`` are ``[V, 4, 4]``, ``Ks`` ``[V, 3, 3]``. It has neither depth nor ``absgrad``.
+    Returns blended colours ``[V, H, W, C]``, those of :func:`rasterize` up to rounding.
     """
     count, colors = len(viewmats), inputs.colors
     if not count:
@@ -73,15 +63,9 @@ def rasterize_cameras(inputs: Inputs, viewmats: Tensor, Ks: Tensor, *, backend: 
 def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, backend: Backend) -> Tensor:
     """Evaluate real spherical harmonics up to ``degree``: the raw sum ``[N, 3]``, without the 0.5 that colours add.
 
-    Args:
-        degree: SH degree, 0 to 4; only the first ``(degree + 1) ** 2`` coefficients are read.
-        directions: From the camera to the Gaussian, of any length; zero vectors are taken as +z, without gradient.
-            ``[N, 3]``
-        coeffs: Coefficients in the order and with the signs of 3DGS. ``[N, K, 3]``
-        backend: From :func:`select_backend`.
-
-    Raises:
-        DataError: The degree is out of range or a shape is wrong.
+    ``directions`` ``[N, 3]``, of any length, lead from the camera to the Gaussian; zero vectors are taken as +z,
+    without gradient. ``coeffs`` ``[N, K, 3]`` have the order and the signs of 3DGS; only the first ``(degree + 1) **
+    2`` are read. ``DataError`` for a degree outside of 0 to 4, or a wrong shape.
     """
     if not 0 <= degree <= MAX_SH_DEGREE:
         raise DataError(f"spherical harmonics of degree {degree} are unknown; use 0 to {MAX_SH_DEGREE}")
@@ -102,15 +86,9 @@ def harmonic_colors(
 ) -> Tensor:
     """Colours of Gaussians as seen from a point: their harmonics plus 0.5, at least 0 ``[N, 3]``.
 
-    Args:
-        degree: SH degree, 0 to 4.
-        means: Centres in world units. ``[N, 3]``
-        center: Camera centre ``[3]``, or one for each Gaussian ``[N, 3]``.
-        features_dc, features_rest: First coefficients ``[N, 3]``, and at least those of the degree ``[N, K - 1, 3]``.
-        backend: From :func:`select_backend`.
-
-    Raises:
-        DataError: The degree is out of range or a shape is wrong.
+    ``center`` is that of the camera ``[3]``, or one for each Gaussian ``[N, 3]``. ``features_dc`` ``[N, 3]`` are the
+    first coefficients, ``features_rest`` ``[N, K - 1, 3]`` at least those of the degree; errors as
+    :func:`spherical_harmonics`.
     """
     if isinstance(backend, RecordableGsplat) and len(means):
         check_kernels_take(means)
@@ -120,18 +98,11 @@ def harmonic_colors(
 
 
 def blending_weights(inputs: Inputs, pixels: Tensor | None = None, *, backend: Backend) -> Tensor:
-    """Contribution of each Gaussian to one image: its alpha times transmittance, summed over the pixels.
+    """Contribution of each Gaussian to one image ``[N]``: its alpha times transmittance, summed over pixels, detached.
 
     Blending is linear in the colours. So this is exactly the gradient of the summed image with respect to a one-channel
-    colour, and no backend needs code for it.
-
-    Args:
-        inputs: As for :func:`rasterize`; colours are ignored.
-        pixels: Weight of each pixel; None for 1. ``[H, W]``
-        backend: From :func:`select_backend`.
-
-    Returns:
-        ``[N]``, in pixels, detached; 0 for Gaussians that are invisible. Errors are those of :func:`rasterize`.
+    colour, and no backend needs code for it. ``pixels`` ``[H, W]`` are weights; None stands for 1. All else is as for
+    :func:`rasterize`; colours are ignored.
     """
     camera = inputs.camera
     if pixels is not None:
@@ -177,11 +148,8 @@ def select_backend(name: BackendName, device: torch.device | str) -> Backend:
 
     ``auto`` chooses gsplat on a CUDA device where its kernels run, cpu on a CPU where numba works, and else the
     reference. Each check runs once per process; it builds gsplat's kernels if none are prebuilt. Only a CUDA device
-    imports gsplat, and only a CPU numba.
-
-    Raises:
-        BackendError: ``gsplat`` or ``cpu`` was requested and cannot run on ``device``.
-        ConfigError: The name is unknown.
+    imports gsplat, and only a CPU numba. ``BackendError`` for one that cannot run there, ``ConfigError`` for another
+    name.
     """
     device = torch.device(device)
     if name not in ("auto", "gsplat", "cpu", "reference"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -124,8 +124,17 @@ def packed_file(path: Path) -> tuple[Scene, bytes]:
 
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> dict[str, Tensor]:
     """Write base colours in a format of other viewers; returns the written Gaussians. See :func:`save`."""
-    marks = Marks(scene.antialiased, scene.in_model_frame, scene.up, scene.offset)
-    return formats.write_for_viewers(path, scene.gaussians, marks, upright=upright)
+    return formats.write_for_viewers(path, scene.gaussians, _marks_of(scene), upright=upright)
+
+
+def save_levels(levels: Sequence[Scene], folder: Path, *, upright: bool = False) -> None:
+    """Write the base colours of levels of detail, the full one first, as streamed SOG; see :func:`save`."""
+    gaussians = [level.gaussians for level in levels]
+    formats.write_levels(folder, gaussians, _marks_of(levels[0]), upright=upright)
+
+
+def _marks_of(scene: Scene) -> Marks:
+    return Marks(scene.antialiased, scene.in_model_frame, scene.up, scene.offset)
 
 
 def _of_run(path: Path) -> Scene:

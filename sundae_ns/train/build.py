@@ -42,19 +42,11 @@ def check(options: Any) -> None:
 def build(
     options: Any, num_images: int, points: Points | None, frame: Frame | None
 ) -> tuple[TrainingState, list[Callback], Start]:
-    """Build the parts on the CPU.
+    """Build the parts on the CPU, by the ``options`` of a ``SundaeModelConfig``; ``ConfigError`` if one cannot work.
 
-    Args:
-        options: ``SundaeModelConfig``.
-        num_images: number of training images.
-        points: sparse points of the capture, if it has any.
-        frame: transform from the capture's coordinates to the model's, if known.
-
-    Returns:
-        State of Gaussians and head; callbacks in their order; what to announce when training starts.
-
-    Raises:
-        ConfigError: an option cannot work.
+    ``points`` are the sparse ones of a capture of ``num_images``, if it has any; ``frame`` leads from its coordinates
+    to the model's, if known. Returns the state of Gaussians and head; callbacks in their order; what to announce at the
+    start.
     """
     check(options)
     pruning, head, warm = options.pruning, options.head.resolved, options.warm_start is not None

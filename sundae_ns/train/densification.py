@@ -25,12 +25,9 @@ def limit_growth(
 ) -> None:
     """Let at most ``capacity`` Gaussians be added, by the highest gradients; others lose their statistics.
 
-    Args:
-        state: of gsplat's strategy, with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used.
-        small: Gaussians that a high gradient duplicates; it splits the others, bool ``[N]``.
-        capacity: number of Gaussians that may be added: one for each duplicated or split, two for one that is both.
-        threshold: mean gradient above which a Gaussian grows.
-        radius: radius above which it is split, as a share of the image; None ignores the radius.
+    ``state`` of gsplat's strategy has ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used. A mean
+    gradient above the ``threshold`` duplicates the Gaussians ``small``, bool ``[N]``, and splits the others, and those
+    of a ``radius`` above this share of the image. One that is both adds two.
     """
     gradients = state["grad2d"] / state["count"].clamp_min(1)
     high = gradients > threshold
@@ -56,11 +53,8 @@ def start_counting(state: MutableMapping[str, Any], means: Tensor) -> None:
 def count_view(state: Mapping[str, Any], grads: Tensor, radii: Tensor, width: int, height: int) -> None:
     """Add the statistics of one view to the running state of gsplat's strategy, without waiting for the GPU.
 
-    Args:
-        state: with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used; changed in place.
-        grads: gradients of the projected centres, per pixel ``[N, 2]``.
-        radii: on the screen, pixels ``[N]``, or one per axis ``[N, 2]``; 0 where a Gaussian is not drawn.
-        width, height: of the image, pixels.
+    ``grads`` ``[N, 2]`` are those of the projected centres, per pixel; ``radii`` on the screen, pixels ``[N]``, or one
+    per axis ``[N, 2]``, 0 where a Gaussian is not drawn; ``width`` and ``height`` those of the image, pixels.
     """
     drawn = radii > 0 if radii.ndim == 1 else (radii > 0).all(dim=-1)
     norms = torch.hypot(grads[:, 0] * (width / 2), grads[:, 1] * (height / 2))

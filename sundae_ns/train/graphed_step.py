@@ -49,9 +49,7 @@ class Buffers:
         """Let the tensors of a state be the first rows of the buffers; those replaced since the last call are copied.
 
         The optimizers have states for the parameters ``trained``. Buffers of ``growing`` Gaussians have spare rows.
-
-        Returns:
-            Whether the buffers are new, so that work on the older ones is void.
+        Returns whether the buffers are new, so that work on the older ones is void.
         """
         n, rows = state.gaussians.num_gaussians, list(_rows(state, trained))
         shapes = {name: mapping[key].shape[1:] for name, mapping, key in rows}
@@ -155,11 +153,8 @@ class StepRecordings:
     ) -> StepResult | None:
         """Run a step, by a recording where there is one; None if steps cannot be recorded, and nothing has changed.
 
-        Args:
-            work, inputs: of this step.
-            settings: of training images, with the backend gsplat for recording.
-            kind: decides on the kernels of the step.
-            addresses: of what a recording reads beside its inputs, where they may change.
+        ``kind`` decides on the kernels of the step; ``addresses`` are of what a recording reads beside its inputs,
+        where they may change. The backend of ``settings`` is gsplat for recording.
         """
         if self._failed:
             return None
@@ -277,11 +272,8 @@ class RecordedStep:
     def __call__(self, state: TrainingState, inputs: StepInputs, settings: RenderSettings) -> StepResult | None:
         """Train one step; None if steps cannot be recorded, and nothing has changed.
 
-        Args:
-            state: the field. Afterwards its tensors are rows of this object's buffers, and ``info`` says that the
-                statistics of densification are counted.
-            inputs: of this step; learning rates are those of the optimizers.
-            settings: of training images, with the backend gsplat for recording.
+        Afterwards the tensors of ``state`` are rows of this object's buffers, and ``info`` says that the statistics of
+        densification are counted. Learning rates are those of the optimizers; the backend of ``settings`` is gsplat.
         """
         held = self._held
         if held is None or not held.unchanged(state, settings):

@@ -56,17 +56,11 @@ class Start:
 def initial_gaussians(
     options: Any, points: Points | None, frame: Frame | None, *, num_features: int, cap: int | None
 ) -> tuple[dict[str, Tensor], Start]:
-    """Parameters of a new model, float32 on the CPU, and what to report if it is trained.
+    """Parameters of a new model, float32 on the CPU, and what to report if it is trained; arguments as for ``build``.
 
     A finished run must open without the file that it started from. The field then comes from the sparse points, and the
-    error is reported only when training starts.
-
-    Args:
-        options: ``SundaeModelConfig``.
-        points: sparse points of the capture, if it has any.
-        frame: of the capture, if known.
-        num_features: length of the feature vectors; 0 for none.
-        cap: highest number of Gaussians to start with; None for no cap.
+    error is reported only when training starts. ``num_features`` is the length of the feature vectors, 0 for none;
+    ``cap`` the highest number of Gaussians to start with.
     """
     start = Start()
     try:

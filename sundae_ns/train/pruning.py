@@ -179,23 +179,14 @@ def prune_when_due(
 def prune_to(
     target: Callable[[int], int], rule: PruneRule, pruner: Pruner, state: Running, step: int, contribute: Contribute
 ) -> dict[str, Any]:
-    """Prune in training: drop what is not finite, decide the count, render, cut, and record the step.
+    """Prune in training: drop what is not finite, decide the count, render, cut, and record the ``step`` that ended.
 
-    Args:
-        target: maps the number of finite Gaussians to the number to keep.
-        rule: which Gaussians stay.
-        pruner: of the field.
-        state: :data:`UNPRUNED`, or from a checkpoint.
-        step: training step that has just ended.
-        contribute: called only if the rule needs it, after Gaussians that are not finite have been removed.
-
-    Returns:
-        ``step``; numbers of Gaussians: ``before`` (with those that are not finite), ``after``, ``dropped_nonfinite``,
-        and the ``peak`` of all steps; ``seconds``, synchronised; and of the graph, None without one: ``tau``, the
-        threshold on squared distances, ``sigma``, the width of the edge weights, and the number of ``isolated``.
-
-    Raises:
-        DataError: the field cannot be pruned, see :func:`sundae_ns.pruning.decision.decide`.
+    ``target`` maps the number of finite Gaussians to the number to keep; ``state`` is :data:`UNPRUNED`, or from a
+    checkpoint; ``contribute`` is called only if the rule needs it, after Gaussians that are not finite have been
+    removed. Returns ``step``; numbers of Gaussians: ``before`` (with those that are not finite), ``after``,
+    ``dropped_nonfinite``, and the ``peak`` of all steps; ``seconds``, synchronised; and of the graph, None without one:
+    ``tau``, the threshold on squared distances, ``sigma``, the width of the edge weights, and the number of
+    ``isolated``. ``DataError`` as :func:`sundae_ns.pruning.decision.decide`.
     """
     device = pruner.params["means"].device
     before, started = pruner.total, now(device)

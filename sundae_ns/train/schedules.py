@@ -102,14 +102,11 @@ def sparse_factor(count: int) -> float:
 def notify_pruned(
     schedulers: Mapping[str, LRScheduler], step: int, count: int, *, last: bool = True, ends_at: int | None = None
 ) -> None:
-    """Restart every :class:`Decay` among ``schedulers`` at ``step``; later calls change nothing.
+    """Restart every :class:`Decay` among ``schedulers`` at the ``step`` of a prune; later calls change nothing.
 
-    Args:
-        schedulers: by name.
-        step: training step of the prune.
-        count: number of Gaussians that were kept. With fewer than :data:`SPARSE` centres move faster.
-        last: False while pruning goes on or the head is still disabled; rates that hold until then are left alone.
-        ends_at: training step at which they reach their final value, as for a trial; None for that of the run.
+    ``count`` Gaussians were kept; of fewer than :data:`SPARSE` the centres move faster. ``last`` is False while pruning
+    goes on or the head is still disabled: rates that hold until then are left alone. They reach their final value at
+    the step ``ends_at``, as for a trial; None stands for that of the run.
     """
     for name, scheduler, decay in _decays(schedulers):
         if decay.pruned_at is None and (last or not decay.hold_until_prune):
@@ -175,13 +172,9 @@ RESETS = "pipeline.model.reset_alpha_every"  # Counts rounds of densification, n
 def set_schedule(config: Any, usual: Any, words: Iterable[str]) -> None:
     """Fit all options that count steps to the length of the run, or take those of the run that is resumed.
 
-    Args:
-        config: ``SundaeTrainerConfig``; its schedule changes.
-        usual: the method's own configuration, not changed; None if it is not known.
-        words: the command line; options in it keep their value.
-
-    Raises:
-        ConfigError: no steps are left, or the length is no number of steps.
+    The schedule of ``config``, a ``SundaeTrainerConfig``, changes; ``usual`` is the method's own configuration, None if
+    it is not known. Options in the command line ``words`` keep their value. ``ConfigError`` if no steps are left, or
+    the length is no number of steps.
     """
     usual = deepcopy(usual)
     given, saved = given_options(words), config.load_dir or config.load_checkpoint
@@ -246,14 +239,10 @@ def step_options(config: Any) -> list[str]:
 
 
 def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
-    """Scale the schedule to ``config.schedule_length``, but for options that were set by hand.
+    """Scale the schedule of a ``SundaeTrainerConfig`` to its ``schedule_length``, but for options set by hand.
 
-    A warm start skips the steps before the prune. Its schedule is compressed only if the steps after it do not fit.
-
-    Args:
-        config: ``SundaeTrainerConfig``; its schedule changes.
-        usual: the method's own configuration.
-        given: dotted names of options that keep their value, beside those that differ from ``usual``.
+    These are the dotted names ``given``, and what differs from ``usual``, the method's own configuration. A warm start
+    skips the steps before the prune. Its schedule is compressed only if the steps after it do not fit.
     """
     share = steps_share = config.schedule_length / usual.max_num_iterations
     if share == 1:
@@ -282,18 +271,10 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
 
 
 def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> list[str]:
-    """Give a configuration schedule and model of the run that it resumes, but for options that were set by hand.
+    """Give a ``SundaeTrainerConfig`` the schedule and the model of the ``run`` that it resumes.
 
-    Args:
-        config: ``SundaeTrainerConfig``; its schedule and its model change.
-        run: the configuration of that run.
-        usual, given: see :func:`fit_to_length`.
-
-    Returns:
-        A line for each option that the run has otherwise.
-
-    Raises:
-        ConfigError: an option would change shapes or schedulers of the checkpoint.
+    Options that were set by hand stay, see :func:`fit_to_length`. Returns a line for each option that the run has
+    otherwise; ``ConfigError`` if one would change shapes or schedulers of the checkpoint.
     """
     config.optimizers, differing = deepcopy(config.optimizers), []
     names = [*step_options(usual), *_leaves(usual.pipeline.model, "pipeline.model")]

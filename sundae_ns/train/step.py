@@ -48,16 +48,11 @@ class StepLosses:
         mask: Tensor | None,
         count: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """The terms by name, each ``[]``.
+        """The terms by name, each ``[]``, for an image ``rgb``, its base colours and the truth, all ``[H, W, 3]``.
 
-        Args:
-            state: says what is enabled at this step.
-            params: trained parameters, with logits ``opacities`` ``[N, 1]`` and logarithms ``scales`` ``[N, 3]``.
-            rgb: the image ``[H, W, 3]``.
-            base: its base colours ``[H, W, 3]``.
-            target: the truth ``[H, W, 3]``.
-            mask: pixels that count ``[H, W, 1]``; None for all.
-            count: number of Gaussians ``[]``, where further rows are transparent and without width; None for N.
+        ``state`` says what is enabled at this step. ``params`` have logits ``opacities`` ``[N, 1]`` and logarithms
+        ``scales`` ``[N, 3]``; rows beyond ``count`` ``[]`` of them, if given, are transparent and without width.
+        ``mask`` ``[H, W, 1]`` has the pixels that count, None for all.
         """
         if mask is not None:
             target, rgb, base = target * mask, rgb * mask, base * mask
@@ -87,19 +82,10 @@ def image_losses(
 ) -> tuple[Tensor, Tensor | None]:
     """``lambda_1 L1 + lambda_2 (1 - SSIM)`` of the paper for an image, and the L1 loss of its base colours.
 
-    In float32 one kernel computes both (:mod:`sundae_ns.cuda.loss`), and on a CPU SSIM is OpenCV's
-    (:func:`ssim_loss`). Images smaller than the window of SSIM are compared by L1 alone.
-
-    Args:
-        image: rendered image ``[H, W, 3]``, differentiable.
-        base: base colours ``[H, W, 3]``, differentiable; None for none.
-        target: the truth ``[H, W, 3]``.
-        ssim: SSIM of images ``[1, 3, H, W]``, with the window and constants of kernel and loop.
-        weight: lambda_2; lambda_1 is ``1 - weight``.
-        squares: whether the image is compared by the root of the mean square in place of L1.
-
-    Returns:
-        Both losses; the second is None without base colours.
+    In float32 one kernel computes both (:mod:`sundae_ns.cuda.loss`), and on a CPU SSIM is OpenCV's (:func:`ssim_loss`).
+    Images smaller than the window of SSIM are compared by L1 alone. All images are ``[H, W, 3]``; without a ``base``
+    its loss is None. ``ssim`` has the window and constants of kernel and loop; ``weight`` is lambda_2, and lambda_1 is
+    ``1 - weight``. With ``squares`` the image is compared by the root of the mean square in place of L1.
     """
     root = ((image - target).square().mean() + LEAST_SQUARE).sqrt() if squares else None
     windows = weight > 0 and min(target.shape[:2]) >= SSIM_WINDOW

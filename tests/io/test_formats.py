@@ -104,8 +104,14 @@ def test_survey_coordinates_are_moved_stated_and_kept(tmp_path, kind, caplog):
     assert "lies where float32 is too coarse; its coordinates are less 4000032 " in caplog.text
     offset = -torch.tensor(scene.meta["frame"]["transform"], dtype=torch.float64)[:, 3]
     torch.testing.assert_close(scene.gaussians["means"].double() + offset, truth, rtol=0, atol=2e-6)
+    scene = replace(scene, up=(0.6, 0.0, 0.8))
+    caplog.clear()
     sn.save(scene, tmp_path / f"b{kind}")
+    assert ("cannot hold the offset" in caplog.text) == (kind == ".spz")
     back = sn.load(tmp_path / f"b{kind}")
+    if kind != ".spz":
+        assert back.up == pytest.approx(scene.up, abs=1e-7)
+        assert back.meta["frame"] == scene.meta["frame"]
     error = torch.cdist(scene.gaussians["means"].double(), back.gaussians["means"].double()).amin(dim=1).max()
     assert error < {".ply": 1e-9, ".glb": 1e-5, ".spz": 1e-5}.get(kind, 0.01)
     if kind in (".ply", ".sundae"):

@@ -17,6 +17,7 @@ import sundae_ns as sn
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.gltf import EXTENSION, read_glb, semantics, write_glb
+from sundae_ns.io.ply import Marks
 from sundae_ns.io.spz import read_spz
 
 THEIRS = Path(__file__).parent / "foreign" / "splat_transform.glb"
@@ -39,9 +40,9 @@ def write(path, document, binary):
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
-def written(path, gaussians, **options):
+def written(path, gaussians, **marks):
     """The document of a field, and its buffer."""
-    write_glb(path, gaussians, **options)
+    write_glb(path, gaussians, Marks(**marks))
     return parts(path)
 
 
@@ -68,7 +69,7 @@ def test_up_is_plus_y(tmp_path, in_model_frame):
 
 
 def test_a_file_of_another_program_is_read_and_written_alike(tmp_path):
-    found, _, in_model_frame = read_glb(THEIRS)
+    found, (_, in_model_frame, *_) = read_glb(THEIRS)
     torch.testing.assert_close(found["means"].float(), torch.rand(5, 3, generator=torch.Generator().manual_seed(0)))
     assert (found["features_rest"].shape, in_model_frame) == ((5, 8, 3), False)
     (ours, data), (theirs, truth) = written(tmp_path / "a.glb", found), parts(THEIRS)
@@ -203,7 +204,7 @@ def test_a_spz_inside(tmp_path):
     }
     put(document, compressed)
     write(tmp_path / "b.glb", document, content)
-    found, antialiased, _ = read_glb(tmp_path / "b.glb")
+    found, (antialiased, *_) = read_glb(tmp_path / "b.glb")
     assert antialiased
     means = read_spz(tmp_path / "a.spz")[0]["means"] * torch.tensor([-1.0, -1.0, 1.0])
     torch.testing.assert_close(found["means"].float(), means)

@@ -20,7 +20,8 @@ from PIL import Image
 import sundae_ns as sn
 from sundae_ns.io.coordinates import scene_order
 from sundae_ns.io.formats import read_gaussian_file
-from sundae_ns.io.sog import codebook, kmeans, palette, write_sog
+from sundae_ns.io.ply import Marks
+from sundae_ns.io.sog import codebook, kmeans, palette, write_sog, write_streamed
 
 
 def gaussians(n=150, degree=3):
@@ -226,6 +227,27 @@ def _all(side, **changes):
     return lambda files: _meta(**changes)(files | dict.fromkeys(names, webp(side, side, lossless=True)))
 
 
+def _streamed(*leaves, chunks=1, more=None, **changes):
+    """Levels of detail with these leaves, whose chunks in turn are copies of one."""
+
+    def make(files):
+        lods = [{"file": i % chunks, "offset": start, "count": count} for i, (start, count) in enumerate(leaves)]
+        meta = {"tree": {"children": [{"lods": {"0": each}} for each in lods]}} if leaves else {}
+        meta |= {"filenames": [f"{i}/meta.json" for i in range(chunks)], **changes}
+        copies = {f"{i}/{name}": data for i in range(chunks) for name, data in files.items()}
+        return zipped({"lod-meta.json": json.dumps(meta).encode(), **copies, **(more or {})})
+
+    return make
+
+
+def _many_chunks(files):
+    one = webp(650, 650, lossless=True)
+    chunk = entries(
+        io.BytesIO(_meta(shN=GONE, count=422_500)(dict.fromkeys(files, one) | {"meta.json": files["meta.json"]}))
+    )
+    return _streamed(*[(0, 422_500)] * 9, chunks=9)(chunk)
+
+
 SCALES, MEANS = ["scales.webp"], ["means_l.webp", "means_u.webp"]
 HOSTILE = {
     "a lossy image": (_with("means_l.webp", webp(13, 13, quality=80)), "no lossless WebP"),
@@ -240,7 +262,12 @@ HOSTILE = {
     "a size beyond the file": (lambda files: _lie(zipped(files), b"means_l.webp", 2**32 - 2), "would unpack to"),
     "three levels": (lambda files: zipped({"a.sog": zipped({"b.sog": zipped(files)})}), "0 meta.json and 1 .sog"),
     "two scenes": (lambda files: zipped({"a.sog": zipped(files), "b.sog": b""}), "0 meta.json and 2 .sog"),
-    "streamed": (lambda _: zipped({"lod-meta.json": b"{}", "0/meta.json": b"{}"}), "streamed SOG; give the meta.json"),
+    "streamed, without a tree": (_streamed(), "'tree'"),
+    "leaves that share Gaussians": (_streamed((0, 100), (99, 51)), "leaves share Gaussians of 0/meta.json"),
+    "a leaf beyond its chunk": (_streamed((100, 51)), "leaves share Gaussians of 0/meta.json, or it has fewer"),
+    "a negative leaf": (_streamed((-50, 50)), "leaves share Gaussians of 0/meta.json"),
+    "no chunk": (_streamed((0, 150), filenames=["1/meta.json"]), "no item named"),
+    "many chunks of few bytes": (_many_chunks, "would unpack to"),
     "deep JSON": (_with("meta.json", b"[" * 999_999), "recursion"),
     "fewer than no Gaussians": (_meta(count=-5), "it states -5 Gaussians"),
     "endless Gaussians": (_meta(count=math.inf), "infinity"),
@@ -285,7 +312,69 @@ def test_a_folder_has_all_its_files(tmp_path, bundled, file, words):
     refused(read_gaussian_file, folder / "meta.json", words)
 
 
-@pytest.mark.parametrize("name", ["", "lod-meta.json"])
-def test_a_streamed_folder_is_named(tmp_path, name):
-    (tmp_path / "lod-meta.json").write_text("{}")
-    refused(read_gaussian_file, tmp_path / name, "it is streamed SOG; give the meta.json of one of its folders")
+def write_folder(folder, monkeypatch):
+    """Write three levels of detail in several chunks and leaves; returns them."""
+    monkeypatch.setattr("sundae_ns.io.sog._LEAF", 20)
+    monkeypatch.setattr("sundae_ns.io.sog._CHUNK", 50)
+    levels = [gaussians(n, degree=1) for n in (150, 70, 4)]
+    write_streamed(folder, levels, Marks(True, up=(0.0, 0.6, 0.8), offset=(4e6 + 1 / 3, 0.0, -7.0)))
+    return levels
+
+
+def leaves_of(node):
+    return [leaf for child in node["children"] for leaf in leaves_of(child)] if "children" in node else [node]
+
+
+def test_levels_of_detail(tmp_path, monkeypatch):
+    levels = write_folder(tmp_path, monkeypatch)
+    meta = json.loads((tmp_path / "lod-meta.json").read_text())
+    assert (meta["version"], meta["count"], meta["counts"], meta["lodLevels"]) == (1, 224, [150, 70, 4], 3)
+    leaves = leaves_of(meta["tree"])
+    chunks = [read_gaussian_file(tmp_path / name)[0].gaussians for name in meta["filenames"]]
+    ends = [0] * len(chunks)
+    for leaf in leaves:
+        assert leaf["lods"]["0"]["count"] <= 20
+        for level, rows in leaf["lods"].items():
+            assert meta["filenames"][rows["file"]].startswith(f"{level}_")
+            assert rows["offset"] == ends[rows["file"]]
+            ends[rows["file"]] += rows["count"]
+            means, scales = (
+                chunks[rows["file"]][name][rows["offset"] :][: rows["count"]] for name in ("means", "scales")
+            )
+            reach = 3 * scales.exp().amin(dim=1, keepdim=True) - 1e-3  # it holds the ball in each ellipsoid
+            low, high = (torch.tensor(leaf["bound"][end]) for end in ("min", "max"))
+            assert ((means - reach >= low) & (means + reach <= high)).all()
+    assert ends == [len(chunk["means"]) for chunk in chunks]
+    assert len(ends) > 5
+    for path in (tmp_path, tmp_path / "lod-meta.json"):
+        found, marks = read_gaussian_file(path)
+        assert marks == Marks(True, up=(0.0, 0.6, 0.8), offset=(4e6 + 1 / 3, 0.0, -7.0))
+        apart = torch.cdist(levels[0]["means"], found.gaussians["means"])
+        assert apart.amin(dim=1).max() < 1e-3
+        assert found.gaussians.num_gaussians == 150
+
+
+def test_other_levels_replace_those_of_a_folder(tmp_path, monkeypatch):
+    write_folder(tmp_path, monkeypatch)
+    (tmp_path / "0_0-notes").mkdir()
+    write_streamed(tmp_path, [gaussians(9, degree=0)])
+    chunk = json.loads((tmp_path / "lod-meta.json").read_text())["filenames"][0].split("/")[0]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([chunk, "0_0-notes", "lod-meta.json"])
+
+
+def test_a_chunk_elsewhere_is_refused(tmp_path, monkeypatch):
+    write_folder(tmp_path / "a", monkeypatch)
+    text = (tmp_path / "a" / "lod-meta.json").read_text()
+    (tmp_path / "a" / "lod-meta.json").write_text(text.replace('"0_0', '"../a/0_0'))
+    refused(read_gaussian_file, tmp_path / "a", "lies elsewhere")
+
+
+def test_a_zip_with_an_environment(tmp_path, bundled):
+    """It belongs to every level, and may have fewer harmonics."""
+    write_sog(tmp_path / "sky.sog", gaussians(30, degree=0))
+    sky = {f"env/{name}": data for name, data in entries(tmp_path / "sky.sog").items()}
+    make = _streamed((0, 50), (50, 60), more=sky, environment="env/meta.json")
+    (tmp_path / "a.zip").write_bytes(make(bundled))
+    found = read_gaussian_file(tmp_path / "a.zip")[0].gaussians
+    assert found["features_rest"].shape == (140, 15, 3)
+    assert not found["features_rest"][110:].any()

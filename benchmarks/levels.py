@@ -1,0 +1,135 @@
+"""Levels of detail of full fields, beside PlayCanvas's decimation of the same count; print one CSV row for each level.
+
+    python benchmarks/levels.py FIELD ... -o benchmarks/results/levels.csv                         # ours, best on a GPU
+    python benchmarks/levels.py FIELD ... --tools splat-transform --decimated DIR -o benchmarks/results/levels.csv
+    python benchmarks/levels.py --means benchmarks/results/levels.csv
+
+``sundae`` makes levels as ``sundae export --lod`` does. Those of ``splat-transform`` are ``DIR/NAME_50.sog`` and so on;
+missing ones are made with ``--splat-transform COMMAND``, by ``--decimate`` on its CPU path. All are written as .sog by
+one program, read again, and compared with the images of the full field in 32 virtual cameras, which no tool was given;
+``DIR/NAME.cameras.json`` keeps them, so that every machine has the same. Rows of ``-o`` that are there are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import mean
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from bench_formats import read_rows, replace_rows
+
+import sundae_ns as sn
+from sundae_ns.plugin.distill import LEVELS, levels_of
+
+COLUMNS = ("field", "share", "tool", "gaussians", "psnr_to_field", "psnr_worst", "seconds", "device")
+OURS, OTHER = "sundae", "splat-transform"
+
+
+def held_out(scene: sn.Scene, path: Path) -> list[sn.Camera]:
+    """The cameras of a file; virtual ones if it is missing, which are written to it."""
+    if not path.exists():
+        cameras = sn.virtual_cameras(scene.to("cpu"), 32, seed=10_000, size=512)
+        poses = [[*camera.pose.double().flatten().tolist(), 0.0, 0.0, 0.0, 1.0] for camera in cameras]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        entries = [{"camera_to_world": pose, "fov": 40.0} for pose in poses]
+        path.write_text(json.dumps({"render_width": 512, "render_height": 512, "camera_path": entries}))
+    return sn.cameras_of(path)
+
+
+def decimated(scene: sn.Scene, name: str, options: argparse.Namespace) -> Iterator[tuple[sn.Scene, float]]:
+    """The levels of the other program, and the seconds that each took; 0 for one that was there."""
+    for share in LEVELS:
+        path, seconds = options.decimated / f"{name}_{round(100 * share)}.sog", 0.0
+        if not path.exists():
+            with TemporaryDirectory() as folder:
+                full, small = Path(folder, "full.ply"), Path(folder, "small.ply")
+                sn.save(scene, full)
+                began = time.monotonic()
+                words = [*shlex.split(options.splat_transform), "--gpu", "cpu", "--quiet", str(full)]
+                count = round(share * scene.num_gaussians)
+                subprocess.run([*words, "--decimate", str(count), str(small)], check=True, stdout=sys.stderr)
+                seconds = time.monotonic() - began
+                sn.save(sn.load(small), path)
+        yield sn.load(path, device=scene.device), seconds
+
+
+def trained(scene: sn.Scene, folder: Path) -> Iterator[tuple[sn.Scene, float]]:
+    """Our levels, and the seconds that each took."""
+    began = time.monotonic()
+    for level, _ in levels_of(scene):
+        if scene.device.type == "cuda":
+            torch.cuda.synchronize()
+        seconds = time.monotonic() - began
+        sn.save(level, folder / "level.sog")
+        yield sn.load(folder / "level.sog", device=scene.device), seconds
+        began = time.monotonic()
+
+
+def rows_of(path: Path, tool: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """The rows of a field."""
+    on_gpu = torch.cuda.is_available()
+    scene = sn.load(path, device="cuda" if on_gpu else "cpu")
+    cameras = held_out(scene, options.decimated / f"{path.stem}.cameras.json")
+    images = [sn.render(scene, camera).rgb for camera in cameras]
+    with TemporaryDirectory() as folder:
+        levels = trained(scene, Path(folder)) if tool == OURS else decimated(scene, path.stem, options)
+        for share, (level, seconds) in zip(LEVELS, levels, strict=True):
+            values = [sn.measure(level, [image], [camera]).psnr for image, camera in zip(images, cameras, strict=True)]
+            yield {
+                **{"field": path.stem, "share": share, "tool": tool, "gaussians": level.num_gaussians},
+                **{"psnr_to_field": f"{mean(values):.3f}", "psnr_worst": f"{min(values):.3f}"},
+                **{"seconds": f"{seconds:.1f}", "device": torch.cuda.get_device_name() if on_gpu else "cpu"},
+            }
+
+
+def print_means(path: Path) -> None:
+    """The mean PSNR of both tools by share, over the fields that have both, as lines of Markdown."""
+    found = {(row["tool"], row["field"], row["share"]): float(row["psnr_to_field"]) for row in read_rows(path)}
+    print(f"| share | fields | {OTHER} | {OURS} | gain, dB |\n|---:|---:|---:|---:|---:|")
+    for share in map(str, LEVELS):
+        fields = [field for tool, field, other in found if (tool, other) == (OTHER, share)]
+        both = [field for field in fields if (OURS, field, share) in found]
+        theirs, ours = (mean(found[tool, field, share] for field in both) for tool in (OTHER, OURS))
+        print(f"| {share} | {len(both)} | {theirs:.2f} | {ours:.2f} | {ours - theirs:+.2f} |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("fields", nargs="*", type=Path, help="files of full fields; their names tell them apart")
+    parser.add_argument("-o", "--out", type=Path, help="table of results")
+    parser.add_argument("--tools", nargs="+", choices=(OURS, OTHER), default=[OURS])
+    parser.add_argument("--decimated", type=Path, default=Path("decimated"), help="folder of the other's levels")
+    parser.add_argument("--splat-transform", default=OTHER, help="its command, with options if it needs any")
+    parser.add_argument("--means", type=Path, help="print the means of a table, and measure nothing")
+    options = parser.parse_args()
+    if options.means is not None:
+        print_means(options.means)
+        return
+    rows = read_rows(options.out)
+    printed = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
+    printed.writeheader()
+    for path in options.fields:
+        for tool in options.tools:
+            if sum((row["field"], row["tool"]) == (path.stem, tool) for row in rows) == len(LEVELS):
+                continue
+            rows = [row for row in rows if (row["field"], row["tool"]) != (path.stem, tool)]
+            for row in rows_of(path, tool, options):
+                rows.append(row)
+                printed.writerow(row)
+                sys.stdout.flush()
+                if options.out is not None:
+                    replace_rows(options.out, rows, COLUMNS)
+
+
+if __name__ == "__main__":
+    main()
