@@ -1,7 +1,5 @@
 """The commands of ``sundae run``, in a folder with photos."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -12,12 +10,12 @@ from short_prunes import short_prunes  # noqa: F401
 
 
 @pytest.fixture(autouse=True)
-def _short(short_prunes: None) -> None:  # noqa: F811
+def _short(short_prunes):  # noqa: F811
     """No test here is about how good a prune is."""
 
 
 @pytest.fixture
-def commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Commands:
+def commands(tmp_path, monkeypatch):
     """The commands, in a folder with photos."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "photos").mkdir()
@@ -27,5 +25,5 @@ def commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Commands:
     for module in ("run", "train"):
         monkeypatch.setattr(f"sundae_ns.cli.{module}.run_command", made)
     monkeypatch.setattr("sundae_ns.cli.run.has_gpu", lambda: made.gpu)
-    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())
     return made

@@ -1,10 +1,7 @@
 """``--crop`` and ``--remove-floaters`` of ``sundae prune``, ``pack`` and ``export``."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +14,7 @@ import sundae_ns as sn
 INSIDE = ("--crop", 0, 0, 0, 0.5, 1, 1)
 
 
-def scene(n: int = 400) -> sn.Scene:
+def scene(n=400):
     """Points of a cube of side 1, and one far beside it."""
     generator = torch.Generator().manual_seed(0)
     points = torch.cat([torch.rand(n, 3, generator=generator), torch.tensor([[3.0, 0.5, 0.5]])])
@@ -28,7 +25,7 @@ def scene(n: int = 400) -> sn.Scene:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """The scene as ``.ply`` with a property of its own and a broken Gaussian, and as ``.sundae``."""
     folder = tmp_path_factory.mktemp("scenes")
     sn.save(scene(), folder / "packed.sundae")
@@ -43,11 +40,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def vertices(path: Path) -> np.ndarray:
+def vertices(path):
     return PlyData.read(path)["vertex"].data
 
 
-def test_export_cuts_a_ply_and_keeps_its_rows(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_cuts_a_ply_and_keeps_its_rows(folder, tmp_path, capsys):
     before = vertices(folder / "a.ply")
     assert run("export", folder / "a.ply", "-o", tmp_path / "a.ply", *INSIDE) == 0
     after = vertices(tmp_path / "a.ply")
@@ -62,7 +59,7 @@ def test_export_cuts_a_ply_and_keeps_its_rows(folder: Path, tmp_path: Path, caps
     assert "removed 1 floaters of 401 Gaussians, by their neighbours alone" in err
 
 
-def test_export_to_a_page_and_to_other_formats(folder: Path, tmp_path: Path) -> None:
+def test_export_to_a_page_and_to_other_formats(folder, tmp_path):
     for name in ("site", "a.spz", "b.ply"):
         assert run("export", folder / "packed.sundae", "-o", tmp_path / name, "--remove-floaters") == 0
     assert run("export", folder / "packed.sundae", "-o", tmp_path / "c.spz", *INSIDE) == 0
@@ -76,7 +73,7 @@ def test_export_to_a_page_and_to_other_formats(folder: Path, tmp_path: Path) -> 
     assert len(cut) == int((sn.load(folder / "packed.sundae").gaussians["means"][:, 0] <= 0.5).sum())
 
 
-def test_prune_keeps_a_share_of_what_remains(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_prune_keeps_a_share_of_what_remains(folder, tmp_path, capsys):
     inside = int((vertices(folder / "a.ply")["x"] <= 0.5).sum())
     words = ("--keep", 0.5, "--num-cameras", 4, *INSIDE)
     assert run("prune", folder / "a.ply", "-o", tmp_path / "a.ply", *words) == 0
@@ -97,9 +94,7 @@ def test_prune_keeps_a_share_of_what_remains(folder: Path, tmp_path: Path, capsy
     assert float(found.gaussians["means"].max()) < 1.2
 
 
-def test_pack_cuts_and_what_is_left_without_a_neighbour_is_refused(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pack_cuts_and_what_is_left_without_a_neighbour_is_refused(folder, tmp_path, capsys):
     out = tmp_path / "a.sundae"
     assert run("pack", folder / "a.ply", "-o", out, "--remove-floaters", "--crop", 0, 0, 0, 9, 9, 9) == 0
     assert sn.load(out).num_gaussians == 400

@@ -1,10 +1,7 @@
 """``sundae distill``."""
 
-from __future__ import annotations
-
 import os
 import signal
-from pathlib import Path
 
 import command_line
 import pytest
@@ -14,26 +11,24 @@ import sundae_ns as sn
 from sundae_ns.plugin.distill import Distillation
 
 
-def run(*words: object) -> int:
+def run(*words):
     return command_line.run("distill", *words)
 
 
 @pytest.fixture
-def source(tmp_path: Path) -> Path:
+def source(tmp_path):
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(200, 3, generator=generator)
     sn.save(sn.Scene.from_points(points, points), tmp_path / "a.ply")
     return tmp_path / "a.ply"
 
 
-def test_an_interrupted_distillation_goes_on(
-    source: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_distillation_goes_on(source, capsys, monkeypatch):
     out = source.with_name("b.spz")
     words = (source, "-o", out, "--keep", "0.5", "--steps", "6", "--no-head")
     train_step = Distillation._train_step
 
-    def interrupted(self: Distillation, i: int) -> None:
+    def interrupted(self, i):
         train_step(self, i)
         if i == 3:
             os.kill(os.getpid(), signal.SIGINT)

@@ -1,11 +1,8 @@
 """What the doctor finds on simulated machines, and what it advises."""
 
-from __future__ import annotations
-
 import ctypes.util
 import sys
 from importlib import metadata
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -16,19 +13,19 @@ from sundae_ns.cli import doctor
 from sundae_ns.core.errors import BackendError
 
 
-def check(name: str, compile_kernels: bool = False) -> tuple[bool, str, str]:
+def check(name, compile_kernels=False):
     """Whether a part is there, what the doctor says of it, and its remedy."""
     (part,) = [part for part in doctor.parts(compile_kernels) if part.name == name]
     return part.works, part.text, part.remedy
 
 
 @pytest.fixture
-def no_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_cuda(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 
 @pytest.fixture
-def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+def cuda(monkeypatch):
     """A CUDA device that only torch's answers simulate."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Imaginary 9000")
@@ -38,8 +35,8 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sundae_ns.cuda.loss.loss_kernels", lambda *_: None)
 
 
-def select(problem: str | None = None) -> object:
-    def selected(name: str, device: str) -> None:
+def select(problem=None):
+    def selected(name, device):
         assert (name, device) == ("gsplat", "cuda")
         if problem:
             raise BackendError(problem)
@@ -47,7 +44,7 @@ def select(problem: str | None = None) -> object:
     return selected
 
 
-def test_without_cuda_auto_selects_the_compiled_loops(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_cuda_auto_selects_the_compiled_loops(no_cuda, monkeypatch):
     assert not check("CUDA")[0]
     assert "auto selects cpu" in check("rasteriser")[1]
     for name in ("gsplat kernels", "our kernels"):
@@ -59,7 +56,7 @@ def test_without_cuda_auto_selects_the_compiled_loops(no_cuda: None, monkeypatch
     assert "numba does not import (x; y)" in text
 
 
-def test_kernels_of_gsplat(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_of_gsplat(cuda, monkeypatch):
     assert "Imaginary 9000" in check("CUDA")[1]
     monkeypatch.setattr("sundae_ns.rasterize.interface.select_backend", select("its kernels do not run (no nvcc)"))
     works, text, remedy = check("gsplat kernels")
@@ -72,10 +69,10 @@ def test_kernels_of_gsplat(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("kernel", ["graph.neighbors.Kernel", "head.fused.head_kernels", "cuda.loss.loss_kernels"])
-def test_our_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch, kernel: str) -> None:
+def test_our_kernels(cuda, monkeypatch, kernel):
     assert check("our kernels")[:2] == (True, "working")
 
-    def refuse(*_: object) -> None:
+    def refuse(*_):
         raise BackendError("a CUDA kernel does not run (too old): update the driver")
 
     monkeypatch.setattr(f"sundae_ns.{kernel}", refuse)
@@ -85,7 +82,7 @@ def test_our_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch, kernel: str) -
     assert "update the driver" in remedy
 
 
-def test_built_kernels_are_found_in_torchs_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_built_kernels_are_found_in_torchs_folders(tmp_path, monkeypatch):
     package = tmp_path / "gsplat" / "__init__.py"
     package.parent.mkdir()
     package.touch()
@@ -99,7 +96,7 @@ def test_built_kernels_are_found_in_torchs_folders(tmp_path: Path, monkeypatch: 
         built.unlink()
 
 
-def compiler(folder: Path, output: str) -> Path:
+def compiler(folder, output):
     """A program that reports its CUDA version like nvcc."""
     folder.mkdir(parents=True, exist_ok=True)
     made = folder / "nvcc"
@@ -109,7 +106,7 @@ def compiler(folder: Path, output: str) -> Path:
 
 
 @pytest.fixture
-def no_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def no_compiler(tmp_path, monkeypatch):
     """An empty folder as PATH, for a torch built for CUDA 13.0."""
     folder = tmp_path / "bin"
     folder.mkdir()
@@ -130,7 +127,7 @@ def no_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("hello", False),
     ],
 )
-def test_nvcc_of_the_same_major_version_suffices(no_compiler: Path, output: str, suffices: bool) -> None:
+def test_nvcc_of_the_same_major_version_suffices(no_compiler, output, suffices):
     compiler(no_compiler, output)
     works, text, remedy = check("nvcc")
     assert works == suffices
@@ -139,7 +136,7 @@ def test_nvcc_of_the_same_major_version_suffices(no_compiler: Path, output: str,
     assert "export CUDA_HOME=/usr/local/cuda-13.0" in remedy
 
 
-def test_nvcc_is_searched_like_torch_and_gsplat_do(no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nvcc_is_searched_like_torch_and_gsplat_do(no_compiler, monkeypatch):
     """gsplat calls nvcc from PATH, torch the one in CUDA_HOME; both must exist, and torch's version counts."""
     home = no_compiler.parent / "cuda"
     monkeypatch.setenv("CUDA_HOME", str(home))
@@ -154,7 +151,7 @@ def test_nvcc_is_searched_like_torch_and_gsplat_do(no_compiler: Path, monkeypatc
     assert check("nvcc")[0], "there is no version to compare"
 
 
-def test_the_oldest_driver_is_named(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_oldest_driver_is_named(no_cuda, monkeypatch):
     for version, words in (("13.0", "driver 580 or newer"), ("12.8", "driver 525 or newer"), ("99.0", "of its CUDA")):
         monkeypatch.setattr(torch.version, "cuda", version)
         assert words in check("CUDA")[2]
@@ -162,14 +159,14 @@ def test_the_oldest_driver_is_named(no_cuda: None, monkeypatch: pytest.MonkeyPat
     assert check("CUDA") == (False, "this torch is built without CUDA", "pip install torch==2.11.0")
 
 
-def test_programs_and_packages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_programs_and_packages(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert check("ffmpeg") == (False, "not found, for ns-render", "apt-get install ffmpeg")
     (tmp_path / "ffmpeg").touch(mode=0o755)
     assert check("ffmpeg")[:2] == (True, f"{tmp_path / 'ffmpeg'}, for ns-render")
     monkeypatch.setattr(ctypes.util, "find_library", lambda _: None)
     assert not check("libGL")[0]
-    monkeypatch.setitem(sys.modules, "pycolmap", SimpleNamespace(__version__="4.2.1"))  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "pycolmap", SimpleNamespace(__version__="4.2.1"))
     assert check("pycolmap")[1].startswith("4.2.1, for ")
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     works, text, remedy = check("pycolmap")
@@ -180,7 +177,7 @@ def test_programs_and_packages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     assert "cannot be loaded (libgomp.so.1: cannot open" in check("pycolmap")[1]
 
 
-def test_the_weights_of_lpips(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_weights_of_lpips(monkeypatch, tmp_path):
     path = tmp_path / "weights.pth"
     monkeypatch.setattr(doctor, "lpips_weights", lambda: ("https://a", path))
     assert not check("LPIPS weights")[0]
@@ -189,9 +186,7 @@ def test_the_weights_of_lpips(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     assert check("LPIPS weights")[0]
 
 
-def test_the_report_lists_every_part_and_each_remedy(
-    no_cuda: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_report_lists_every_part_and_each_remedy(no_cuda, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "300")
     assert run("doctor") == 0
     text = capsys.readouterr().out

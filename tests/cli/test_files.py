@@ -1,13 +1,10 @@
 """``sundae export`` and ``sundae prune``."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +15,6 @@ from foreign_files import FOREIGN, KSPLAT, small_field
 from packed_scenes import KINDS, write_kind
 from plyfile import PlyData, PlyElement
 from short_prunes import SHORT
-from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.gaussians import SH_C0, SPLAT_NAMES
@@ -31,7 +27,7 @@ from sundae_ns.scene.initialization import from_points
 MODEL = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "black"}
 
 
-def gaussians(n: int = 200, features: int = 0) -> dict[str, Tensor]:
+def gaussians(n=200, features=0):
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(n, 3, generator=generator)
     made = from_points(points, points, sh_degree=1, num_features=features, generator=generator)
@@ -40,7 +36,7 @@ def gaussians(n: int = 200, features: int = 0) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
+def test_export_of_a_packed_scene(tmp_path, mode):
     write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": {**MODEL, "rasterize_mode": mode}}))
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply") == 0
     found, truth = read_ply(tmp_path / "a.ply"), read_scene(tmp_path / "a.sundae").gaussians
@@ -51,13 +47,7 @@ def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
 
 @pytest.mark.parametrize("kind", [".spz", ".sog"])
 @pytest.mark.parametrize("comments", [[], ["SplatRenderMode: mip"]])
-def test_export_of_a_ply_of_any_program(
-    tmp_path: Path,
-    kind: str,
-    comments: list[str],
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_export_of_a_ply_of_any_program(tmp_path, kind, comments, capsys, caplog):
     """The file's name does not matter, and the result equals that of the same field as a packed scene."""
     given = gaussians()
     given["means"][3] = torch.nan
@@ -76,9 +66,7 @@ def test_export_of_a_ply_of_any_program(
 
 
 @pytest.mark.parametrize(("kind", "clamped"), [(".spz", 3), (".sog", 0)])
-def test_export_says_how_many_primitives_are_clamped(
-    tmp_path: Path, kind: str, clamped: int, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_says_how_many_primitives_are_clamped(tmp_path, kind, clamped, capsys):
     given = gaussians()
     given["features_rest"].clamp_(-1, 1)
     given["scales"][3, 1] = -11.0
@@ -91,14 +79,14 @@ def test_export_says_how_many_primitives_are_clamped(
     assert ("clamped" in text) == (clamped > 0)
 
 
-def test_export_of_a_ply_of_nerfstudio_upright(tmp_path: Path) -> None:
+def test_export_of_a_ply_of_nerfstudio_upright(tmp_path):
     write_ply(tmp_path / "in.ply", gaussians(), comments=[MODEL_FRAME])
     assert run("export", tmp_path / "in.ply", "-o", tmp_path / "a.spz", "--upright") == 0
     write_for_viewers(tmp_path / "b.spz", gaussians(), upright=True)
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
 
 
-def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
+def test_export_of_a_model_without_harmonics(tmp_path):
     given = gaussians()
     given["features_rest"] = given["features_rest"][:, :0]
     write_scene(tmp_path / "a.sundae", PackedScene(given, meta={"model": {**MODEL, "sh_degree": 0}}))
@@ -114,9 +102,7 @@ def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
     "options",
     [["--num-cameras", "4"], ["--score", "response", "--selection", "band"]],
 )
-def test_prune_does_not_change_kept_rows(
-    tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_prune_does_not_change_kept_rows(tmp_path, options, capsys, caplog):
     source, out = tmp_path / "in.ply", tmp_path / "out.ply"
     write_ply(source, gaussians(), comments=["SplatRenderMode: mip", "by another program"])
     # Add a property that is not part of 3DGS, and an element beside the vertices.
@@ -144,9 +130,7 @@ def test_prune_does_not_change_kept_rows(
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_every_command_reads_files_of_other_programs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str
-) -> None:
+def test_every_command_reads_files_of_other_programs(tmp_path, monkeypatch, caplog, name):
     """In folders that do not exist yet."""
     monkeypatch.chdir(tmp_path)
     truth = KSPLAT if name == "a.ksplat" else small_field()
@@ -189,7 +173,7 @@ print(json.dumps(codes))
 """
 
 
-def without(package: str, commands: list[list[str]], folder: Path) -> tuple[list[int], list[str]]:
+def without(package, commands, folder):
     """Run commands of ``sundae`` in one process where importing a package fails; exit codes, and lines of stderr."""
     started = [sys.executable, "-c", WITHOUT % SHORT, json.dumps([package, commands])]
     done = subprocess.run(started, cwd=folder, capture_output=True, text=True, check=False)
@@ -197,7 +181,7 @@ def without(package: str, commands: list[list[str]], folder: Path) -> tuple[list
     return json.loads(done.stdout.splitlines()[-1]), done.stderr.splitlines()
 
 
-def test_files_are_exported_pruned_and_refused_without_nerfstudio(tmp_path: Path) -> None:
+def test_files_are_exported_pruned_and_refused_without_nerfstudio(tmp_path):
     write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": MODEL}))
     write_kind(tmp_path / "head.sundae", KINDS["residual"])
     commands = [
@@ -219,13 +203,13 @@ def test_files_are_exported_pruned_and_refused_without_nerfstudio(tmp_path: Path
         assert reason in error
 
 
-def test_fields_are_pruned_without_a_compiler(tmp_path: Path) -> None:
+def test_fields_are_pruned_without_a_compiler(tmp_path):
     write_ply(tmp_path / "a.ply", gaussians())
     codes, errors = without("numba", [["prune", "a.ply", "-o", "pruned.ply", "--num-cameras", "2"]], tmp_path)
     assert codes == [0], errors
 
 
-def test_prune_by_the_cameras_of_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_prune_by_the_cameras_of_files(tmp_path, capsys):
     """Those of a packed scene, of a COLMAP model and of a transforms.json; each says how many it is."""
     scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
     sn.save(scene, tmp_path / "a.ply")
@@ -247,11 +231,11 @@ def test_prune_by_the_cameras_of_files(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.gpu
-def test_prune_uses_the_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    devices: list[str] = []
+def test_prune_uses_the_gpu(tmp_path, monkeypatch):
+    devices = []
     whole = pruning.prune_with_mask
 
-    def noted(scene: sn.Scene, *arguments: Any, **options: Any) -> pruning.PrunedScene:
+    def noted(scene, *arguments, **options):
         devices.append(scene.device.type)
         return whole(scene, *arguments, **options)
 

@@ -1,7 +1,5 @@
 """The ``sundae`` command itself: help, exit codes, names that are no text, warnings of libraries."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -18,7 +16,7 @@ from sundae_ns.cli.main import COMMANDS
 SUNDAE = Path(sys.executable).parent / "sundae"
 
 
-def test_the_twelve_commands() -> None:
+def test_the_twelve_commands():
     names = "run poses train prune distill pack export view render report demo doctor"
     assert list(COMMANDS) == names.split()
 
@@ -33,15 +31,15 @@ def test_the_twelve_commands() -> None:
         (["--version"], 0, f"sundae_ns {sn.__version__}\n"),
     ],
 )
-def test_what_a_newcomer_types(words: list[str], code: int, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_newcomer_types(words, code, says, capsys):
     assert run(*words) == code
     printed = capsys.readouterr()
     assert says in printed.out
     assert not printed.err
 
 
-def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> int:
+def test_other_errors_are_not_hidden(monkeypatch):
+    def broken(*_):
         raise ZeroDivisionError
 
     monkeypatch.setattr("sundae_ns.cli.doctor.parts", broken)
@@ -50,9 +48,7 @@ def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("chosen", [None, "ACTIVE"])
-def test_threads_of_torch_do_not_spin_unless_the_user_chose(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chosen: str | None
-) -> None:
+def test_threads_of_torch_do_not_spin_unless_the_user_chose(tmp_path, monkeypatch, chosen):
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
     if chosen is None:
         monkeypatch.delenv("OMP_WAIT_POLICY")
@@ -60,17 +56,17 @@ def test_threads_of_torch_do_not_spin_unless_the_user_chose(
     assert os.environ["OMP_WAIT_POLICY"] == (chosen or "PASSIVE")
 
 
-def test_torch_is_not_loaded_before_a_command_starts() -> None:
+def test_torch_is_not_loaded_before_a_command_starts():
     code = "import sys, sundae_ns.cli; sys.exit(bool({'torch', 'numpy', 'nerfstudio'} & sys.modules.keys()))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_the_installed_command_takes_any_name_and_no_warning_for_an_error(tmp_path: Path) -> None:
+def test_the_installed_command_takes_any_name_and_no_warning_for_an_error(tmp_path):
     """Names of files may hold bytes that are no text."""
     sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), tmp_path / "a.glb")
     environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"}
 
-    def started(*words: str | bytes) -> tuple[int, bytes, bytes]:
+    def started(*words):
         done = subprocess.run([SUNDAE, *words], cwd=tmp_path, env=environment, capture_output=True, check=False)
         return done.returncode, done.stdout, done.stderr
 

@@ -1,11 +1,8 @@
 """What commands may write, and what they may read: nothing is lost, nothing hangs, a full disk is one line."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -19,11 +16,9 @@ from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
 from sundae_ns.io.ply import write_ply
 from sundae_ns.scene.initialization import from_points
 
-Refused = Callable[..., str]
-
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path, monkeypatch):
     """A folder with a scene in two formats, as current folder."""
     monkeypatch.chdir(tmp_path)
     points = torch.rand(400, 3)
@@ -35,16 +30,14 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
+def refused(capsys):
     """Run a command that fails; returns its error, one line."""
     return partial(refusal, capsys)
 
 
 @pytest.mark.parametrize("link", [None, os.symlink, os.link])
 @pytest.mark.parametrize("more", [[], ["--overwrite"]])
-def test_no_command_writes_onto_its_input(
-    here: Path, refused: Refused, link: Callable[[str, str], None] | None, more: list[str]
-) -> None:
+def test_no_command_writes_onto_its_input(here, refused, link, more):
     before = (here / "a.ply").read_bytes()
     out = "a.ply"
     if link is not None:
@@ -65,7 +58,7 @@ def test_no_command_writes_onto_its_input(
         (["export", "a.sundae"], "out.ply"),
     ],
 )
-def test_an_existing_output_needs_overwrite(here: Path, refused: Refused, words: list[str], out: str) -> None:
+def test_an_existing_output_needs_overwrite(here, refused, words, out):
     assert run(*words, "-o", out) == 0
     first = {path: path.stat().st_mtime_ns for path in [here / out, *(here / out).glob("*")]}
     assert "--overwrite" in refused(*words, "-o", out)
@@ -74,7 +67,7 @@ def test_an_existing_output_needs_overwrite(here: Path, refused: Refused, words:
     assert all(path.stat().st_mtime_ns > earlier for path, earlier in first.items() if path.is_file())
 
 
-def test_parts_of_a_run_are_no_output(here: Path) -> None:
+def test_parts_of_a_run_are_no_output(here):
     (here / "run").mkdir()
     (here / "run" / "config.yml").write_text("a: 1")
     (here / "run" / "nerfstudio_models").mkdir()
@@ -88,7 +81,7 @@ def test_parts_of_a_run_are_no_output(here: Path) -> None:
     check_file(here / "run" / "scene.sundae", reads=reads, overwrite=True)
 
 
-def test_only_files_and_folders_are_replaced(here: Path) -> None:
+def test_only_files_and_folders_are_replaced(here):
     os.mkfifo(here / "pipe")
     for path in (here, here / "pipe", Path(os.devnull)):
         with pytest.raises(StorageError, match="name a file"):
@@ -111,7 +104,7 @@ def test_only_files_and_folders_are_replaced(here: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_what_is_no_file_is_refused_at_once(here: Path, refused: Refused, words: list[str], kind: str) -> None:
+def test_what_is_no_file_is_refused_at_once(here, refused, words, kind):
     (here / "run" / "nerfstudio_models").mkdir(parents=True)
     for path in ("in", "run/config.yml", "run/nerfstudio_models/step-000000001.ckpt"):
         if kind == "pipe":
@@ -123,7 +116,7 @@ def test_what_is_no_file_is_refused_at_once(here: Path, refused: Refused, words:
 
 
 @pytest.fixture
-def full(tmp_path: Path) -> Iterator[Path]:
+def full(tmp_path):
     """A file system of 64 KiB; skips where it cannot be mounted."""
     folder = tmp_path / "full"
     folder.mkdir()
@@ -136,7 +129,7 @@ def full(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", str(folder)], check=True)
 
 
-def test_a_full_disk_is_one_line(here: Path, full: Path, refused: Refused) -> None:
+def test_a_full_disk_is_one_line(here, full, refused):
     for words in (
         ["demo", full / "demo"],
         ["prune", "a.ply", "--keep", "0.9", "-o", full / "a.ply", "--num-cameras", "2"],
@@ -153,7 +146,7 @@ def test_a_full_disk_is_one_line(here: Path, full: Path, refused: Refused) -> No
         assert not out.exists()
 
 
-def test_a_full_disk_behind_stdout_is_one_line(here: Path) -> None:
+def test_a_full_disk_behind_stdout_is_one_line(here):
     with open("/dev/full", "w") as nowhere:
         command = [Path(sys.executable).parent / "sundae", "export", "a.sundae", "-o", "out.ply"]
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -165,7 +158,7 @@ def test_a_full_disk_behind_stdout_is_one_line(here: Path) -> None:
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_reader_of_stdout_that_has_left_is_no_error(here: Path, unbuffered: str) -> None:
+def test_a_reader_of_stdout_that_has_left_is_no_error(here, unbuffered):
     command = [Path(sys.executable).parent / "sundae", "export", "a.sundae", "-o", "left.ply"]
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:

@@ -1,20 +1,17 @@
 """``sundae poses``: what it refuses, what it says, and how it ends."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import command_line
 import pytest
 from fake_colmap import FakeColmap
 from PIL import Image
-from run_commands import photo, write_video
+from run_commands import NASTY, photo, write_video
 
 from sundae_ns.io import run_folder
 
@@ -22,11 +19,11 @@ PHOTOS = 6
 
 
 @pytest.fixture
-def colmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeColmap:
+def colmap(tmp_path, monkeypatch):
     """pycolmap, in a folder with photos."""
     made = FakeColmap()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "pycolmap", made)  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "pycolmap", made)
     monkeypatch.setattr(run_folder, "_held", {})
     Path("photos").mkdir()
     for index in range(PHOTOS):
@@ -34,15 +31,15 @@ def colmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeColmap:
     return made
 
 
-def poses(*words: str) -> int:
+def poses(*words):
     return command_line.run("poses", *words)
 
 
-def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+def refusal(capsys, *words):
     return command_line.refusal(capsys, "poses", *words)
 
 
-def test_each_stage_and_the_result_are_one_line(colmap: FakeColmap, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_stage_and_the_result_are_one_line(colmap, capsys):
     colmap.models = [4]
     assert poses("photos", "-o", "capture") == 0
     lines = capsys.readouterr().out.splitlines()
@@ -54,7 +51,7 @@ def test_each_stage_and_the_result_are_one_line(colmap: FakeColmap, capsys: pyte
     assert len(json.loads(Path("capture/transforms.json").read_text())["frames"]) == 4
 
 
-def test_masks_beside_the_photos_are_used(colmap: FakeColmap, capsys: pytest.CaptureFixture[str]) -> None:
+def test_masks_beside_the_photos_are_used(colmap, capsys):
     Path("photos/masks").mkdir()
     for index in range(PHOTOS):
         Image.new("L", (16, 12), 255).save(f"photos/masks/{index}.png")
@@ -71,13 +68,25 @@ def test_masks_beside_the_photos_are_used(colmap: FakeColmap, capsys: pytest.Cap
     assert "masks: " not in said
 
 
-def test_a_video(colmap: FakeColmap, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_video(colmap, capsys):
     write_video(Path("walk.mp4"), 40)
     assert poses("walk.mp4", "-o", "capture", "--frames", "9") == 0
     assert "frames: 9 of 9" in capsys.readouterr().out
 
 
-def test_an_error_of_colmap_is_one_line(colmap: FakeColmap, capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_are_no_options_and_nothing_of_a_shell(colmap, tmp_path):
+    Path(NASTY).mkdir()
+    names = ["--help.png", f"{NASTY}.png", "-b.PNG"]
+    for name in names:
+        photo(Path(NASTY, name), "png")
+    assert poses(f"./{NASTY}", "-o", f"./out{NASTY}") == 0
+    frames = json.loads(Path(f"out{NASTY}/transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"images/frame_{number:05d}.png" for number in (1, 2, 3)]
+    assert [frame["original"] for frame in frames] == names
+    assert not list(tmp_path.rglob("PWNED"))
+
+
+def test_an_error_of_colmap_is_one_line(colmap, capsys):
     colmap.fails = "models"
     line = refusal(capsys, "photos", "-o", "capture")
     assert "COLMAP failed (models ended early); remove capture.partial and start again, or report it" in line
@@ -98,7 +107,7 @@ main()
 """
 
 
-def started(photos: Path) -> subprocess.Popen[str]:
+def started(photos):
     """The command, in the middle of a function that does not return."""
     support = Path(__file__).parents[1] / "support"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(support), *sys.path])}
@@ -111,11 +120,11 @@ def started(photos: Path) -> subprocess.Popen[str]:
     return process
 
 
-def interrupt(process: subprocess.Popen[str]) -> None:
+def interrupt(process):
     process.send_signal(signal.SIGINT)
 
 
-def kill(process: subprocess.Popen[str]) -> None:
+def kill(process):
     process.kill()
 
 
@@ -123,9 +132,7 @@ def kill(process: subprocess.Popen[str]) -> None:
     ("end", "code", "says"),
     [(interrupt, 130, "sundae: interrupted; the same command continues here\n"), (kill, -signal.SIGKILL, "")],
 )
-def test_an_interrupt_ends_at_once_and_the_same_command_continues(
-    colmap: FakeColmap, tmp_path: Path, end: Callable[[subprocess.Popen[str]], None], code: int, says: str
-) -> None:
+def test_an_interrupt_ends_at_once_and_the_same_command_continues(colmap, tmp_path, end, code, says):
     process = started(tmp_path / "photos")
     end(process)
     _, errors = process.communicate(timeout=60)

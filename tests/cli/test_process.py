@@ -1,7 +1,5 @@
 """Commands in a process group: exit codes, and signals that reach them and what they started."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -11,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from run_commands import NASTY
 
 from sundae_ns.cli.process import quoted, run_command, run_logged, word
 from sundae_ns.core.errors import SundaeError
@@ -33,21 +32,32 @@ signal.pause()
 """
 
 
-@pytest.mark.parametrize(("code", "expected"), [("pass", 0), ("raise SystemExit(7)", 7)])
-def test_the_exit_code_is_the_command_s(code: str, expected: int) -> None:
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("pass", 0),
+        ("raise SystemExit(7)", 7),
+        ("import os; os.kill(os.getpid(), 9)", 137),
+        ("import sys; raise SystemExit(sys.stdin.read() != '')", 0),
+    ],
+)
+def test_the_exit_code_is_the_command_s_which_gets_no_input(code, expected):
     assert run_command([sys.executable, "-c", code]) == expected
 
 
-def test_a_command_that_a_signal_ended() -> None:
-    assert run_command([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]) == 137
+def test_no_word_reaches_a_shell(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code = f"import sys; raise SystemExit(sys.argv[1] != {NASTY!r})"
+    assert run_command([sys.executable, "-c", code, NASTY]) == 0
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("sent", "passed_on"),
     [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGTERM), (signal.SIGHUP, signal.SIGTERM)],
 )
-def test_a_signal_reaches_the_whole_group_once(tmp_path: Path, sent: signal.Signals, passed_on: signal.Signals) -> None:
-    def interrupt() -> None:
+def test_a_signal_reaches_the_whole_group_once(tmp_path, sent, passed_on):
+    def interrupt():
         while not (tmp_path / "ready").exists():
             time.sleep(0.01)
         os.kill(os.getpid(), sent)
@@ -66,20 +76,14 @@ def test_a_signal_reaches_the_whole_group_once(tmp_path: Path, sent: signal.Sign
     assert _ends(int((tmp_path / "grandchild").read_text()))
 
 
-def _ends(pid: int) -> bool:
+def _ends(pid):
     """Whether a process ends, or has ended and waits for its parent."""
     for _ in range(1000):
-        state = subprocess.run(
-            ["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False
-        ).stdout
-        if not state.strip() or state.startswith("Z"):
+        status = Path("/proc", str(pid), "stat")
+        if not status.exists() or ") Z " in status.read_text():
             return True
         time.sleep(0.01)
     return False
-
-
-def test_the_command_gets_no_input() -> None:
-    assert run_command([sys.executable, "-c", "import sys; raise SystemExit(sys.stdin.read() != '')"]) == 0
 
 
 PARENT = """
@@ -92,7 +96,7 @@ run_command(words) if sys.argv[3] == "shown" else run_logged(words, here / "log"
 
 
 @pytest.mark.parametrize("way", ["shown", "logged"])
-def test_a_command_ends_with_a_killed_process(tmp_path: Path, way: str) -> None:
+def test_a_command_ends_with_a_killed_process(tmp_path, way):
     parent = subprocess.Popen([sys.executable, "-c", PARENT, CHILD, tmp_path, way], stdout=subprocess.DEVNULL)
     wait_for(tmp_path / "ready")
     parent.kill()
@@ -101,7 +105,7 @@ def test_a_command_ends_with_a_killed_process(tmp_path: Path, way: str) -> None:
     assert (tmp_path / "signals").read_text().split() == [str(int(signal.SIGTERM))], "a training saves itself"
 
 
-def wait_for(path: Path) -> None:
+def wait_for(path):
     for _ in range(3000):
         if path.exists():
             return
@@ -109,7 +113,7 @@ def wait_for(path: Path) -> None:
     pytest.fail(f"there is no {path.name}")
 
 
-def test_a_command_that_is_not_installed() -> None:
+def test_a_command_that_is_not_installed():
     with pytest.raises(SundaeError, match="^no-such-command cannot be started \\(No such file or directory\\); "):
         run_command(["no-such-command"])
 
@@ -130,7 +134,7 @@ sys.exit(len(sys.argv) > 1)
 """
 
 
-def test_a_logged_training_shows_messages_and_the_schedule(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_logged_training_shows_messages_and_the_schedule(tmp_path, capfd):
     log = tmp_path / "train.log"
     assert run_command([sys.executable, "-c", TRAINING], log) == 0
     _, *printed = capfd.readouterr().out.split(TRAINING)[-1].splitlines()
@@ -143,19 +147,17 @@ SHOWN = ["[00:00:02]", "Warning:", "30"]
 
 
 @pytest.mark.parametrize(("cause", "shown"), [("sundae: a is damaged; repair it", False), ("KeyError: 'a'", True)])
-def test_a_logged_training_that_fails_says_why(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], cause: str, shown: bool
-) -> None:
+def test_a_logged_training_that_fails_says_why(tmp_path, capfd, cause, shown):
     assert run_command([sys.executable, "-c", TRAINING, cause], tmp_path / "log") == 1
     printed = capfd.readouterr()
     assert cause in (printed.err if shown else printed.out)
     assert bool(printed.err) == shown
 
 
-def test_an_error_leaves_no_logged_command_behind(tmp_path: Path) -> None:
+def test_an_error_leaves_no_logged_command_behind(tmp_path):
     pids = []
 
-    def interrupt(line: str) -> None:
+    def interrupt(line):
         pids.append(int(line))
         raise KeyboardInterrupt
 
@@ -166,7 +168,7 @@ def test_an_error_leaves_no_logged_command_behind(tmp_path: Path) -> None:
         os.kill(pids[0], 0)
 
 
-def test_a_signal_that_is_ignored_stays_ignored() -> None:
+def test_a_signal_that_is_ignored_stays_ignored():
     """As under nohup."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
@@ -176,6 +178,6 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_path_is_no_option() -> None:
+def test_a_path_is_no_option():
     assert [word(Path(name)) for name in ("-a", "--help", "a", "/-a")] == ["./-a", "./--help", "a", "/-a"]
     assert [quoted(Path(name)) for name in ("-a", "a b", "$(b)")] == ["./-a", "'a b'", "'$(b)'"]

@@ -1,12 +1,9 @@
 """What each command refuses: one line with the cause and the remedy, before anything is written or started."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shlex
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -144,7 +141,7 @@ REFUSALS = {
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def inputs(tmp_path_factory):
     """A folder with scenes, photos and captures, right and wrong."""
     folder = tmp_path_factory.mktemp("inputs")
     points = torch.rand(200, 3)
@@ -179,11 +176,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("words", REFUSALS)
-def test_refusals_are_one_line(
-    words: str, inputs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_refusals_are_one_line(words, inputs, monkeypatch, capsys):
     monkeypatch.chdir(inputs)
-    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())
     before = sorted(inputs.rglob("*"))
     assert REFUSALS[words] in refusal(capsys, *shlex.split(words))
     assert sorted(inputs.rglob("*")) == before

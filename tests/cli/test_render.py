@@ -1,12 +1,8 @@
 """``sundae render``: images, videos, and refusals in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json
-from pathlib import Path
-from typing import Any
 
 import av
 import command_line
@@ -22,11 +18,11 @@ VIEWS = [
 ]
 
 
-def run(*arguments: object) -> int:
+def run(*arguments):
     return command_line.run("render", *arguments)
 
 
-def capture_file(path: Path, count: int) -> Path:
+def capture_file(path, count):
     """A ``transforms.json`` with cameras that look along y."""
     pose = torch.eye(4)
     pose[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -39,7 +35,7 @@ def capture_file(path: Path, count: int) -> Path:
     return path
 
 
-def camera_path(path: Path, count: int, **options: Any) -> Path:
+def camera_path(path, count, **options):
     """A camera path of nerfstudio's viewer."""
     pose = [1.0, 0, 0, 0.5, 0, 0, -1.0, -2.0, 0, 1.0, 0, 0.5, 0, 0, 0, 1.0]
     cameras = [{"camera_to_world": pose, "fov": 60}] * count
@@ -47,18 +43,18 @@ def camera_path(path: Path, count: int, **options: Any) -> Path:
     return path
 
 
-def pixels(path: Path) -> np.ndarray:
+def pixels(path):
     with Image.open(path) as image:
         return np.asarray(image.convert("RGB"))
 
 
-def frames_of(path: Path) -> list[Any]:
+def frames_of(path):
     with av.open(str(path)) as container:
         return list(container.decode(video=0))
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A scene without views as ``.ply``, and with two of odd sides as ``.sundae``."""
     folder = tmp_path_factory.mktemp("scenes")
     generator = torch.Generator().manual_seed(0)
@@ -70,7 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_an_image_of_a_stored_view(folder: Path, tmp_path: Path, index: int) -> None:
+def test_an_image_of_a_stored_view(folder, tmp_path, index):
     out = tmp_path / "a.png"
     assert run(folder / "packed.sundae", "-o", out, "--view", index) == 0
     scene = sundae_ns.load(folder / "packed.sundae")
@@ -79,7 +75,7 @@ def test_an_image_of_a_stored_view(folder: Path, tmp_path: Path, index: int) -> 
     assert np.array_equal(pixels(out), expected)
 
 
-def test_an_image_of_the_camera_in_a_file(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_image_of_the_camera_in_a_file(folder, tmp_path, capsys):
     camera, out = capture_file(tmp_path / "camera.json", 1), tmp_path / "a.jpg"
     assert run(folder / "cloud.ply", "--camera", camera, "-o", out) == 0
     assert capsys.readouterr().out == f"{out}: 40 x 30 px\n"
@@ -90,14 +86,12 @@ def test_an_image_of_the_camera_in_a_file(folder: Path, tmp_path: Path, capsys: 
     assert pixels(tmp_path / "b.png").shape == (60, 80, 3)
 
 
-def test_a_scene_without_cameras_is_seen_from_the_front(folder: Path, tmp_path: Path) -> None:
+def test_a_scene_without_cameras_is_seen_from_the_front(folder, tmp_path):
     assert run(folder / "cloud.ply", "-o", tmp_path / "a.webp", "--width", 64) == 0
     assert pixels(tmp_path / "a.webp").shape == (48, 64, 3)
 
 
-def test_a_video_has_a_frame_for_each_camera_and_even_sides(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_video_has_a_frame_for_each_camera_and_even_sides(folder, tmp_path, capsys):
     out = tmp_path / "a.mp4"
     assert run(folder / "cloud.ply", "--camera", camera_path(tmp_path / "path.json", 5, fps=10), "-o", out) == 0
     assert capsys.readouterr().out == f"{out}: 5 frames of 40 x 30 px, 0.5 s\n"
@@ -108,9 +102,7 @@ def test_a_video_has_a_frame_for_each_camera_and_even_sides(
 
 
 @pytest.mark.parametrize("name", ["packed.sundae", "cloud.ply"])
-def test_a_film_without_a_camera_path(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
+def test_a_film_without_a_camera_path(folder, tmp_path, capsys, name):
     out = tmp_path / "a.mp4"
     assert run(folder / name, "-o", out, "--width", 63, "--seconds", 0.5, "--fps", 10, "--up", 0, 0, 1) == 0
     shown = {"packed.sundae": (62, 48), "cloud.ply": (62, 34)}[name]
@@ -121,7 +113,7 @@ def test_a_film_without_a_camera_path(
     assert min(np.abs(one - other).mean() for one, other in itertools.pairwise(frames)) > 1
 
 
-def test_an_image_is_that_of_the_start_view(folder: Path, tmp_path: Path) -> None:
+def test_an_image_is_that_of_the_start_view(folder, tmp_path):
     scene = sundae_ns.load(folder / "packed.sundae")
     start = scene.cameras[1].zoomed(2)
     sundae_ns.save(dataclasses.replace(scene, start=start), tmp_path / "a.sundae")

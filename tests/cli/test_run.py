@@ -1,21 +1,18 @@
 """``sundae run``: its steps, what is done again, and what is refused; integration/test_run.py trains."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import tyro
 from colmap_models import write_model
 from PIL import Image
-from run_commands import NAMES, PHOTOS, STEPS, Commands, refusal, run, write_video
+from run_commands import NAMES, PHOTOS, STEPS, refusal, run, write_video
 
 from sundae_ns import method_configs
 
@@ -30,7 +27,7 @@ sys.stdin.read()
 """
 
 
-def test_photos_become_a_scene_and_a_report(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_photos_become_a_scene_and_a_report(commands, capsys):
     assert run("photos", "-o", "out", "--keep", "20%", "--steps", "100") == 0
     assert commands.names == STEPS
     # Each command is printed before it runs.
@@ -45,7 +42,7 @@ def test_photos_become_a_scene_and_a_report(commands: Commands, capsys: pytest.C
         assert commands.option("--data", place) == "out/capture"
 
 
-def test_the_options_of_poses_are_passed_on(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_options_of_poses_are_passed_on(commands, capsys):
     shutil.copytree("photos", "masks")
     for path in Path("masks").iterdir():
         Image.new("L", (16, 12), 255).save(path.with_suffix(".png"))
@@ -56,14 +53,14 @@ def test_the_options_of_poses_are_passed_on(commands: Commands, capsys: pytest.C
     assert "not left out; repeat the first command" in refusal(capsys, *again)
 
 
-def test_a_video_is_taken(commands: Commands, tmp_path: Path) -> None:
+def test_a_video_is_taken(commands, tmp_path):
     write_video(tmp_path / "my walk.mp4", 12)
     assert run("my walk.mp4", "-o", "out") == 0
     assert commands.ran[0] == ["sundae", "poses", "my walk.mp4", "-o", "out/capture"]
     assert commands.option("--experiment-name", 1) == "my walk"
 
 
-def test_a_capture_needs_no_poses(commands: Commands) -> None:
+def test_a_capture_needs_no_poses(commands):
     assert run("photos", "-o", "out") == 0
     commands.ran.clear()
     assert run("out/capture", "-o", "again") == 0
@@ -72,9 +69,7 @@ def test_a_capture_needs_no_poses(commands: Commands) -> None:
     assert not Path("again/capture").exists()
 
 
-def test_a_capture_in_colmap_layout_needs_no_poses(
-    commands: Commands, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_capture_in_colmap_layout_needs_no_poses(commands, tmp_path, capsys):
     shutil.copytree("photos", "scene/dense/images")
     write_model(tmp_path / "scene" / "dense" / "sparse", [f"{index}.JPG" for index in range(PHOTOS)], (16, 12))
     assert run("scene", "-o", "my scene") == 0
@@ -94,7 +89,7 @@ def test_a_capture_in_colmap_layout_needs_no_poses(
     assert "--load-dir" in commands.ran[1]
 
 
-def test_a_capture_of_blender_needs_no_poses(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_capture_of_blender_needs_no_poses(commands, capsys):
     shutil.copytree("photos", "lego/train")
     for path in Path("lego/train").iterdir():
         path.rename(path.with_suffix(".png"))
@@ -107,7 +102,7 @@ def test_a_capture_of_blender_needs_no_poses(commands: Commands, capsys: pytest.
     assert commands.ran[0][-1] == "blender-data"
 
 
-def test_a_size_and_a_quality(commands: Commands) -> None:
+def test_a_size_and_a_quality(commands):
     assert run("photos", "-o", "out", "--max-mb", "2", "--quality", "best") == 0
     usual = method_configs.sundae.config
     words = commands.ran[1]
@@ -122,7 +117,7 @@ def test_a_size_and_a_quality(commands: Commands) -> None:
     assert "--target-bytes" not in commands.ran[2]
 
 
-def test_a_gpu_packs_with_a_fine_tune(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_gpu_packs_with_a_fine_tune(commands, capsys):
     commands.gpu = True
     assert run("photos", "-o", "out", "--max-mb", "2") == 0
     assert commands.option("--finetune", 2) == commands.option("--finetune-steps", 1) == "1500"
@@ -140,7 +135,7 @@ def test_a_gpu_packs_with_a_fine_tune(commands: Commands, capsys: pytest.Capture
 # ---------------------------------------------------------------------------------------------- the same command again
 
 
-def test_what_is_done_is_skipped(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_done_is_skipped(commands, capsys):
     assert run("photos", "-o", "out") == 0
     commands.ran.clear()
     capsys.readouterr()
@@ -149,12 +144,12 @@ def test_what_is_done_is_skipped(commands: Commands, capsys: pytest.CaptureFixtu
     assert capsys.readouterr().out.count(": done\n") == 5
 
 
-def cut(path: Path, size: int | None = None) -> None:
+def cut(path, size=None):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 if size is None else size])
 
 
 @pytest.mark.parametrize("figure", ["NaN", '"x"', "Infinity", None])
-def test_a_report_without_figures_is_made_again(commands: Commands, figure: str | None) -> None:
+def test_a_report_without_figures_is_made_again(commands, figure):
     assert run("photos", "-o", "out") == 0
     report = Path("out/report/report.json")
     report.write_text("[]" if figure is None else report.read_text().replace("30.0", figure))
@@ -175,9 +170,7 @@ def test_a_report_without_figures_is_made_again(commands: Commands, figure: str 
         ("out/scene.html", 4),
     ],
 )
-def test_half_a_result_is_made_again(
-    commands: Commands, result: str, step: int, harm: Callable[[Path], object]
-) -> None:
+def test_half_a_result_is_made_again(commands, result, step, harm):
     assert run("photos", "-o", "out") == 0
     harm(Path(result))
     commands.ran.clear()
@@ -188,7 +181,7 @@ def test_half_a_result_is_made_again(
     assert commands.ran == []
 
 
-def test_a_checkpoint_before_a_damaged_one_is_resumed(commands: Commands) -> None:
+def test_a_checkpoint_before_a_damaged_one_is_resumed(commands):
     commands.codes["ns-train"] = 130
     assert run("photos", "-o", "out") == 130
     commands.codes.clear()
@@ -197,7 +190,7 @@ def test_a_checkpoint_before_a_damaged_one_is_resumed(commands: Commands) -> Non
     assert "--load-dir" in commands.ran[2]
 
 
-def test_a_training_without_its_options_starts_anew_and_is_kept(commands: Commands) -> None:
+def test_a_training_without_its_options_starts_anew_and_is_kept(commands):
     assert run("photos", "-o", "out") == 0
     cut(Path(RUN, "config.yml"), 0)
     commands.codes["ns-train"] = 130
@@ -213,9 +206,7 @@ def test_a_training_without_its_options_starts_anew_and_is_kept(commands: Comman
 
 
 @pytest.mark.parametrize(("step", "name"), zip(STEPS, NAMES))
-def test_a_step_that_fails_ends_with_its_code_and_is_repeated(
-    commands: Commands, capsys: pytest.CaptureFixture[str], step: str, name: str
-) -> None:
+def test_a_step_that_fails_ends_with_its_code_and_is_repeated(commands, capsys, step, name):
     for code, says in ((2, "ended with 2, as the lines above say; mend that, and"), (137, "was killed by signal 9;")):
         commands.codes[step] = code
         assert run("photos", "-o", "out") == code
@@ -227,7 +218,7 @@ def test_a_step_that_fails_ends_with_its_code_and_is_repeated(
     assert commands.names == STEPS[STEPS.index(step) :]
 
 
-def test_an_interrupted_training_resumes(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_interrupted_training_resumes(commands, capsys):
     commands.codes["ns-train"] = 130
     assert run("photos", "-o", "out", "--steps", "100") == 130
     assert "the same command continues here" in capsys.readouterr().err
@@ -243,7 +234,7 @@ def test_an_interrupted_training_resumes(commands: Commands, capsys: pytest.Capt
     ]
 
 
-def test_a_fine_tune_ends_the_training_where_there_is_a_gpu(commands: Commands) -> None:
+def test_a_fine_tune_ends_the_training_where_there_is_a_gpu(commands):
     commands.gpu, commands.length, commands.saved_at[0] = True, 30000, 28499
     assert run("photos", "-o", "out") == 0
     commands.ran.clear()
@@ -256,7 +247,7 @@ def test_a_fine_tune_ends_the_training_where_there_is_a_gpu(commands: Commands) 
     assert commands.option("--load-dir", 0) == f"{RUN}/nerfstudio_models"
 
 
-def test_a_training_without_a_checkpoint_starts_anew(commands: Commands) -> None:
+def test_a_training_without_a_checkpoint_starts_anew(commands):
     commands.codes["ns-train"] = 137
     assert run("photos", "-o", "out", "--steps", "100") == 137
     commands.codes.clear()
@@ -264,7 +255,7 @@ def test_a_training_without_a_checkpoint_starts_anew(commands: Commands) -> None
     assert commands.ran[2] == commands.ran[1]
 
 
-def test_results_of_an_older_training_are_made_again(commands: Commands) -> None:
+def test_results_of_an_older_training_are_made_again(commands):
     assert run("photos", "-o", "out") == 0
     shutil.rmtree("out/runs")
     commands.ran.clear()
@@ -279,9 +270,7 @@ def test_results_of_an_older_training_are_made_again(commands: Commands) -> None
 
 
 @pytest.mark.parametrize(("placed", "enough"), [(2, False), (3, False), (4, True)])
-def test_too_few_placed_photos(
-    commands: Commands, capsys: pytest.CaptureFixture[str], placed: int, enough: bool
-) -> None:
+def test_too_few_placed_photos(commands, capsys, placed, enough):
     commands.placed = placed
     if enough:
         assert run("photos", "-o", "out") == 0
@@ -294,12 +283,12 @@ def test_too_few_placed_photos(
     assert run("out/capture", "-o", "other") == 0
 
 
-def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_that_writes_nothing(commands, capsys):
     commands.silent = True
     assert "camera poses ended without its result" in refusal(capsys, "photos", "-o", "out")
 
 
-def test_other_or_damaged_settings_are_refused(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_or_damaged_settings_are_refused(commands, capsys):
     assert run("photos", "-o", "out") == 0
     for more, cause in (
         (["--steps", "200"], "steps left out, not 200"),
@@ -313,9 +302,7 @@ def test_other_or_damaged_settings_are_refused(commands: Commands, capsys: pytes
         assert "out/run.json is damaged" in refusal(capsys, "photos", "-o", "out")
 
 
-def test_without_pycolmap_nothing_starts(
-    commands: Commands, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pycolmap_nothing_starts(commands, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     line = refusal(capsys, "photos", "-o", "out")
     assert line == 'sundae: camera poses need pycolmap; install it with pip install "sundae_ns[photos]"'
@@ -325,7 +312,7 @@ def test_without_pycolmap_nothing_starts(
     assert refusal(capsys, "photos", "-o", "out") == line
 
 
-def test_photos_are_judged_before_anything_starts(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_photos_are_judged_before_anything_starts(commands, capsys):
     for name in "abcdefghi":
         os.mkfifo(f"photos/{name}.png")
     assert "photos/i.png cannot be read (it is a pipe" in refusal(capsys, "photos", "-o", "out")
@@ -339,7 +326,7 @@ def test_photos_are_judged_before_anything_starts(commands: Commands, capsys: py
     assert run("photos", "-o", "out") == 0
 
 
-def test_names_with_a_dash_are_no_options(commands: Commands) -> None:
+def test_names_with_a_dash_are_no_options(commands):
     shutil.copytree("photos", "-photos")
     assert run("./-photos", "-o", "./-out") == 0
     for words in commands.ran[1:]:
@@ -351,7 +338,7 @@ def test_names_with_a_dash_are_no_options(commands: Commands) -> None:
     assert commands.option("--data", 0) == "./-out/capture"
 
 
-def test_one_command_works_in_a_folder(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_command_works_in_a_folder(commands, capsys):
     other = subprocess.Popen([sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     with other:
         assert other.stdout is not None

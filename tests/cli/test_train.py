@@ -1,14 +1,11 @@
 """``sundae train``: the command that it prints is the one that it runs, and ns-train knows its options."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import re
 import shlex
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import command_line
 import pytest
@@ -24,12 +21,12 @@ from sundae_ns.io.run_folder import LOCK, unfinished_run
 class Commands:
     """Stands for the commands of ``sundae train``: a training leaves its run; each ends with the code it is told."""
 
-    def __init__(self) -> None:
-        self.ran: list[list[str]] = []
-        self.codes: dict[str, int] = {}
+    def __init__(self):
+        self.ran = []
+        self.codes = {}
         self.elsewhere = False
 
-    def __call__(self, words: list[str]) -> int:
+    def __call__(self, words):
         print(shlex.join(words))
         self.ran.append(words)
         if words[0] == "ns-train" and not self.elsewhere:
@@ -37,13 +34,13 @@ class Commands:
         return self.codes.get("--finetune" if "--finetune" in words else words[0], 0)
 
     @property
-    def run(self) -> Path:
+    def run(self):
         words = self.ran[0]
         return Path(words[5]) / "scene" / words[1] / option_of(words, "--timestamp")
 
 
 @pytest.fixture
-def commands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Commands:
+def commands(monkeypatch, tmp_path):
     """The commands, in a folder with an empty capture, ``scene``, on a machine without a GPU."""
     made = Commands()
     (tmp_path / "scene").mkdir()
@@ -54,25 +51,25 @@ def commands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Commands:
     return made
 
 
-def train(*words: object) -> int:
+def train(*words):
     return command_line.run("train", *words)
 
 
-def refusal(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+def refusal(capsys, *words):
     return command_line.refusal(capsys, "train", *words)
 
 
-def option_of(words: list[str], name: str) -> str:
+def option_of(words, name):
     return words[words.index(name) + 1]
 
 
-def config_of(words: list[str], method: str = "sundae") -> Any:
+def config_of(words, method="sundae"):
     """The options that ns-train reads from the words of a method and its options."""
     usual = getattr(method_configs, method.replace("-", "_")).config
     return tyro.cli(type(usual), default=usual, args=words[2:])
 
 
-def run_of(folder: Path, capture: Path, step: int, *, source: Path | None = None) -> Path:
+def run_of(folder, capture, step, *, source=None):
     """Write a run of 30,000 steps with a checkpoint of a step."""
     (folder / "nerfstudio_models").mkdir(parents=True)
     text = "!!python/object:sundae_ns.plugin.trainer.SundaeTrainerConfig\nschedule_length: 30000\n"
@@ -86,7 +83,7 @@ def run_of(folder: Path, capture: Path, step: int, *, source: Path | None = None
 
 
 @pytest.mark.parametrize("method", methods())
-def test_the_printed_command_runs(commands: Commands, capsys: pytest.CaptureFixture[str], method: str) -> None:
+def test_the_printed_command_runs(commands, capsys, method):
     assert train("scene", "-o", "my runs", "--method", method, "--steps", "700", "--keep", "0.05") == 0
     assert shlex.split(capsys.readouterr().out.splitlines()[0]) == commands.ran[0]
     assert commands.ran[0][:2] == ["ns-train", method]
@@ -95,14 +92,14 @@ def test_the_printed_command_runs(commands: Commands, capsys: pytest.CaptureFixt
     assert config.pipeline.model.pruning.keep_ratio == 0.05
 
 
-def test_what_is_not_given_is_the_method_s_own(commands: Commands) -> None:
+def test_what_is_not_given_is_the_method_s_own(commands):
     assert train("scene") == 0
     *words, name = commands.ran[0]
     assert words == ["ns-train", "sundae", "--data", "scene", "--output-dir", "outputs", "--timestamp"]
     assert re.fullmatch(r"[\d_-]+", name), "its run is found by this name"
 
 
-def test_further_options_and_the_parser_of_a_capture(commands: Commands) -> None:
+def test_further_options_and_the_parser_of_a_capture(commands):
     Path("scene/transforms.json").unlink()
     Path("scene/images").mkdir()
     Image.new("RGB", (20, 16), "grey").save("scene/images/0.png")
@@ -117,7 +114,7 @@ def test_further_options_and_the_parser_of_a_capture(commands: Commands) -> None
     assert config_of(words[: words.index("colmap")]).pipeline.model.sh_degree == 1
 
 
-def test_a_capture_of_blender_is_read_over_white(commands: Commands) -> None:
+def test_a_capture_of_blender_is_read_over_white(commands):
     Path("scene/transforms.json").unlink()
     for split in ("train", "val", "test"):
         Path(f"scene/transforms_{split}.json").write_text(json.dumps({"frames": [{"file_path": "./0"}]}))
@@ -133,7 +130,7 @@ def test_a_capture_of_blender_is_read_over_white(commands: Commands) -> None:
     assert "--pipeline.model.background-color" not in commands.ran[0]
 
 
-def test_an_unfinished_run_is_named_and_resumed(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unfinished_run_is_named_and_resumed(commands, capsys):
     commands.elsewhere = True
     for name in ("my scene", "other"):
         Path(name).mkdir()
@@ -157,7 +154,7 @@ def test_an_unfinished_run_is_named_and_resumed(commands: Commands, capsys: pyte
         assert "no unfinished run" in refusal(capsys, "my scene", "--resume", *more)
 
 
-def test_a_run_that_another_one_has_resumed_or_that_is_trained_is_not_named(tmp_path: Path) -> None:
+def test_a_run_that_another_one_has_resumed_or_that_is_trained_is_not_named(tmp_path):
     out, capture = tmp_path / "outputs", tmp_path / "scene"
     first = run_of(out / "scene" / "sundae" / "first", capture, 1999)
     assert unfinished_run(out, "sundae", capture) == (first, 2000, 30000)
@@ -168,7 +165,7 @@ def test_a_run_that_another_one_has_resumed_or_that_is_trained_is_not_named(tmp_
     assert unfinished_run(out, "sundae", capture) is None
 
 
-def test_a_finished_training_is_packed(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_finished_training_is_packed(commands, capsys):
     assert train("scene") == 0
     _, pack = commands.ran
     assert pack == ["sundae", "pack", str(commands.run), "-o", str(commands.run / "scene.sundae")]
@@ -176,7 +173,7 @@ def test_a_finished_training_is_packed(commands: Commands, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize("given", [["--timestamp", "mine"], ["--timestamp=mine"]])
-def test_a_run_of_the_user_s_own_name_is_packed(commands: Commands, given: list[str]) -> None:
+def test_a_run_of_the_user_s_own_name_is_packed(commands, given):
     run_of(Path("outputs/scene/sundae/other"), Path("scene"), 29999)
     commands.elsewhere = True
     run_of(Path("outputs/scene/sundae/mine"), Path("scene"), 29999)
@@ -186,9 +183,7 @@ def test_a_run_of_the_user_s_own_name_is_packed(commands: Commands, given: list[
 
 
 @pytest.mark.parametrize(("failed", "last"), [(False, "--finetune"), (True, "scene.sundae")])
-def test_a_gpu_fine_tunes_the_pack_or_leaves_it(
-    commands: Commands, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], failed: bool, last: str
-) -> None:
+def test_a_gpu_fine_tunes_the_pack_or_leaves_it(commands, monkeypatch, capsys, failed, last):
     monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: True)
     commands.codes = {"--finetune": int(failed)}
     assert train("scene") == 0
@@ -201,15 +196,13 @@ def test_a_gpu_fine_tunes_the_pack_or_leaves_it(
 
 
 @pytest.mark.parametrize("length", ["--max-num-iterations", "--schedule-length", "--finetune-steps"])
-def test_a_length_of_ns_train_is_the_user_s(commands: Commands, monkeypatch: pytest.MonkeyPatch, length: str) -> None:
+def test_a_length_of_ns_train_is_the_user_s(commands, monkeypatch, length):
     monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: True)
     assert train("scene", "--", length, "40000") == 0
     assert sum(word.startswith("--finetune-steps") for word in commands.ran[0]) == (length == "--finetune-steps")
 
 
-def test_a_run_that_its_fine_tune_has_finished_is_no_interrupted_one(
-    commands: Commands, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_its_fine_tune_has_finished_is_no_interrupted_one(commands, capsys):
     run = run_of(Path("outputs/scene/sundae/tuned"), Path("scene"), 28499)
     (run / "scene.sundae").touch()
     assert train("scene") == 0
@@ -224,14 +217,14 @@ def test_a_run_that_its_fine_tune_has_finished_is_no_interrupted_one(
 
 
 @pytest.mark.parametrize("stage", ["ns-train", "--finetune", "sundae"])
-def test_what_ends_early_ends_the_command(commands: Commands, monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
+def test_what_ends_early_ends_the_command(commands, monkeypatch, stage):
     monkeypatch.setattr("sundae_ns.cli.train.has_gpu", lambda: stage == "--finetune")
     commands.codes = {stage: 130}
     assert train("scene") == 130
     assert len(commands.ran) == (1 if stage == "ns-train" else 2)
 
 
-def test_a_run_that_is_not_found_is_not_packed(commands: Commands) -> None:
+def test_a_run_that_is_not_found_is_not_packed(commands):
     commands.elsewhere = True
     assert train("scene", "--", "--output-dir", "own") == 0
     assert len(commands.ran) == 1

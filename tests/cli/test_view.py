@@ -1,7 +1,5 @@
 """``sundae view``."""
 
-from __future__ import annotations
-
 import http.client
 import socket
 import struct
@@ -10,9 +8,7 @@ import time
 import urllib.error
 import urllib.request
 import webbrowser
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 from packed_scenes import KINDS, write_kind
@@ -26,7 +22,7 @@ SECONDS = 60
 
 
 @contextmanager
-def served(page: str) -> Iterator[int]:
+def served(page):
     """The port of a server of one page."""
     with command.serve(page, 0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -36,7 +32,7 @@ def served(page: str) -> Iterator[int]:
         server.shutdown()
 
 
-def until_gone(name: str) -> None:
+def until_gone(name):
     """Wait until no thread with this in its name is left."""
     last = time.monotonic() + SECONDS
     while any(name in thread.name for thread in threading.enumerate()):
@@ -44,7 +40,7 @@ def until_gone(name: str) -> None:
         time.sleep(0.01)
 
 
-def test_the_server_has_one_page_and_listens_on_this_machine_only() -> None:
+def test_the_server_has_one_page_and_listens_on_this_machine_only():
     with served("<p>a scene</p>") as port:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
             assert answer.read() == b"<p>a scene</p>"
@@ -55,7 +51,7 @@ def test_the_server_has_one_page_and_listens_on_this_machine_only() -> None:
             command.serve("", port)
 
 
-def status_of(port: int, *hosts: str) -> tuple[int, bytes]:
+def status_of(port, *hosts):
     """Status and content of an answer to a request with these headers ``Host``."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=SECONDS)
     connection.putrequest("GET", "/", skip_host=True)
@@ -68,7 +64,7 @@ def status_of(port: int, *hosts: str) -> tuple[int, bytes]:
     return found
 
 
-def test_only_this_machine_by_name_is_answered() -> None:
+def test_only_this_machine_by_name_is_answered():
     """Another site whose name resolves to 127.0.0.1 must not read the scene."""
     with served("a scene") as port:
         for host in ("127.0.0.1", "localhost", "[::1]", "LocalHost"):
@@ -82,12 +78,12 @@ def test_only_this_machine_by_name_is_answered() -> None:
         assert status_of(port, f"localhost:{port}", f"evil.example:{port}")[0] == 421
 
 
-def test_on_the_default_port_browsers_name_no_port() -> None:
+def test_on_the_default_port_browsers_name_no_port():
     assert {"localhost", "127.0.0.1", "[::1]", "localhost:80"} <= command._hosts(80)
     assert "localhost" not in command._hosts(8080)
 
 
-def test_idle_connections_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_connections_end(monkeypatch):
     monkeypatch.setattr(command, "IDLE_SECONDS", 0.2)
     with served("x" * (32 << 20)) as port:
         for said in (b"", b"GET / HTTP/1.1\r\nHost: local"):
@@ -101,7 +97,7 @@ def test_idle_connections_end(monkeypatch: pytest.MonkeyPatch) -> None:
             until_gone("process_request_thread")
 
 
-def test_a_slow_connection_gets_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_connection_gets_the_page(monkeypatch):
     monkeypatch.setattr(command, "IDLE_SECONDS", 1.0)
     # The kernel holds 10 MB of it; the client takes the rest in more seconds than a connection may idle.
     with served("x" * (24 << 20)) as port, socket.create_connection(("127.0.0.1", port), timeout=SECONDS) as client:
@@ -113,7 +109,7 @@ def test_a_slow_connection_gets_the_page(monkeypatch: pytest.MonkeyPatch) -> Non
         assert received > 24 << 20
 
 
-def test_a_browser_that_leaves_causes_no_traceback(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_browser_that_leaves_causes_no_traceback(capfd):
     with served("x" * (32 << 20)) as port:
         client = socket.create_connection(("127.0.0.1", port), timeout=SECONDS)
         client.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
@@ -126,14 +122,12 @@ def test_a_browser_that_leaves_causes_no_traceback(capfd: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize("opens", [True, False])
-def test_view_opens_the_page(
-    opens: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_view_opens_the_page(opens, tmp_path, monkeypatch, capsys):
     packed = write_kind(tmp_path / "a.sundae", KINDS["no head, degree 3"])
-    opened: list[str] = []
+    opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
 
-    def serve(server: object) -> None:
+    def serve(server):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", serve)

@@ -1,15 +1,10 @@
 """Cameras: of nerfstudio, of files, virtual ones; windows of their images, start view and up axis of a scene."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json
 import math
 import re
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nerfstudio.cameras.cameras import Cameras
 from short_prunes import short_prunes  # noqa: F401
-from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.covariance import rotation_matrices
@@ -30,7 +24,6 @@ from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.io.pack import container
 from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.distill import distill
-from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.scene import virtual_cameras as virtual
 from sundae_ns.scene.cameras import camera_in_front, is_frame, read_cameras, with_start
 from sundae_ns.scene.packing import start_of, stated_start
@@ -49,17 +42,17 @@ PATH = {
 }
 
 
-def written(tmp_path: Path, content: Any) -> Path:
+def written(tmp_path, content):
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps(content))
     return path
 
 
-def scene(**options: Any) -> sn.Scene:
+def scene(**options):
     return sn.Scene(Gaussians(random_field(100, features=0)), **options)
 
 
-def test_a_transforms_file(tmp_path: Path) -> None:
+def test_a_transforms_file(tmp_path):
     path = written(tmp_path, {**LENS, "frames": [FRAME, {**FRAME, "fl_x": 70}]})
     first, second = sn.cameras_of(tmp_path)
     assert (first.width, first.height, first.focal) == (64, 48, 55)
@@ -71,7 +64,7 @@ def test_a_transforms_file(tmp_path: Path) -> None:
     assert read_cameras(path).frames_per_second is None
 
 
-def test_a_camera_path(tmp_path: Path) -> None:
+def test_a_camera_path(tmp_path):
     found = read_cameras(written(tmp_path, PATH))
     (camera,) = found.cameras
     assert found.frames_per_second == 12
@@ -79,7 +72,7 @@ def test_a_camera_path(tmp_path: Path) -> None:
     torch.testing.assert_close(camera.center, torch.tensor([0.0, 0, 3]))
 
 
-def test_a_colmap_model(tmp_path: Path) -> None:
+def test_a_colmap_model(tmp_path):
     """Its poses are world-to-camera, and the images of a run's capture move as those of a transforms.json do."""
     write_model(tmp_path, ["a.png", "b.png"], (64, 48))
     _, camera = sn.cameras_of(tmp_path)
@@ -92,7 +85,7 @@ def test_a_colmap_model(tmp_path: Path) -> None:
     torch.testing.assert_close(moved, torch.tensor([(1 - y) / 2, (x + 2) / 2, (z + 3) / 2]))
 
 
-def test_cameras_of_a_capture_move_with_its_model(tmp_path: Path) -> None:
+def test_cameras_of_a_capture_move_with_its_model(tmp_path):
     """As nerfstudio moves and scales them for training; those of a camera path are in the model's coordinates."""
     turn = [[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
     trained = scene(in_model_frame=True, meta={"frame": {"transform": turn, "scale": 0.5}})
@@ -120,11 +113,11 @@ def test_cameras_of_a_capture_move_with_its_model(tmp_path: Path) -> None:
         ({**PATH, "camera_path": []}, "empty camera_path"),
         ({**PATH, "camera_type": "equirectangular"}, "equirectangular"),
         ({**PATH, "camera_path": [{"camera_to_world": [1, 2]}]}, "camera_to_world"),
-        ({**PATH, "camera_path": [{**PATH["camera_path"][0], "fov": 200}]}, "below 180"),  # type: ignore[index]
+        ({**PATH, "camera_path": [{**PATH["camera_path"][0], "fov": 200}]}, "below 180"),
         ({**PATH, "fps": 0}, "fps"),
     ],
 )
-def test_files_without_usable_cameras_are_refused_in_one_line(content: Any, message: str, tmp_path: Path) -> None:
+def test_files_without_usable_cameras_are_refused_in_one_line(content, message, tmp_path):
     with pytest.raises(DataError, match=message) as caught:
         sn.cameras_of(written(tmp_path, content))
     assert "\n" not in str(caught.value)
@@ -132,7 +125,7 @@ def test_files_without_usable_cameras_are_refused_in_one_line(content: Any, mess
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0)])
 @pytest.mark.parametrize("eye", [(1.0, -2.0, 0.5), (0.0, 0.0, 4.0), (0.0, 4.0, 0.0)])
-def test_a_camera_looks_at_its_target(eye: tuple[float, ...], up: tuple[float, ...]) -> None:
+def test_a_camera_looks_at_its_target(eye, up):
     camera = sn.Camera.look_at(eye, (0.0, 0.0, 0.0), up, fov=90, width=20, height=10)
     x, y, z = camera.viewmat[:3, 3].tolist()
     assert (x, y) == (pytest.approx(0, abs=1e-6), pytest.approx(0, abs=1e-6))
@@ -143,7 +136,7 @@ def test_a_camera_looks_at_its_target(eye: tuple[float, ...], up: tuple[float, .
     assert float(camera.K[1, 1]) == pytest.approx(5)
 
 
-def test_virtual_views_are_the_same_for_a_seed_and_see_the_scene() -> None:
+def test_virtual_views_are_the_same_for_a_seed_and_see_the_scene():
     one, same, other = (sn.virtual_cameras(scene(), 16, seed=seed) for seed in (0, 0, 1))
     assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(one, same, strict=True))
     assert not torch.equal(one[0].viewmat, other[0].viewmat)
@@ -153,7 +146,7 @@ def test_virtual_views_are_the_same_for_a_seed_and_see_the_scene() -> None:
 
 @pytest.mark.usefixtures("short_prunes")
 @pytest.mark.parametrize("factor", [1e-3, 1e6])
-def test_a_scene_of_any_size_is_pruned_alike(factor: float) -> None:
+def test_a_scene_of_any_size_is_pruned_alike(factor):
     """The near plane is 0.01 world units away, which is more than the whole of a small scene."""
     moved = scene()
     moved.gaussians["means"] *= factor
@@ -164,7 +157,7 @@ def test_a_scene_of_any_size_is_pruned_alike(factor: float) -> None:
 
 
 @pytest.mark.parametrize("count", [5, 999])
-def test_the_factor_of_a_limited_sum(count: int) -> None:
+def test_the_factor_of_a_limited_sum(count):
     values = torch.rand(1000, generator=torch.Generator().manual_seed(0), dtype=torch.float64).pow(9)
     factor = virtual._factor(values, count)
     assert float((factor * values).clamp(max=1).sum()) == pytest.approx(count)
@@ -173,7 +166,7 @@ def test_the_factor_of_a_limited_sum(count: int) -> None:
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("evenness", [0.0, 4.0])
-def test_a_gpu_judges_cameras_like_a_cpu(evenness: float) -> None:
+def test_a_gpu_judges_cameras_like_a_cpu(evenness):
     made, generator = scene(), torch.Generator().manual_seed(0)
     sizes, eyes = made.gaussians["scales"].mean(dim=1), ball(150, generator).double()
     targets = made.gaussians["means"][:1].double().expand(150, 3)
@@ -182,20 +175,20 @@ def test_a_gpu_judges_cameras_like_a_cpu(evenness: float) -> None:
     torch.testing.assert_close(found, virtual._coarseness(made, sizes, eyes, targets, evenness), rtol=1e-2, atol=1e-2)
 
 
-def centers_of(made: sn.Scene, n: int = 32) -> torch.Tensor:
+def centers_of(made, n=32):
     return torch.stack([camera.center for camera in sn.virtual_cameras(made, n)])
 
 
-def ball(n: int, generator: torch.Generator) -> torch.Tensor:
+def ball(n, generator):
     return torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1)
 
 
-def without_search(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_search(monkeypatch):
     monkeypatch.setattr("sundae_ns.scene.virtual_cameras.FIRST", 1)
     monkeypatch.setattr("sundae_ns.scene.virtual_cameras.ROUNDS", 0)
 
 
-def test_virtual_eyes_are_not_in_a_fog(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_virtual_eyes_are_not_in_a_fog(monkeypatch):
     """Fewer are in a fog around half of a ball than of random ones; also if a few Gaussians stand for all."""
     generator = torch.Generator().manual_seed(0)
     points = ball(2000, generator)
@@ -204,7 +197,7 @@ def test_virtual_eyes_are_not_in_a_fog(monkeypatch: pytest.MonkeyPatch) -> None:
     made.gaussians["opacities"][:2000], made.gaussians["opacities"][2000:] = 4.0, -1.0
     made.gaussians["scales"][:2000], made.gaussians["scales"][2000:] = math.log(0.05), math.log(0.4)
 
-    def in_fog() -> float:
+    def in_fog():
         centers = centers_of(made)
         return float(((centers[:, 0] > 0) & (centers.norm(dim=1) > 1.2)).float().mean())
 
@@ -215,7 +208,7 @@ def test_virtual_eyes_are_not_in_a_fog(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(all_judge, few_judge) < in_fog() - 0.1
 
 
-def test_virtual_eyes_are_inside_of_a_room_whose_walls_are_fine_inside(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_virtual_eyes_are_inside_of_a_room_whose_walls_are_fine_inside(monkeypatch):
     """Gaussians behind the walls, which no photograph saw, are coarse."""
     generator = torch.Generator().manual_seed(0)
     points = torch.cat([ball(3000, generator), 1.2 * ball(300, generator)])
@@ -228,7 +221,7 @@ def test_virtual_eyes_are_inside_of_a_room_whose_walls_are_fine_inside(monkeypat
     assert (centers_of(made).norm(dim=1) < 1).float().mean() < inside - 0.2
 
 
-def test_virtual_eyes_are_outside_of_an_object_and_look_at_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_virtual_eyes_are_outside_of_an_object_and_look_at_it(monkeypatch):
     """From within, its Gaussians are large; from far away, most of an image is empty."""
     generator = torch.Generator().manual_seed(0)
     solid = ball(3000, generator) * torch.rand(3000, 1, generator=generator) ** (1 / 3)
@@ -245,14 +238,14 @@ def test_virtual_eyes_are_outside_of_an_object_and_look_at_it(monkeypatch: pytes
     assert outside.float().mean() > (centers_of(made).norm(dim=1) > 1).float().mean() + 0.2
 
 
-def test_virtual_views_that_see_nothing_are_refused() -> None:
+def test_virtual_views_that_see_nothing_are_refused():
     broken = scene()
     broken.gaussians["means"][:] = torch.nan
     with pytest.raises(DataError, match="no camera sees the scene"):
         sn.virtual_cameras(broken)
 
 
-def test_a_scene_that_no_view_sees_is_not_pruned() -> None:
+def test_a_scene_that_no_view_sees_is_not_pruned():
     faint = scene()
     faint.gaussians["opacities"][:] = -20
     with pytest.raises(DataError, match="4 views see none of 100 Gaussians"):
@@ -276,19 +269,12 @@ EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         ({"transform": EYE, "scale": 10**400}, False),
     ],
 )
-def test_a_frame_is_a_transform_and_a_scale(frame: Any, valid: bool) -> None:
+def test_a_frame_is_a_transform_and_a_scale(frame, valid):
     assert is_frame(frame) == valid
 
 
-Build = Callable[..., SundaeModel]
-Perturb = Callable[[SundaeModel], SundaeModel]
-MakeCamera = Callable[..., Cameras]
-MakeBatch = Callable[..., dict[str, Tensor]]
-TrainingOf = Callable[[SundaeModel], Any]
-
-
 @torch.no_grad()
-def test_a_primitive_lands_where_the_pinhole_says(build: Build, camera: MakeCamera) -> None:
+def test_a_primitive_lands_where_the_pinhole_says(build, camera):
     xyz = torch.tensor([[0.55, 0.35, 0.0]])
     model = build(seed_points=(xyz, torch.zeros(1, 3, dtype=torch.uint8))).eval()
     model.gauss_params["scales"].data.fill_(-5)
@@ -299,15 +285,7 @@ def test_a_primitive_lands_where_the_pinhole_says(build: Build, camera: MakeCame
 
 
 @pytest.mark.parametrize(("step", "mirrored"), [(10, True), (11, False)])
-def test_a_window_is_a_part_of_the_whole_picture(
-    build: Build,
-    perturb: Perturb,
-    camera: MakeCamera,
-    batch: MakeBatch,
-    monkeypatch: pytest.MonkeyPatch,
-    step: int,
-    mirrored: bool,
-) -> None:
+def test_a_window_is_a_part_of_the_whole_picture(build, perturb, camera, batch, monkeypatch, step, mirrored):
     """Pictures, truth and mask of a window are what the whole picture shows there, or its mirror image."""
     whole, cut = (perturb(build(head={"max_train_pixels": limit}, background_color="black")) for limit in (0, 600))
     with torch.no_grad():
@@ -325,7 +303,7 @@ def test_a_window_is_a_part_of_the_whole_picture(
     assert crop.width * crop.height <= 600
     assert crop.mirrored == mirrored
 
-    def part(image: Tensor) -> Tensor:
+    def part(image):
         seen = image[crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
         return seen.flip(1) if mirrored else seen
 
@@ -338,7 +316,7 @@ def test_a_window_is_a_part_of_the_whole_picture(
     torch.testing.assert_close(losses["base_loss"], cut.config.base_loss_weight * expected)
 
 
-def test_windows_wait_for_the_head_and_for_densification(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+def test_windows_wait_for_the_head_and_for_densification(build, perturb, camera):
     model = build(head={"max_train_pixels": 600})
     assert not model.state.head_enabled
     assert model.resolution(0) == StepResolution(0, 1, 0)
@@ -354,7 +332,7 @@ def test_windows_wait_for_the_head_and_for_densification(build: Build, perturb: 
     assert not paper.resolution(0).mirror
 
 
-def made(seed: int, count: int = 3) -> Cameras:
+def made(seed, count=3):
     generator = torch.Generator().manual_seed(seed)
     poses = torch.cat(
         [
@@ -369,7 +347,7 @@ def made(seed: int, count: int = 3) -> Cameras:
 
 
 @given(seed=st.integers(0, 10**6), downscale=st.integers(1, 4), index=st.integers(0, 2))
-def test_a_view_is_what_the_matrices_say(seed: int, downscale: int, index: int) -> None:
+def test_a_view_is_what_the_matrices_say(seed, downscale, index):
     """World-to-camera is the inverse of the pose with y and z turned; intrinsics shrink with the picture."""
     cameras = made(seed)
     camera = cameras[index : index + 1]
@@ -394,14 +372,14 @@ def test_a_view_is_what_the_matrices_say(seed: int, downscale: int, index: int) 
     assert torch.equal(cam.viewmat, before), "the view keeps no hold of its camera"
 
 
-def test_a_pose_that_learns_gives_the_same_view_and_a_gradient() -> None:
+def test_a_pose_that_learns_gives_the_same_view_and_a_gradient():
     camera = made(0)[1:2]
     pose = camera.camera_to_worlds.clone().requires_grad_()
     plain, learned = camera_of(camera, "cpu"), camera_of(camera, "cpu", pose=pose)
     torch.testing.assert_close(plain.viewmat, learned.viewmat.detach(), rtol=1e-6, atol=1e-5)
     assert torch.equal(plain.K, learned.K)
     assert plain[2:] == learned[2:]
-    learned.viewmat[:3].sum().backward()  # type: ignore[no-untyped-call]
+    learned.viewmat[:3].sum().backward()
     assert pose.grad is not None
     assert (pose.grad != 0).any()
 
@@ -409,18 +387,18 @@ def test_a_pose_that_learns_gives_the_same_view_and_a_gradient() -> None:
 UP = (0.6, 0.0, -0.8)
 
 
-def two_seen(**options: Any) -> sn.Scene:
+def two_seen(**options):
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(80, 3, generator=generator)
     cameras = tuple(sn.Camera.look_at((0.5 + dx, -2.0, 0.5), (0.5, 0.5, 0.5), width=40, height=30) for dx in (0.0, 0.8))
     return dataclasses.replace(sn.Scene.from_points(points, points), cameras=cameras, **options)
 
 
-def started() -> sn.Scene:
+def started():
     return two_seen(up=UP, start=sn.Camera.look_at((3, 0.5, 0.5), (0.5, 0.5, 0.5), UP, fov=70, width=64, height=48))
 
 
-def same(one: sn.Scene, other: sn.Scene) -> bool:
+def same(one, other):
     assert one.start is not None
     assert other.start is not None
     alike = all(torch.allclose(a, b, atol=1e-6) for a, b in zip(one.start[:2], other.start[:2], strict=True))
@@ -428,7 +406,7 @@ def same(one: sn.Scene, other: sn.Scene) -> bool:
 
 
 @pytest.mark.usefixtures("short_prunes")
-def test_files_and_scenes_made_of_a_scene_keep_both(tmp_path: Path) -> None:
+def test_files_and_scenes_made_of_a_scene_keep_both(tmp_path):
     truth = started()
     sn.save(truth, tmp_path / "a.sundae")
     found = sn.load(tmp_path / "a.sundae")
@@ -439,7 +417,7 @@ def test_files_and_scenes_made_of_a_scene_keep_both(tmp_path: Path) -> None:
     assert same(sn.load(tmp_path / "b.sundae"), truth)
 
 
-def test_a_file_without_them_is_read_and_adds_nothing(tmp_path: Path) -> None:
+def test_a_file_without_them_is_read_and_adds_nothing(tmp_path):
     sn.save(two_seen(), tmp_path / "a.sundae")
     header = container.read_header(tmp_path / "a.sundae")
     assert header.meta.keys().isdisjoint({"up", "start"})
@@ -447,7 +425,7 @@ def test_a_file_without_them_is_read_and_adds_nothing(tmp_path: Path) -> None:
     assert (found.up, found.start) == (None, None)
 
 
-def test_the_first_image_is_that_of_the_start_view() -> None:
+def test_the_first_image_is_that_of_the_start_view():
     shown = started()
     assert shown.start is not None
     expected = image_of(sn.render(shown, shown.start).rgb)
@@ -456,7 +434,7 @@ def test_the_first_image_is_that_of_the_start_view() -> None:
 
 
 @pytest.mark.parametrize("up", [None, UP, (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-0.95, 0.3122499, 0.0)])
-def test_the_camera_in_front_stands_upright(up: Any) -> None:
+def test_the_camera_in_front_stands_upright(up):
     camera = camera_in_front(two_seen(up=up))
     wanted = torch.tensor(up or (0.0, 0.0, 1.0))
     assert torch.allclose(camera.pose[:, 1], wanted, atol=1e-5)
@@ -467,7 +445,7 @@ def test_the_camera_in_front_stands_upright(up: Any) -> None:
         assert torch.allclose(camera.pose[:, 2], torch.tensor([0.0, -1.0, 0.0]), atol=1e-6)
 
 
-def test_options_name_a_view_or_a_file(tmp_path: Path) -> None:
+def test_options_name_a_view_or_a_file(tmp_path):
     plain = two_seen()
     assert with_start(plain, None, None) is plain
     assert with_start(plain, "1", None).start is plain.cameras[1]
@@ -488,7 +466,7 @@ def test_options_name_a_view_or_a_file(tmp_path: Path) -> None:
         with_start(dataclasses.replace(plain, cameras=()), "0", None)
 
 
-def test_values_that_readers_refuse_are_not_written(tmp_path: Path) -> None:
+def test_values_that_readers_refuse_are_not_written(tmp_path):
     far = sn.Camera.look_at((2e9, 0, 0), (0, 0, 0))
     for wrong in (far, far._replace(viewmat=torch.zeros(4, 4)), far.zoomed(1e6)):
         with pytest.raises(ConfigError, match="has values that readers refuse"):
@@ -497,7 +475,7 @@ def test_values_that_readers_refuse_are_not_written(tmp_path: Path) -> None:
     assert start_of(stated_start(started()))[0] == pytest.approx(UP)
 
 
-def test_commands_state_them_without_coding_the_scene_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_state_them_without_coding_the_scene_again(tmp_path, capsys):
     sn.save(two_seen(), tmp_path / "a.sundae")
     words = ("--start-view", 1, "--up", 0, -2, 0)
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "site", *words) == 0

@@ -1,13 +1,10 @@
 """Boxes around scenes, and floaters."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
 import pytest
 import torch
-from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError, DataError
@@ -16,7 +13,7 @@ from sundae_ns.scene.prune_scene import crop_mask, floater_mask, within
 VIEWS = tuple(sn.Camera.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=96, height=72) for x in (-2.0, 0.0, 2.0))
 
 
-def scene_of(points: Tensor, scale: float) -> sn.Scene:
+def scene_of(points, scale):
     made = sn.Scene.from_points(points, points.sigmoid())
     values = {
         "scales": torch.full_like(made.gaussians["scales"], math.log(scale)),
@@ -25,13 +22,13 @@ def scene_of(points: Tensor, scale: float) -> sn.Scene:
     return dataclasses.replace(made, gaussians=made.gaussians.replaced(values), cameras=VIEWS)
 
 
-def wall(n: int = 4000) -> Tensor:
+def wall(n=4000):
     """Points of a square of side 4, which faces the views."""
     generator = torch.Generator().manual_seed(0)
     return (torch.rand(n, 3, generator=generator) - 0.5) * torch.tensor([4.0, 0.02, 4.0])
 
 
-def planted(n: int = 30) -> Tensor:
+def planted(n=30):
     """Points in the air between wall and views, some of them in threes."""
     generator = torch.Generator().manual_seed(1)
     alone = torch.rand(n, 3, generator=generator) * torch.tensor([3.0, 1.5, 3.0]) + torch.tensor([-1.5, -2.5, -1.5])
@@ -40,7 +37,7 @@ def planted(n: int = 30) -> Tensor:
 
 @pytest.mark.parametrize("factor", [1.0, 1e-3, 1e3])
 @pytest.mark.parametrize("with_views", [True, False])
-def test_planted_floaters_vanish_and_the_surface_stays(factor: float, with_views: bool) -> None:
+def test_planted_floaters_vanish_and_the_surface_stays(factor, with_views):
     floaters, surface = planted(), wall()
     whole = scene_of(factor * torch.cat([surface, floaters]), factor * 0.02)
     cameras = [camera._replace(viewmat=camera.viewmat.clone()) for camera in VIEWS]
@@ -57,7 +54,7 @@ def test_planted_floaters_vanish_and_the_surface_stays(factor: float, with_views
         assert sn.measure(whole, truth).psnr < 35
 
 
-def test_what_no_view_sees_goes_and_no_image_changes() -> None:
+def test_what_no_view_sees_goes_and_no_image_changes():
     """A second wall right behind the first, and one behind the cameras; both touch themselves."""
     hidden = torch.cat([wall() * 0.5 + torch.tensor([0.0, 0.9, 0.0]), wall() + torch.tensor([0.0, -9.0, 0.0])])
     whole = scene_of(torch.cat([wall(), hidden]), 0.12)
@@ -69,7 +66,7 @@ def test_what_no_view_sees_goes_and_no_image_changes() -> None:
     assert int(floater_mask(whole, ())[4000:].sum()) <= 4, "without views, walls are supported"
 
 
-def test_floaters_are_counted_after_values_without_meaning() -> None:
+def test_floaters_are_counted_after_values_without_meaning():
     whole = scene_of(torch.cat([wall(), planted()]), 0.02)
     whole.gaussians["means"][7] = math.nan
     found = floater_mask(whole, VIEWS)
@@ -85,13 +82,13 @@ def test_floaters_are_counted_after_values_without_meaning() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
-def test_few_primitives(n: int) -> None:
+def test_few_primitives(n):
     points = torch.arange(3.0 * n).view(n, 3)
     assert int(floater_mask(scene_of(points, 9.0), ()).sum()) == 0
     assert int(floater_mask(scene_of(points, 0.01), ()).sum()) == (n if n > 1 else 0)
 
 
-def test_a_box_is_exact_and_keeps_all_else() -> None:
+def test_a_box_is_exact_and_keeps_all_else():
     points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.1, 0.5, 0.5], [1.0, 1.0, 1.0000001], [-1e-30, 0, 0]])
     whole = dataclasses.replace(scene_of(points, 0.1), up=(0.0, 0.0, 1.0), start=VIEWS[1], antialiased=True)
     assert crop_mask(whole, (0, 0, 0), (1, 1, 1)).tolist() == [True, True, True, False, False]
@@ -104,7 +101,7 @@ def test_a_box_is_exact_and_keeps_all_else() -> None:
     assert whole.num_gaussians == 5
 
 
-def test_an_empty_result_says_where_the_scene_is() -> None:
+def test_an_empty_result_says_where_the_scene_is():
     broken = scene_of(wall(), 0.1)
     with pytest.raises(DataError, match=r"most of them lie between -1\.\d+ .* and 1\.\d+ "):
         sn.crop(broken, (50, 50, 50), (51, 51, 51))
@@ -115,7 +112,7 @@ def test_an_empty_result_says_where_the_scene_is() -> None:
         sn.crop(broken, (0, 0, 0), (1, 1, 1))
 
 
-def test_masks_within_masks() -> None:
+def test_masks_within_masks():
     outer, inner = torch.tensor([True, False, True, True]), torch.tensor([False, True, True])
     assert within(outer, inner).tolist() == [False, False, True, True]
     assert within(None, inner) is inner

@@ -1,33 +1,24 @@
 """What each Gaussian contributes to the training pictures."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
 from fields import random_field
-from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.gaussians import Gaussians
-from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterize.interface import blending_weights, rasterize
 from sundae_ns.scene.render import GaussianSource, TrainingCamera, contribution, pass_inputs
-
-Build = Callable[..., SundaeModel]
-TrainingOf = Callable[[SundaeModel], Any]
 
 N = 60
 """Gaussians of a model that is built without a count."""
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: Any, mode: str) -> None:
+def test_contribution_is_the_weight_in_the_pictures(build, datamanager, mode):
     model = build(rasterize_mode=mode)
     # Thinner than a pixel, where the two modes differ by far.
     model.gauss_params["scales"].data[:30] = -6.0
@@ -44,9 +35,7 @@ def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: A
 
 
 @pytest.mark.parametrize("count", [None, N // 2])
-def test_what_masks_leave_out_of_training_asks_for_no_primitives(
-    build: Build, datamanager: Any, count: int | None
-) -> None:
+def test_what_masks_leave_out_of_training_asks_for_no_primitives(build, datamanager, count):
     """The two halves of an image add up to the whole; many Gaussians contribute to one half only."""
     model = build()
     model.gauss_params["scales"].data[:] = -4.0
@@ -67,7 +56,7 @@ def test_what_masks_leave_out_of_training_asks_for_no_primitives(
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_weights_by_detail_are_those_of_an_image_and_a_second_pass(masked: bool) -> None:
+def test_weights_by_detail_are_those_of_an_image_and_a_second_pass(masked):
     scene = sn.Scene(Gaussians(random_field(60, features=0)))
     camera, settings = sn.virtual_cameras(scene, 1, size=40)[0], scene.settings()
     mask = torch.rand(40, 40, 1, generator=torch.Generator().manual_seed(0)) < 0.5 if masked else None
@@ -84,13 +73,11 @@ def test_weights_by_detail_are_those_of_an_image_and_a_second_pass(masked: bool)
     assert not any(value.requires_grad for value in scene.gaussians.values())
 
 
-def test_a_prune_weighs_detail_for_the_count_that_it_keeps(
-    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_prune_weighs_detail_for_the_count_that_it_keeps(build, training_of, monkeypatch):
     training = training_of(build(pruning={"mode": "continuous", "start": 3, "stop": 3, "target_gaussians": 15}))
-    asked: list[float] = []
+    asked = []
 
-    def spy(image: Tensor, cells: float) -> Tensor:
+    def spy(image, cells):
         asked.append(cells)
         return pixel_detail(image, cells)
 

@@ -1,13 +1,10 @@
 """Films: closed, smooth paths through a scene's views, or around a scene without any."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
 import pytest
 import torch
-from torch import Tensor
 
 import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError
@@ -16,7 +13,7 @@ from sundae_ns.scene.cameras import MOST_FRAMES, film_views
 COUNT = 120
 
 
-def ball(n: int = 4000) -> sn.Scene:
+def ball(n=4000):
     """A solid one of radius 1."""
     generator = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1)
@@ -27,37 +24,35 @@ def ball(n: int = 4000) -> sn.Scene:
     )
 
 
-def looking(
-    eyes: list[tuple[float, float, float]], targets: list[tuple[float, float, float]], roll: float = 0.0
-) -> tuple:
+def looking(eyes, targets, roll=0.0):
     up = (math.sin(roll), 0.0, math.cos(roll))
     pairs = zip(eyes, targets, strict=True)
     return tuple(sn.Camera.look_at(eye, target, up, fov=50, width=40, height=30) for eye, target in pairs)
 
 
-def on_a_ring(n: int, radius: float = 4.0) -> list[tuple[float, float, float]]:
+def on_a_ring(n, radius=4.0):
     """In no order, some higher than others."""
     turns = [2 * math.pi * (7 * i % n) / n for i in range(n)]
     return [(radius * math.cos(turn), radius * math.sin(turn), 0.5 * math.cos(3 * turn)) for turn in turns]
 
 
-def film(scene: sn.Scene) -> list[sn.Camera]:
+def film(scene):
     return film_views(scene, seconds=COUNT / 24, frames_per_second=24)
 
 
-def steps(cameras: list[sn.Camera], distance: float) -> Tensor:
+def steps(cameras, distance):
     """Motion and turning from each frame to the next, and from the last to the first ``[V]``."""
     parts = torch.stack([torch.cat([camera.center / distance, -camera.pose[:, 2]]) for camera in cameras]).double()
     return (parts.roll(-1, dims=0) - parts).norm(dim=1)
 
 
-def check_upright(cameras: list[sn.Camera], up: Tensor) -> None:
+def check_upright(cameras, up):
     for camera in cameras:
         assert abs(float(camera.pose[:, 0] @ up)) < 1e-5
         assert float(camera.pose[:, 1] @ up) > 0.3
 
 
-def test_the_path_leads_through_views_and_closes() -> None:
+def test_the_path_leads_through_views_and_closes():
     eyes = on_a_ring(23)
     scene = dataclasses.replace(ball(), cameras=looking(eyes, len(eyes) * [(0.0, 0.0, 0.0)]))
     cameras = film(scene)
@@ -77,7 +72,7 @@ def test_the_path_leads_through_views_and_closes() -> None:
     assert float(centers.norm(dim=1).min()) > 3.5, "the spline cuts no corner"
 
 
-def test_it_begins_with_the_start_view_and_keeps_the_up_axis() -> None:
+def test_it_begins_with_the_start_view_and_keeps_the_up_axis():
     eyes = on_a_ring(9)
     rolled = looking(eyes, len(eyes) * [(0.0, 0.0, 0.0)], roll=0.3)
     start = sn.Camera.look_at((0, -5, 1), (0, 0, 0), fov=30, width=3000, height=2000)
@@ -89,7 +84,7 @@ def test_it_begins_with_the_start_view_and_keeps_the_up_axis() -> None:
     check_upright(cameras, torch.tensor(up))
 
 
-def test_views_that_look_in_opposite_directions_are_turned_between() -> None:
+def test_views_that_look_in_opposite_directions_are_turned_between():
     eyes = [(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.2, 0.0, 0.0)]
     scene = dataclasses.replace(ball(), cameras=looking(eyes, [(0.0, 9.0, 0.0), (0.1, -9.0, 0.0), (0.2, 9.0, 0.0)]))
     cameras = film(scene)
@@ -98,7 +93,7 @@ def test_views_that_look_in_opposite_directions_are_turned_between() -> None:
     check_upright(cameras, torch.tensor([0.0, 0.0, 1.0]))
 
 
-def test_views_that_see_nothing_make_a_path_too() -> None:
+def test_views_that_see_nothing_make_a_path_too():
     eyes = on_a_ring(9, radius=400.0)
     outward = [(2 * x, 2 * y, z) for x, y, z in eyes]
     cameras = film(dataclasses.replace(ball(), cameras=looking(eyes, outward)))
@@ -107,7 +102,7 @@ def test_views_that_see_nothing_make_a_path_too() -> None:
     assert min(float(camera.center.norm()) for camera in cameras) > 300
 
 
-def test_a_view_straight_down_is_passed_over() -> None:
+def test_a_view_straight_down_is_passed_over():
     eyes = on_a_ring(5)
     cameras = looking([(0.0, 0.0, 6.0), *eyes], 6 * [(0.0, 0.0, 0.0)])
     found = film(dataclasses.replace(ball(), cameras=cameras, up=(0.0, 0.0, 1.0)))
@@ -116,7 +111,7 @@ def test_a_view_straight_down_is_passed_over() -> None:
 
 
 @pytest.mark.parametrize(("stored", "factor"), [(0, 1.0), (1, 1000.0), (4, 1.0)])
-def test_a_scene_without_a_path_is_seen_from_all_around(stored: int, factor: float) -> None:
+def test_a_scene_without_a_path_is_seen_from_all_around(stored, factor):
     scene = ball(1500)
     grown = {"means": factor * scene.gaussians["means"], "scales": scene.gaussians["scales"] + math.log(factor)}
     camera = looking([(0.0, -5.0 * factor, 0.0)], [(0.0, 0.0, 0.0)])
@@ -139,6 +134,6 @@ def test_a_scene_without_a_path_is_seen_from_all_around(stored: int, factor: flo
 @pytest.mark.parametrize(
     ("seconds", "speed"), [(0, 24), (-1, -24), (0.01, 24), (math.nan, 24), (math.inf, 24), (9, MOST_FRAMES)]
 )
-def test_impossible_lengths_are_refused(seconds: float, speed: float) -> None:
+def test_impossible_lengths_are_refused(seconds, speed):
     with pytest.raises(ConfigError, match="is impossible"):
         film_views(ball(), seconds=seconds, frames_per_second=speed)

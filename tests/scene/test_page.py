@@ -1,7 +1,5 @@
 """The web page of a packed scene: what Python writes, the page's decoder against Python's, and parts of its program."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import html
@@ -10,10 +8,8 @@ import json
 import logging
 import re
 import subprocess
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import fuzz_packs
 import numpy as np
@@ -36,15 +32,14 @@ from sundae_ns.scene.page import page_of, render_first, write_page
 
 ROOT = Path(__file__).parents[2]
 WEB = ROOT / "web"
-Json = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
-def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def packed(tmp_path_factory):
     return write_kind(tmp_path_factory.mktemp("scenes") / "a.sundae", KINDS["residual"])
 
 
-def test_a_page_holds_the_scene_and_no_address(packed: Path, tmp_path: Path) -> None:
+def test_a_page_holds_the_scene_and_no_address(packed, tmp_path):
     out = tmp_path / "a.html"
     assert write_page(out, *packed_file(packed), title="a <b> & c") == out.stat().st_size
     page = out.read_text()
@@ -57,7 +52,7 @@ def test_a_page_holds_the_scene_and_no_address(packed: Path, tmp_path: Path) -> 
     assert "default-src 'none'" in page
 
 
-def test_a_page_shows_the_first_camera_until_it_draws(packed: Path) -> None:
+def test_a_page_shows_the_first_camera_until_it_draws(packed):
     (code,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page_of(*packed_file(packed), title="a"))
     found = np.asarray(Image.open(io.BytesIO(base64.b64decode(code))), dtype=np.float32)
     truth = np.asarray(render_first(packed_file(packed)[0]), dtype=np.float32)
@@ -65,9 +60,7 @@ def test_a_page_shows_the_first_camera_until_it_draws(packed: Path) -> None:
     assert np.abs(found - truth).mean() < 6  # JPEG
 
 
-def test_a_page_of_too_many_primitives_has_no_first_image(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_page_of_too_many_primitives_has_no_first_image(tmp_path, capsys, caplog):
     bomb = write_bomb(tmp_path / "a.sundae")
     assert bomb.stat().st_size < 100_000
     with pytest.raises(SystemExit) as caught:
@@ -89,7 +82,7 @@ def test_a_page_of_too_many_primitives_has_no_first_image(
     assert "Gaussians in each tile of its image" in err
 
 
-def test_a_folder_has_page_and_scene_apart(packed: Path, tmp_path: Path) -> None:
+def test_a_folder_has_page_and_scene_apart(packed, tmp_path):
     out = tmp_path / "site"
     assert write_page(out, *packed_file(packed), title="a") == sum(path.stat().st_size for path in out.iterdir())
     assert (out / "scene.sundae").read_bytes() == packed.read_bytes()
@@ -97,7 +90,7 @@ def test_a_folder_has_page_and_scene_apart(packed: Path, tmp_path: Path) -> None
     write_page(out, *packed_file(packed), title="a")
 
 
-def test_export_writes_pages(packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_writes_pages(packed, tmp_path, capsys):
     for out in ("a.html", "folder", "no/folder"):
         with pytest.raises(SystemExit) as caught:
             main(["export", str(packed), "-o", str(tmp_path / out)])
@@ -111,26 +104,26 @@ def test_export_writes_pages(packed: Path, tmp_path: Path, capsys: pytest.Captur
 
 
 @needs_node
-def test_the_page_is_built_from_its_sources(tmp_path: Path) -> None:
+def test_the_page_is_built_from_its_sources(tmp_path):
     built = tmp_path / "page.html"
     subprocess.run(["node", "build.mjs", built], cwd=WEB, check=True)
     assert built.read_text() == (ROOT / "sundae_ns" / "scene" / "page.html").read_text(), "run make web"
 
 
 @needs_node
-def test_the_sources_pass_their_checks() -> None:
+def test_the_sources_pass_their_checks():
     for command in (["tsc"], ["biome", "ci", "."]):
         subprocess.run([WEB / "node_modules" / ".bin" / command[0], *command[1:]], cwd=WEB, check=True)
 
 
 @pytest.fixture(scope="module")
-def decode(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[Json]]:
+def decode(tmp_path_factory):
     """The page's decoder under Node: a JSON object for each file."""
     program = tmp_path_factory.mktemp("node") / "dump.mjs"
     bundle = [WEB / "node_modules/.bin/esbuild", "tests/dump.ts", "--bundle", "--platform=node", "--format=esm"]
     subprocess.run([*bundle, "--log-level=error", f"--outfile={program}"], cwd=WEB, check=True)
 
-    def run(*files: Path) -> list[Json]:
+    def run(*files):
         found = subprocess.run(["node", program, *files], check=True, capture_output=True, text=True)
         return [json.loads(line) for line in found.stdout.splitlines()]
 
@@ -138,7 +131,7 @@ def decode(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[Json]
 
 
 @needs_node
-def test_the_decoder_agrees_with_python(decode: Callable[..., list[Json]], tmp_path: Path) -> None:
+def test_the_decoder_agrees_with_python(decode, tmp_path):
     files = [write_kind(tmp_path / f"{i}.sundae", kind) for i, kind in enumerate(KINDS.values())]
     for file, found, kind in zip(files, decode(*files), KINDS.values(), strict=True):
         truth = read_scene(file)
@@ -157,7 +150,7 @@ def test_the_decoder_agrees_with_python(decode: Callable[..., list[Json]], tmp_p
         assert torch.equal(torch.tensor(poses).reshape(-1, 3, 4), truth.cameras["poses"])
 
 
-def compressed(sections: list[Json]) -> tuple[int, int, Json]:
+def compressed(sections):
     """First byte, length and entry of a deflated section."""
     start = 0
     for entry in sections:
@@ -168,12 +161,12 @@ def compressed(sections: list[Json]) -> tuple[int, int, Json]:
     raise AssertionError("no section is compressed")
 
 
-def put(path: str, value: Any) -> Callable[[Json], None]:
+def put(path, value):
     """Set one value of the header. ``path`` is dotted keys; after a leading colon the first names a section."""
 
-    def apply(meta: Json) -> None:
+    def apply(meta):
         *keys, last = path.split(".")
-        place: Any = meta
+        place = meta
         if path.startswith(":"):
             name = keys.pop(0)[1:]
             place = next(entry for entry in meta["sections"] if entry["name"] == name)
@@ -185,7 +178,7 @@ def put(path: str, value: Any) -> Callable[[Json], None]:
 
 
 POSE = [[1, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 0]]
-LIES: dict[str, Callable[[Json], None]] = {
+LIES = {
     "a billion Gaussians": put("primitives", 10**9),
     "more Gaussians than it has": put("primitives", 401),
     "an attribute of another codec": put("attributes.scales.codec", "pickle"),
@@ -212,9 +205,7 @@ LIES: dict[str, Callable[[Json], None]] = {
 
 
 @needs_node
-def test_the_decoder_refuses_what_python_refuses(
-    decode: Callable[..., list[Json]], packed: Path, tmp_path: Path
-) -> None:
+def test_the_decoder_refuses_what_python_refuses(decode, packed, tmp_path):
     good = packed.read_bytes()
     files = {"truncated": good[:-1], "longer": good + b"x", "empty": b"", "another file": b"ply\n" + good[4:]}
     files |= {"cut in its header": good[:100], "another version": good[:8] + b"\x02" + good[9:]}
@@ -242,7 +233,7 @@ def test_the_decoder_refuses_what_python_refuses(
 
 
 @needs_node
-def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]], packed: Path, tmp_path: Path) -> None:
+def test_the_decoder_refuses_impossible_models(decode, packed, tmp_path):
     meta, body = header_and_body(packed.read_bytes())
     lies = {
         "model": None,
@@ -271,7 +262,7 @@ def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]]
 
 
 @needs_node
-def test_the_page_counts_fragments_before_it_draws(tmp_path: Path) -> None:
+def test_the_page_counts_fragments_before_it_draws(tmp_path):
     """Without WebGPU; the sums of the quads' rectangles, by Python's projection."""
     files = [write_kind(tmp_path / f"{i}.sundae", kind) for i, kind in enumerate([*KINDS.values()][::2])]
     files.append(write_bomb(tmp_path / "bomb.sundae", 30_000))
@@ -295,7 +286,7 @@ def test_the_page_counts_fragments_before_it_draws(tmp_path: Path) -> None:
 
 
 @needs_node
-def test_both_readers_give_the_same_verdicts() -> None:
+def test_both_readers_give_the_same_verdicts():
     """A short version of ``python benchmarks/fuzz_packs.py``, from another seed."""
     tally, problems = fuzz_packs.run(150, seed=1_000_000)
     assert not problems
@@ -305,7 +296,7 @@ def test_both_readers_give_the_same_verdicts() -> None:
 HOSTILE = """"></iframe><script>alert('&amp;')</script><b x='"""
 
 
-def frame_of(text: str) -> dict[str, str]:
+def frame_of(text):
     """Attributes of the one element of a fragment, an ``iframe``."""
     ((attributes,),) = [re.findall(r"<iframe ([^<>]*)></iframe>", text)]
     assert text == f"<iframe {attributes}></iframe>"
@@ -313,11 +304,11 @@ def frame_of(text: str) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> sn.Scene:
+def scene(tmp_path_factory):
     return sn.load(write_kind(tmp_path_factory.mktemp("scenes") / "a.sundae", KINDS["residual"]))
 
 
-def test_the_page_in_the_frame_holds_the_scene(scene: sn.Scene, tmp_path: Path) -> None:
+def test_the_page_in_the_frame_holds_the_scene(scene, tmp_path):
     frame = frame_of(sn.show(scene, height=321)._repr_html_())
     assert (frame["height"], frame["width"]) == ("321", "100%")
     assert frame["srcdoc"] == page_of(scene, packed_bytes(scene), title="Scene")
@@ -331,7 +322,7 @@ def test_the_page_in_the_frame_holds_the_scene(scene: sn.Scene, tmp_path: Path) 
     assert float((sn.render(shown, camera).rgb - sn.render(scene, camera).rgb).abs().mean()) < 0.02  # packed once more
 
 
-def test_a_hostile_title_stays_text(scene: sn.Scene) -> None:
+def test_a_hostile_title_stays_text(scene):
     frame = frame_of(sn.show(scene, title=HOSTILE)._repr_html_())
     assert frame["title"] == HOSTILE
     plain = frame_of(sn.show(scene, title="plain")._repr_html_())
@@ -339,9 +330,7 @@ def test_a_hostile_title_stays_text(scene: sn.Scene) -> None:
     assert set(frame) == set(plain) == {"srcdoc", "title", "width", "height", "style", "allow"}
 
 
-def test_a_large_page_is_shown_with_a_warning(
-    scene: sn.Scene, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_large_page_is_shown_with_a_warning(scene, monkeypatch, caplog):
     caplog.set_level(logging.WARNING)
     assert sn.show(scene).page
     assert caplog.text == ""
@@ -353,7 +342,7 @@ def test_a_large_page_is_shown_with_a_warning(
 
 @pytest.mark.browser
 @needs_chromium
-def test_a_browser_renders_the_scene_in_the_frame(scene: sn.Scene, tmp_path: Path) -> None:
+def test_a_browser_renders_the_scene_in_the_frame(scene, tmp_path):
     (tmp_path / "a.html").write_text(f"<body style='margin: 0'>{sn.show(scene, height=120)._repr_html_()}")
     with browser.Browser(CHROMIUM, 160, 120, browser.WEBGPU) as page:
         page.open((tmp_path / "a.html").as_uri())
@@ -365,10 +354,10 @@ def test_a_browser_renders_the_scene_in_the_frame(scene: sn.Scene, tmp_path: Pat
 
 
 @pytest.fixture(scope="module")
-def parts_of_page(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Json]:
+def parts_of_page(tmp_path_factory):
     program = bench_page.bundled("page.ts", tmp_path_factory.mktemp("node") / "page.mjs", "--platform=node")
 
-    def run(**task: Any) -> Json:
+    def run(**task):
         words = json.dumps({"addresses": [], "stops": 3, "places": [], "frames": []} | task)
         found = subprocess.run(["node", program, words], check=True, capture_output=True, text=True)
         return dict(json.loads(found.stdout))
@@ -377,7 +366,7 @@ def parts_of_page(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Jso
 
 
 @needs_node
-def test_addresses_name_views(parts_of_page: Callable[..., Json]) -> None:
+def test_addresses_name_views(parts_of_page):
     place = {"position": [1.5, -2e-7, 300.0], "ahead": [0.0, 1.0, -4.25], "lens": 1}
     links = parts_of_page(places=[[2, place], [None, place]])["links"]
     assert links == ["#camera=3", "#camera=1.5,-2e-7,300,0,1,-4.25,2"]
@@ -396,13 +385,13 @@ HOSTILE_ADDRESSES = ["", "#", "#other=1", "#camera=" + "1," * 10_000 + "1"] + [
 
 
 @needs_node
-def test_hostile_addresses_name_none(parts_of_page: Callable[..., Json]) -> None:
+def test_hostile_addresses_name_none(parts_of_page):
     assert parts_of_page(addresses=HOSTILE_ADDRESSES)["views"] == [None] * len(HOSTILE_ADDRESSES)
 
 
 @needs_node
 @pytest.mark.parametrize("cost", [20, 45, 100, 300, 5000])
-def test_the_resolution_follows_the_time_of_a_frame(cost: int, parts_of_page: Callable[..., Json]) -> None:
+def test_the_resolution_follows_the_time_of_a_frame(cost, parts_of_page):
     shares = parts_of_page(frames=[[cost, 2]] * 40)["shares"]
     assert shares[0] == 1
     # It rests at the largest of its steps that has thirty frames a second, or at a quarter.

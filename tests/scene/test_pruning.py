@@ -1,9 +1,6 @@
 """Prunes of scenes: the refit of a pruned field, the count for a loss, and memory."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -13,7 +10,7 @@ from torch.utils._pytree import tree_leaves
 
 import sundae_ns as sn
 from sundae_ns.core import covariance
-from sundae_ns.core.gaussians import Encoding, Gaussians, sh_to_rgb
+from sundae_ns.core.gaussians import Gaussians, sh_to_rgb
 from sundae_ns.pruning import merge
 from sundae_ns.pruning.decision import prune_gaussians
 from sundae_ns.scene import prune_scene as module
@@ -22,7 +19,7 @@ from sundae_ns.scene.prune_scene import count_for_drop, refit
 N = 1500
 
 
-def scene(encoding: Encoding = "harmonics") -> sn.Scene:
+def scene(encoding="harmonics"):
     """A ball with stripes."""
     generator = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(N, 3, generator=generator), dim=1)
@@ -34,12 +31,12 @@ def scene(encoding: Encoding = "harmonics") -> sn.Scene:
     return sn.Scene(Gaussians({**made.gaussians, "features_dc": colors}, encoding))
 
 
-def pruned(full: sn.Scene, count: int = 150) -> Gaussians:
+def pruned(full, count=150):
     return prune_gaussians(full.gaussians, sn.PruneRule(selection="pairs"), count, torch.ones(N)).gaussians
 
 
 @pytest.mark.parametrize("encoding", ["harmonics", "logits"])
-def test_a_refit_matches_views_that_it_was_not_given(encoding: Encoding) -> None:
+def test_a_refit_matches_views_that_it_was_not_given(encoding):
     full = scene(encoding)
     small, cameras = pruned(full), sn.virtual_cameras(full, 32, size=32)
     values = {name: value.clone() for name, value in small.items()}
@@ -55,17 +52,17 @@ def test_a_refit_matches_views_that_it_was_not_given(encoding: Encoding) -> None
     assert after > before + 1
 
 
-def test_a_field_that_matches_already_is_unchanged() -> None:
+def test_a_field_that_matches_already_is_unchanged():
     full = scene()
     cameras = sn.virtual_cameras(full, 4, size=24)
     assert refit(full.gaussians, full.gaussians, cameras, full.settings()) is full.gaussians
 
 
-def test_a_refit_that_diverges_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refit_that_diverges_is_dropped(monkeypatch):
     full = scene()
     small, cameras = pruned(full), sn.virtual_cameras(full, 4, size=24)
 
-    def diverge(_: Any, optimizers: Any, *__: Any, **___: Any) -> None:
+    def diverge(_, optimizers, *__, **___):
         for group in optimizers["field"].param_groups:
             group["params"][0].data.fill_(math.nan)
 
@@ -73,14 +70,14 @@ def test_a_refit_that_diverges_is_dropped(monkeypatch: pytest.MonkeyPatch) -> No
     assert refit(small, full.gaussians, cameras, full.settings()) is small
 
 
-def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_views_are_rendered_small(monkeypatch):
     monkeypatch.setattr(module, "REFIT_PIXELS", 24 * 24)
     full, sizes = scene(), set()
     images = module._blended
 
-    def spy(gaussians: Gaussians, cameras: list[sn.Camera], settings: object) -> list[torch.Tensor]:
+    def spy(gaussians, cameras, settings):
         sizes.update((camera.width, camera.height) for camera in cameras)
-        return images(gaussians, cameras, settings)  # type: ignore[arg-type]
+        return images(gaussians, cameras, settings)
 
     monkeypatch.setattr(module, "_blended", spy)
     cameras = [*sn.virtual_cameras(full, 2, size=96), *sn.virtual_cameras(full, 1, size=12)]
@@ -88,7 +85,7 @@ def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None
     assert sizes == {(24, 24), (12, 12)}
 
 
-def test_images_are_those_of_the_renderer() -> None:
+def test_images_are_those_of_the_renderer():
     """Also of views of several sizes."""
     full = scene()
     cameras = [*sn.virtual_cameras(full, 2, size=24), *sn.virtual_cameras(full, 1, size=12)]
@@ -100,7 +97,7 @@ def test_images_are_those_of_the_renderer() -> None:
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("encoding", ["harmonics", "logits"])
-def test_a_gpu_takes_the_views_of_a_step_together(encoding: Encoding) -> None:
+def test_a_gpu_takes_the_views_of_a_step_together(encoding):
     full = scene(encoding).to("cuda")
     full.gaussians["scales"][:, 0] += 0.7  # rotations of balls have no gradient but noise
     settings, cameras = full.settings(), [camera.to("cuda") for camera in sn.virtual_cameras(full, 40, size=48)]
@@ -124,7 +121,7 @@ def test_a_gpu_takes_the_views_of_a_step_together(encoding: Encoding) -> None:
     assert after > before + 1
 
 
-def test_prune_refits_after_merges_by_pairs_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prune_refits_after_merges_by_pairs_alone(monkeypatch):
     full, called = scene(), []
     monkeypatch.setattr("sundae_ns.scene.prune_scene.refit", lambda small, *_, **__: called.append(small) or small)
     cameras = sn.virtual_cameras(full, 2, size=24)
@@ -135,7 +132,7 @@ def test_prune_refits_after_merges_by_pairs_alone(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.fixture(scope="module")
-def ball() -> sn.Scene:
+def ball():
     """Points on a sphere, coloured smoothly."""
     torch.manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(2000, 3), dim=1)
@@ -145,14 +142,14 @@ def ball() -> sn.Scene:
 
 
 @pytest.fixture(scope="module")
-def cameras() -> list[sn.Camera]:
+def cameras():
     turns = torch.arange(16) * 0.4
     eyes = torch.stack([2.5 * turns.cos(), 2.5 * turns.sin(), 0.1 * turns], dim=1)
     return [sn.Camera.look_at(eye, (0, 0, 0), width=48, height=48) for eye in eyes]
 
 
 @pytest.mark.parametrize("drop", [1.0, 6.0])
-def test_the_count_meets_the_tolerated_loss(drop: float, ball: sn.Scene, cameras: list[sn.Camera]) -> None:
+def test_the_count_meets_the_tolerated_loss(drop, ball, cameras):
     kept, curve = count_for_drop(ball, drop, cameras, sn.PruneRule())
     counts = [count for count, _ in curve]
     assert counts == [2000 // 2 ** (i + 1) for i in range(len(counts))]
@@ -168,11 +165,11 @@ def test_the_count_meets_the_tolerated_loss(drop: float, ball: sn.Scene, cameras
 class Doubles(TorchDispatchMode):
     """Collects the numbers of elements of the float64 tensors that are made."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
-        self.sizes: list[int] = []
+        self.sizes = []
 
-    def __torch_dispatch__(self, function: Any, types: Any, arguments: Any = (), options: Any = None) -> Any:
+    def __torch_dispatch__(self, function, types, arguments=(), options=None):
         made = function(*arguments, **(options or {}))
         for value in tree_leaves(made):
             if isinstance(value, torch.Tensor) and value.dtype == torch.float64:
@@ -180,7 +177,7 @@ class Doubles(TorchDispatchMode):
         return made
 
 
-def test_values_between_are_computed_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_between_are_computed_in_parts(monkeypatch):
     """Of twenty million Gaussians, each number of an edge in float64 takes 2.6 GB."""
     for part, name, size in ((covariance, "ROWS", 64), (merge, "ROWS", 64), (covariance, "PAIRS", 1024)):
         monkeypatch.setattr(part, name, size)

@@ -1,55 +1,42 @@
 """Images of the model: its outputs, made when they are read, crops, other scales, full memory, and recorded frames."""
 
-from __future__ import annotations
-
 import copy
 import logging
 import sys
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Barrier
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.utils import colormaps
-from torch import Tensor
 
-from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, MemoryExhaustedError
 from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.cuda.cuda_graphs import RECORD_AT
 from sundae_ns.head.head import resize
-from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.scene import frames
 from sundae_ns.scene.frames import FrameReplay, Later, LazyOutputs
-from sundae_ns.scene.render import GaussianSource, RenderSettings, render_view
+from sundae_ns.scene.render import GaussianSource, render_view
 
-Build = Callable[..., SundaeModel]
-Perturb = Callable[[SundaeModel], SundaeModel]
-MakeCamera = Callable[..., Cameras]
-TrainingOf = Callable[[SundaeModel], Any]
 N = 60
 """Gaussians of a model that is built without a count."""
 VIEWER_KEYS = {"rgb": 3, "base_rgb": 3, "depth": 1, "accumulation": 1, "features": 3, "response": 1, "background": 3}
 
 
 @pytest.fixture
-def model(build: Build, perturb: Perturb) -> SundaeModel:
+def model(build, perturb):
     return perturb(build()).eval()
 
 
 @pytest.mark.parametrize("size", [(30, 30), (31, 47), (97, 33)])
 @pytest.mark.parametrize("mode", ["residual", "features", "off"])
 @torch.no_grad()
-def test_every_output_can_be_shown(
-    build: Build, perturb: Perturb, camera: MakeCamera, mode: str, size: tuple[int, int]
-) -> None:
+def test_every_output_can_be_shown(build, perturb, camera, mode, size):
     model = perturb(build(head={"mode": mode})).eval()
     outputs = model.get_outputs_for_camera(camera(*size))
     assert {name: (*size[::-1], count) for name, count in VIEWER_KEYS.items()} == {
@@ -67,9 +54,7 @@ def test_every_output_can_be_shown(
 
 
 @torch.no_grad()
-def test_depth_is_splatted_when_it_is_looked_at(
-    build: Build, perturb: Perturb, camera: MakeCamera, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_depth_is_splatted_when_it_is_looked_at(build, perturb, camera, monkeypatch):
     """The same depth as in one pass with the colours, of what was drawn: in a box, of what lies in the box."""
     model = perturb(build(head={"mode": "residual"})).eval()
     box = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, 0.0]), torch.tensor([1.0, 1.0, 1.0]))
@@ -94,7 +79,7 @@ def test_depth_is_splatted_when_it_is_looked_at(
 
 
 @torch.no_grad()
-def test_a_crop_without_primitives_has_the_same_keys(model: SundaeModel, camera: MakeCamera) -> None:
+def test_a_crop_without_primitives_has_the_same_keys(model, camera):
     whole = model.get_outputs_for_camera(camera())
     far = OrientedBox.from_params((50.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     empty = model.get_outputs_for_camera(camera(), obb_box=far)
@@ -108,7 +93,7 @@ def test_a_crop_without_primitives_has_the_same_keys(model: SundaeModel, camera:
 
 
 @torch.no_grad()
-def test_without_the_head_the_picture_is_the_base_exactly(model: SundaeModel, camera: MakeCamera) -> None:
+def test_without_the_head_the_picture_is_the_base_exactly(model, camera):
     on = model.get_outputs_for_camera(camera())
     assert (on["rgb"] - on["base_rgb"]).abs().max() > 1e-3
     settings = model.render_settings(training=False).without_head()
@@ -122,7 +107,7 @@ def test_without_the_head_the_picture_is_the_base_exactly(model: SundaeModel, ca
 
 
 @torch.no_grad()
-def test_residual_head_starts_at_the_base_and_features_head_does_not_need_it(build: Build, camera: MakeCamera) -> None:
+def test_residual_head_starts_at_the_base_and_features_head_does_not_need_it(build, camera):
     residual, features = build(), build(head={"mode": "features"})
     residual.step = features.step = 10
     outputs = residual.eval().get_outputs_for_camera(camera())
@@ -137,9 +122,7 @@ def test_residual_head_starts_at_the_base_and_features_head_does_not_need_it(bui
 @pytest.mark.parametrize("mode", ["residual", "features"])
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 @torch.no_grad()
-def test_background_shows_where_nothing_is(
-    build: Build, perturb: Perturb, camera: MakeCamera, mode: str, factor: float
-) -> None:
+def test_background_shows_where_nothing_is(build, perturb, camera, mode, factor):
     """Whatever the head has learnt, at its own scale and at another one."""
     model = perturb(build(head={"mode": mode})).eval()
     model.step, model.state.trained_focal = 10_000, (30.0, 30.0)
@@ -151,7 +134,7 @@ def test_background_shows_where_nothing_is(
 
 
 @torch.no_grad()
-def test_what_features_make_lies_over_the_background(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+def test_what_features_make_lies_over_the_background(build, perturb, camera):
     """Once, by accumulation: between two backgrounds the picture differs by what shines through."""
     model = perturb(build(head={"mode": "features"})).eval()
     model.step = 10_000
@@ -166,7 +149,7 @@ def test_what_features_make_lies_over_the_background(build: Build, perturb: Pert
     torch.testing.assert_close((light - dark)[inside[..., 0]], (0.5 * (1 - alpha))[inside].expand(3, -1).T)
 
 
-def at_focal(camera: MakeCamera, factor: float) -> Cameras:
+def at_focal(camera, factor):
     """The test camera, its picture magnified."""
     small = camera()
     sides = {"width": round(40 * factor), "height": round(32 * factor)}
@@ -175,9 +158,7 @@ def at_focal(camera: MakeCamera, factor: float) -> Cameras:
 
 
 @pytest.mark.parametrize("mode", ["residual", "features"])
-def test_other_scales_get_the_correction_of_the_trained_one(
-    build: Build, perturb: Perturb, camera: MakeCamera, mode: Any
-) -> None:
+def test_other_scales_get_the_correction_of_the_trained_one(build, perturb, camera, mode):
     model = perturb(build(head={"mode": mode}, background_color="black")).eval()
     model.state.trained_focal = (30.0, 30.0)
     own = model.get_outputs(camera())
@@ -193,7 +174,7 @@ def test_other_scales_get_the_correction_of_the_trained_one(
     assert torch.equal(near["rgb"], model.get_outputs(at_focal(camera, 10.05))["rgb"])
 
 
-def test_the_head_remembers_its_scale(build: Build, training_of: TrainingOf) -> None:
+def test_the_head_remembers_its_scale(build, training_of):
     training = training_of(build(background_color="black"))
     for step in range(4):
         training.step(step)
@@ -210,26 +191,24 @@ class FullBackend:
 
     name = "full"
 
-    def rasterize(self, *_: Any, **__: Any) -> Any:
+    def rasterize(self, *_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total ...")
 
-    def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
+    def spherical_harmonics(self, degree, directions, coeffs):
         return torch.zeros_like(directions)
 
 
 @pytest.mark.parametrize("training", [True, False], ids=["training", "rendering"])
-def test_full_memory_says_how_much_and_what_to_try(build: Build, camera: MakeCamera, training: bool) -> None:
+def test_full_memory_says_how_much_and_what_to_try(build, camera, training):
     model = build().train(training)
-    model.backend = FullBackend()  # type: ignore[assignment]
+    model.backend = FullBackend()
     options = f"cache-images cpu .*camera-res-scale-factor .*max-gaussians {N // 2}"
     with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 2\.50 GiB more with {N} Gaussians; .*{options}"):
         model.get_outputs_for_camera(camera())
 
 
-def test_outputs_that_nobody_asks_for_cost_nothing(
-    model: SundaeModel, camera: MakeCamera, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    splatted: list[int] = []
+def test_outputs_that_nobody_asks_for_cost_nothing(model, camera, monkeypatch):
+    splatted = []
     rendering = sys.modules["sundae_ns.scene.render"]  # its name is also that of a function
     rasterize = rendering.rasterize
     monkeypatch.setattr(rendering, "rasterize", lambda *a, **kwargs: splatted.append(1) or rasterize(*a, **kwargs))
@@ -240,7 +219,7 @@ def test_outputs_that_nobody_asks_for_cost_nothing(
     assert len(splatted) == 2
 
 
-def test_outputs_belong_to_the_field_that_was_rendered(model: SundaeModel, camera: MakeCamera) -> None:
+def test_outputs_belong_to_the_field_that_was_rendered(model, camera):
     before = {name: value.clone() for name, value in model.get_outputs_for_camera(camera()).items()}
     outputs = model.get_outputs_for_camera(camera())
     with torch.no_grad():  # a prune, while another thread still shows the picture
@@ -254,16 +233,16 @@ def test_outputs_belong_to_the_field_that_was_rendered(model: SundaeModel, camer
 
 @torch.no_grad()
 @pytest.mark.parametrize("n", [1, 5])
-def test_one_primitive_has_no_response_to_show_and_few_have_one(build: Build, camera: MakeCamera, n: int) -> None:
+def test_one_primitive_has_no_response_to_show_and_few_have_one(build, camera, n):
     picture = build(n=n).eval().get_outputs_for_camera(camera())["response"]
     assert picture.isfinite().all()
     assert bool(picture.any()) == (n > 1)
 
 
-def test_an_output_is_made_once_by_every_way_to_it_and_without_gradients() -> None:
+def test_an_output_is_made_once_by_every_way_to_it_and_without_gradients():
     calls, weight = [], torch.ones(1, requires_grad=True)
 
-    def make(name: str) -> Tensor:
+    def make(name):
         calls.append(name)
         return 2 * weight
 
@@ -278,7 +257,7 @@ def test_an_output_is_made_once_by_every_way_to_it_and_without_gradients() -> No
     assert list(outputs) == ["rgb", "features"]
 
 
-def test_two_threads_get_values() -> None:
+def test_two_threads_get_values():
     barrier = Barrier(2, timeout=10)  # both are in it before either has its value
     outputs = LazyOutputs(x=Later(lambda: barrier.wait() >= 0))
     with ThreadPoolExecutor(2) as pool:
@@ -288,30 +267,30 @@ def test_two_threads_get_values() -> None:
 class Recorder:
     """In place of the GPU's: what it plays is rendered anew, and it notes what it was asked for."""
 
-    def __init__(self) -> None:
-        self.recorded: list[int | None] = []
+    def __init__(self):
+        self.recorded = []
         self.played = 0
         self.needed = 100
-        self.fails: Exception | None = None
+        self.fails = None
 
-    def record(self, source: Any, _: Any, __: Any, settings: RenderSettings, capacity: int | None = None) -> Any:
+    def record(self, source, _, __, settings, capacity=None):
         if self.fails is not None:
             raise self.fails
         self.recorded.append(capacity)
 
-        def show(camera: Camera, background: Tensor) -> dict[str, Tensor]:
+        def show(camera, background):
             shown = render_view(source, camera, background, settings, depth=False)[0]
             return {name: shown[name] for name in frames.REPLAYED}
 
         return SimpleNamespace(show=show, capacity=capacity or 120)
 
-    def play(self, recording: Any, camera: Camera, background: Tensor) -> tuple[dict[str, Tensor], int]:
+    def play(self, recording, camera, background):
         self.played += 1
         return recording.show(camera, background), self.needed
 
 
 @pytest.fixture
-def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+def recorder(monkeypatch):
     found = Recorder()
     monkeypatch.setattr(frames, "_record", found.record)
     monkeypatch.setattr(frames, "_replay", found.play)
@@ -319,9 +298,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     return found
 
 
-def test_a_size_that_stays_is_recorded_and_played_back(
-    build: Build, perturb: Perturb, camera: MakeCamera, recorder: Recorder
-) -> None:
+def test_a_size_that_stays_is_recorded_and_played_back(build, perturb, camera, recorder):
     model = perturb(build(background_color="black")).eval()
     shown = [model.get_outputs_for_camera(camera(shift=0.1 * i))["rgb"] for i in range(RECORD_AT + 2)]
     assert (len(recorder.recorded), recorder.played) == (1, 3)
@@ -331,10 +308,8 @@ def test_a_size_that_stays_is_recorded_and_played_back(
         model.get_outputs_for_camera(camera(width=20 + i))
 
 
-def test_what_a_recording_has_fixed_makes_another_one(
-    model: SundaeModel, camera: MakeCamera, recorder: Recorder
-) -> None:
-    def show(**options: Any) -> int:
+def test_what_a_recording_has_fixed_makes_another_one(model, camera, recorder):
+    def show(**options):
         for _ in range(RECORD_AT):
             model.get_outputs_for_camera(camera(**options))
         return len(recorder.recorded)
@@ -362,9 +337,7 @@ def test_what_a_recording_has_fixed_makes_another_one(
     assert show() == 10  # those of a field that is gone hold memory for nothing
 
 
-def test_a_view_of_more_pairs_than_there_is_room_for_is_recorded_again(
-    model: SundaeModel, camera: MakeCamera, recorder: Recorder
-) -> None:
+def test_a_view_of_more_pairs_than_there_is_room_for_is_recorded_again(model, camera, recorder):
     for _ in range(RECORD_AT):
         model.get_outputs_for_camera(camera())
     recorder.needed = 121
@@ -376,12 +349,10 @@ def test_a_view_of_more_pairs_than_there_is_room_for_is_recorded_again(
     assert len(recorder.recorded) == 2
 
 
-def test_one_thread_plays_at_a_time(
-    model: SundaeModel, camera: MakeCamera, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_thread_plays_at_a_time(model, camera, recorder, monkeypatch):
     inside, most, play = [0], [0], recorder.play
 
-    def slowly(*arguments: Any) -> Any:
+    def slowly(*arguments):
         inside[0] += 1
         most[0] = max(most[0], inside[0])
         time.sleep(0.02)
@@ -396,9 +367,7 @@ def test_one_thread_plays_at_a_time(
 
 
 @pytest.mark.parametrize("error", [BackendError("no compiler: install one"), torch.cuda.OutOfMemoryError("full")])
-def test_what_cannot_be_recorded_is_rendered_and_said_once(
-    model: SundaeModel, camera: MakeCamera, recorder: Recorder, caplog: pytest.LogCaptureFixture, error: Exception
-) -> None:
+def test_what_cannot_be_recorded_is_rendered_and_said_once(model, camera, recorder, caplog, error):
     recorder.fails = error
     with caplog.at_level(logging.WARNING):
         shown = [model.get_outputs_for_camera(camera())["rgb"] for _ in range(2 * RECORD_AT)]
@@ -406,9 +375,7 @@ def test_what_cannot_be_recorded_is_rendered_and_said_once(
     assert all(torch.equal(picture, shown[0]) for picture in shown)
 
 
-def test_a_part_of_a_field_is_never_recorded(
-    model: SundaeModel, camera: MakeCamera, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_of_a_field_is_never_recorded(model, camera, recorder, monkeypatch):
     """Its tensors are gone with the frame."""
     box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     for _ in range(2 * RECORD_AT):
@@ -425,15 +392,13 @@ def test_a_part_of_a_field_is_never_recorded(
     assert not torch.equal(previewed, whole)
 
 
-def test_nothing_is_recorded_on_a_cpu_or_in_training(
-    model: SundaeModel, camera: MakeCamera, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_recorded_on_a_cpu_or_in_training(model, camera, monkeypatch):
     monkeypatch.delattr(frames, "_record")
     for _ in range(2 * RECORD_AT):
         model.get_outputs_for_camera(camera())
     source, empty = (GaussianSource(Gaussians({"means": torch.zeros(n, 3)})) for n in (1, 0))
     settings = model.render_settings(training=False)
-    settings = replace(settings, backend=SimpleNamespace(name="gsplat"))  # type: ignore[arg-type]
+    settings = replace(settings, backend=SimpleNamespace(name="gsplat"))
     with torch.no_grad():
         assert frames._recordable(source, settings)
         assert not frames._recordable(empty, settings)
@@ -442,7 +407,7 @@ def test_nothing_is_recorded_on_a_cpu_or_in_training(
     assert not frames._recordable(source, settings)  # with gradients
 
 
-def eager(model: SundaeModel, camera: Cameras) -> dict[str, Tensor]:
+def eager(model, camera):
     model._replay = FrameReplay()
     outputs = model.get_outputs_for_camera(camera)
     assert len(model._replay._frames) == 0
@@ -452,9 +417,7 @@ def eager(model: SundaeModel, camera: Cameras) -> dict[str, Tensor]:
 @pytest.mark.gpu
 @pytest.mark.parametrize("head", [{}, {"precision": "fp32"}, {"mode": "features"}, {"mode": "off"}])
 @pytest.mark.parametrize("focal", [None, 12.0])
-def test_what_is_played_back_is_what_would_be_rendered(
-    build: Build, perturb: Perturb, camera: MakeCamera, head: dict[str, Any], focal: float | None
-) -> None:
+def test_what_is_played_back_is_what_would_be_rendered(build, perturb, camera, head, focal):
     model = perturb(build(n=2000, sh_degree=3, head=head, background_color="white")).cuda().eval()
     model.step = 10_000
     if focal is not None:
@@ -476,12 +439,12 @@ def test_what_is_played_back_is_what_would_be_rendered(
 
 
 @pytest.mark.gpu
-def test_what_is_trained_meanwhile_is_seen(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+def test_what_is_trained_meanwhile_is_seen(build, perturb, camera):
     model = perturb(build(n=500)).cuda().eval()
     before = [model.get_outputs_for_camera(camera())["rgb"] for _ in range(RECORD_AT + 1)][-1]
     with torch.no_grad():
         model.gauss_params["features_dc"] += 0.5
-        for value in model.head.parameters():  # type: ignore[union-attr]
+        for value in model.head.parameters():
             value += 0.02
     after = model.get_outputs_for_camera(camera())["rgb"]
     assert len(model._replay._frames) == 1
@@ -496,7 +459,7 @@ def test_what_is_trained_meanwhile_is_seen(build: Build, perturb: Perturb, camer
 
 
 @pytest.mark.gpu
-def test_a_view_of_many_more_pairs(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+def test_a_view_of_many_more_pairs(build, perturb, camera):
     model = perturb(build(n=3000)).cuda().eval()
     far, near = camera(width=640, height=480, shift=300.0), camera(width=640, height=480)
     expected = eager(model, near)["base_rgb"]

@@ -1,9 +1,6 @@
 """Scenes as values: opening, saving, rendering, pruning and measuring them."""
 
-from __future__ import annotations
-
 import dataclasses
-from pathlib import Path
 
 import pytest
 import torch
@@ -21,16 +18,15 @@ from sundae_ns.core.errors import (
 )
 from sundae_ns.core.gaussians import Gaussians
 from sundae_ns.rasterize.gsplat_backend import GsplatBackend
-from sundae_ns.rasterize.interface import BackendName
 
 
-def scene(n: int = 200, degree: int = 2) -> sn.Scene:
+def scene(n=200, degree=2):
     gaussians = random_field(n, degree=degree, features=0)
     gaussians["scales"] += 2
     return sn.Scene(Gaussians(gaussians))
 
 
-def cameras(n: int = 3) -> list[sn.Camera]:
+def cameras(n=3):
     return sn.virtual_cameras(scene(), n, size=32)
 
 
@@ -41,7 +37,7 @@ def cameras(n: int = 3) -> list[sn.Camera]:
     ("suffix", "least"), [(".ply", 80.0), (".glb", 80.0), (".spz", 35.0), (".sog", 33.0), (".sundae", 33.0)], ids=str
 )
 @pytest.mark.parametrize("degree", [0, 2])
-def test_a_file_gives_the_scene_back(suffix: str, least: float, degree: int, tmp_path: Path) -> None:
+def test_a_file_gives_the_scene_back(suffix, least, degree, tmp_path):
     """Measured: exact for .ply, else 36 dB and more."""
     truth = scene(degree=degree)
     sn.save(truth, tmp_path / f"a{suffix}")
@@ -53,7 +49,7 @@ def test_a_file_gives_the_scene_back(suffix: str, least: float, degree: int, tmp
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".glb", ".sundae"])
-def test_files_say_that_a_scene_is_antialiased(suffix: str, tmp_path: Path) -> None:
+def test_files_say_that_a_scene_is_antialiased(suffix, tmp_path):
     for antialiased in (True, False):
         path = tmp_path / f"{antialiased}{suffix}"
         sn.save(sn.Scene(scene().gaussians, antialiased=antialiased), path)
@@ -61,7 +57,7 @@ def test_files_say_that_a_scene_is_antialiased(suffix: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_packed_scenes_are_packed_again(name: str, tmp_path: Path) -> None:
+def test_packed_scenes_are_packed_again(name, tmp_path):
     found = sn.load(write_kind(tmp_path / "a.sundae", KINDS[name]))
     assert len(found.cameras) == 2
     sn.save(found, tmp_path / "b.sundae")
@@ -82,9 +78,7 @@ def test_packed_scenes_are_packed_again(name: str, tmp_path: Path) -> None:
         ("a.ply", b"ply\nformat ascii 1.0\nend_header\n", DataError, "a.ply"),
     ],
 )
-def test_what_is_no_scene_is_refused_in_one_line(
-    name: str, content: bytes | None, error: type[Exception], message: str, tmp_path: Path
-) -> None:
+def test_what_is_no_scene_is_refused_in_one_line(name, content, error, message, tmp_path):
     if content is not None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(error, match=message) as caught:
@@ -92,7 +86,7 @@ def test_what_is_no_scene_is_refused_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_saving_refuses_what_it_cannot(tmp_path: Path) -> None:
+def test_saving_refuses_what_it_cannot(tmp_path):
     with pytest.raises(ConfigError, match="no supported suffix"):
         sn.save(scene(), tmp_path / "a.png")
     with pytest.raises(ConfigError, match="leave out upright"):
@@ -107,7 +101,7 @@ def test_saving_refuses_what_it_cannot(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------------------------------- images
 
 
-def test_a_head_corrects_images_unless_it_is_left_out(tmp_path: Path) -> None:
+def test_a_head_corrects_images_unless_it_is_left_out(tmp_path):
     found = sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
     images, without = (sn.render(found, found.cameras[0], head=head) for head in (True, False))
     assert (images.rgb - images.base_rgb).abs().max() > 1e-3
@@ -115,7 +109,7 @@ def test_a_head_corrects_images_unless_it_is_left_out(tmp_path: Path) -> None:
     assert [tuple(image.shape) for image in images] == [(37, 50, 3), (37, 50, 3), (37, 50, 1), (37, 50, 1)]
 
 
-def test_a_head_moves_to_another_device(tmp_path: Path) -> None:
+def test_a_head_moves_to_another_device(tmp_path):
     found = sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
     assert found.head is not None
     before = torch.get_rng_state()
@@ -131,12 +125,12 @@ def test_a_head_moves_to_another_device(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [{"keep": 0.25}, {"count": 50}])
-def test_a_prune_keeps_exactly_what_was_asked_for(kept: dict[str, float]) -> None:
-    small = sn.prune(scene(), cameras=cameras(), **kept)  # type: ignore[arg-type]
+def test_a_prune_keeps_exactly_what_was_asked_for(kept):
+    small = sn.prune(scene(), cameras=cameras(), **kept)
     assert small.num_gaussians == 50
 
 
-def test_a_prune_merges_what_it_drops() -> None:
+def test_a_prune_merges_what_it_drops():
     """A wall keeps its cover if the dropped quarter is merged, and gets holes otherwise."""
     across = torch.linspace(-1, 1, 40)
     points = torch.stack([*torch.meshgrid(across, across, indexing="ij"), torch.zeros(40, 40)], dim=-1).reshape(-1, 3)
@@ -150,7 +144,7 @@ def test_a_prune_merges_what_it_drops() -> None:
     assert sn.measure(merged, truth, seen).psnr > sn.measure(dropped, truth, seen).psnr + 1
 
 
-def test_views_choose_what_stays() -> None:
+def test_views_choose_what_stays():
     """What no view sees goes first."""
     truth = scene(400)
     truth.gaussians["means"][:200, 0] += 50
@@ -160,7 +154,7 @@ def test_views_choose_what_stays() -> None:
     assert (small.gaussians["means"][:, 0] < 25).all()
 
 
-def test_primitives_that_are_not_finite_are_dropped() -> None:
+def test_primitives_that_are_not_finite_are_dropped():
     truth = scene()
     truth.gaussians["means"][:100] = torch.nan
     assert sn.prune(truth, keep=1.0, cameras=cameras()).num_gaussians == 100
@@ -169,7 +163,7 @@ def test_primitives_that_are_not_finite_are_dropped() -> None:
 
 
 @pytest.mark.parametrize("kind", [".ply", ".spz", ".sog", ".glb", ".sundae", ".html"])
-def test_a_scene_of_opaque_and_flat_primitives_is_saved_whole(tmp_path: Path, kind: str) -> None:
+def test_a_scene_of_opaque_and_flat_primitives_is_saved_whole(tmp_path, kind):
     """One that was made in memory: files are mended when they are opened."""
     truth = dataclasses.replace(scene(), cameras=tuple(sn.virtual_cameras(scene(), 2, size=32)))
     truth.gaussians["opacities"][:90], truth.gaussians["scales"][80:, 1] = torch.inf, -torch.inf
@@ -188,7 +182,7 @@ def test_a_scene_of_opaque_and_flat_primitives_is_saved_whole(tmp_path: Path, ki
 # ------------------------------------------------------------------------------------------------------------- quality
 
 
-def test_quality_against_images_and_against_a_scene() -> None:
+def test_quality_against_images_and_against_a_scene():
     truth, seen = scene(), cameras()
     small = sn.prune(truth, keep=0.5, cameras=seen)
     images = [sn.render(truth, camera).rgb for camera in seen]
@@ -198,7 +192,7 @@ def test_quality_against_images_and_against_a_scene() -> None:
     assert sn.measure(truth, truth, seen).ssim == pytest.approx(1.0)
 
 
-def test_both_scenes_have_the_background_of_the_reference() -> None:
+def test_both_scenes_have_the_background_of_the_reference():
     truth, seen = sn.Scene(scene().gaussians, background_color="white"), cameras()
     assert sn.measure(scene(), truth, seen).psnr > 80
 
@@ -210,13 +204,13 @@ def test_both_scenes_have_the_background_of_the_reference() -> None:
 @pytest.mark.parametrize(
     "name", ["means", "quats", "scales", "opacities", "features_dc", "features_rest", "viewmat", "K"]
 )
-def test_an_image_has_a_gradient_for_each_tensor_that_asks_for_one(name: str, backend: BackendName) -> None:
+def test_an_image_has_a_gradient_for_each_tensor_that_asks_for_one(name, backend):
     """The gradient is the slope of the image's sum."""
     field, camera = scene(40).gaussians, cameras(1)[0]
     on_camera = name in ("viewmat", "K")
     value = (getattr(camera, name) if on_camera else field[name]).clone().requires_grad_()
 
-    def total(value: torch.Tensor) -> torch.Tensor:
+    def total(value):
         there = camera._replace(**{name: value}) if on_camera else camera
         made = sn.Scene(field if on_camera else field.replaced({name: value}))
         return (sn.render(made, there, backend=backend).rgb.double() * weights).sum()
@@ -229,7 +223,7 @@ def test_an_image_has_a_gradient_for_each_tensor_that_asks_for_one(name: str, ba
     assert float(slope) == pytest.approx(float((gradient * step).sum()), rel=0.1)
 
 
-def test_an_image_has_no_graph_unless_something_asks_for_it(tmp_path: Path) -> None:
+def test_an_image_has_no_graph_unless_something_asks_for_it(tmp_path):
     field, camera = scene().gaussians, cameras(1)[0]
     asking = sn.Scene(field.replaced({"means": field["means"].clone().requires_grad_()}))
     assert sn.render(asking, camera).rgb.requires_grad
@@ -246,7 +240,7 @@ def test_an_image_has_no_graph_unless_something_asks_for_it(tmp_path: Path) -> N
     assert not image.base_rgb.requires_grad
 
 
-def test_gsplat_refuses_a_gradient_that_it_would_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gsplat_refuses_a_gradient_that_it_would_cut(monkeypatch):
     camera = cameras(1)[0]
     monkeypatch.setattr("sundae_ns.scene.scene.select_backend", lambda *_: GsplatBackend())
     with pytest.raises(BackendError, match="no gradient for camera.K; detach it, or use the backend 'reference'"):
@@ -261,8 +255,8 @@ def test_gsplat_refuses_a_gradient_that_it_would_cut(monkeypatch: pytest.MonkeyP
     ],
     ids=["numpy", "torch"],
 )
-def test_full_memory_is_one_line(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
+def test_full_memory_is_one_line(error, monkeypatch):
+    def full(*_):
         raise error
 
     camera = cameras(1)[0]

@@ -1,30 +1,25 @@
 """What errors of a pack do to images: predicted changes are those of renderings."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest
 import torch
 from fields import random_field
-from torch import Tensor
 
-from sundae_ns.core.camera import Camera
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.pack.packed_scene import PackedScene
 from sundae_ns.scene.packing import cameras_of_arrays, scene_of, sensitivity_of
 from sundae_ns.scene.render import GaussianSource, render_view
-from sundae_ns.scene.scene import Scene
 
 
-def head() -> dict[str, Tensor]:
+def head():
     torch.manual_seed(0)
     state = dict(CompensationHead(HeadConfig(size="tiny", num_features=5)).state_dict())
     state["net.out.weight"] = 0.1 * torch.randn_like(state["net.out.weight"])
     return state
 
 
-def cameras(n: int, *, turn: float, away: float = 0.0) -> tuple[Camera, ...]:
+def cameras(n, *, turn, away=0.0):
     """Cameras on a circle around the origin, or on a part of it, which look at its centre."""
     angles = torch.arange(n) * (turn / n)
     zero, one = torch.zeros(n), torch.ones(n)
@@ -41,7 +36,7 @@ def cameras(n: int, *, turn: float, away: float = 0.0) -> tuple[Camera, ...]:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     kind = {"mode": "residual", "size": "tiny", "pixel_unshuffle": 2, "num_features": 5, "precision": "fp32"}
     stated = {"sh_degree": 2, "rasterize_mode": "classic", "background_color": "black", "head": kind}
     gaussians = random_field(300)
@@ -50,15 +45,13 @@ def scene() -> Scene:
 
 
 @torch.no_grad()
-def image(scene: Scene, camera: Camera) -> Tensor:
+def image(scene, camera):
     settings = dataclasses.replace(scene.settings(), training=True)
-    found: Tensor = render_view(GaussianSource(scene.gaussians), camera, scene.background, settings, depth=False)[0][
-        "rgb"
-    ]
+    found = render_view(GaussianSource(scene.gaussians), camera, scene.background, settings, depth=False)[0]["rgb"]
     return found.double()
 
 
-def changed(scene: Scene, cameras: tuple[Camera, ...], parameters: list[Tensor], size: float) -> float:
+def changed(scene, cameras, parameters, size):
     """Mean squared change of images by random changes of parameters, for a change of length 1 of each number."""
     before = [value.detach().clone() for value in parameters]
     images = [image(scene, camera) for camera in cameras]
@@ -74,7 +67,7 @@ def changed(scene: Scene, cameras: tuple[Camera, ...], parameters: list[Tensor],
     return total / tries / size**2
 
 
-def test_predicted_changes_are_those_of_images(scene: Scene) -> None:
+def test_predicted_changes_are_those_of_images(scene):
     torch.manual_seed(1)
     seen = cameras(8, turn=6.28)
     found = sensitivity_of(scene, seen)
@@ -90,7 +83,7 @@ def test_predicted_changes_are_those_of_images(scene: Scene) -> None:
     assert all(torch.equal(found.head[name], again.head[name]) for name in found.head)
 
 
-def test_cameras_of_one_side_tell_fewer_harmonics_apart(scene: Scene) -> None:
+def test_cameras_of_one_side_tell_fewer_harmonics_apart(scene):
     forms = [sensitivity_of(scene, cameras(24, turn=turn)).rows["features_rest"] for turn in (6.28, 0.1)]
     assert all(form.shape == (24, 24) for form in forms)
     values = [torch.linalg.eigvalsh(form) for form in forms]
@@ -99,7 +92,7 @@ def test_cameras_of_one_side_tell_fewer_harmonics_apart(scene: Scene) -> None:
     assert around > aside + 1
 
 
-def test_primitives_that_no_camera_sees(scene: Scene) -> None:
+def test_primitives_that_no_camera_sees(scene):
     form = sensitivity_of(scene, cameras(2, turn=0.1, away=1000.0)).rows["features_rest"]
     assert torch.isfinite(form).all()
     assert float(torch.linalg.eigvalsh(form)[0]) > 0
