@@ -104,6 +104,12 @@ def page_of(*runs, notes=()):
     return report_page(runs, notes, "sundae report x")
 
 
+@pytest.fixture
+def text(measured):
+    """A page of a run with a head and a curve, and of one without."""
+    return page_of(shown(measured(), curve=CURVE), shown(measured("b", head=False)))
+
+
 # ------------------------------------------------------------------------------------------------- the choice of views
 
 
@@ -138,22 +144,16 @@ def test_a_page_of_many_runs_shows_fewer_views_of_each():
 # ------------------------------------------------------------------------------------------------------- the error map
 
 
-def test_the_error_map_of_equal_images_has_one_color():
-    image = torch.rand(9, 12, 3)
-    found = error_map(image, image.clone())
-    assert found.size == (12, 9)
-    assert np.array_equal(np.unique(np.asarray(found.convert("RGB")).reshape(-1, 3), axis=0), ERROR_COLORS[:1])
-
-
 def test_errors_have_their_place_among_the_colors():
     photo = torch.zeros(1, 4, 3)
     levels = torch.tensor([0.0, LARGEST_ERROR / 2, LARGEST_ERROR, 255]) / 255
-    found = np.asarray(error_map(levels[None, :, None].expand(1, 4, 3), photo).convert("RGB"))[0]
-    colors = ERROR_COLORS
-    middle = len(colors) // 2
-    assert found[0].tolist() == colors[0].tolist()
-    assert found[1].tolist() in colors[middle - 1 : middle + 1].tolist()
-    assert found[2].tolist() == found[3].tolist() == colors[-1].tolist()
+    found = error_map(levels[None, :, None].expand(1, 4, 3), photo)
+    assert found.size == (4, 1)
+    first, half, *most = np.asarray(found.convert("RGB"))[0].tolist()
+    colors, middle = ERROR_COLORS.tolist(), len(ERROR_COLORS) // 2
+    assert first == colors[0]
+    assert half in colors[middle - 1 : middle + 1]
+    assert most == [colors[-1]] * 2
     # The mean of the channels, whatever the sign.
     one = torch.tensor([LARGEST_ERROR / 255, 0.0, 0.0]).expand(1, 4, 3)
     three = torch.full((1, 4, 3), LARGEST_ERROR / 255 / 3)
@@ -176,29 +176,25 @@ def test_an_error_map_needs_two_images_of_one_size():
 # ------------------------------------------------------------------------------------------------------------ one view
 
 
-def camera_of(measured, height, width, *, head=True):
-    run, photos = measured(), images(0, height, width)
-    return shown_view(3, "a.png", *photos, run.full.views[0], run.base.views[0] if head else None), photos
-
-
-@pytest.mark.parametrize(("size", "expected"), [((24, 32), (32, 24)), ((700, 2400), (LONGEST_SIDE, 350))])
-def test_images_of_a_view_have_one_size(measured, size, expected):
-    view, _ = camera_of(measured, *size)
+@pytest.mark.parametrize("head", [True, False])
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [((24, 32), (32, 24)), ((700, 2400), (LONGEST_SIDE, 350)), ((24, EXACT_SIDE), (EXACT_SIDE, 24))],
+)
+def test_images_of_a_view_have_one_size_and_small_ones_lose_nothing(measured, size, expected, head):
+    run, (photo, rendering, bare) = measured(), images(0, *size)
+    view = shown_view(3, "a.png", photo, rendering, bare, run.full.views[0], run.base.views[0] if head else None)
     assert (view.index, view.name, view.size, view.shown) == (3, "a.png", size[::-1], expected)
-    assert list(view.images) == ["rendering", "head off", "error map"]
-    for address in (view.photo, *view.images.values()):
-        assert decoded(address).size == expected
-    assert list(camera_of(measured, *size, head=False)[0].images) == ["rendering", "error map"]
-
-
-@pytest.mark.parametrize(("width", "exact"), [(EXACT_SIDE, True), (EXACT_SIDE + 2, False)])
-def test_small_images_lose_nothing(measured, width, exact):
-    view, (photo, rendering, bare) = camera_of(measured, 24, width)
-    addresses = (view.photo, view.images["rendering"], view.images["head off"])
-    for address, image in zip(addresses, (photo, rendering, bare), strict=True):
-        assert np.array_equal(np.asarray(decoded(address)), (255 * image).round().numpy()) is exact
-    errors = error_map(rendering, photo).convert("RGB")
-    assert np.array_equal(decoded(view.images["error map"]).convert("RGB"), errors)
+    assert list(view.images) == ["rendering", *(["head off"] if head else []), "error map"]
+    given = {"photo": photo, "rendering": rendering, "head off": bare}
+    for name, address in {"photo": view.photo, **view.images}.items():
+        found = decoded(address)
+        assert found.size == expected
+        if name in given:
+            exact = found.size == size[::-1] and np.array_equal(found, (255 * given[name]).round().numpy())
+            assert exact == (expected[0] <= EXACT_SIDE)
+        elif found.size == size[::-1]:
+            assert np.array_equal(found.convert("RGB"), error_map(rendering, photo).convert("RGB"))
 
 
 def test_a_rendering_that_is_not_finite_is_shown(measured):
@@ -220,27 +216,29 @@ def outside(text):
     return re.findall(named, plain, re.IGNORECASE)
 
 
-def test_it_asks_nobody_for_anything(measured):
-    text = page_of(shown(measured(), curve=CURVE), shown(measured("b", head=False)))
+def test_it_asks_nobody_for_anything(text):
     assert outside(text) == []
     for wrong in ('<img src="a.png">', "fetch('https://a')", "url(a.png)", "<link>"):
         assert outside(wrong)
-    ((policy,),) = [[value["content"]] for value in Page(text).all("meta") if value.get("http-equiv")]
-    assert policy is not None
+    (policy,) = [value["content"] for value in Page(text).all("meta") if value.get("http-equiv")]
     rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
     assert (rules["default-src"], rules["img-src"]) == ("'none'", "data:")
     assert re.fullmatch(r"'sha256-[\w+/=]+'", rules["script-src"])
 
 
-def test_every_image_decodes(measured):
-    page = Page(page_of(shown(measured()), shown(measured("b", head=False))))
+def test_every_image_decodes_and_names_of_elements_are_unique(text):
+    page = Page(text)
     drawn = [image for image in page.all("img") if "width" in image]
     # Photo, rendering, rendering without the head and error map; photo, rendering and error map.
     assert len(drawn) == 3 * 4 + 3 * 3
     for image in drawn:
-        assert decoded(image["src"]).size == (32, 24) == (int(image["width"] or 0), int(image["height"] or 0))
+        assert decoded(image["src"]).size == (32, 24) == (int(image["width"]), int(image["height"]))
         assert (image["loading"], image["decoding"]) == ("lazy", "async")
     assert all(image["alt"] for image in page.all("img"))
+    names = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(names) == len(set(names))
+    wanted = {attributes.get(key) for _, attributes in page.elements for key in ("for", "aria-labelledby")}
+    assert wanted - {None} <= set(names)
 
 
 def test_its_figures_are_those_of_the_report(measured):
@@ -249,11 +247,9 @@ def test_its_figures_are_those_of_the_report(measured):
     for row in rows_of([run]):
         assert " ".join(row) in page.words
     for view, base in zip(run.full.views, run.base.views, strict=True):
-        assert (
-            f"PSNR {view.psnr:.2f} dB, SSIM {view.ssim:.4f}, FLIP 0.2000 head off: PSNR {base.psnr:.2f}" in page.words
-        )
-    cards = [card for card in page.all("article")]
-    assert [float(card["data-psnr"] or 0) for card in cards] == [view.psnr for view in run.full.views]
+        figures = f"PSNR {view.psnr:.2f} dB, SSIM {view.ssim:.4f}, FLIP 0.2000 head off: PSNR {base.psnr:.2f}"
+        assert figures in page.words
+    assert [float(card["data-psnr"]) for card in page.all("article")] == [view.psnr for view in run.full.views]
     assert "sundae report x" in page.words
     assert "All 3 test views" in page.words
 
@@ -270,38 +266,22 @@ def test_hostile_names_stay_text(measured):
     assert any(f"0{HOSTILE}" == card["data-name"] for card in hostile.all("article"))
 
 
-def test_names_of_elements_are_unique(measured):
-    page = Page(page_of(shown(measured(), curve=CURVE), shown(measured("b"), curve=CURVE)))
-    names = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
-    assert len(names) == len(set(names))
-    wanted = [
-        value for _, attributes in page.elements for key in ("for", "aria-labelledby") if (value := attributes.get(key))
-    ]
-    assert set(wanted) <= set(names)
-
-
-def test_the_curve_marks_the_choice(measured):
-    page = Page(page_of(shown(measured(), curve=CURVE)))
+def test_the_curve_marks_the_choice(text, measured):
+    page = Page(text)
     assert "Chosen: 3,000 of 9,000 Gaussians" in page.words
-    (plot,) = [image for image in page.all("img") if (image["src"] or "").startswith("data:image/svg+xml;base64,")]
-    assert "3,000 of 9,000 were chosen" in (plot["alt"] or "")
-    drawing = base64.b64decode((plot["src"] or "").partition(",")[2]).decode().lower()
+    (plot,) = [image for image in page.all("img") if image["src"].startswith("data:image/svg+xml;base64,")]
+    assert "3,000 of 9,000 were chosen" in plot["alt"]
+    drawing = base64.b64decode(plot["src"].partition(",")[2]).decode().lower()
     assert drawing.count("#d55e00") >= 2
     assert drawing.count("#0072b2") > 2 * len(CURVE.points)
     assert "svg+xml" not in page_of(shown(measured()))
 
 
 def test_views_of_other_runs_stand_beside_those_of_the_same_capture(measured):
-    page = Page(
-        page_of(
-            shown(measured("a"), capture="x"),
-            shown(measured("b"), capture="x"),
-            shown(measured("c"), capture="y"),
-            shown(measured("d", scene="other"), capture="x"),
-        )
-    )
+    runs = [shown(measured(name), capture=capture) for name, capture in (("a", "x"), ("b", "x"), ("c", "y"))]
+    page = Page(page_of(*runs, shown(measured("d", scene="other"), capture="x")))
     choices = [choice["value"] for choice in page.all("option") if (choice.get("value") or "").startswith("v")]
-    places = [card["id"] for card in page.all("article") if (card["id"] or "").startswith(("v0", "v1"))]
+    places = [card["id"] for card in page.all("article") if card["id"].startswith(("v0", "v1"))]
     assert choices == [*places[3:], *places[:3]] == ["v1-0", "v1-1", "v1-2", "v0-0", "v0-1", "v0-2"]
 
 
