@@ -1,4 +1,4 @@
-"""The commands of ``sundae run``, in a folder with photos."""
+"""Photos and a COLMAP that is a fake, and the commands that ``sundae run`` and ``sundae train`` start."""
 
 import sys
 from pathlib import Path
@@ -8,6 +8,8 @@ from fake_colmap import FakeColmap
 from run_commands import PHOTOS, Commands, photo
 from short_prunes import short_prunes  # noqa: F401
 
+from sundae_ns.io import run_folder
+
 
 @pytest.fixture(autouse=True)
 def _short(short_prunes):  # noqa: F811
@@ -15,15 +17,25 @@ def _short(short_prunes):  # noqa: F811
 
 
 @pytest.fixture
-def commands(tmp_path, monkeypatch):
-    """The commands, in a folder with photos."""
+def colmap(tmp_path, monkeypatch):
+    """pycolmap, in a folder with photos and with an empty capture, ``scene``."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "photos").mkdir()
+    Path("photos").mkdir()
     for index in range(PHOTOS):
         photo(Path("photos", f"{index}.JPG"))
+    Path("scene").mkdir()
+    Path("scene/transforms.json").touch()
+    made = FakeColmap()
+    monkeypatch.setitem(sys.modules, "pycolmap", made)
+    monkeypatch.setattr(run_folder, "_held", {})
+    return made
+
+
+@pytest.fixture
+def commands(colmap, monkeypatch):
+    """The commands, in the folder with photos."""
     made = Commands()
     for module in ("run", "train"):
         monkeypatch.setattr(f"sundae_ns.cli.{module}.run_command", made)
-    monkeypatch.setattr("sundae_ns.cli.run.has_gpu", lambda: made.gpu)
-    monkeypatch.setitem(sys.modules, "pycolmap", FakeColmap())
+        monkeypatch.setattr(f"sundae_ns.cli.{module}.has_gpu", lambda: made.gpu)
     return made

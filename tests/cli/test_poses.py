@@ -9,26 +9,8 @@ from pathlib import Path
 
 import command_line
 import pytest
-from fake_colmap import FakeColmap
 from PIL import Image
-from run_commands import NASTY, photo, write_video
-
-from sundae_ns.io import run_folder
-
-PHOTOS = 6
-
-
-@pytest.fixture
-def colmap(tmp_path, monkeypatch):
-    """pycolmap, in a folder with photos."""
-    made = FakeColmap()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "pycolmap", made)
-    monkeypatch.setattr(run_folder, "_held", {})
-    Path("photos").mkdir()
-    for index in range(PHOTOS):
-        photo(Path("photos", f"{index}.JPG"))
-    return made
+from run_commands import NASTY, PHOTOS, photo, write_video
 
 
 def poses(*words):
@@ -40,15 +22,15 @@ def refusal(capsys, *words):
 
 
 def test_each_stage_and_the_result_are_one_line(colmap, capsys):
-    colmap.models = [4]
+    colmap.models = [6]
     assert poses("photos", "-o", "capture") == 0
     lines = capsys.readouterr().out.splitlines()
-    stages = ["images: 6 of 6", "features: 6 of 6", "matches of pairs: 15 of 15", "poses: 6 of 6", "capture: 4 of 4"]
+    stages = ["images: 8 of 8", "features: 8 of 8", "matches of pairs: 28 of 28", "poses: 6 of 8", "capture: 6 of 6"]
     assert [line.rpartition(",")[0] for line in lines[:5]] == stages
-    assert lines[5] == "capture: 4 of 6 photos have a pose, of 1 camera; mean reprojection error 0.50 px"
-    again = "to add them, photograph the way from 3.JPG to 4.JPG again"
-    assert lines[6].startswith(f"# without a pose: 4.JPG, 5.JPG; {again}")
-    assert len(json.loads(Path("capture/transforms.json").read_text())["frames"]) == 4
+    assert lines[5] == "capture: 6 of 8 photos have a pose, of 1 camera; mean reprojection error 0.50 px"
+    again = "to add them, photograph the way from 5.JPG to 6.JPG again"
+    assert lines[6].startswith(f"# without a pose: 6.JPG, 7.JPG; {again}")
+    assert len(json.loads(Path("capture/transforms.json").read_text())["frames"]) == 6
 
 
 def test_masks_beside_the_photos_are_used(colmap, capsys):
@@ -57,7 +39,7 @@ def test_masks_beside_the_photos_are_used(colmap, capsys):
         Image.new("L", (16, 12), 255).save(f"photos/masks/{index}.png")
     assert poses("photos", "-o", "capture") == 0
     said = capsys.readouterr().out
-    assert "# masks: 6 of 6\n" in said
+    assert "# masks: 8 of 8\n" in said
     assert "left out" not in said
     Path("photos/masks/0.png").unlink()
     assert poses("photos", "-o", "other") == 0
@@ -112,32 +94,26 @@ def started(photos):
     support = Path(__file__).parents[1] / "support"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(support), *sys.path])}
     words = [sys.executable, "-c", SLOW, "poses", str(photos), "-o", "capture"]
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, env=environment, cwd=photos.parent)
-    assert process.stdout is not None
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(words, text=True, env=environment, cwd=photos.parent, **pipes)
     while "waits" not in process.stdout.readline():
         assert process.poll() is None, process.communicate()
     return process
 
 
-def interrupt(process):
-    process.send_signal(signal.SIGINT)
-
-
-def kill(process):
-    process.kill()
-
-
 @pytest.mark.parametrize(
-    ("end", "code", "says"),
-    [(interrupt, 130, "sundae: interrupted; the same command continues here\n"), (kill, -signal.SIGKILL, "")],
+    ("sent", "code", "says"),
+    [
+        (signal.SIGINT, 130, "sundae: interrupted; the same command continues here\n"),
+        (signal.SIGKILL, -signal.SIGKILL, ""),
+    ],
 )
-def test_an_interrupt_ends_at_once_and_the_same_command_continues(colmap, tmp_path, end, code, says):
+def test_an_interrupt_ends_at_once_and_the_same_command_continues(colmap, tmp_path, sent, code, says):
     process = started(tmp_path / "photos")
-    end(process)
+    process.send_signal(sent)
     _, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (code, says)
     assert poses("photos", "-o", "capture") == 0
     assert colmap.calls["features"] == [], "these were found before"
     assert colmap.calls["models"] == ["OPENCV"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "photos"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "photos", "scene"]

@@ -16,6 +16,7 @@ from run_commands import NAMES, PHOTOS, STEPS, refusal, run, write_video
 
 from sundae_ns import method_configs
 
+OUT = ("photos", "-o", "out")
 RUN = "out/runs/photos/sundae/run"
 HOLDER = """
 import sys
@@ -27,8 +28,16 @@ sys.stdin.read()
 """
 
 
+def started(commands, *words, codes=()):
+    """Names of the commands that ``sundae run`` starts, where some end with these codes."""
+    commands.ran.clear()
+    commands.codes = dict(codes)
+    assert run(*(words or OUT)) == max(commands.codes.values(), default=0)
+    return commands.names
+
+
 def test_photos_become_a_scene_and_a_report(commands, capsys):
-    assert run("photos", "-o", "out", "--keep", "20%", "--steps", "100") == 0
+    assert run(*OUT, "--keep", "20%", "--steps", "100") == 0
     assert commands.names == STEPS
     # Each command is printed before it runs.
     printed = [shlex.split(line) for line in capsys.readouterr().out.splitlines() if not line.startswith("#")]
@@ -47,7 +56,7 @@ def test_the_options_of_poses_are_passed_on(commands, capsys):
     for path in Path("masks").iterdir():
         Image.new("L", (16, 12), 255).save(path.with_suffix(".png"))
         path.unlink()
-    assert run("photos", "-o", "out", "--masks", "masks", "--matching", "similar", "--frames", "99") == 0
+    assert run(*OUT, "--masks", "masks", "--matching", "similar", "--frames", "99") == 0
     assert commands.ran[0][5:] == ["--matching", "similar", "--frames", "99", "--masks", "masks"]
     again = ["photos", "-o", "out", "--matching", "similar", "--frames", "99"]
     assert "not left out; repeat the first command" in refusal(capsys, *again)
@@ -61,32 +70,25 @@ def test_a_video_is_taken(commands, tmp_path):
 
 
 def test_a_capture_needs_no_poses(commands):
-    assert run("photos", "-o", "out") == 0
-    commands.ran.clear()
-    assert run("out/capture", "-o", "again") == 0
-    assert commands.names == STEPS[1:]
+    assert run(*OUT) == 0
+    assert started(commands, "out/capture", "-o", "again") == STEPS[1:]
     assert commands.option("--data", 0) == "out/capture"
     assert not Path("again/capture").exists()
 
 
-def test_a_capture_in_colmap_layout_needs_no_poses(commands, tmp_path, capsys):
-    shutil.copytree("photos", "scene/dense/images")
-    write_model(tmp_path / "scene" / "dense" / "sparse", [f"{index}.JPG" for index in range(PHOTOS)], (16, 12))
-    assert run("scene", "-o", "my scene") == 0
-    assert commands.names == STEPS[1:]
+def test_a_capture_in_colmap_layout_needs_no_poses(commands, capsys):
+    shutil.copytree("photos", "photographed/dense/images")
+    write_model(Path("photographed/dense/sparse"), [f"{index}.JPG" for index in range(PHOTOS)], (16, 12))
+    words = ("photographed", "-o", "my scene")
+    assert started(commands, *words, codes={"ns-train": 130}) == ["ns-train"]
     said = "# capture in COLMAP layout: 8 images in dense/images, poses of dense/sparse\n"
     assert capsys.readouterr().out.startswith(said)
+    assert commands.option("--output-dir", 0) == "my scene/runs"
     parser = ["colmap", "--colmap-path", "dense/sparse", "--images-path", "dense/images", "--downscale-factor", "1"]
     assert commands.ran[0][-len(parser) :] == parser
-    assert commands.option("--output-dir", 0) == "my scene/runs"
-    commands.ran.clear()
-    shutil.rmtree("my scene/runs")
-    commands.codes["ns-train"] = 130
-    assert run("scene", "-o", "my scene") == 130
-    commands.codes.clear()
-    assert run("scene", "-o", "my scene") == 0
-    assert commands.ran[1][-len(parser) :] == parser, "a resumed training reads the same"
-    assert "--load-dir" in commands.ran[1]
+    assert started(commands, *words) == STEPS[1:]
+    assert commands.ran[0][-len(parser) :] == parser, "a resumed training reads the same"
+    assert "--load-dir" in commands.ran[0]
 
 
 def test_a_capture_of_blender_needs_no_poses(commands, capsys):
@@ -103,44 +105,38 @@ def test_a_capture_of_blender_needs_no_poses(commands, capsys):
 
 
 def test_a_size_and_a_quality(commands):
-    assert run("photos", "-o", "out", "--max-mb", "2", "--quality", "best") == 0
+    started(commands, *OUT, "--max-mb", "2", "--quality", "best")
     usual = method_configs.sundae.config
-    words = commands.ran[1]
-    config = tyro.cli(type(usual), default=usual, args=words[2:])
-    assert config.pipeline.model.pruning.max_bytes == 2_000_000
-    assert config.pipeline.model.pruning.max_drop == 0.03
-    config.pipeline.model.pruning.validate()
+    pruning = tyro.cli(type(usual), default=usual, args=commands.ran[1][2:]).pipeline.model.pruning
+    assert (pruning.max_bytes, pruning.max_drop) == (2_000_000, 0.03)
+    pruning.validate()
     assert commands.option("--target-bytes", 2) == "2000000"
-    commands.ran.clear()
-    assert run("photos", "-o", "draft", "--quality", "draft") == 0
+    started(commands, "photos", "-o", "draft", "--quality", "draft")
     assert commands.option("--max-num-iterations", 1) == "3000"
     assert "--target-bytes" not in commands.ran[2]
 
 
 def test_a_gpu_packs_with_a_fine_tune(commands, capsys):
     commands.gpu = True
-    assert run("photos", "-o", "out", "--max-mb", "2") == 0
+    started(commands, *OUT, "--max-mb", "2")
     assert commands.option("--finetune", 2) == commands.option("--finetune-steps", 1) == "1500"
     assert commands.option("--target-bytes", 2) == "2000000"
     # Trials count the bytes of a pack without one.
     assert commands.option("--pipeline.model.pruning.max-bytes", 1) == "3333333"
     assert shlex.join(commands.ran[2]) in capsys.readouterr().out
-    commands.ran.clear()
-    assert run("photos", "-o", "draft", "--quality", "draft") == 0
-    commands.gpu = False
-    assert run("photos", "-o", "cpu") == 0
-    assert not any("--finetune" in words for words in commands.ran)
+    for out, more, gpu in (("draft", ("--quality", "draft"), True), ("cpu", (), False)):
+        commands.gpu = gpu
+        started(commands, "photos", "-o", out, *more)
+        assert not any("--finetune" in words for words in commands.ran)
 
 
 # ---------------------------------------------------------------------------------------------- the same command again
 
 
 def test_what_is_done_is_skipped(commands, capsys):
-    assert run("photos", "-o", "out") == 0
-    commands.ran.clear()
+    assert started(commands) == STEPS
     capsys.readouterr()
-    assert run("photos", "-o", "out") == 0
-    assert commands.ran == []
+    assert started(commands) == []
     assert capsys.readouterr().out.count(": done\n") == 5
 
 
@@ -150,12 +146,10 @@ def cut(path, size=None):
 
 @pytest.mark.parametrize("figure", ["NaN", '"x"', "Infinity", None])
 def test_a_report_without_figures_is_made_again(commands, figure):
-    assert run("photos", "-o", "out") == 0
+    started(commands)
     report = Path("out/report/report.json")
     report.write_text("[]" if figure is None else report.read_text().replace("30.0", figure))
-    commands.ran.clear()
-    assert run("photos", "-o", "out") == 0
-    assert commands.names == STEPS[3:]
+    assert started(commands) == STEPS[3:]
 
 
 @pytest.mark.parametrize("harm", [cut, lambda path: cut(path, 0), Path.unlink], ids=["cut", "empty", "gone"])
@@ -171,112 +165,87 @@ def test_a_report_without_figures_is_made_again(commands, figure):
     ],
 )
 def test_half_a_result_is_made_again(commands, result, step, harm):
-    assert run("photos", "-o", "out") == 0
+    started(commands)
     harm(Path(result))
-    commands.ran.clear()
-    assert run("photos", "-o", "out") == 0
-    assert commands.names[0] == STEPS[step]
-    commands.ran.clear()
-    assert run("photos", "-o", "out") == 0
-    assert commands.ran == []
+    assert started(commands)[0] == STEPS[step]
+    assert started(commands) == []
 
 
 def test_a_checkpoint_before_a_damaged_one_is_resumed(commands):
-    commands.codes["ns-train"] = 130
-    assert run("photos", "-o", "out") == 130
-    commands.codes.clear()
+    started(commands, codes={"ns-train": 130})
     Path(RUN, "nerfstudio_models", "step-000000099.ckpt").write_bytes(b"PK")
-    assert run("photos", "-o", "out") == 0
-    assert "--load-dir" in commands.ran[2]
+    assert started(commands)[0] == "ns-train"
+    assert "--load-dir" in commands.ran[0]
 
 
 def test_a_training_without_its_options_starts_anew_and_is_kept(commands):
-    assert run("photos", "-o", "out") == 0
+    started(commands)
     cut(Path(RUN, "config.yml"), 0)
-    commands.codes["ns-train"] = 130
-    assert run("photos", "-o", "out") == 130
+    started(commands, codes={"ns-train": 130})
     assert "--load-dir" not in commands.ran[-1]
     # Its last checkpoint is not taken for one of the new training.
     assert Path(f"{RUN}.damaged/nerfstudio_models/step-000000099.ckpt").exists()
-    commands.codes.clear()
-    commands.ran.clear()
-    assert run("photos", "-o", "out") == 0
-    assert commands.names[0] == "ns-train"
+    assert started(commands)[0] == "ns-train"
     assert "--load-dir" in commands.ran[0]
 
 
 @pytest.mark.parametrize(("step", "name"), zip(STEPS, NAMES))
 def test_a_step_that_fails_ends_with_its_code_and_is_repeated(commands, capsys, step, name):
     for code, says in ((2, "ended with 2, as the lines above say; mend that, and"), (137, "was killed by signal 9;")):
-        commands.codes[step] = code
-        assert run("photos", "-o", "out") == code
+        started(commands, codes={step: code})
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert line.startswith(f"sundae: {name} {says} the same command ")
-    commands.codes.clear()
-    commands.ran.clear()
-    assert run("photos", "-o", "out") == 0
-    assert commands.names == STEPS[STEPS.index(step) :]
+    assert started(commands) == STEPS[STEPS.index(step) :]
 
 
 def test_an_interrupted_training_resumes(commands, capsys):
-    commands.codes["ns-train"] = 130
-    assert run("photos", "-o", "out", "--steps", "100") == 130
+    assert started(commands, *OUT, "--steps", "100", codes={"ns-train": 130}) == STEPS[:2]
     assert "the same command continues here" in capsys.readouterr().err
-    commands.codes.clear()
-    assert run("photos", "-o", "out", "--steps", "100") == 0
-    assert commands.names == ["sundae poses", "ns-train", *STEPS[1:]]
-    saved = "out/runs/photos/sundae/run/nerfstudio_models"
-    assert commands.option("--load-dir", 2) == saved
-    assert "--max-num-iterations" not in commands.ran[2]
+    first = commands.ran[1]
+    assert started(commands, *OUT, "--steps", "100") == STEPS[1:]
     # All else is the same, so that the run goes on in its folder.
-    assert [word for word in commands.ran[2] if word not in ("--load-dir", saved)] == [
-        word for word in commands.ran[1] if word not in ("--max-num-iterations", "100")
-    ]
+    fresh, resumed = ["--max-num-iterations", "100"], ["--load-dir", f"{RUN}/nerfstudio_models"]
+    assert [word for word in commands.ran[0] if word not in resumed] == [word for word in first if word not in fresh]
+    assert commands.option("--load-dir", 0) == resumed[1]
 
 
 def test_a_fine_tune_ends_the_training_where_there_is_a_gpu(commands):
     commands.gpu, commands.length, commands.saved_at[0] = True, 30000, 28499
-    assert run("photos", "-o", "out") == 0
-    commands.ran.clear()
-    assert run("photos", "-o", "out") == 0
-    assert commands.ran == [], "the fine-tune took the place of the other steps"
+    started(commands)
+    assert started(commands) == [], "the fine-tune took the place of the other steps"
     commands.gpu, commands.saved_at[0] = False, 29999
-    assert run("photos", "-o", "out") == 0
-    assert commands.names[0] == "ns-train", "without one they are trained"
+    assert started(commands)[0] == "ns-train", "without one they are trained"
     assert "--finetune-steps" not in commands.ran[0]
     assert commands.option("--load-dir", 0) == f"{RUN}/nerfstudio_models"
 
 
 def test_a_training_without_a_checkpoint_starts_anew(commands):
-    commands.codes["ns-train"] = 137
-    assert run("photos", "-o", "out", "--steps", "100") == 137
-    commands.codes.clear()
-    assert run("photos", "-o", "out", "--steps", "100") == 0
-    assert commands.ran[2] == commands.ran[1]
+    started(commands, *OUT, "--steps", "100", codes={"ns-train": 137})
+    first = commands.ran[1]
+    started(commands, *OUT, "--steps", "100")
+    assert commands.ran[0] == first
 
 
 def test_results_of_an_older_training_are_made_again(commands):
-    assert run("photos", "-o", "out") == 0
+    started(commands)
     shutil.rmtree("out/runs")
-    commands.ran.clear()
-    commands.codes["ns-train"] = 1
-    assert run("photos", "-o", "out") == 1
-    commands.codes.clear()
-    assert run("photos", "-o", "out") == 0
-    assert commands.names == ["ns-train", *STEPS[1:]]
+    started(commands, codes={"ns-train": 1})
+    assert started(commands) == STEPS[1:]
 
 
 # ------------------------------------------------------------------------------------------------------------ refusals
 
 
-@pytest.mark.parametrize(("placed", "enough"), [(2, False), (3, False), (4, True)])
-def test_too_few_placed_photos(commands, capsys, placed, enough):
+def test_four_placed_photos_are_enough(commands):
+    commands.placed = 4
+    assert started(commands) == STEPS
+
+
+@pytest.mark.parametrize("placed", [2, 3])
+def test_too_few_placed_photos(commands, capsys, placed):
     commands.placed = placed
-    if enough:
-        assert run("photos", "-o", "out") == 0
-        return
     for _ in range(2):  # the repeated command too, which finds the poses
-        line = refusal(capsys, "photos", "-o", "out")
+        line = refusal(capsys, *OUT)
         assert f"COLMAP placed {placed} of {PHOTOS} photos; photograph the way from {placed - 1}.JPG to" in line
         assert "sundae run out/capture -o OTHER" in line
     assert commands.names == ["sundae poses"]
@@ -285,45 +254,45 @@ def test_too_few_placed_photos(commands, capsys, placed, enough):
 
 def test_a_command_that_writes_nothing(commands, capsys):
     commands.silent = True
-    assert "camera poses ended without its result" in refusal(capsys, "photos", "-o", "out")
+    assert "camera poses ended without its result" in refusal(capsys, *OUT)
 
 
 def test_other_or_damaged_settings_are_refused(commands, capsys):
-    assert run("photos", "-o", "out") == 0
+    assert run(*OUT) == 0
     for more, cause in (
         (["--steps", "200"], "steps left out, not 200"),
         (["--keep", "0.5"], "keep left out, not 0.5"),
         (["--method", "sundae-tiny"], "method sundae, not sundae-tiny"),
         (["--max-mb", "2"], f"size by `sundae pack {RUN} -o FILE --target-bytes 2000000`"),
     ):
-        assert cause in refusal(capsys, "photos", "-o", "out", *more)
+        assert cause in refusal(capsys, *OUT, *more)
     for text in ("[]", "{"):
         Path("out/run.json").write_text(text)
-        assert "out/run.json is damaged" in refusal(capsys, "photos", "-o", "out")
+        assert "out/run.json is damaged" in refusal(capsys, *OUT)
 
 
 def test_without_pycolmap_nothing_starts(commands, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    line = refusal(capsys, "photos", "-o", "out")
+    line = refusal(capsys, *OUT)
     assert line == 'sundae: camera poses need pycolmap; install it with pip install "sundae_ns[photos]"'
     assert not Path("out").exists()
     monkeypatch.delitem(sys.modules, "pycolmap")
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    assert refusal(capsys, "photos", "-o", "out") == line
+    assert refusal(capsys, *OUT) == line
 
 
 def test_photos_are_judged_before_anything_starts(commands, capsys):
     for name in "abcdefghi":
         os.mkfifo(f"photos/{name}.png")
-    assert "photos/i.png cannot be read (it is a pipe" in refusal(capsys, "photos", "-o", "out")
+    assert "photos/i.png cannot be read (it is a pipe" in refusal(capsys, *OUT)
     assert commands.ran == []
     assert not Path("out").exists()
     Path("photos/i.png").unlink()
-    assert run("photos", "-o", "out") == 0
+    assert run(*OUT) == 0
     # Photos are of no more use once there are poses.
     shutil.rmtree("photos")
     Path("photos").mkdir()
-    assert run("photos", "-o", "out") == 0
+    assert run(*OUT) == 0
 
 
 def test_names_with_a_dash_are_no_options(commands):
@@ -341,13 +310,12 @@ def test_names_with_a_dash_are_no_options(commands):
 def test_one_command_works_in_a_folder(commands, capsys):
     other = subprocess.Popen([sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     with other:
-        assert other.stdout is not None
         other.stdout.readline()
-        line = refusal(capsys, "photos", "-o", "out")
+        line = refusal(capsys, *OUT)
         assert f"process {other.pid} on " in line
         assert line.endswith(f"works in {Path('out').resolve()}; wait for it, or choose another folder")
         assert commands.ran == []
         other.kill()
     # The other was killed before it wrote its settings.
     assert os.listdir("out") == ["training.lock"]
-    assert run("photos", "-o", "out") == 0
+    assert run(*OUT) == 0

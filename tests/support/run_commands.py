@@ -30,13 +30,12 @@ class Commands:
     def __init__(self) -> None:
         self.ran: list[list[str]] = []
         self.codes: dict[str, int] = {}
+        """Exit codes by names; ``--finetune`` is that of a pack with it."""
         self.placed = PHOTOS
         self.saved_at = {0: 99, 130: 39}
         """Step of the checkpoint, by the exit code of the training."""
         self.silent = False
         self.gpu = False
-        self.out_of_memory = False
-        """Whether a fine-tune ends with an error."""
         self.length = 100
         """Of a training, in steps."""
 
@@ -44,7 +43,7 @@ class Commands:
         print(shlex.join(words))
         self.ran.append(list(words))
         name = self.names[-1]
-        code = 2 if self.out_of_memory and "--finetune" in words else self.codes.get(name, 0)
+        code = self.codes.get("--finetune" if "--finetune" in words else name, 0)
         if not self.silent:
             self.write(name, words, code)
         return code
@@ -58,19 +57,16 @@ class Commands:
         joined = [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
         return joined[0] if joined else words[words.index(name) + 1]
 
+    def run_folder(self, place: int = -1) -> Path:
+        """Of a training."""
+        words = " ".join(self.ran[place])
+        name = "--experiment-name" if "--experiment-name" in words else "--data"
+        root, experiment, stamp = (self.option(each, place) for each in ("--output-dir", name, "--timestamp"))
+        return Path(root, experiment, self.ran[place][1], stamp)
+
     def write(self, name: str, words: list[str], code: int) -> None:
         if name == "ns-train":
-            names = ("--output-dir", "--experiment-name", "--timestamp")
-            root, experiment, stamp = (self.option(each) for each in names)
-            folder = Path(root, experiment, words[1], stamp)
-            (folder / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
-            (folder / "config.yml").write_text(
-                f"!!python/object:sundae_ns.plugin.trainer.SundaeTrainerConfig\nschedule_length: {self.length}\n"
-            )
-            if code in self.saved_at:
-                checkpoint = folder / "nerfstudio_models" / f"step-{self.saved_at[code]:09d}.ckpt"
-                with zipfile.ZipFile(checkpoint, "w") as archive:
-                    archive.writestr("data.pkl", bytes(500))
+            write_run(self.run_folder(), self.saved_at.get(code), self.length)
         elif code:
             return
         elif name == "sundae poses":
@@ -92,6 +88,23 @@ class Commands:
             (folder / "report.html").write_text("<html><body>a report</body></html>\n")
             figures = {"psnr": 30.0, "lpips": None}
             (folder / "report.json").write_text(json.dumps([{"configurations": [{"mean": figures}]}]))
+
+
+def write_run(
+    folder: Path, step: int | None, length: int = 100, *, capture: Path | None = None, source: Path | None = None
+) -> Path:
+    """Write a run of a capture, resumed from a source, with a checkpoint of a step."""
+    (folder / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
+    text = f"!!python/object:sundae_ns.plugin.trainer.SundaeTrainerConfig\nschedule_length: {length}\n"
+    for name, path in (("data", capture), ("load_dir", source)):
+        if path is not None:
+            parts = "".join(f"- {part}\n" for part in path.absolute().parts)
+            text += f"{name}: !!python/object/apply:pathlib.PosixPath\n{parts}"
+    (folder / "config.yml").write_text(text)
+    if step is not None:
+        with zipfile.ZipFile(folder / "nerfstudio_models" / f"step-{step:09d}.ckpt", "w") as archive:
+            archive.writestr("data.pkl", bytes(500))
+    return folder
 
 
 def packed() -> bytes:
