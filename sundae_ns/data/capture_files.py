@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
 from sundae_ns.core.camera import OPENGL_TO_OPENCV
 from sundae_ns.core.errors import DataError, writing
@@ -154,11 +153,12 @@ def write_capture(
     if masks:
         write_smaller(out / "masks", masks=True)
     model.write(stored)
-    kinds = [(axis, "f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
+    kinds = [(axis, "<f4", "float") for axis in "xyz"] + [(name, "u1", "uchar") for name in ("red", "green", "blue")]
     points = [(*(APPLIED[:, :3] @ point.xyz), *point.color) for point in model.points3D.values()]
-    table = PlyElement.describe(np.array(points, dtype=kinds), "vertex")
-    with (out / CLOUD).open("wb") as file:
-        PlyData([table], byte_order="<").write(file)
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    head += [*(f"property {word} {name}" for name, _, word in kinds), "end_header", ""]
+    rows = np.array(points, dtype=[(name, kind) for name, kind, _ in kinds])
+    (out / CLOUD).write_bytes("\n".join(head).encode() + rows.tobytes())
     write_text(out / TRANSFORMS, json.dumps(transforms_of(model, sources, masked=bool(masks)), indent=4) + "\n")
 
 
