@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import sys
+import zipfile
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,19 +13,28 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from photos import ORIENTATION, photo
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.data import capture_files
 from sundae_ns.data.capture import check_transforms
-from sundae_ns.data.capture_files import APPLIED, Placed, names_of, placed_in, write_images, write_smaller
-from sundae_ns.data.images import reads_heif
+from sundae_ns.data.capture_files import (
+    APPLIED,
+    ARCHIVE,
+    Placed,
+    names_of,
+    placed_in,
+    write_demo_capture,
+    write_images,
+    write_smaller,
+)
+from sundae_ns.data.images import check_image, reads_heif
 from sundae_ns.data.photos import find_photos
 from sundae_ns.scene.cameras import cameras_of
 
 PARAMETERS = [50.0, 60.0, 20.0, 15.0, 0.01, -0.02, 0.003, 0.004]
-ORIENTATION, MODEL, FOCAL, EXIF = 0x0112, 0x0110, 0x920A, 0x8769
 
 
 def model(cameras=1):
@@ -106,14 +116,6 @@ def gradient(width=40, height=24):
     return Image.fromarray(np.stack([x, y, np.zeros_like(x)], axis=2).astype(np.uint8))
 
 
-def save(path, image=None, focal=None, **entries):
-    exif = Image.Exif()
-    exif.update({{"orientation": ORIENTATION, "model": MODEL}[name]: value for name, value in entries.items()})
-    if focal is not None:
-        exif.get_ifd(EXIF)[FOCAL] = focal
-    (image or gradient()).save(path, exif=exif)
-
-
 def written(folder, out):
     photos = find_photos(folder)
     done = []
@@ -131,7 +133,7 @@ def test_photos_of_one_camera_share_a_folder(tmp_path):
         ("d.jpg", tall, {"model": "Phone", "focal": 4.2, "orientation": 6}),  # turned, it is as the first
         ("e.png", None, {"model": "Other"}),
     ):
-        save(tmp_path / name, image, **entries)
+        photo(tmp_path / name, image=image or gradient(), **entries)
     names = [f"c{camera}/frame_{number:05d}" for number, camera in enumerate((1, 2, 3, 1, 4), start=1)]
     assert names_of(find_photos(tmp_path)) == [*(f"{name}.jpg" for name in names[:4]), f"{names[4]}.png"]
 
@@ -143,7 +145,7 @@ def test_photos_become_upright(tmp_path, orientation):
     turn = turns[orientation - 1]
     stored = gradient() if turn is None else gradient().transpose(Image.Transpose[turn])
     for name in ("a", "b", "c"):
-        save(tmp_path / f"{name}.jpg", stored, orientation=orientation)
+        photo(tmp_path / f"{name}.jpg", image=stored, orientation=orientation)
     assert find_photos(tmp_path)[0].as_it_is == (orientation == 1)
     with Image.open(written(tmp_path, tmp_path / "out")[0]) as image:
         assert image.getexif().get(ORIENTATION, 1) == 1
@@ -154,8 +156,8 @@ def test_photos_become_upright(tmp_path, orientation):
 def test_files_that_can_stay_are_copied_and_others_saved(tmp_path):
     clear = gradient().convert("RGBA")
     clear.putalpha(100)
-    save(tmp_path / "a.jpg")
-    save(tmp_path / "b.png")
+    for name in ("a.jpg", "b.png"):
+        photo(tmp_path / name, image=gradient())
     gradient().save(tmp_path / "c.tif")
     clear.save(tmp_path / "d.webp", lossless=True)
     gradient().convert("L").save(tmp_path / "e.bmp")
@@ -175,10 +177,8 @@ def test_files_that_can_stay_are_copied_and_others_saved(tmp_path):
 def test_heic_is_turned_as_its_box_says(tmp_path):
     if not reads_heif():
         pytest.skip("pillow-heif is not installed")
-    exif = Image.Exif()
-    exif[ORIENTATION] = 6
     for name in ("a", "b", "c"):
-        gradient().save(tmp_path / f"{name}.HEIC", exif=exif.tobytes())
+        photo(tmp_path / f"{name}.HEIC", image=gradient(), orientation=6)
     with Image.open(written(tmp_path, tmp_path / "out")[0]) as image:
         assert (image.size, image.getexif().get(ORIENTATION, 1)) == ((24, 40), 1)
         assert image.getpixel((2, 20))[1] > image.getpixel((21, 20))[1] + 100  # the bottom is at the left
@@ -233,3 +233,44 @@ def test_raw_photos(tmp_path, monkeypatch):
     shutil.rmtree(tmp_path / "out")
     assert [photo.size for photo in find_photos(tmp_path)] == [(16, 12), (16, 12), (12, 16)]
     assert [path.parent.name for path in written(tmp_path, tmp_path / "out")] == ["c1", "c1", "c2"]
+
+
+TRAIN, TEST, SIDE = 48, 8, 128  # of the demo's capture
+
+
+def test_a_copy_is_a_sound_capture_and_is_replaced(tmp_path):
+    copy = write_demo_capture(tmp_path / "new" / "folder")
+    check_transforms(copy / "transforms.json", splits=("train", "test"))
+    meta = json.loads((copy / "transforms.json").read_text())
+    assert (len(meta["train_filenames"]), len(meta["test_filenames"])) == (TRAIN, TEST)
+    assert {check_image(copy / frame["file_path"]) for frame in meta["frames"]} == {(SIDE, SIDE)}
+    assert ARCHIVE.stat().st_size < 1_400_000
+    for name in ("notes.txt", "images/frame_00001.png"):
+        (copy / name).write_text("mine")
+    write_demo_capture(copy)
+    assert (copy / "notes.txt").read_text() == "mine"
+    assert check_image(copy / "images" / "frame_00001.png") == (SIDE, SIDE)
+    (tmp_path / "transforms.json").write_text("{}")
+    for out, cause in ((tmp_path, "other files than the demo's capture"), (tmp_path / "transforms.json", "is a file")):
+        with pytest.raises(DataError, match=cause):
+            write_demo_capture(out)
+    assert (tmp_path / "transforms.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize("left", [0, 1, TRAIN + TEST + 1])
+def test_an_interrupted_copy_has_no_transforms_and_is_made_again(tmp_path, monkeypatch, left):
+    read, done = zipfile.ZipFile.read, []
+
+    def until_the_end(self, name):
+        done.append(name)
+        if len(done) > left:
+            raise KeyboardInterrupt
+        return read(self, name)
+
+    write_demo_capture(tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(zipfile.ZipFile, "read", until_the_end)
+        with pytest.raises(KeyboardInterrupt):
+            write_demo_capture(tmp_path)
+    assert not (tmp_path / "transforms.json").exists()
+    check_transforms(write_demo_capture(tmp_path) / "transforms.json")

@@ -6,21 +6,13 @@ from pathlib import Path
 
 import pytest
 from colmap_models import write_model
-from PIL import Image
+from photos import photos
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.data import layouts
 from sundae_ns.data.capture import beside
 from sundae_ns.data.colmap import check_colmap
 from sundae_ns.data.layouts import is_posed, no_model, no_transforms, posed_layout, unused_masks
-
-
-def photos(folder, count=3, size=(20, 16)):
-    folder.mkdir(parents=True)
-    names = [f"{index}.png" for index in range(count)]
-    for name in names:
-        Image.new("RGB", size, "grey").save(folder / name)
-    return names
 
 
 def model(folder, images=3):

@@ -7,6 +7,8 @@ import struct
 import zlib
 
 import pytest
+from photos import photo
+from photos import photos as write_photos
 from PIL import Image
 
 from sundae_ns.cli.poses import check_poses
@@ -16,24 +18,14 @@ from sundae_ns.data import reconstruct
 from sundae_ns.data.photos import find_photos, left_out, masks_beside, masks_of, photo_of
 
 
-def photo(path, kind="png", mode="RGB", size=(16, 12), orientation=1):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    Image.new(mode, size, "grey" if mode == "RGB" else 0).save(path, format=kind, exif=exif)
-    return path
-
-
 def paths_of(folder):
     return [photo.path for photo in find_photos(folder)]
 
 
 @pytest.fixture
 def photos(tmp_path):
-    folder = tmp_path / "photos"
-    for index in range(3):
-        photo(folder / f"{index}.png")
-    return folder
+    write_photos(tmp_path / "photos")
+    return tmp_path / "photos"
 
 
 def test_photos_of_all_folders_in_the_order_of_their_paths(photos):

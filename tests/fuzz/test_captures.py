@@ -17,9 +17,11 @@ import pytest
 import torch
 from colmap_models import write_model
 from damage import damage
+from documents import GONE, put
 from hypothesis import HealthCheck, given, settings
 from icc_profiles import judged, profile
 from limits import verdict
+from photos import photo
 from PIL import Image
 from small_captures import HEIGHT, SIZE, VIEWS, WIDTH, bytes_of, load, manager, meta_of, write_text_model
 
@@ -31,9 +33,9 @@ from sundae_ns.plugin.model import SundaeModelConfig
 Change = Callable[[dict[str, Any]], object]
 
 
-def rewrite(data, change):
+def rewrite(data, changes):
     meta = meta_of(data)
-    change(meta)
+    put(meta, changes)
     (data / "transforms.json").write_text(json.dumps(meta), encoding="utf-8")
 
 
@@ -97,59 +99,49 @@ def test_damaged_values_of_transforms(capture, data, value):
     (capture / "transforms.json").write_text(content)
 
 
-def _frame(**changes):
-    return lambda meta: meta["frames"][1].update(changes)
+NAN = float("nan")
+POSE = "frames/1/transform_matrix"
+ROUND = {"camera_model": "FISHEYE624", "distortion_params": [0.0] * 12}
 
 
-def _top(**changes):
-    return lambda meta: meta.update(changes)
-
-
-def _pose(row, column, value):
-    return lambda meta: meta["frames"][1]["transform_matrix"][row].__setitem__(column, value)
-
-
-def _round(**changes):
-    return _top(camera_model="FISHEYE624", distortion_params=[0.0] * 12, **changes)
+def masked(path):
+    return lambda frames: [{**frame, "mask_path": path} for frame in frames]
 
 
 REFUSED = {
-    "NaN in a pose": (_pose(0, 3, float("nan")), r"frame 1 .*transform_matrix is nan; it must be finite"),
-    "infinity in a pose": (_pose(2, 1, float("inf")), "frame 1 .*finite"),
-    "a pose of zeros": (_frame(transform_matrix=[[0.0] * 4] * 4), "frame 1 .*singular"),
-    "a pose of 3 rows": (_frame(transform_matrix=[[1.0, 0, 0, 0]] * 3), "4 rows of 4"),
-    "no pose": (lambda meta: meta["frames"][1].pop("transform_matrix"), "4 rows of 4"),
-    "zero focal length": (_top(fl_x=0.0), "fl_x is 0.0; it must be positive"),
-    "negative focal length": (_top(fl_y=-3), "fl_y is -3; it must be positive"),
-    "focal length NaN": (_top(fl_x=float("nan")), "fl_x is nan"),
-    "no focal length": (lambda meta: meta.pop("fl_x"), "fl_x missing"),
-    "zero width": (_top(w=0), "w is 0; .*whole number of pixels"),
-    "a huge width": (_top(w=10**9), "w is 1000000000"),
-    "half a pixel": (_top(h=16.5), "h is 16.5"),
-    "no frames": (_top(frames=[]), "lists 0 images; training needs 2"),
-    "one frame": (lambda meta: meta["frames"].__delitem__(slice(1, None)), "lists 1 image; training needs 2"),
-    "frames that are numbers": (_top(frames=[1, 2]), "frame 0"),
-    "an unknown camera": (_top(camera_model="BRAIN"), "camera_model is 'BRAIN'; use one of SIMPLE_PINHOLE"),
-    "a round lens without a radius": (_round(), "fisheye_crop_radius is None; .*a positive number"),
-    "a round lens of a whole number": (_round(fisheye_crop_radius=7), "with a decimal point"),
+    "NaN in a pose": ({f"{POSE}/0/3": NAN}, r"frame 1 .*transform_matrix is nan; it must be finite"),
+    "infinity in a pose": ({f"{POSE}/2/1": float("inf")}, "frame 1 .*finite"),
+    "a pose of zeros": ({POSE: [[0.0] * 4] * 4}, "frame 1 .*singular"),
+    "a pose of 3 rows": ({POSE: [[1.0, 0, 0, 0]] * 3}, "4 rows of 4"),
+    "no pose": ({POSE: GONE}, "4 rows of 4"),
+    "zero focal length": ({"fl_x": 0.0}, "fl_x is 0.0; it must be positive"),
+    "negative focal length": ({"fl_y": -3}, "fl_y is -3; it must be positive"),
+    "focal length NaN": ({"fl_x": NAN}, "fl_x is nan"),
+    "no focal length": ({"fl_x": GONE}, "fl_x missing"),
+    "zero width": ({"w": 0}, "w is 0; .*whole number of pixels"),
+    "a huge width": ({"w": 10**9}, "w is 1000000000"),
+    "half a pixel": ({"h": 16.5}, "h is 16.5"),
+    "no frames": ({"frames": []}, "lists 0 images; training needs 2"),
+    "one frame": ({"frames": lambda frames: frames[:1]}, "lists 1 image; training needs 2"),
+    "frames that are numbers": ({"frames": [1, 2]}, "frame 0"),
+    "an unknown camera": ({"camera_model": "BRAIN"}, "camera_model is 'BRAIN'; use one of SIMPLE_PINHOLE"),
+    "a round lens without a radius": (ROUND, "fisheye_crop_radius is None; .*a positive number"),
+    "a round lens of a whole number": ({**ROUND, "fisheye_crop_radius": 7}, "with a decimal point"),
     "a round lens and masks": (
-        lambda meta: (
-            _round(fisheye_crop_radius=7.0)(meta),
-            [frame.update(mask_path="images/frame_00001.png") for frame in meta["frames"]],
-        ),
+        {**ROUND, "fisheye_crop_radius": 7.0, "frames": masked("images/frame_00001.png")},
         "remove mask_path",
     ),
-    "distortion NaN": (_top(k1=float("nan")), "k1 is nan"),
-    "distortion of 3 numbers": (_top(distortion_params=[0, 0, 0]), "4, 6 or 12"),
-    "a split of other images": (_frame(file_path="images/none.png"), "which no frame has as its file_path"),
-    "a missing split": (_top(train_filenames=["images/a.png"], val_filenames=None), "train_filenames|val_filenames"),
-    "no list of test images": (lambda meta: [meta.pop(f"{s}_filenames", 0) for s in ("val", "test")], "none for val"),
-    "a mask for one": (_frame(mask_path="images/frame_00001.png"), "1 of .* frames have a mask_path"),
-    "a scale of zero": (_top(applied_scale=0), "applied_scale"),
-    "a frame of NaN": (_top(applied_transform=[[float("nan")] * 4] * 3), "applied_transform"),
-    "an unknown orientation": (_top(orientation_override="sideways"), "orientation_override"),
-    "a cloud that is a number": (_top(ply_file_path=3), "ply_file_path"),
-    "a missing cloud": (_top(ply_file_path="none.ply"), r"none\.ply does not exist"),
+    "distortion NaN": ({"k1": NAN}, "k1 is nan"),
+    "distortion of 3 numbers": ({"distortion_params": [0, 0, 0]}, "4, 6 or 12"),
+    "a split of other images": ({"frames/1/file_path": "images/none.png"}, "which no frame has as its file_path"),
+    "a missing split": ({"train_filenames": ["a.png"], "val_filenames": None}, "train_filenames|val_filenames"),
+    "no list of test images": ({"val_filenames": GONE, "test_filenames": GONE}, "none for val"),
+    "a mask for one": ({"frames/1/mask_path": "images/frame_00001.png"}, "1 of .* frames have a mask_path"),
+    "a scale of zero": ({"applied_scale": 0}, "applied_scale"),
+    "a frame of NaN": ({"applied_transform": [[NAN] * 4] * 3}, "applied_transform"),
+    "an unknown orientation": ({"orientation_override": "sideways"}, "orientation_override"),
+    "a cloud that is a number": ({"ply_file_path": 3}, "ply_file_path"),
+    "a missing cloud": ({"ply_file_path": "none.ply"}, r"none\.ply does not exist"),
 }
 
 
@@ -323,17 +315,7 @@ def _each_image(change):
     return make
 
 
-def _one_pixel(data):
-    _each_image(lambda image: image.resize((1, 1)))(data)
-    rewrite(data, _top(w=1, h=1, cx=0.5, cy=0.5))
-
-
-def _masks(data):
-    (data / "masks").mkdir()
-    half = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
-    half[:, : WIDTH // 2] = 255
-    Image.fromarray(half).save(data / "masks" / "half.png")
-    rewrite(data, lambda meta: [frame.update(mask_path="masks/half.png") for frame in meta["frames"]])
+HALF = np.repeat(np.array([[255, 0]], np.uint8), WIDTH // 2, axis=1).repeat(HEIGHT, axis=0)
 
 
 def _renamed(data):
@@ -346,10 +328,16 @@ def _renamed(data):
 FINE = {
     "unchanged": lambda data: None,
     **{mode: _each_image(lambda image, mode=mode: image.convert(mode)) for mode in ("1", "L", "LA", "P", "RGBA")},
-    "one pixel": _one_pixel,
-    "masks": _masks,
+    "one pixel": lambda data: (
+        _each_image(lambda image: image.resize((1, 1)))(data),
+        rewrite(data, {"w": 1, "h": 1, "cx": 0.5, "cy": 0.5}),
+    ),
+    "masks": lambda data: (
+        photo(data / "masks" / "half.png", image=Image.fromarray(HALF)),
+        rewrite(data, {"frames": masked("masks/half.png")}),
+    ),
     "unicode and spaces in names": _renamed,
-    "no points": lambda data: rewrite(data, lambda meta: meta.pop("ply_file_path")),
+    "no points": lambda data: rewrite(data, {"ply_file_path": GONE}),
 }
 
 

@@ -5,18 +5,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from fields import normal_points
 from torch import Tensor
+
+from sundae_ns.graph import neighbors
 
 Cloud = Callable[[int], Tensor]
 
 
-def _normal(n, seed=0):
-    return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 def _clusters(n):
     """Clusters of 1e-5 and of 1e-2 beside a background of 1e3."""
-    points = _normal(n)
+    points = normal_points(n)
     points[: n // 2] = points[: n // 2] * 1e-5 + 0.5
     points[n // 2 : 3 * n // 4] = points[n // 2 : 3 * n // 4] * 1e-2 - 0.25
     points[3 * n // 4 :] *= 1e3
@@ -31,7 +30,7 @@ def _half_duplicated(n):
 
 def _piles(n):
     """Most points at three spots, one of them the origin with both signs of zero."""
-    points = _normal(n)
+    points = normal_points(n)
     points[: n // 3] = 0.0
     points[: n // 6] = -0.0
     points[n // 3 : n // 2] = 1.0
@@ -58,7 +57,7 @@ def _line(n):
 
 
 CLOUDS = {
-    "normal": _normal,
+    "normal": normal_points,
     "clusters": _clusters,
     "half duplicated": _half_duplicated,
     "piles": _piles,
@@ -66,11 +65,11 @@ CLOUDS = {
     "lattice": _lattice,
     "sphere": _sphere,
     "line": _line,
-    "plane": lambda n: _normal(n) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64),
-    "two clusters 1e6 apart": lambda n: _normal(n) + torch.arange(n)[:, None] % 2 * 1e6,
-    "far from the origin": lambda n: _normal(n) + 1e5,
-    "one floater": lambda n: torch.cat([_normal(n - 1), torch.full((1, 3), 1e20, dtype=torch.float64)]),
-    "tiny": lambda n: _normal(n) * 1e-30,
+    "plane": lambda n: normal_points(n) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64),
+    "two clusters 1e6 apart": lambda n: normal_points(n) + torch.arange(n)[:, None] % 2 * 1e6,
+    "far from the origin": lambda n: normal_points(n) + 1e5,
+    "one floater": lambda n: torch.cat([normal_points(n - 1), torch.full((1, 3), 1e20, dtype=torch.float64)]),
+    "tiny": lambda n: normal_points(n) * 1e-30,
 }
 
 
@@ -78,3 +77,9 @@ CLOUDS = {
 def cloud(request):
     """One distribution: maps a number N to its first N points, float64 ``[N, 3]``."""
     return CLOUDS[request.param]
+
+
+@pytest.fixture
+def on_gpu():
+    """Without the kernel, the search on the CPU would be compared with itself."""
+    assert neighbors._kernel(torch.device("cuda", torch.cuda.current_device()), torch.float32, 16) is not None

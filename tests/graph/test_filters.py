@@ -3,15 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from fields import normal_points as cloud
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.graph import filters
 from sundae_ns.graph.filters import Smoother, high_pass, low_pass, response_magnitude
 from sundae_ns.graph.graph import NeighborGraph, build_graph
-
-
-def cloud(n=60, seed=0):
-    return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def random_walk(graph):

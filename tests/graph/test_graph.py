@@ -4,16 +4,13 @@ import math
 
 import pytest
 import torch
+from fields import normal_points as normal
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sundae_ns.graph import graph
 from sundae_ns.graph.filters import high_pass, response_magnitude
 from sundae_ns.graph.graph import build_graph
-
-
-def normal(n=120, seed=0):
-    return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def dense(graph):
@@ -52,7 +49,7 @@ def test_weights_follow_the_equation_of_the_paper():
 
 
 def test_the_median_ignores_clones_and_floaters():
-    points = normal()
+    points = normal(120)
     clean = build_graph(points)
     spoiled = build_graph(torch.cat([points, points[:20], torch.full((5, 3), 1e9, dtype=torch.float64)]))
     assert clean.tau == pytest.approx((3 * clean.sigma) ** 2)
@@ -85,7 +82,7 @@ def test_given_values_replace_the_median():
 
 
 def test_symmetries_are_followed():
-    points, order = normal(), torch.randperm(120, generator=torch.Generator().manual_seed(3))
+    points, order = normal(120), torch.randperm(120, generator=torch.Generator().manual_seed(3))
     rotation = torch.linalg.qr(normal(3, seed=5)).Q
     found, shuffled, scaled = build_graph(points), build_graph(points[order]), build_graph(points * 1e-6)
     torch.testing.assert_close(dense(shuffled), dense(found)[order][:, order])
@@ -153,3 +150,48 @@ def test_an_overflowing_distance_and_an_infinite_width_give_no_nan():
     points = torch.cat([torch.randn(20, 3), torch.tensor([[3e38, 3e38, 3e38]])])
     graph = build_graph(points, num_neighbors=6, sigma=float("inf"))
     assert set(graph.weights.unique().tolist()) == {0.0, 1.0}
+
+
+@pytest.mark.gpu
+@pytest.mark.usefixtures("on_gpu")
+def test_the_same_from_run_to_run(cloud):
+    points = cloud(100_000).float().cuda()
+    first = build_graph(points)
+    response = high_pass(first, points)
+    for _ in range(3):
+        again = build_graph(points)
+        assert torch.equal(again.indices, first.indices)
+        assert torch.equal(again.weights, first.weights)
+        assert again.sigma == first.sigma
+        assert torch.equal(high_pass(again, points).nan_to_num(-1), response.nan_to_num(-1))
+
+
+@pytest.mark.gpu
+@pytest.mark.usefixtures("on_gpu")
+def test_same_bandwidth_and_close_responses(cloud):
+    points = cloud(20_000).float()
+    on_gpu, on_cpu = build_graph(points.cuda()), build_graph(points)
+    assert (on_gpu.tau, on_gpu.sigma) == (on_cpu.tau, on_cpu.sigma)
+    torch.testing.assert_close(on_gpu.weights.cpu(), on_cpu.weights, rtol=1e-5, atol=1e-6)
+    magnitude = [response_magnitude(high_pass(graph, x)) for graph, x in ((on_gpu, points.cuda()), (on_cpu, points))]
+    known = ~magnitude[1].isnan()
+    assert torch.equal(~magnitude[0].cpu().isnan(), known)
+    # Among neighbours at equal distances each device may take others.
+    known &= (on_gpu.indices.cpu().sort(dim=1).values == on_cpu.indices.sort(dim=1).values).all(dim=1)
+    scale = magnitude[1][known].max().clamp_min(1e-38) if known.any() else 1.0
+    torch.testing.assert_close(magnitude[0].cpu()[known] / scale, magnitude[1][known] / scale, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.gpu
+@pytest.mark.usefixtures("on_gpu")
+def test_extra_memory_grows_with_the_number_of_points_only():
+    peaks = []
+    for n in (250_000, 500_000):
+        points = torch.rand(n, 3, device="cuda")
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        high_pass(build_graph(points), points)
+        peaks.append((torch.cuda.max_memory_allocated() - before) / n)
+    # 2 GiB at 5,000,000 points are 429 bytes per point; the 8 MiB chunks add more at this size.
+    assert max(peaks) < 600
+    assert peaks[1] < 1.1 * peaks[0]

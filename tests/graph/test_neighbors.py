@@ -1,18 +1,15 @@
-"""Neighbour search against all pairs, on the CPU and by the kernel compiled for the CPU: clones, floaters, ties."""
+"""Neighbour search against all pairs, on the CPU and by the kernel, also compiled for it: clones, floaters, ties."""
 
-import ctypes
 import tracemalloc
-from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from sundae_ns.core.errors import BackendError, ConfigError, DataError
 from sundae_ns.cuda import kernels
-from sundae_ns.cuda.kernels import Launch
 from sundae_ns.graph import neighbors
 from sundae_ns.graph.neighbors import FILE, KERNEL, LEAF, MAX_NEIGHBORS, build_tree, kernel_options, knn, search_tree
 
@@ -105,47 +102,14 @@ def test_without_a_kernel_the_cpu_searches_and_logs_one_line(monkeypatch, caplog
     neighbors._kernel.cache_clear()
 
 
-# The kernel's source with a counter of visited points, and a loop over the threads.
-SHIM = """
-extern "C" long long visited;
-long long visited = 0;
-%s
-extern "C" void run(int threads, const REAL* points, const int* order, const REAL* boxes, const int* lowest, int n,
-                    int depth, double infinity, long long* indices, REAL* distances) {
-    blockDim.x = 128;
-    for (blockIdx.x = 0; blockIdx.x * 128 < threads; ++blockIdx.x)
-        for (threadIdx.x = 0; threadIdx.x < 128; ++threadIdx.x)
-            nearest(points, order, boxes, lowest, n, depth, infinity, indices, distances);
-}
-"""
+def options_of(dtype, k):
+    return ["-ffp-contract=off", *kernel_options(dtype, k)[1:]]
 
 
-Compile = Callable[..., Launch]
-
-
-@pytest.fixture(scope="module")
-def compiled(compile_for_cpu):
-    """Compiles the kernel for a dtype and a number of neighbours; launches append the number of visited points."""
-    visit = "const double dx = points"
-    source = kernels.read_source(FILE)
-    assert source.count(visit) == 1
-    source = SHIM % source.replace(visit, "++visited; " + visit)
-
-    def compile_for(dtype, k, visited=None):
-        kernel = compile_for_cpu(source, ["-ffp-contract=off", *kernel_options(dtype, k)[1:]])
-        counter = ctypes.c_longlong.in_dll(kernel, "visited")
-
-        def launch(threads, arguments):
-            assert all(a.is_contiguous() for a in arguments if isinstance(a, Tensor))
-            values = [kernels._as_c(argument, torch.device("cpu")) for argument in arguments]
-            counter.value = 0
-            kernel.run(ctypes.c_int(threads), *values)
-            if visited is not None:
-                visited.append(counter.value)
-
-        return launch
-
-    return compile_for
+@pytest.fixture
+def compiled(load_on_cpu):
+    """Compiles the kernel for a dtype and a number of neighbours."""
+    return lambda dtype, k: load_on_cpu(FILE, [KERNEL], options_of(dtype, k))[KERNEL]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -175,13 +139,19 @@ def test_tree_holds_every_point_once_in_tight_boxes(cloud):
             assert level < tree.depth or n < 2 * LEAF or LEAF <= end - begin <= 2 * LEAF
 
 
-def test_thousands_of_clones_visit_no_more_points_than_others(compiled):
+def test_thousands_of_clones_visit_no_more_points_than_others(compiled, compile_for_cpu, monkeypatch):
     # Counts visited points, not seconds. Without the lowest index of each node, every clone would visit all others.
-    visited = []
+    visit, visited = "const double dx = points", []
+    source = kernels.read_source(FILE)
+    assert source.count(visit) == 1
+    source = 'static long long total; extern "C" long long visited() { return total; }\n' + source
+    source = source.replace(visit, f"++total; {visit}")
+    monkeypatch.setattr(kernels, "read_source", lambda _: source)
     for points in (torch.zeros(20_000, 3), torch.randn(20_000, 3)):
-        search_tree(build_tree(points), 16, compiled(torch.float32, 16, visited))
-    clones, others = (count / 20_000 for count in visited)
-    assert clones < 2 * others  # measured 116 and 114 points per query
+        search_tree(build_tree(points), 16, compiled(torch.float32, 16))
+        visited.append(compile_for_cpu(source, options_of(torch.float32, 16)).visited())
+    clones, both = (count / 20_000 for count in visited)
+    assert clones < 2 * (both - clones)  # measured 116 and 114 points per query
 
 
 def test_kernel_compiles_for_gpus_from_turing_to_hopper(compile_for_gpu):
@@ -190,3 +160,58 @@ def test_kernel_compiles_for_gpus_from_turing_to_hopper(compile_for_gpu):
         assert KERNEL.encode() in compile_for_gpu(FILE, architecture, kernel_options(dtype, k))
     with pytest.raises(BackendError, match="does not compile for sm_90.*REAL"):
         compile_for_gpu(FILE, "sm_90", ())
+
+
+@pytest.mark.gpu
+@pytest.mark.usefixtures("on_gpu")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("n", "k"), [(200_000, 16), (20_000, 32), (2000, 1), (300, 100), (2, 1)])
+def test_same_neighbours_on_a_gpu(cloud, dtype, n, k):
+    points = cloud(n).to(dtype)
+    on_gpu, on_cpu = knn(points.cuda(), k), knn(points, k)
+    assert on_gpu.indices.is_cuda
+    assert on_gpu.distances.is_cuda
+    assert torch.equal(on_gpu.distances.cpu(), on_cpu.distances)
+    # Ties may come in any order on the CPU, also at the end of the list.
+    apart = (on_cpu.distances.diff(dim=1) > 0).all(dim=1)
+    assert torch.equal(on_gpu.indices.cpu()[apart, :-1], on_cpu.indices[apart, :-1])
+
+
+@pytest.mark.gpu
+@pytest.mark.usefixtures("on_gpu")
+def test_same_tree_as_on_the_cpu(cloud):
+    points = cloud(50_000).float()
+    on_gpu, on_cpu = build_tree(points.cuda()), build_tree(points)
+    assert on_gpu.depth == on_cpu.depth
+    for name in ("points", "order", "boxes", "lowest"):
+        assert torch.equal(getattr(on_gpu, name).cpu(), getattr(on_cpu, name))
+
+
+@pytest.mark.gpu
+@pytest.mark.usefixtures("on_gpu")
+def test_a_million_clones_of_one_point():
+    found = knn(torch.ones(1_000_000, 3, device="cuda"), 16)
+    assert (found.distances == 0).all()
+    assert torch.equal(found.indices[20:], torch.arange(16, device="cuda").expand(999_980, -1))
+    for row in range(17):
+        assert found.indices[row].tolist() == [other for other in range(17) if other != row]
+
+
+@pytest.mark.gpu
+@pytest.mark.usefixtures("on_gpu")
+def test_other_streams_and_threads_and_a_search_without_the_kernel_agree(monkeypatch):
+    points, stream = torch.rand(100_000, 3, device="cuda"), torch.cuda.Stream()
+    expected = knn(points, 8)
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        beside = knn(points, 8)
+    stream.synchronize()
+    neighbors._kernel.cache_clear()
+    with ThreadPoolExecutor(1) as pool:
+        elsewhere = pool.submit(knn, points, 8).result()
+    monkeypatch.setattr(neighbors, "_kernel", lambda *_: None)
+    without = knn(points, 8)
+    assert without.indices.is_cuda
+    for found in (beside, elsewhere, without):
+        assert torch.equal(found.indices, expected.indices)
+        assert torch.equal(found.distances, expected.distances)

@@ -119,7 +119,7 @@ UNKNOWN = "does not say how it stores colours"
         ({**OURS, "encoding": "harmonics"}, "harmonics"),
         (
             {"method": "sundae", "format": 1, "logits": True},
-            "format 1, this version reads 2; use the version that wrote",
+            "format 1, this version reads 2; use the version",
         ),
         *((extra, UNKNOWN) for extra in (OURS, {**OURS, "encoding": "words"}, {**OURS, "encoding": torch.zeros(2)})),
     ],

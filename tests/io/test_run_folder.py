@@ -1,5 +1,6 @@
 """The folder of a run: one process trains in it, and damaged records of prunes do not end a training."""
 
+import json
 import os
 import subprocess
 import sys
@@ -25,29 +26,6 @@ def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path):
     assert [find_config(place) for place in places] == [run / "config.yml"] * 4
     assert find_config(tmp_path) is None
     assert find_config(tmp_path / "gone") is None
-
-
-def test_earlier_records_are_kept_and_a_damaged_file_is_renamed(tmp_path):
-    path = tmp_path / "prune.json"
-    assert prunes_before(path, 5) == []
-    path.write_text('[{"step": 3, "before": 9}, {"step": 7}]')
-    assert prunes_before(path, 7) == [{"step": 3, "before": 9}]
-    assert path.exists()
-    for text in ('[{"step": 3', "", '"step"', "3", '[{"before": 9}]', "[3]", '[{"step": "3"}]'):
-        path.write_text(text)
-        assert prunes_before(path, 7) == []
-        assert not path.exists()
-        assert (tmp_path / "prune.damaged.json").read_text() == text
-
-
-def test_records_of_a_finished_run_are_read_whole_or_not_at_all(tmp_path):
-    assert prunes_of(tmp_path) == []
-    (tmp_path / "prune.json").write_text('[{"before": 9, "after": 3}]')
-    assert prunes_of(tmp_path) == [{"before": 9, "after": 3}]
-    for text in ("[", "3", '{"before": 9}', "[3]", '[{"before": 9}, 3]', "\x00"):
-        (tmp_path / "prune.json").write_text(text)
-        assert prunes_of(tmp_path) == []
-        assert (tmp_path / "prune.json").read_text() == text
 
 
 def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):
@@ -100,7 +78,27 @@ def test_records_follow_a_resumed_run(tmp_path):
     (new / "prune.json").write_text("[]")
     take_records(old, new, 8)
     assert prunes_of(new) == []  # its own record
-    for text in ("[", "[1]", "1", '{"step": "a"}', '[{"step": "a"}]', "[{}]"):
-        (old / "prune.json").write_text(text)
-        take_records(old, tmp_path / "none", 9)
+
+
+DAMAGED = ("[", "", "3", '"step"', "[3]", "\x00", '{"before": 9}', '[{"step": 3}, 3]')
+
+
+@pytest.mark.parametrize("text", [*DAMAGED, '[{"before": 9}]', '[{"step": "3"}]'])
+def test_damaged_records_end_no_training(tmp_path, text):
+    path = tmp_path / "prune.json"
+    path.write_text(text)
+    assert prunes_of(tmp_path) == ([] if text in DAMAGED else json.loads(text))
+    take_records(tmp_path, tmp_path / "none", 9)
     assert not (tmp_path / "none").exists()
+    assert path.read_text() == text
+    assert prunes_before(path, 7) == []
+    assert not path.exists()
+    assert (tmp_path / "prune.damaged.json").read_text() == text
+
+
+def test_records_before_a_step(tmp_path):
+    path = tmp_path / "prune.json"
+    assert (prunes_before(path, 5), prunes_of(tmp_path)) == ([], [])
+    path.write_text('[{"step": 3, "before": 9}, {"step": 7}]')
+    assert prunes_before(path, 7) == [{"step": 3, "before": 9}]
+    assert prunes_of(tmp_path) == [{"step": 3, "before": 9}, {"step": 7}]

@@ -66,3 +66,8 @@ def assert_close(found: Mapping[str, Tensor], truth: Mapping[str, Tensor], toler
             value = value * (value * expected).sum(dim=1, keepdim=True).sign()
         tolerance = tolerances.get(name, 0.0)
         torch.testing.assert_close(value, expected, rtol=0, atol=tolerance, msg=lambda text, n=name: f"{n}: {text}")
+
+
+def normal_points(n: int = 60, seed: int = 0) -> Tensor:
+    """Points of a normal distribution, float64 ``[n, 3]``."""
+    return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)

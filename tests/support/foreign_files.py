@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -144,7 +144,10 @@ def write_gsplat(path: Path, gaussians: Mapping[str, Tensor], **others: object) 
 
 
 def write_checkpoint(
-    path: Path, gaussians: Mapping[str, Tensor], extra: Mapping[str, Any] = MappingProxyType({}), **others: object
+    path: Path | IO[bytes],
+    gaussians: Mapping[str, Tensor],
+    extra: Mapping[str, Any] = MappingProxyType({}),
+    **others: object,
 ) -> None:
     """As nerfstudio's trainer after its first step; ``extra`` is further state of the pipeline."""
     state = {f"_model.gauss_params.{name}": value for name, value in gaussians.items()}
