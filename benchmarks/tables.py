@@ -101,56 +101,49 @@ def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
 
 def quality() -> list[str]:
     """All methods on the captures: quality and size; :func:`speed` has times, because suites share their GPUs."""
-    heads = ["capture", "method", "keep", "Gaussians", "PSNR, dB", "SSIM", "PSNR, head off", "MB"]
-    rows, found = [], runs()
+    found, cells = runs(), {}
     usual = {(row["scene"], row["variant"]) for row in found if row["keep_ratio"] == SHARE}
     compared = {row["scene"] for row in found if row["variant"] in ("sundae", "sundae-auto")}
     for row in found:
         other_share = row["keep_ratio"] != SHARE and (row["scene"], row["variant"]) in usual
         if other_share or row["variant"] in LEFT_OUT or row["scene"] not in compared:
             continue
+        keep = "" if row["keep_ratio"] in (None, 1.0) else f" ({row['keep_ratio']:.0%})"
+        size = f"{number(row['primitives'], 0)}{keep}, {number(row['bytes_total'] / MB, 1)} MB"
+        base = f"<br>head off: {number(row['psnr_base'], 2)}" if row["bytes_head"] else ""
         capture = f"{row['scene']}, {row['resolution'].replace('x', ' x ')}"
-        keep = "" if row["keep_ratio"] is None else f"{row['keep_ratio']:.0%}"
-        cells = [METHODS[row["variant"]], keep, number(row["primitives"], 0), row["psnr_cell"], row["ssim_cell"]]
-        base = number(row["psnr_base"], 2) if row["bytes_head"] else ""
-        rows.append([capture, *cells, base, number(row["bytes_total"] / MB, 1)])
-    return table(heads, first_of_each(rows))
+        cells[capture, METHODS[row["variant"]]] = f"{row['psnr_cell']}, {row['ssim_cell']}<br>{size}{base}"
+    return side_by_side(cells)
+
+
+def side_by_side(cells: dict[tuple[str, str], str]) -> list[str]:
+    """A table of cells by capture and method: a row for each capture, a column for each method."""
+    captures, methods = (list(dict.fromkeys(pair[i] for pair in cells)) for i in range(2))
+    rows = [[capture, *(cells.get((capture, method), "") for method in methods)] for capture in captures]
+    return table(["capture", *methods], rows, words=1)
 
 
 def speed() -> list[str]:
     """Milliseconds of frames, each with the error of the same frames."""
-    heads = ["field", "size", "head in", "Gaussians", "frame, ms", "splat, ms", "head, ms", "PSNR, dB", "SSIM", "GPU"]
-    rows = [
-        [
-            line["config"],
-            *(f"{line['width']} x {line['height']}", line["precision"] if line["ms_head"] else ""),
-            *(number(line["primitives"], 0), number(line["ms_frame"], 2), number(line["ms_splat"], 2)),
-            number(line["ms_head"], 2) if line["ms_head"] else "",
-            *(number(line["psnr"], 2), number(line["ssim"], 4), gpu(line["device"])),
-        ]
-        for line in lines_of("frames.jsonl")
-    ]
-    return table(heads, first_of_each(rows))
+    cells = {}
+    for line in lines_of("frames.jsonl"):
+        capture, method = line["config"].split(", ", 1)
+        parts = f" (splat {line['ms_splat']:.2f}, head {line['ms_head']:.2f})" if line["ms_head"] else ""
+        quality = f"{number(line['primitives'], 0)}; {line['psnr']:.2f}, {line['ssim']:.4f}"
+        size = f"{line['width']} x {line['height']}"
+        cells[f"{capture}, {size}", method] = f"{line['ms_frame']:.2f} ms{parts}<br>{quality}"
+    return side_by_side(cells)
 
 
 def training_time() -> list[str]:
     """Seconds of whole trainings, each with the error of what was trained."""
-    heads = ["capture", "method", "steps", "seconds", "ms a step", "Gaussians", "PSNR, dB", "SSIM", "GPU"]
-    rows = [
-        [
-            *(line["scene"], line["arm"]),
-            *(number(line["steps"], 0), number(line["train_s"], 0)),
-            number(1000 * line["train_s"] / line["steps"], 2),
-            number(line["primitives"], 0),
-            *(
-                number(line[name], digits) if line[name] is not None else "-"
-                for name, digits in (("psnr", 2), ("ssim", 4))
-            ),
-            gpu(line["gpu"]),
-        ]
-        for line in {(line["scene"], line["arm"]): line for line in lines_of("training_time.jsonl")}.values()
-    ]
-    return table(heads, first_of_each(rows))
+    cells = {}
+    for line in lines_of("training_time.jsonl"):
+        step = f"{1000 * line['train_s'] / line['steps']:.2f} ms a step"
+        quality = ", ".join(number(line[name], digits) for name, digits in (("psnr", 2), ("ssim", 4)))
+        arm = f"{line['arm']}, {number(line['steps'], 0)} steps"
+        cells[line["scene"], arm] = f"{line['train_s']:.0f} s, {step}<br>{number(line['primitives'], 0)}; {quality}"
+    return side_by_side(cells)
 
 
 def packing() -> list[str]:
