@@ -8,20 +8,33 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from sundae_ns.cli.inputs import Cleaning, copies_rows, open_packed
-from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file, check_folder, check_suffix
+from sundae_ns.cli.inputs import Cleaning, copies_rows, open_packed, open_scene
+from sundae_ns.cli.options import (
+    Direction,
+    Flag,
+    Out,
+    Overwrite,
+    Scene,
+    check_file,
+    check_folder,
+    check_suffix,
+    progress_bar,
+)
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.gaussians import sh_degree
 from sundae_ns.io.formats import FORMATS
 from sundae_ns.io.pack import container
 from sundae_ns.io.ply import keep_vertices
 from sundae_ns.io.run_folder import files_of
+from sundae_ns.io.sog import STREAMED
 from sundae_ns.io.spz import clamped
+from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.cameras import with_start
-from sundae_ns.scene.load_save import load, load_with_mask, save_for_viewers
+from sundae_ns.scene.load_save import load, load_with_mask, save_for_viewers, save_levels
 from sundae_ns.scene.packing import packed_bytes, stated_start
 from sundae_ns.scene.page import write_page
 from sundae_ns.scene.prune_scene import within
+from sundae_ns.scene.scene import Scene as Opened
 
 
 def export(
@@ -31,6 +44,7 @@ def export(
     start_view: str | None = None,
     up: Direction | None = None,
     data: Path | None = None,
+    lod: Flag = False,
     overwrite: Overwrite = False,
     cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
 ) -> int:
@@ -46,10 +60,15 @@ def export(
         start_view: what a page opens with: index of a stored camera, or a camera file as sundae render reads it; by
             default that of a packed scene, else the first camera.
         up: direction about which a page turns, for example 0 0 1; by default that of the scene, else of its cameras.
-        data: folder of the capture, if it moved; for a page of a run.
+        data: folder of the capture, if it moved; for a page or levels of a run.
+        lod: write levels of detail as streamed SOG (lod-meta.json) into the folder, for PlayCanvas's viewers. Below
+            the full scene are a half, a quarter and a tenth of its Gaussians, each pruned from it and trained on its
+            images; minutes on a GPU.
     """
-    page = out.suffix.lower() in (".html", "")
-    if not page:
+    if lod and out.suffix:
+        raise ConfigError(f"{out} is no folder, which levels of detail take; name one without a suffix")
+    page = out.suffix.lower() in (".html", "") and not lod
+    if out.suffix and not page:
         check_suffix(out, (*FORMATS, ".html"))
     (check_file if out.suffix else check_folder)(out, reads=[*files_of(scene), data], overwrite=overwrite)
     started = start_view is not None or up is not None
@@ -70,7 +89,7 @@ def export(
     if copies and (upright or not cleaning.chosen):
         raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
     if started:
-        raise ConfigError(f"{out.suffix} files hold neither a start view nor an up axis; leave them out")
+        raise ConfigError(f"{out.suffix or '.sog'} files hold neither a start view nor an up axis; leave them out")
     if copies:
         opened, usable = load_with_mask(scene)
         rows = within(usable, cleaning.mask(opened, ()))
@@ -78,9 +97,11 @@ def export(
         print(f"{out}: {int(rows.sum()):,} of {len(rows):,} Gaussians")
         return 0
     # A run's cameras, which tell floaters, are in its capture.
-    opened = cleaning.cleaned(open_packed(scene, data)[0] if cleaning.remove_floaters else load(scene))
+    opened = cleaning.cleaned(open_scene(scene, data) if cleaning.remove_floaters or lod else load(scene))
     if upright and not opened.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
+    if lod:
+        return _write_levels(opened, out, upright)
     with Console(stderr=True).status(f"Writing {opened.num_gaussians:,} Gaussians"):  # a .sog takes minutes
         written = save_for_viewers(opened, out, upright=upright)
     mode, degree = ", antialiased" if opened.antialiased else "", sh_degree(written["features_rest"])
@@ -89,4 +110,24 @@ def export(
         print(f"clamped scales or colours of {beyond:,} Gaussians to the range of a .spz; a .sog has none")
     if degree < opened.gaussians.sh_degree:
         print(f"left out harmonics above SH degree {degree}, which {out.suffix} cannot store; .ply can")
+    return 0
+
+
+def _write_levels(scene: Opened, out: Path, upright: bool) -> int:
+    from sundae_ns.plugin.distill import levels_of  # imports nerfstudio, which takes seconds
+
+    levels = [scene.to(fastest_device())]
+    with progress_bar() as bar:
+        task = bar.add_task("Levels of detail", total=None)
+
+        def after_step(done: int, total: int) -> bool:
+            bar.update(task, completed=done, total=total)
+            return True
+
+        for level, psnr in levels_of(levels[0], scene.cameras, after_step):
+            print(f"{level.num_gaussians:,} Gaussians: {psnr:.2f} dB against the full scene, on cameras of no step")
+            levels.append(level)
+    save_levels(levels, out, upright=upright)
+    size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
+    print(f"{out / STREAMED}: {scene.num_gaussians:,} Gaussians and {len(levels) - 1} levels below, {size:,} bytes")
     return 0

@@ -73,11 +73,16 @@ def open_run(run: Path, **options: Any) -> Scene:
         return load_run(run, **options)
 
 
+def open_scene(path: Path, data: Path | None) -> Scene:
+    """A scene; that of a run, whose capture may have moved, has cameras of it."""
+    return open_run(path, data=data) if _is_run(path) else load(path)
+
+
 def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
-    """A scene, and the packed file that holds it; a run, whose capture may have moved, is packed in memory."""
+    """As :func:`open_scene`, with the packed file that holds it; others are packed in memory."""
     if not _is_run(path):
         return packed_file(path)
-    scene = open_run(path, data=data)
+    scene = open_scene(path, data)
     from sundae_ns.scene.packing import packed_bytes
 
     return scene, packed_bytes(scene)

@@ -41,23 +41,12 @@ def loss_kernels(device: torch.device) -> dict[str, Launch]:
 def fused_loss(
     image: Tensor, target: Tensor, weight: float, base: Tensor | None = None, l1_weight: float | None = None
 ) -> tuple[Tensor, Tensor | None]:
-    """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, and L1 of its base colours; differentiable scalars.
+    """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, and L1 of its base colours or None; differentiable scalars.
 
-    L1 is the mean over all values. SSIM is pytorch_msssim's, over windows inside the image, with a data range of 1.
-
-    Args:
-        image: float32 on a CUDA device ``[H, W, 3]``, both sides at least :data:`SSIM_WINDOW`.
-        target: target image, as ``image``; gets no gradient.
-        weight: weight of 1 - SSIM, in [0, 1].
-        base: base colours to compare with the target, as ``image``, or None.
-        l1_weight: weight of L1; None for ``1 - weight``.
-
-    Returns:
-        The loss, and the L1 of ``base`` or None; float32 ``[]`` each.
-
-    Raises:
-        BackendError: the kernels cannot be compiled or loaded.
-        DataError: the images differ in shape, are too small, or are not float32.
+    L1 is the mean over all values, with ``l1_weight`` if it is given. SSIM is pytorch_msssim's, over windows inside the
+    image, with a data range of 1. All images are float32 on a CUDA device ``[H, W, 3]``, both sides at least
+    :data:`SSIM_WINDOW`; the target gets no gradient. ``BackendError`` if the kernels cannot be compiled or loaded,
+    ``DataError`` if the images differ in shape, are too small, or are not float32.
     """
     for each in (image,) if base is None else (image, base):
         same_kind = each.shape == target.shape and each.dtype == target.dtype == torch.float32

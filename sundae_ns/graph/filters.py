@@ -64,16 +64,13 @@ def response_magnitude(response: Tensor) -> Tensor:
 
 
 class Smoother:
-    """The low-pass filter ``(M + strength L)^-1 M`` of a graph.
+    """The low-pass filter ``(M + strength L)^-1 M`` of a graph, whose weights in both directions may differ.
 
     L is the Laplacian over the mean degree, of weights that are the mean of both directions, and M is diagonal: 1 for
     nodes with a known value, else 0. The result x minimises the squared differences to the signal over known nodes,
     plus ``strength x^T L x`` (Shuman et al., IEEE Signal Processing Magazine 2013, section III). Columns of L sum to 0,
-    so over known nodes x and the signal have the same mean: the high-pass response ``y - x`` sums to 0.
-
-    Args:
-        graph: its nodes; weights in both directions may differ.
-        strength: 0 leaves a signal as it is; a large one makes it constant on each connected part.
+    so over known nodes x and the signal have the same mean: the high-pass response ``y - x`` sums to 0. A ``strength``
+    of 0 leaves a signal as it is; a large one makes it constant on each connected part.
     """
 
     def __init__(self, graph: NeighborGraph, strength: float) -> None:

@@ -41,24 +41,14 @@ def build_graph(
 ) -> NeighborGraph:
     """Nearest-neighbour graph with Gaussian weights ``exp(-d^2 / (2 sigma^2))`` where ``d^2 < tau`` (paper, ``W_ij``).
 
-    By default ``sigma`` is the median of the positive distances to neighbours, and ``tau = (3 sigma)^2``. The median
-    scales with the scene. Clones (distance 0, left out) and far floaters do not move it. Half of all neighbours lie
-    within one sigma, so weights spread over (0, 1); only Gaussians beyond three times the typical spacing have no
-    edge. The paper's rule (``tau`` ten times the smallest distance, ``sigma`` the variance of distances) mixes units,
-    and leaves the graph empty if the field has a pair of clones.
-
-    Args:
-        points: centres in scene units, any floating dtype and device ``[N, 3]``.
-        num_neighbors: most edges of a node; must be less than N.
-        tau: threshold on the squared distance, squared scene units, at least 0.
-        sigma: width of the weights, positive, scene units; 1 by default if no distance is positive.
-
-    Returns:
-        A graph on the device and with the dtype of the points.
-
-    Raises:
-        ConfigError: ``num_neighbors`` is less than 1.
-        DataError: too few points, or points that are not finite.
+    By default ``sigma`` is the median of the positive distances to neighbours, or 1 without any, and ``tau = (3
+    sigma)^2``. The median scales with the scene. Clones (distance 0, left out) and far floaters do not move it. Half of
+    all neighbours lie within one sigma, so weights spread over (0, 1); only Gaussians beyond three times the typical
+    spacing have no edge. The paper's rule (``tau`` ten times the smallest distance, ``sigma`` the variance of
+    distances) mixes units, and leaves the graph empty if the field has a pair of clones. ``points`` ``[N, 3]`` have any
+    floating dtype and device, which the graph gets; ``sigma`` is in scene units, ``tau`` in squared ones.
+    ``num_neighbors``, the most edges of a node, are at least 1, else a ``ConfigError``. ``DataError`` for as few
+    points, or for some that are not finite.
     """
     indices, distances = knn(points, num_neighbors)
     sigma = _typical_distance(distances) if sigma is None else sigma

@@ -40,22 +40,13 @@ class Neighbors(NamedTuple):
 
 
 def knn(points: Tensor, k: int) -> Neighbors:
-    """Exact ``k`` nearest neighbours of every point, without the point itself.
+    """Exact ``k`` nearest neighbours of every point but itself: indices and ascending distances ``[N, k]``.
 
     Coincident points are neighbours of each other at distance 0, those of lower index first. Other points at equal
-    distances may come in any order. The search runs on the points' device. It runs on the CPU if the GPU kernel cannot
-    be compiled, or for more than :data:`MAX_NEIGHBORS` neighbours.
-
-    Args:
-        points: positions in scene units, any floating dtype and device ``[N, 3]``.
-        k: number of neighbours, at least 1 and less than N.
-
-    Returns:
-        Indices and ascending distances ``[N, k]``, on the points' device.
-
-    Raises:
-        ConfigError: ``k`` is less than 1.
-        DataError: at most ``k`` points, or points that have a wrong shape, are not finite, or exceed 1e150.
+    distances may come in any order. ``points`` ``[N, 3]`` have any floating dtype; the search runs on their device. It
+    runs on the CPU if the GPU kernel cannot be compiled, or for more than :data:`MAX_NEIGHBORS` neighbours.
+    ``ConfigError`` for no neighbours; ``DataError`` for at most ``k`` points, a wrong shape, and points that are not
+    finite or exceed 1e150.
     """
     if k < 1:
         raise ConfigError(f"cannot search for {k} neighbours: use at least 1")

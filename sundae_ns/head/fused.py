@@ -90,11 +90,7 @@ def head_options(net: UNet, residual: bool) -> tuple[str, ...]:
 
 
 def head_kernels(device: torch.device, dtype: torch.dtype, options: tuple[str, ...]) -> Launches:
-    """The kernels for a device, compiled on the first call.
-
-    Raises:
-        BackendError: the kernels cannot be compiled or loaded.
-    """
+    """The kernels for a device, compiled on the first call; ``BackendError`` if they cannot be compiled or loaded."""
     return load_kernels("head.cu", KERNELS, (_TYPES[dtype], *options), device)
 
 
@@ -292,9 +288,8 @@ def unfold_backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradients of :func:`unfold_pixels`, from that of the image ``[H, W, 3]``.
 
-    Returns:
-        The gradients of ``raw``, of accumulation ``[H, W, 1]``, and of weight and bias of the 1 x 1 convolution; the
-        last three are float32.
+    They are those of ``raw``, of accumulation ``[H, W, 1]``, and of weight and bias of the 1 x 1 convolution; the last
+    three are float32.
     """
     height, width = gradient.shape[:2]
     rows, columns = raw.shape[-2:]

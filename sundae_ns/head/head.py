@@ -85,11 +85,7 @@ class HeadConfig:
 class CompensationHead(nn.Module):
     """Computes the compensated image (``I_hat = Phi(F)`` of the paper, and our residual variant).
 
-    Args:
-        config: mode, size and arithmetic; mode auto makes a residual head, off is refused.
-
-    Raises:
-        ConfigError: the configuration is invalid.
+    Mode auto makes a residual head, off is refused; ``ConfigError`` for an invalid configuration.
     """
 
     def __init__(self, config: HeadConfig) -> None:
@@ -155,16 +151,11 @@ class CompensationHead(nn.Module):
         self._weights = tuple(self.net.parameters())
 
     def forward(self, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
-        """Compensate one image.
+        """Compensate one image; returns ``[H, W, 3]`` float32, not clamped.
 
-        Args:
-            base: spherical-harmonics image over its background, in [0, 1] ``[H, W, 3]``.
-            splatted: the same colours without background, so that the head does not depend on it, and the features
-                ``[H, W, 3 + F]``.
-            alpha: accumulation ``[H, W, 1]``.
-
-        Returns:
-            ``[H, W, 3]`` float32, not clamped. Where nothing was splatted, the residual head returns ``base``.
+        ``base`` is the spherical-harmonics image over its background, in [0, 1] ``[H, W, 3]``. ``splatted`` ``[H, W, 3
+        + F]`` are the same colours without background, so that the head does not depend on it, and the features. Where
+        the accumulation ``alpha`` ``[H, W, 1]`` is 0, the residual head returns ``base``.
         """
         residual = self.config.mode == "residual"
         dtype = PRECISIONS[self.config.precision] if base.device.type == "cuda" else torch.float32

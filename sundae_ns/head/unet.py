@@ -30,17 +30,11 @@ def _double_conv(c_in: int, c_out: int) -> nn.Sequential:
 class UNet(nn.Module):
     """Four-level fully convolutional U-Net (Neural Compensation section of the paper).
 
-    Works at any image size of at least one pixel: inputs are padded by zeros to a multiple of
-    ``pixel_unshuffle * 2 ** (LEVELS - 1)`` and the result is cropped back.
-
-    Args:
-        in_channels: channels of the input image.
-        out_channels: channels of the output image.
-        width: channels of the finest level; each coarser level doubles them. 64 gives the paper's 30 MB.
-        max_width: largest number of channels of a level; None for the paper's doubling.
-        pixel_unshuffle: fold blocks of this many pixels per side into channels first, and unfold the result. 1 is the
-            paper's network; 2 quarters the work at the full-resolution level.
-        zero_init: initialise the output to exactly zero.
+    Works at any image size of at least one pixel: inputs are padded by zeros to a multiple of ``pixel_unshuffle * 2 **
+    (LEVELS - 1)`` and the result is cropped back. The finest level has ``width`` channels, 64 for the paper's 30 MB;
+    each coarser one doubles them, to at most ``max_width``, None for no limit. ``pixel_unshuffle`` folds blocks of this
+    many pixels per side into channels first, and unfolds the result: 1 is the paper's network, 2 quarters the work at
+    the full-resolution level. ``zero_init`` initialises the output to exactly zero.
     """
 
     def __init__(

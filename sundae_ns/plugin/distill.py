@@ -301,21 +301,18 @@ def distill(
 
 
 def levels_of(
-    scene: Scene,
-    cameras: Sequence[Camera] = (),
-    *,
-    after_step: Callable[[int, int], bool] = lambda *_: True,
-    progress: bool = False,
+    scene: Scene, cameras: Sequence[Camera] = (), after_step: Callable[[int, int], bool] = lambda *_: True
 ) -> Iterator[tuple[Scene, float]]:
     """The levels of detail below a scene, :data:`LEVELS`, and the PSNR of each on held-out cameras, dB.
 
-    Each is pruned from the scene and trained on the images of its base colours; arguments as for :func:`distill`.
+    Each is pruned from the scene, and trained on the images of its base colours from ``cameras``, by default virtual
+    ones; ``after_step`` as for :meth:`Distillation.train`.
     """
     side, plain = by_device(SIDES, scene.device), dataclasses.replace(scene, head=None)
     cameras = [camera.zoomed(min(1.0, side / max(camera.width, camera.height))) for camera in cameras]
     cameras = cameras or virtual_cameras(plain, CAMERAS, size=side)
     steps = by_device(LEVEL_STEPS, scene.device)
     for share in LEVELS:
-        made = Distillation(plain, keep=share, cameras=cameras, steps=steps, head=False, progress=progress)
+        made = Distillation(plain, keep=share, cameras=cameras, steps=steps, head=False)
         made.train(after_step)
         yield made.result(), made.quality()

@@ -73,9 +73,8 @@ class ShownRun:
 def choose_cameras(qualities: Sequence[float], most: int) -> list[int]:
     """Indices of the views to show, ascending: the worst, the best, and others evenly spaced in the capture's order.
 
-    Args:
-        qualities: PSNR by view; NaN counts as worst.
-        most: number of indices to return; at least 2, and all views if they are fewer.
+    ``qualities`` are the PSNR by view; NaN counts as worst. At least 2 and at most ``most`` are returned, or all if
+    fewer.
     """
     count, most = len(qualities), max(most, 2)
     if count <= most:
@@ -95,15 +94,9 @@ def cameras_for_each(runs: int) -> int:
 def error_map(rendering: Tensor, photo: Tensor, size: tuple[int, int] | None = None) -> Image.Image:
     """Mean absolute difference of the three channels as colours; equal images get the first colour everywhere.
 
-    Args:
-        rendering, photo: ``[H, W, 3]`` in [0, 1]; values beyond are clamped.
-        size: width and height of the map; by default that of the images.
-
-    Returns:
-        An image with a palette, from 0 to :data:`LARGEST_ERROR` levels of 255; more gets the last colour.
-
-    Raises:
-        DataError: the shapes differ, or are not ``[H, W, 3]``.
+    Both images are ``[H, W, 3]`` in [0, 1], else a ``DataError``; values beyond are clamped. Returns an image with a
+    palette, of this width and height or those of the images, from 0 to :data:`LARGEST_ERROR` levels of 255; more gets
+    the last colour.
     """
     if rendering.shape != photo.shape or photo.dim() != 3 or photo.shape[-1] != 3:
         raise DataError(f"Images have shapes {list(rendering.shape)} and {list(photo.shape)}; give two of one size.")
@@ -183,12 +176,9 @@ def curve_plot(curve: CountCurve) -> str:
 
 
 def report_page(runs: Sequence[ShownRun], notes: Sequence[str], command: str) -> str:
-    """The HTML of a page that loads nothing, which its policy forbids.
+    """The HTML of a page that loads nothing, which its policy forbids; made by a ``command``.
 
-    Args:
-        runs: with labels that differ.
-        notes: what was left out and why, one sentence each.
-        command: the command that made the page.
+    Labels of ``runs`` differ; ``notes`` say what was left out and why, in one sentence each.
     """
     measured = [run.measured for run in runs]
     numbers = {run.label: number for number, run in enumerate(measured)}

@@ -80,9 +80,8 @@ def weights_of(state: TrainingState) -> dict[str, Tensor]:
 class Averaging(Callback):
     """Ends a training with the mean of field and head, a first part of one too if it ends within the share.
 
-    Args:
-        share: of the schedule, at its end, over which weights are averaged.
-        settled_at: step of the schedule before which the number of Gaussians may change, so that nothing is averaged.
+    ``share`` of the schedule, at its end, is averaged, but nothing before the step ``settled_at``, until which the
+    number of Gaussians may change.
     """
 
     name = "averaging"

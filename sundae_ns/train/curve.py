@@ -43,8 +43,7 @@ class CountCurve:
 def read_count_curve(folder: Path) -> CountCurve | None:
     """The record in a run's folder; None if trials have not decided about its number of Gaussians.
 
-    Raises:
-        CheckpointError: the record is damaged.
+    ``CheckpointError`` if the record is damaged.
     """
     path, names = folder / RECORD, {entry.name for entry in fields(CurvePoint)}
     try:

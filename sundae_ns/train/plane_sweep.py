@@ -57,12 +57,10 @@ class _Reduced:
 
 
 class Sweep:
-    """The sweep through all views, one at a time.
+    """The sweep through all views, one at a time, so that one photo in full size is held.
 
-    Args:
-        photos: images and cameras; one in full size is held at a time.
-        sparse: finite points of the scene that state the range of depths ``[P, 3]``.
-        longest: longest side of the compared images, pixels.
+    ``sparse`` points of the scene ``[P, 3]``, finite, state the range of depths; ``longest`` is the longest side of the
+    compared images, pixels.
     """
 
     def __init__(self, photos: Iterable[Photo], sparse: Tensor, longest: int) -> None:

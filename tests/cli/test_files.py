@@ -45,6 +45,18 @@ def test_export_of_a_packed_scene(tmp_path, mode):
     assert ("SplatRenderMode: mip" in PlyData.read(tmp_path / "a.ply").comments) == (mode == "antialiased")
 
 
+def test_export_of_levels_of_detail(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"LEVEL_STEPS": {"cpu": 2}, "CAMERAS": 16, "SIDES": {"cpu": 32}}.items():
+        monkeypatch.setattr(f"sundae_ns.plugin.distill.{name}", value)
+    write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": MODEL}))
+    assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "b", "--lod") == 0
+    assert json.loads((tmp_path / "b" / "lod-meta.json").read_text())["counts"] == [200, 100, 50, 20]
+    assert capsys.readouterr().out.count("dB against the full scene") == 3
+    assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "b", "--lod") == 2
+
+
 @pytest.mark.parametrize("kind", [".spz", ".sog"])
 @pytest.mark.parametrize("comments", [[], ["SplatRenderMode: mip"]])
 def test_export_of_a_ply_of_any_program(tmp_path, kind, comments, capsys, caplog):

@@ -50,6 +50,8 @@ REFUSALS = {
     "export in.ply -o a.splat": "name it .ply, .spz, .sog, .glb, .html",
     "export in.ply -o in.bin/new/a.sog": "in.bin is no folder",
     "export in.ply -o a.ply": "in.ply is a .ply already; give an output name that ends in .spz or",
+    "export in.ply -o a.sog --lod": "a.sog is no folder, which levels of detail take",
+    "export in.ply -o a --lod --up 0 0 1": ".sog files hold neither a start view",
     "export in.ply -o a.sog --upright": "not in nerfstudio's coordinates",
     "export in.bin -o a.ply": "in.bin is not a complete .spz (",
     "export nothing.sundae -o a.ply": "nothing.sundae cannot be read",

@@ -104,6 +104,19 @@ def test_a_run_is_cut_before_it_is_packed_or_exported(tiny, packed, tmp_path, ca
     assert load(tmp_path / "a.ply").num_gaussians == found.num_gaussians
 
 
+def test_levels_of_a_run_are_trained_from_the_cameras_of_its_photos(tiny, packed, tmp_path, monkeypatch):
+    given = []
+
+    def levels_of(scene, cameras, after_step):
+        given.extend(cameras)
+        return [(scene, 30.0)]
+
+    monkeypatch.setattr("sundae_ns.plugin.distill.levels_of", levels_of)
+    assert run("export", tiny.folder, "-o", tmp_path / "a", "--lod", "--upright") == 0
+    assert len(given) == len(load(packed).cameras)
+    assert load(tmp_path / "a").up == pytest.approx((0, -1, 0), abs=1e-6)
+
+
 def test_a_packed_scene_is_measured_on_its_capture(tiny, packed):
     before, after = load_model(tiny.config), load_model(packed, data=tiny.scene)
     for name in ("rgb", "base_rgb"):

@@ -57,10 +57,8 @@ class Lists(NamedTuple):
 def tile_lists(projection: Projection, opacities: Tensor, width: int, height: int) -> Iterator[Lists]:
     """List the Gaussians of each tile; ``opacities`` ``[N]`` are those to blend.
 
-    An image with more than :data:`MOST_PAIRS` is halved until each region has fewer, or is a single tile.
-
-    Raises:
-        MemoryExhaustedError: without gradients, the image has more Gaussians than that of any real scene.
+    An image with more than :data:`MOST_PAIRS` is halved until each region has fewer, or is a single tile. Without
+    gradients one with more Gaussians than any real scene is a ``MemoryExhaustedError``.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     depths, radii, opacity = (as_array(value) for value in (projection.depths, projection.radii, opacities))
