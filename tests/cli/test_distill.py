@@ -33,6 +33,7 @@ def test_an_interrupted_distillation_goes_on(source, capsys, monkeypatch):
         if i == 3:
             os.kill(os.getpid(), signal.SIGINT)
 
+    monkeypatch.setattr("sundae_ns.plugin.distill.CAMERAS", 8)
     monkeypatch.setattr(Distillation, "_train_step", interrupted)
     assert run(*words) == 130
     assert "saved step 4 of 6" in capsys.readouterr().err

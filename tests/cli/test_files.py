@@ -145,6 +145,7 @@ def test_prune_does_not_change_kept_rows(tmp_path, options, capsys, caplog):
 def test_every_command_reads_files_of_other_programs(tmp_path, monkeypatch, caplog, name):
     """In folders that do not exist yet."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sundae_ns.plugin.distill.CAMERAS", 8)
     truth = KSPLAT if name == "a.ksplat" else small_field()
     FOREIGN[name](Path(name), truth)
     colors = read_gaussian_file(Path(name))[0].gaussians["features_dc"]

@@ -1,5 +1,6 @@
 """The ``sundae`` command itself: help, exit codes, names that are no text, warnings of libraries."""
 
+import io
 import os
 import subprocess
 import sys
@@ -63,16 +64,18 @@ def test_torch_is_not_loaded_before_a_command_starts():
 
 def test_the_installed_command_takes_any_name_and_no_warning_for_an_error(tmp_path):
     """Names of files may hold bytes that are no text."""
-    sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), tmp_path / "a.glb")
     environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"}
-
-    def started(*words):
-        done = subprocess.run([SUNDAE, *words], cwd=tmp_path, env=environment, capture_output=True, check=False)
-        return done.returncode, done.stdout, done.stderr
-
-    code, out, errors = started("export", "a.glb", "-o", b"\xff.html")
-    assert (code, errors) == (0, b"")
-    assert out.startswith(b"\\udcff.html: ")
-    assert (tmp_path / os.fsdecode(b"\xff.html")).stat().st_size > 1000
+    words = [SUNDAE, "pack", b"\xff.ply", "-o", "b.sundae"]
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, check=False)
     refused = b"sundae: \\udcff.ply cannot be read (No such file or directory); check the path\n"
-    assert started("pack", b"\xff.ply", "-o", "b.sundae") == (2, b"", refused)
+    assert (done.returncode, done.stdout, done.stderr) == (2, b"", refused)
+
+
+def test_a_file_of_any_name_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), tmp_path / "a.glb")
+    name = os.fsdecode(b"\xff.html")
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), "utf-8", errors="backslashreplace"))
+    assert run("export", "a.glb", "-o", name) == 0
+    assert sys.stdout.buffer.getvalue().startswith(b"\\udcff.html: ")
+    assert Path(name).stat().st_size > 1000

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -32,7 +31,7 @@ def here(tmp_path, monkeypatch):
 @pytest.fixture
 def refused(capsys):
     """Run a command that fails; returns its error, one line."""
-    return partial(refusal, capsys)
+    return lambda *words: refusal(capsys, *words)
 
 
 @pytest.mark.parametrize("link", [None, os.symlink, os.link])
@@ -146,25 +145,23 @@ def test_a_full_disk_is_one_line(here, full, refused):
         assert not out.exists()
 
 
-def test_a_full_disk_behind_stdout_is_one_line(here):
-    with open("/dev/full", "w") as nowhere:
-        command = [Path(sys.executable).parent / "sundae", "export", "a.sundae", "-o", "out.ply"]
-        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-        result = subprocess.run(
-            command, stdout=nowhere, stderr=subprocess.PIPE, text=True, check=False, env=environment
-        )
-    assert "Traceback" not in result.stderr
-    assert "disk is full" in result.stderr
+def installed(unbuffered, **options):
+    """The installed command that prints its help, in a process."""
+    words = [Path(sys.executable).parent / "sundae", "help"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    return subprocess.Popen(words, stderr=subprocess.PIPE, env=environment, **options)
+
+
+def test_a_full_disk_behind_stdout_is_one_line():
+    with open("/dev/full", "w") as nowhere, installed("1", stdout=nowhere) as process:
+        (line,) = process.stderr.read().splitlines()
+    assert b"disk is full" in line
+    assert process.returncode == 2
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_reader_of_stdout_that_has_left_is_no_error(here, unbuffered):
-    command = [Path(sys.executable).parent / "sundae", "export", "a.sundae", "-o", "left.ply"]
-    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
+def test_a_reader_of_stdout_that_has_left_is_no_error(unbuffered):
+    with installed(unbuffered, stdout=subprocess.PIPE) as process:
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 141
-    assert (here / "left.ply").is_file()

@@ -135,7 +135,7 @@ def test_prune_refits_after_merges_by_pairs_alone(monkeypatch):
 def ball():
     """Points on a sphere, coloured smoothly."""
     torch.manual_seed(0)
-    points = torch.nn.functional.normalize(torch.randn(2000, 3), dim=1)
+    points = torch.nn.functional.normalize(torch.randn(1000, 3), dim=1)
     scene = sn.Scene.from_points(points, (points + 1) / 2)
     scene.gaussians["opacities"][:] = 3.0
     return scene
@@ -145,14 +145,14 @@ def ball():
 def cameras():
     turns = torch.arange(16) * 0.4
     eyes = torch.stack([2.5 * turns.cos(), 2.5 * turns.sin(), 0.1 * turns], dim=1)
-    return [sn.Camera.look_at(eye, (0, 0, 0), width=48, height=48) for eye in eyes]
+    return [sn.Camera.look_at(eye, (0, 0, 0), width=36, height=36) for eye in eyes]
 
 
 @pytest.mark.parametrize("drop", [1.0, 6.0])
 def test_the_count_meets_the_tolerated_loss(drop, ball, cameras):
     kept, curve = count_for_drop(ball, drop, cameras, sn.PruneRule())
     counts = [count for count, _ in curve]
-    assert counts == [2000 // 2 ** (i + 1) for i in range(len(counts))]
+    assert counts == [1000 // 2 ** (i + 1) for i in range(len(counts))]
     assert counts[-1] <= kept <= 2 * counts[-1] + 1
     held_out = cameras[::8]
     shown = [camera for i, camera in enumerate(cameras) if i % 8]
