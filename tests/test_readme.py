@@ -1,5 +1,6 @@
-"""README and docs: links resolve, and commands and their options exist."""
+"""README and docs: links resolve, and commands, their options, and functions of equations exist."""
 
+import pkgutil
 import re
 import shlex
 from pathlib import Path
@@ -56,3 +57,39 @@ def test_scripts_and_targets_exist():
     targets = {words[1] for words in commands_of("make")}
     assert {"demo", "test"} <= targets
     assert [target for target in targets if not re.search(rf"^{target}:", makefile, re.MULTILINE)] == []
+
+
+# ------------------------------------------------------------------------------------------------------- docs/method.md
+
+METHOD = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+NAME = re.compile(r"`(sundae_ns(?:\.\w+)+)`")
+EQUATION = re.compile(r"```math\n(.*?)```\n", re.DOTALL)
+
+
+def function_of(name):
+    """What a dotted name stands for; modules come before things of the same name in their package."""
+    module, _, rest = name.rpartition(".")
+    try:
+        return pkgutil.resolve_name(f"{module}:{rest}")
+    except ModuleNotFoundError:  # a method of a class
+        module, _, owner = module.rpartition(".")
+        return pkgutil.resolve_name(f"{module}:{owner}.{rest}")
+
+
+@pytest.mark.parametrize("name", sorted(set(NAME.findall(METHOD))))
+def test_every_function_of_the_method_exists(name):
+    assert callable(function_of(name))
+
+
+def test_every_equation_has_its_function_and_is_rendered_by_github():
+    pieces = EQUATION.split(METHOD)
+    equations, texts = pieces[1::2], pieces[2::2]
+    assert len(equations) > 15
+    for equation, text in zip(equations, texts, strict=True):
+        assert NAME.search(re.split(r"^#", text, maxsplit=1, flags=re.MULTILINE)[0]), equation
+        for one, other in (("{", "}"), ("\\left", "\\right"), ("\\begin", "\\end")):
+            assert equation.count(one) == equation.count(other), equation
+    # GitHub takes ```math blocks and single dollars; other ways stay as they are typed.
+    assert "$$" not in METHOD
+    assert "\\[" not in METHOD
+    assert METHOD.count("```math") == len(equations) == METHOD.count("```") / 2

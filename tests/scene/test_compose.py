@@ -1,13 +1,8 @@
 """Rows of a scene, scenes of arrays, scenes in other coordinates, and several scenes as one."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import subprocess
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,27 +21,27 @@ SCALE = 2.5
 PROGRAM = shutil.which("splat-transform")
 
 
-def scene(degree: int = 4, **values: Any) -> sn.Scene:
+def scene(degree=4, **values):
     gaussians = random_field(200, degree=degree, features=0)
     gaussians["scales"] += 2
     return sn.Scene(Gaussians(gaussians), **values)
 
 
-def moved(whole: sn.Scene) -> sn.Scene:
+def moved(whole):
     return sn.transform(whole, TURN, SCALE, SHIFT)
 
 
-def headed(tmp_path: Path) -> sn.Scene:
+def headed(tmp_path):
     return sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
 
 
-def survey(east: float, **values: Any) -> sn.Scene:
+def survey(east, **values):
     frame = {"transform": [[1.0, 0, 0, -east], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 1.0}
     return scene(meta={"frame": frame}, **values)
 
 
 @pytest.mark.parametrize("form", [torch.Tensor.bool, np.asarray, torch.Tensor.tolist], ids=["torch", "numpy", "list"])
-def test_rows_of_a_scene(form: Callable[[torch.Tensor], Any]) -> None:
+def test_rows_of_a_scene(form):
     whole = scene(up=(0.0, 0.0, 1.0))
     mask = whole.opacities > 0.5
     for rows in (form(mask), mask.nonzero()[:, 0], mask.nonzero()[:, 0].numpy()):
@@ -57,7 +52,7 @@ def test_rows_of_a_scene(form: Callable[[torch.Tensor], Any]) -> None:
     assert torch.equal(whole[[-1, 5]].means, whole.means[[199, 5]])
 
 
-def test_properties_and_arrays_are_counterparts() -> None:
+def test_properties_and_arrays_are_counterparts():
     whole = scene(degree=1)
     harmonics = torch.cat([whole.gaussians["features_dc"][:, None], whole.gaussians["features_rest"]], dim=1)
     given = (whole.means, whole.scales, whole.quats, whole.opacities)
@@ -72,7 +67,7 @@ def test_properties_and_arrays_are_counterparts() -> None:
     torch.testing.assert_close(logits.colors, logits.gaussians["features_dc"].sigmoid())
 
 
-def test_moved_cameras_see_the_same_image(tmp_path: Path) -> None:
+def test_moved_cameras_see_the_same_image(tmp_path):
     """Harmonics of degree 4, the head, and thin Gaussians with their blur in pixels too."""
     cameras = tuple(sn.virtual_cameras(scene(), 3, size=48))
     for whole in (scene(cameras=cameras, start=cameras[1], up=(0.0, 1.0, 0.0)), headed(tmp_path)):
@@ -92,7 +87,7 @@ def test_moved_cameras_see_the_same_image(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(PROGRAM is None, reason="npm install -g @playcanvas/splat-transform")
-def test_splat_transform_moves_alike(tmp_path: Path) -> None:
+def test_splat_transform_moves_alike(tmp_path):
     """It turns in PlayCanvas's axes, whose x and y are those of a .ply reversed. Measured: 6e-8."""
     whole, reversed_ = scene(degree=3), np.diag([-1.0, -1.0, 1.0])
     sn.save(whole, tmp_path / "a.ply")
@@ -106,12 +101,12 @@ def test_splat_transform_moves_alike(tmp_path: Path) -> None:
         torch.testing.assert_close(found.gaussians[name], after.gaussians[name], atol=1e-4, rtol=0)
 
 
-def test_cameras_of_a_capture_follow_a_run() -> None:
+def test_cameras_of_a_capture_follow_a_run():
     frame = {"transform": [[0.0, 1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7]], "scale": 0.5}
     run = scene(in_model_frame=True, meta={"frame": frame})
     points = torch.rand(9, 3, dtype=torch.float64)
 
-    def to_scene(frame: dict[str, Any]) -> torch.Tensor:
+    def to_scene(frame):
         rows = torch.tensor(frame["transform"], dtype=torch.float64)
         return frame["scale"] * (points @ rows[:, :3].T + rows[:, 3])
 
@@ -122,7 +117,7 @@ def test_cameras_of_a_capture_follow_a_run() -> None:
     assert after.offset is None
 
 
-def test_survey_coordinates_are_moved_and_merged_in_the_file(tmp_path: Path) -> None:
+def test_survey_coordinates_are_moved_and_merged_in_the_file(tmp_path):
     here, there = survey(4e6), survey(4e6 + 64)
     assert here.offset == (4e6, 0, 0)
     after = moved(here)
@@ -137,7 +132,7 @@ def test_survey_coordinates_are_moved_and_merged_in_the_file(tmp_path: Path) -> 
     assert sn.load(tmp_path / "a.ply").offset == (4e6, 0, 0)
 
 
-def test_a_merge_is_both_scenes() -> None:
+def test_a_merge_is_both_scenes():
     camera = sn.Camera.look_at((0, -30, 0), (0, 0, 0), width=64, height=32)
     red = scene(0, cameras=(camera,), background_color="white")
     blue = sn.transform(scene(2), translation=(6, 0, 0))
@@ -151,7 +146,7 @@ def test_a_merge_is_both_scenes() -> None:
     assert sn.merge([logits, logits]).gaussians.encoding == "logits"
 
 
-def test_a_head_goes_with_its_features(tmp_path: Path) -> None:
+def test_a_head_goes_with_its_features(tmp_path):
     whole = headed(tmp_path)
     parts = sn.merge([whole[::2], whole[1::2].to("cpu")])
     camera = whole.cameras[0]

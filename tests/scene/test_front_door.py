@@ -1,7 +1,5 @@
 """``import sundae_ns``: its names, its doctests, the lines of README, and that none of it needs nerfstudio."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import inspect
@@ -9,7 +7,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -46,7 +43,7 @@ assert not any(name.split(".")[0] == "nerfstudio" and module for name, module in
 """
 
 
-def five_lines(text: str) -> str:
+def five_lines(text):
     """The Python of the page's first block that imports the library."""
     blocks = re.findall(r"(?:^    .*\n|^\n)+", text, re.MULTILINE)
     block = next(block for block in blocks if "import sundae_ns as sn" in block)
@@ -54,7 +51,7 @@ def five_lines(text: str) -> str:
 
 
 @pytest.fixture
-def garden(tmp_path: Path) -> Path:
+def garden(tmp_path):
     gaussians = random_field(200, features=0)
     gaussians["scales"] += 2
     write_ply(tmp_path / "garden.ply", gaussians)
@@ -65,7 +62,7 @@ def garden(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_lines_of_the_pages_run_without_nerfstudio(garden: Path) -> None:
+def test_the_lines_of_the_pages_run_without_nerfstudio(garden):
     programs = [five_lines((ROOT / page).read_text()) for page in ("README.md", "sundae_ns/__init__.py")]
     for program in programs:
         for name in ("load", "prune", "render", "save"):
@@ -81,7 +78,7 @@ def test_the_lines_of_the_pages_run_without_nerfstudio(garden: Path) -> None:
     assert [sn.load(garden / f"small-{number}.sundae").num_gaussians for number in range(2)] == [20, 20]
 
 
-def test_every_public_name_is_there_and_documented() -> None:
+def test_every_public_name_is_there_and_documented():
     for name in sn.__all__:
         value = getattr(sn, name)
         assert inspect.getdoc(value), name
@@ -91,22 +88,22 @@ def test_every_public_name_is_there_and_documented() -> None:
 
 
 @pytest.mark.usefixtures("short_prunes")
-def test_the_lines_of_the_page_of_the_library_run(garden: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_lines_of_the_page_of_the_library_run(garden, monkeypatch):
     monkeypatch.chdir(garden)
-    names: dict[str, Any] = {}
+    names = {}
     for block in re.findall(r"(?:^    .*\n|^\n)+", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE):
         exec("\n".join(line[4:] for line in block.splitlines()), names)
     assert len(names["both"]) == 2 * len(names["near"]) < 2000
     assert "@@" not in Path("mine.html").read_text()
 
 
-def test_names_are_imported_on_first_use() -> None:
+def test_names_are_imported_on_first_use():
     code = "import sys, sundae_ns; sundae_ns.__version__; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.parametrize("name", [*FUNCTIONS, "Scene", "Camera"])
-def test_doctests(name: str) -> None:
+def test_doctests(name):
     """Each public function has an example, and all examples run."""
     module = importlib.import_module(getattr(sn, name).__module__)
     finder = doctest.DocTestFinder(recurse=True)
@@ -115,5 +112,5 @@ def test_doctests(name: str) -> None:
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
     for test in found:
         torch.manual_seed(0)
-        report: list[str] = []
+        report = []
         assert runner.run(test, out=report.append).failed == 0, "".join(report)

@@ -1,12 +1,7 @@
 """What callers give: lists, arrays, images and paths for tensors, and what is refused in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,31 +21,31 @@ CAMERA = sn.Camera.look_at((2, 2, 2), (0.5, 0.5, 0.5), width=24, height=20)
 EYE = np.eye(4)
 
 
-def image() -> np.ndarray:
+def image():
     return (255 * sn.render(SCENE, CAMERA).rgb.numpy()).round().astype(np.uint8)
 
 
-def scene(**values: Any) -> sn.Scene:
-    return sn.Scene({**random_field(9, degree=1), **values})  # type: ignore[arg-type]
+def scene(**values):
+    return sn.Scene({**random_field(9, degree=1), **values})
 
 
-def arrays(**values: Any) -> sn.Scene:
+def arrays(**values):
     given = {"means": POINTS, "scales": POINTS, "quats": EYE[[0] * 100], "opacities": POINTS[:, 0], "colors": POINTS}
     return sn.Scene.from_arrays(**{**given, **values})
 
 
-def survey(offset: tuple[float, float, float]) -> sn.Scene:
+def survey(offset):
     """A scene as opened from a file of survey coordinates."""
     rows = [[*(float(i == j) for j in range(3)), -value] for i, value in enumerate(offset)]
     return dataclasses.replace(SCENE, meta={"frame": {"transform": rows, "scale": 1.0}})
 
 
-def look_at(*points: Any, **options: Any) -> sn.Camera:
+def look_at(*points, **options):
     return sn.Camera.look_at(*points, **options)
 
 
 @pytest.mark.parametrize("scale", ["as they are", "uint8", "uint16", ">f4", "reversed", "list", "tensor"])
-def test_points_and_colours_of_every_type(scale: str) -> None:
+def test_points_and_colours_of_every_type(scale):
     points, colors = POINTS, POINTS
     match scale:
         case "uint8" | "uint16":
@@ -62,14 +57,14 @@ def test_points_and_colours_of_every_type(scale: str) -> None:
         case "list":
             points = colors = POINTS.tolist()
         case "tensor":
-            points = colors = torch.from_numpy(POINTS)  # type: ignore[assignment]
+            points = colors = torch.from_numpy(POINTS)
     found = sn.Scene.from_points(points, colors)
     torch.testing.assert_close(found.gaussians["means"], SCENE.gaussians["means"])
     error = (found.gaussians["features_dc"] - SCENE.gaussians["features_dc"]).abs().max()
     assert error < (0.5 / 255 / 0.28 + 1e-5 if scale == "uint8" else 1e-4)
 
 
-def test_images_of_every_type(tmp_path: Path) -> None:
+def test_images_of_every_type(tmp_path):
     stored = image()
     Image.fromarray(stored).save(tmp_path / "a.png")
     expected = sn.measure(SCENE, [torch.from_numpy(stored / np.float32(255))], [CAMERA])
@@ -83,16 +78,16 @@ def test_images_of_every_type(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("short_prunes")
-def test_cameras_and_numbers_of_every_type() -> None:
+def test_cameras_and_numbers_of_every_type():
     pose = CAMERA.pose
     for given in (pose, pose.double(), pose.numpy(), pose.tolist()):
-        camera = sn.Camera.from_pose(given, np.array([20, 20, 12, 10]), np.int32(24), 20.0)  # type: ignore[arg-type]
+        camera = sn.Camera.from_pose(given, np.array([20, 20, 12, 10]), np.int32(24), 20.0)
         torch.testing.assert_close(camera.viewmat, CAMERA.viewmat)
         assert (camera.width, camera.height) == (24, 20)
-    assert sn.prune(SCENE, count=np.int64(50), cameras=CAMERA).num_gaussians == 50  # type: ignore[arg-type]
+    assert sn.prune(SCENE, count=np.int64(50), cameras=CAMERA).num_gaussians == 50
     assert sn.crop(SCENE, np.zeros(3), torch.ones(3)).num_gaussians == 100
     arrays = {name: value.double().numpy() for name, value in SCENE.gaussians.items()}
-    made = sn.Scene(arrays, cameras=[CAMERA], up=np.array([0, -2.0, 0]))  # type: ignore[arg-type]
+    made = sn.Scene(arrays, cameras=[CAMERA], up=np.array([0, -2.0, 0]))
     assert torch.equal(sn.render(made, CAMERA).rgb, sn.render(SCENE, CAMERA).rgb)
     assert (made.cameras, made.up) == ((CAMERA,), (0, -1, 0))
     assert dataclasses.replace(made, antialiased=True).gaussians is made.gaussians
@@ -100,7 +95,7 @@ def test_cameras_and_numbers_of_every_type() -> None:
     assert opaque.num_gaussians == 9
 
 
-REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
+REFUSED = {
     "colours to 255": (lambda: sn.Scene.from_points(POINTS, 255 * POINTS), r"colors has values from .* give uint8"),
     "words": (lambda: sn.Scene.from_points([["a"] * 3], POINTS), "points has values of type str"),
     "ragged": (lambda: sn.Scene.from_points([[1, 2], [3]], POINTS), "points is no array"),
@@ -110,7 +105,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "NaN colours": (lambda: sn.Scene.from_points(POINTS, POINTS * np.nan), "colors has values from nan"),
     "a survey": (lambda: sn.Scene.from_points(POINTS + 5e6, POINTS), "points is too far from zero"),
     "degree": (lambda: sn.Scene.from_points(POINTS, POINTS, sh_degree=5), "sh_degree is 5"),
-    "no mapping": (lambda: sn.Scene([POINTS]), "Gaussians map means"),  # type: ignore[arg-type]
+    "no mapping": (lambda: sn.Scene([POINTS]), "Gaussians map means"),
     "names": (lambda: scene(opacity=1), "missing or unknown: opacity"),
     "rows": (lambda: scene(opacities=torch.zeros(9)), r"opacities has shape \[9\]; it must be \[9, 1\]"),
     "rank": (lambda: scene(features_rest=torch.zeros(9, 7, 3)), "features_rest has shape"),
@@ -119,7 +114,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "NaN": (lambda: scene(means=torch.tensor([[torch.nan] * 3, *8 * [[0.0] * 3]])), "1 of 9 Gaussians are NaN"),
     "infinite": (lambda: scene(scales=torch.full((9, 3), torch.inf)), "9 of 9 Gaussians"),
     "devices": (lambda: scene(means=torch.zeros(9, 3, device="meta")), "are on cpu and meta"),
-    "nothing": (lambda: sn.Scene({n: v[:0] for n, v in random_field(9).items()}), "no Gaussians"),  # type: ignore[arg-type]
+    "nothing": (lambda: sn.Scene({n: v[:0] for n, v in random_field(9).items()}), "no Gaussians"),
     "head": (lambda: dataclasses.replace(SCENE, head=CompensationHead(HeadConfig(size="tiny"))), "the head reads"),
     "background": (lambda: dataclasses.replace(SCENE, background_color="grey"), "the background is 'grey'"),
     "up": (lambda: dataclasses.replace(SCENE, up=(0, 0, 0)), "no direction"),
@@ -135,39 +130,39 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "fov": (lambda: look_at((0, 0, 1), (0, 0, 0), fov=180), "fov is 180"),
     "scaled pose": (lambda: sn.Camera.from_pose(2 * EYE, (1, 1, 1, 1), 2, 2), "not a rotation"),
     "focal": (lambda: sn.Camera.from_pose(EYE, (0, 1, 1, 1), 2, 2), "focal lengths are 0 and 1"),
-    "a matrix": (lambda: sn.render(SCENE, EYE), "is no camera"),  # type: ignore[arg-type]
+    "a matrix": (lambda: sn.render(SCENE, EYE), "is no camera"),
     "NaN matrix": (lambda: sn.render(SCENE, CAMERA._replace(K=CAMERA.K * np.nan)), "no finite tensors"),
     "array": (lambda: sn.render(SCENE, CAMERA._replace(K=np.eye(3))), "no finite tensors"),
-    "path": (lambda: sn.prune(SCENE, keep=0.5, cameras="a.json"), "'a.json' is no camera"),  # type: ignore[arg-type]
-    "share": (lambda: sn.prune(SCENE, keep="0.1"), "keep is not made of 1 finite number"),  # type: ignore[arg-type]
+    "path": (lambda: sn.prune(SCENE, keep=0.5, cameras="a.json"), "'a.json' is no camera"),
+    "share": (lambda: sn.prune(SCENE, keep="0.1"), "keep is not made of 1 finite number"),
     "neither": (lambda: sn.prune(SCENE), "either keep .* or count"),
     "both": (lambda: sn.prune(SCENE, keep=0.5, count=5), "either keep .* or count"),
     "none": (lambda: sn.prune(SCENE, keep=0.0), "keep is 0.0"),
     "150%": (lambda: sn.prune(SCENE, keep=1.5), "keep is 1.5"),
     "no view": (lambda: sn.measure(SCENE, SCENE), "no view to measure in"),
-    "height": (lambda: sn.show(SCENE, height="400"), "height is '400'"),  # type: ignore[arg-type]
-    "half": (lambda: sn.prune(SCENE, count=0.5), "count is 0.5"),  # type: ignore[arg-type]
-    "rule": (lambda: sn.prune(SCENE, keep=0.5, rule="pairs"), "the rule is 'pairs'"),  # type: ignore[arg-type]
-    "2.5 views": (lambda: sn.virtual_cameras(SCENE, 2.5), "n is 2.5"),  # type: ignore[arg-type]
+    "height": (lambda: sn.show(SCENE, height="400"), "height is '400'"),
+    "half": (lambda: sn.prune(SCENE, count=0.5), "count is 0.5"),
+    "rule": (lambda: sn.prune(SCENE, keep=0.5, rule="pairs"), "the rule is 'pairs'"),
+    "2.5 views": (lambda: sn.virtual_cameras(SCENE, 2.5), "n is 2.5"),
     "no views": (lambda: sn.virtual_cameras(SCENE, 0), "n is 0"),
-    "seed": (lambda: sn.virtual_cameras(SCENE, 1, seed="a"), "seed is 'a'"),  # type: ignore[arg-type]
+    "seed": (lambda: sn.virtual_cameras(SCENE, 1, seed="a"), "seed is 'a'"),
     "images to 255": (lambda: sn.measure(SCENE, [255.0 * POINTS], [CAMERA]), "image 0 has values from"),
     "NaN image": (lambda: sn.measure(SCENE, [image() * np.nan], [CAMERA]), "image 0 has values from nan"),
     "CHW": (lambda: sn.measure(SCENE, [image().transpose(2, 0, 1)], [CAMERA]), r"\[20, 24, 3\] and \[3, 20, 24\]"),
     "grey": (lambda: sn.measure(SCENE, [image()[..., 0]], [CAMERA]), r"\[20, 24, 3\] and \[20, 24\]"),
-    "no image": (lambda: sn.measure(SCENE, 5, [CAMERA]), "image 0 has values from 5 to 5"),  # type: ignore[arg-type]
+    "no image": (lambda: sn.measure(SCENE, 5, [CAMERA]), "image 0 has values from 5 to 5"),
     "gone": (lambda: sn.measure(SCENE, ["gone.png"], [CAMERA]), "gone.png"),
     "few": (lambda: sn.measure(SCENE, [image()] * 2, [CAMERA]), "2 images do not fit 1 views"),
     "mask": (lambda: SCENE[np.ones(99, bool)], r"rows are bool \[99\]; give a slice, a mask, bool \[100\]"),
     "bytes as rows": (lambda: SCENE[np.ones(100, np.uint8)], "rows are uint8"),
-    "one row": (lambda: SCENE[3], r"rows are int64 \[\]"),  # type: ignore[index]
+    "one row": (lambda: SCENE[3], r"rows are int64 \[\]"),
     "beyond": (lambda: SCENE[[0, 100]], "from 0 to 99"),
     "no rows": (lambda: SCENE[5:5], r"rows are int64 \[0\]"),
     "logits": (lambda: arrays(opacities=np.full(100, 2.0)), "give neither logarithms nor logits"),
     "logarithms": (lambda: arrays(scales=np.log(POINTS)), "give neither logarithms nor logits"),
     "channels": (lambda: arrays(colors=POINTS[:, 0]), r"colors has shape \[100\]; it must be"),
     "no scenes": (lambda: sn.merge([]), "merge found no scenes"),
-    "paths": (lambda: sn.merge(["a.ply"]), "merge found no scenes"),  # type: ignore[list-item]
+    "paths": (lambda: sn.merge(["a.ply"]), "merge found no scenes"),
     "kinds": (lambda: sn.merge([SCENE, dataclasses.replace(SCENE, antialiased=True)]), "train or export all alike"),
     "surveys": (lambda: sn.merge([SCENE, survey((5, 0, 0))]), "some scenes have survey coordinates"),
     "mirror": (lambda: sn.transform(SCENE, np.diag([1, 1, -1])), "rotation is no rotation"),
@@ -178,7 +173,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_refused_in_one_line(name: str) -> None:
+def test_what_is_refused_in_one_line(name):
     call, words = REFUSED[name]
     with pytest.raises(sn.SundaeError, match=words) as caught:
         call()
@@ -186,7 +181,7 @@ def test_what_is_refused_in_one_line(name: str) -> None:
     assert ";" in str(caught.value)
 
 
-def test_the_rule_of_a_prune_is_that_of_the_command() -> None:
+def test_the_rule_of_a_prune_is_that_of_the_command():
     from sundae_ns.cli.prune import RuleOptions
 
     assert vars(sn.PruneRule()) == vars(RuleOptions())
@@ -194,13 +189,13 @@ def test_the_rule_of_a_prune_is_that_of_the_command() -> None:
     assert all(torch.equal(small.gaussians[name], value) for name, value in same.gaussians.items())
 
 
-def test_huge_cameras_score_at_a_smaller_size(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_huge_cameras_score_at_a_smaller_size(monkeypatch):
     monkeypatch.setattr(prune_scene, "MOST_PIXELS", 24 * 20)
     huge = CAMERA.zoomed(1000)
     torch.testing.assert_close(prune_scene.weights_in(SCENE, [huge]), prune_scene.weights_in(SCENE, [CAMERA]))
 
 
-def test_a_file_of_too_many_cameras_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_of_too_many_cameras_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(camera_files, "MOST_CAMERAS", 2)
     for key in ("frames", "camera_path"):
         (tmp_path / "a.json").write_text(json.dumps({key: 3 * [{}], "render_width": 9, "render_height": 9}))
