@@ -43,11 +43,6 @@ def chosen(path, scale=1.0):
     return {arm.name: arm for arm in choose_arms([str(path)], "sundae", scale)}
 
 
-def jobs_of(arms):
-    jobs = plan_scene(Path("fox"), (), list(arms.values()), keep_ratios=[0.1], seeds=[42], repeat_at=[])
-    return {job.arm: job for job in jobs}
-
-
 # ----------------------------------------------------------------------------------------------------- what a file says
 
 
@@ -58,14 +53,8 @@ def test_a_file_of_arms(tmp_path):
         "pipeline.model.pruning.keep-ratio": ("0.3",),
         "pipeline.model.head.mode": ("off",),  # a word, not YAML's False
     }
-    assert listed == Entry(
-        "listed",
-        None,
-        {
-            "pipeline.model.pruning.score": ("response",),
-            "pipeline.model.use-scale-regularization": ("True",),
-        },
-    )
+    scale = "pipeline.model.use-scale-regularization"
+    assert listed == Entry("listed", None, {"pipeline.model.pruning.score": ("response",), scale: ("True",)})
     assert (stock.method, stock.options["max-num-iterations"]) == ("splatfacto", ("1000",))
     assert steady.method == "sundae-continuous"
 
@@ -97,11 +86,10 @@ def test_files_that_are_refused(tmp_path, text, said):
 
 
 def test_a_file_that_cannot_be_read(tmp_path):
-    with pytest.raises(ConfigError, match=r"gone\.yaml cannot be read .*; give a file of arms"):
-        choose_arms([str(tmp_path / "gone.yaml")], "sundae")
     (tmp_path / "mine.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_entries(tmp_path / "mine.yaml")
+    for name in ("gone", "mine"):
+        with pytest.raises(ConfigError, match=rf"{name}\.yaml cannot be read .*; give a file of arms"):
+            choose_arms([str(tmp_path / f"{name}.yaml")], "sundae")
 
 
 # ------------------------------------------------------------------------------------------------------- what is chosen
@@ -160,37 +148,29 @@ def test_methods_and_options_are_checked_before_anything_is_trained(tmp_path, te
 
 
 def test_lengths_come_from_the_method_times_a_factor(tmp_path):
-    path = written(tmp_path, MINE)
-    lengths = {name: (arm.kind, arm.warmup, arm.steps) for name, arm in chosen(path).items()}
-    assert lengths == {
-        "gentle": ("branch", 12_000, 18_000),
-        "listed": ("branch", 12_000, 18_000),
-        "stock": ("whole", 0, 1000),
-        "steady": ("whole", 0, 30_000),
-    }
-    half = {name: (arm.warmup, arm.steps) for name, arm in chosen(path, 0.5).items()}
-    assert half == {"gentle": (6000, 9000), "listed": (6000, 9000), "stock": (0, 500), "steady": (0, 15_000)}
+    path, branch, whole = written(tmp_path, MINE), (12_000, 18_000), (0, 30_000)
+    lengths = {"gentle": branch, "listed": branch, "stock": (0, 1000), "steady": whole}
+    for scale in (1.0, 0.5):
+        found = {name: (arm.warmup, arm.steps) for name, arm in chosen(path, scale).items()}
+        assert found == {name: tuple(scale * steps for steps in length) for name, length in lengths.items()}
+    kinds = {name: arm.kind for name, arm in chosen(path).items()}
+    assert kinds == {"gentle": "branch", "listed": "branch", "stock": "whole", "steady": "whole"}
     for method, scale in (("nerfacto", 1.0), ("sundae-continuous", 1.0), ("sundae", 0.0)):
         with pytest.raises(ConfigError):
             choose_arms(["sundae"], method, scale)
 
 
-# ------------------------------------------------------------------------------------------------------ what is trained
-
-
 def test_arms_of_a_file_become_commands_of_ns_train(tmp_path):
-    jobs = jobs_of(chosen(written(tmp_path, MINE)))
+    arms = list(chosen(written(tmp_path, MINE)).values())
+    planned = plan_scene(Path("fox"), (), arms, keep_ratios=[0.1], seeds=[42], repeat_at=[])
+    jobs = {job.arm: job for job in planned}
     assert set(jobs) == {"sundae-warm-up", "gentle", "listed", "stock", "steady"}
     assert (jobs["gentle"].keep_ratio, jobs["listed"].keep_ratio, jobs["stock"].keep_ratio) == (0.3, 0.1, None)
     assert jobs["gentle"].key == "fox-gentle-30pct-s42"
     assert jobs["gentle"].needs == jobs["listed"].needs == "fox-sundae-warm-up-s42"
-
-    _, command = configure(jobs["stock"], tmp_path / "out")
-    assert (
-        command
-        == "ns-train splatfacto --data fox --machine.seed 42 --max-num-iterations 1000 --pipeline.model.sh-degree 2"
-    )
-    stock, _ = configure(jobs["stock"], tmp_path / "out")
+    stock, command = configure(jobs["stock"], tmp_path / "out")
+    options = "--data fox --machine.seed 42 --max-num-iterations 1000 --pipeline.model.sh-degree 2"
+    assert command == f"ns-train splatfacto {options}"
     assert (stock.max_num_iterations, stock.pipeline.model.sh_degree) == (1000, 2)
     steady, _ = configure(jobs["steady"], tmp_path / "out")
     pruning = steady.pipeline.model.pruning

@@ -24,23 +24,15 @@ def scene(n: int = 300, seed: int = 0) -> Scene:
     }
 
 
-def with_scales(value: float) -> Scene:
+def with_values(rows: slice, **values: float | list[float]) -> Scene:
+    """The scene with other values in some rows."""
     made = scene()
-    made["scales"][:150] = math.log(value)
+    for name, value in values.items():
+        made[name][rows] = torch.tensor(value)
     return made
 
 
-def needles() -> Scene:
-    """One axis a hundred billion times as long as the others."""
-    made = scene()
-    made["scales"][:150] = torch.log(torch.tensor([1e3, 1e-8, 1e-8]))
-    return made
-
-
-def with_opacities(logit: float) -> Scene:
-    made = scene()
-    made["opacities"][:150] = logit
-    return made
+HALF, ALL = slice(150), slice(None)
 
 
 def around_the_near_plane() -> Scene:
@@ -54,29 +46,11 @@ def around_the_near_plane() -> Scene:
     return made
 
 
-def without_rotations() -> Scene:
-    made = scene()
-    made["quats"][:150] = 0.0
-    return made
-
-
-def on_one_pixel() -> Scene:
+def on_one_pixel(logit: float | None = None) -> Scene:
     made = scene(10_000)
     made["means"][:, :2] *= 1e-3
     made["scales"] -= 1.0
-    return made
-
-
-def opaque_on_one_pixel() -> Scene:
-    made = on_one_pixel()
-    made["opacities"][:] = 30.0
-    return made
-
-
-def with_all(name: str, value: float) -> Scene:
-    made = scene()
-    made[name].fill_(value)
-    return made
+    return made if logit is None else {**made, "opacities": torch.full((10_000,), logit)}
 
 
 def huge_at_the_near_plane() -> Scene:
@@ -90,21 +64,26 @@ def huge_at_the_near_plane() -> Scene:
 # and 9.3e-6, except where noted.
 CASES: dict[str, tuple[Callable[[], Scene], int, float, float]] = {
     "ordinary": (scene, 48, 5e-6, 2e-5),
-    "scales of 1e-8": (lambda: with_scales(1e-8), 48, 5e-6, 2e-5),
-    "scales of 1e3": (lambda: with_scales(1e3), 48, 5e-6, 2e-5),
-    "needles of 1e3 and 1e-8": (needles, 48, 5e-5, 1e-3),  # measured 6.5e-6 and 1.6e-4
-    "logits of 30": (lambda: with_opacities(30.0), 48, 5e-6, 2e-5),
-    "logits of -30": (lambda: with_opacities(-30.0), 48, 5e-6, 2e-5),
+    "scales of 1e-8": (lambda: with_values(HALF, scales=math.log(1e-8)), 48, 5e-6, 2e-5),
+    "scales of 1e3": (lambda: with_values(HALF, scales=math.log(1e3)), 48, 5e-6, 2e-5),
+    "needles of 1e3 and 1e-8": (
+        lambda: with_values(HALF, scales=[math.log(1e3), *2 * [math.log(1e-8)]]),
+        48,
+        5e-5,
+        1e-3,
+    ),  # measured 6.5e-6 and 1.6e-4
+    "logits of 30": (lambda: with_values(HALF, opacities=30.0), 48, 5e-6, 2e-5),
+    "logits of -30": (lambda: with_values(HALF, opacities=-30.0), 48, 5e-6, 2e-5),
     "on and behind the near plane": (around_the_near_plane, 48, 5e-6, 2e-5),
-    "all behind the camera": (lambda: with_all("means", -10.0), 48, 0.0, 0.0),
-    "all at the camera": (lambda: with_all("means", 0.0), 48, 0.0, 0.0),
-    "all beside the image": (lambda: with_all("means", 1e6), 48, 0.0, 0.0),
-    "transparent": (lambda: with_all("opacities", -200.0), 48, 0.0, 0.0),
-    "vanishing": (lambda: with_all("scales", -70.0), 20, 5e-6, 1e-4),  # squares underflow
+    "all behind the camera": (lambda: with_values(ALL, means=-10.0), 48, 0.0, 0.0),
+    "all at the camera": (lambda: with_values(ALL, means=0.0), 48, 0.0, 0.0),
+    "all beside the image": (lambda: with_values(ALL, means=1e6), 48, 0.0, 0.0),
+    "transparent": (lambda: with_values(ALL, opacities=-200.0), 48, 0.0, 0.0),
+    "vanishing": (lambda: with_values(ALL, scales=-70.0), 20, 5e-6, 1e-4),  # squares underflow
     "huge at the near plane": (huge_at_the_near_plane, 20, 5e-5, 1e-3),
     "none": (lambda: scene(0), 20, 0.0, 0.0),
-    "quaternions of zeros": (without_rotations, 48, 5e-6, 2e-5),
+    "quaternions of zeros": (lambda: with_values(HALF, quats=0.0), 48, 5e-6, 2e-5),
     "an image of one pixel": (scene, 1, 5e-6, 1e-4),  # measured 9.9e-7 and 2.0e-5
     "10,000 on one pixel": (on_one_pixel, 16, 5e-6, 2e-5),
-    "10,000 opaque on one pixel": (opaque_on_one_pixel, 16, 5e-6, 2e-5),
+    "10,000 opaque on one pixel": (lambda: on_one_pixel(30.0), 16, 5e-6, 2e-5),
 }
