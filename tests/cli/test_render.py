@@ -11,35 +11,18 @@ import pytest
 import torch
 from PIL import Image
 
-import sundae_ns
+import sundae_ns as sn
 
-VIEWS = [
-    sundae_ns.Camera.look_at((0.5 + dx, -2.0, 0.5), (0.5, 0.5, 0.5), fov=60.0, width=41, height=31) for dx in (0.0, 0.8)
-]
+VIEWS = [sn.Camera.look_at((x, -2.0, 0.5), (0.5, 0.5, 0.5), fov=60.0, width=41, height=31) for x in (0.5, 1.3)]
+POSE = [*VIEWS[0].pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
 
 
 def run(*arguments):
     return command_line.run("render", *arguments)
 
 
-def capture_file(path, count):
-    """A ``transforms.json`` with cameras that look along y."""
-    pose = torch.eye(4)
-    pose[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    frames = []
-    for index in range(count):
-        pose[:3, 3] = torch.tensor([0.5 + 0.1 * index, -2.0, 0.5])
-        frames.append({"transform_matrix": pose.tolist()})
-    intrinsics = {"fl_x": 40.0, "fl_y": 40.0, "cx": 20.0, "cy": 15.0, "w": 40, "h": 30}
-    path.write_text(json.dumps({**intrinsics, "frames": frames}))
-    return path
-
-
-def camera_path(path, count, **options):
-    """A camera path of nerfstudio's viewer."""
-    pose = [1.0, 0, 0, 0.5, 0, 0, -1.0, -2.0, 0, 1.0, 0, 0.5, 0, 0, 0, 1.0]
-    cameras = [{"camera_to_world": pose, "fov": 60}] * count
-    path.write_text(json.dumps({"render_width": 41, "render_height": 31, "camera_path": cameras, **options}))
+def write_json(path, **content):
+    path.write_text(json.dumps(content))
     return path
 
 
@@ -58,10 +41,9 @@ def folder(tmp_path_factory):
     """A scene without views as ``.ply``, and with two of odd sides as ``.sundae``."""
     folder = tmp_path_factory.mktemp("scenes")
     generator = torch.Generator().manual_seed(0)
-    points, colors = torch.rand(100, 3, generator=generator), torch.rand(100, 3, generator=generator)
-    scene = sundae_ns.Scene.from_points(points, colors)
-    sundae_ns.save(dataclasses.replace(scene, up=(0.0, 0.0, 1.0)), folder / "cloud.ply")
-    sundae_ns.save(dataclasses.replace(scene, cameras=tuple(VIEWS)), folder / "packed.sundae")
+    scene = sn.Scene.from_points(*(torch.rand(100, 3, generator=generator) for _ in range(2)))
+    sn.save(dataclasses.replace(scene, up=(0.0, 0.0, 1.0)), folder / "cloud.ply")
+    sn.save(dataclasses.replace(scene, cameras=tuple(VIEWS)), folder / "packed.sundae")
     return folder
 
 
@@ -69,18 +51,19 @@ def folder(tmp_path_factory):
 def test_an_image_of_a_stored_view(folder, tmp_path, index):
     out = tmp_path / "a.png"
     assert run(folder / "packed.sundae", "-o", out, "--view", index) == 0
-    scene = sundae_ns.load(folder / "packed.sundae")
-    expected = (255 * sundae_ns.render(scene, scene.cameras[index]).rgb).round().byte().numpy()
+    scene = sn.load(folder / "packed.sundae")
+    expected = (255 * sn.render(scene, scene.cameras[index]).rgb).round().byte().numpy()
     assert expected.std() > 5
     assert np.array_equal(pixels(out), expected)
 
 
 def test_an_image_of_the_camera_in_a_file(folder, tmp_path, capsys):
-    camera, out = capture_file(tmp_path / "camera.json", 1), tmp_path / "a.jpg"
+    lens, out = {"fl_x": 40.0, "fl_y": 40.0, "cx": 20.0, "cy": 15.0, "w": 40, "h": 30}, tmp_path / "a.jpg"
+    camera = write_json(tmp_path / "camera.json", **lens, frames=[{"transform_matrix": POSE}])
     assert run(folder / "cloud.ply", "--camera", camera, "-o", out) == 0
     assert capsys.readouterr().out == f"{out}: 40 x 30 px\n"
-    scene = sundae_ns.load(folder / "cloud.ply")
-    expected = 255 * sundae_ns.render(scene, sundae_ns.cameras_of(camera, scene)[0]).rgb.numpy()
+    scene = sn.load(folder / "cloud.ply")
+    expected = 255 * sn.render(scene, sn.cameras_of(camera, scene)[0]).rgb.numpy()
     assert np.abs(pixels(out) - expected).mean() < 10  # of JPEG
     assert run(folder / "cloud.ply", "--camera", camera, "-o", tmp_path / "b.png", "--width", 80) == 0
     assert pixels(tmp_path / "b.png").shape == (60, 80, 3)
@@ -92,12 +75,13 @@ def test_a_scene_without_cameras_is_seen_from_the_front(folder, tmp_path):
 
 
 def test_a_video_has_a_frame_for_each_camera_and_even_sides(folder, tmp_path, capsys):
-    out = tmp_path / "a.mp4"
-    assert run(folder / "cloud.ply", "--camera", camera_path(tmp_path / "path.json", 5, fps=10), "-o", out) == 0
+    out, cameras = tmp_path / "a.mp4", [{"camera_to_world": sum(POSE, []), "fov": 60}] * 5
+    size = {"render_width": 41, "render_height": 31}
+    words = (folder / "cloud.ply", "--camera", write_json(tmp_path / "a.json", **size, camera_path=cameras, fps=10))
+    assert run(*words, "-o", out) == 0
     assert capsys.readouterr().out == f"{out}: 5 frames of 40 x 30 px, 0.5 s\n"
-    frames = frames_of(out)
-    assert [(frame.width, frame.height) for frame in frames] == [(40, 30)] * 5
-    assert run(folder / "cloud.ply", "--camera", tmp_path / "path.json", "-o", out, "--fps", 5, "--overwrite") == 0
+    assert [(frame.width, frame.height) for frame in frames_of(out)] == [(40, 30)] * 5
+    assert run(*words, "-o", out, "--fps", 5, "--overwrite") == 0
     assert capsys.readouterr().out == f"{out}: 5 frames of 40 x 30 px, 1.0 s\n"
 
 
@@ -114,9 +98,9 @@ def test_a_film_without_a_camera_path(folder, tmp_path, capsys, name):
 
 
 def test_an_image_is_that_of_the_start_view(folder, tmp_path):
-    scene = sundae_ns.load(folder / "packed.sundae")
+    scene = sn.load(folder / "packed.sundae")
     start = scene.cameras[1].zoomed(2)
-    sundae_ns.save(dataclasses.replace(scene, start=start), tmp_path / "a.sundae")
+    sn.save(dataclasses.replace(scene, start=start), tmp_path / "a.sundae")
     assert run(tmp_path / "a.sundae", "-o", tmp_path / "a.png") == 0
     assert pixels(tmp_path / "a.png").shape == (62, 82, 3)
     assert run(tmp_path / "a.sundae", "-o", tmp_path / "b.png", "--view", 0) == 0

@@ -11,9 +11,9 @@ import webbrowser
 from contextlib import contextmanager
 
 import pytest
+from command_line import run
 from packed_scenes import KINDS, write_kind
 
-from sundae_ns.cli import main
 from sundae_ns.cli import view as command
 from sundae_ns.core.errors import ConfigError
 
@@ -32,10 +32,21 @@ def served(page):
         server.shutdown()
 
 
-def until_gone(name):
-    """Wait until no thread with this in its name is left."""
+def connect(port):
+    return socket.create_connection(("127.0.0.1", port), timeout=SECONDS)
+
+
+def asked(port):
+    """A connection that has asked for the page, and has taken none of it."""
+    client = connect(port)
+    client.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
+    return client
+
+
+def until_gone():
+    """Wait until no connection is open."""
     last = time.monotonic() + SECONDS
-    while any(name in thread.name for thread in threading.enumerate()):
+    while any("process_request_thread" in thread.name for thread in threading.enumerate()):
         assert time.monotonic() < last, "the connection stays open"
         time.sleep(0.01)
 
@@ -87,37 +98,32 @@ def test_idle_connections_end(monkeypatch):
     monkeypatch.setattr(command, "IDLE_SECONDS", 0.2)
     with served("x" * (32 << 20)) as port:
         for said in (b"", b"GET / HTTP/1.1\r\nHost: local"):
-            with socket.create_connection(("127.0.0.1", port), timeout=SECONDS) as client:
+            with connect(port) as client:
                 client.sendall(said)
                 assert client.recv(1) == b""
-        # One that asks for the page and takes none of it.
-        with socket.create_connection(("127.0.0.1", port), timeout=SECONDS) as client:
-            client.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
+        with asked(port) as client:
             assert client.recv(1)
-            until_gone("process_request_thread")
+            until_gone()
 
 
 def test_a_slow_connection_gets_the_page(monkeypatch):
-    monkeypatch.setattr(command, "IDLE_SECONDS", 1.0)
+    monkeypatch.setattr(command, "IDLE_SECONDS", 0.5)
     # The kernel holds 10 MB of it; the client takes the rest in more seconds than a connection may idle.
-    with served("x" * (24 << 20)) as port, socket.create_connection(("127.0.0.1", port), timeout=SECONDS) as client:
-        client.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
+    with served("x" * (24 << 20)) as port, asked(port) as client:
         received = 0
         while part := client.recv(1 << 20, socket.MSG_WAITALL):
             received += len(part)
-            time.sleep(0.1)
+            time.sleep(0.05)
         assert received > 24 << 20
 
 
 def test_a_browser_that_leaves_causes_no_traceback(capfd):
     with served("x" * (32 << 20)) as port:
-        client = socket.create_connection(("127.0.0.1", port), timeout=SECONDS)
-        client.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
-        assert client.recv(1)
-        # Close by a reset, as a browser does whose page is left while it loads.
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        client.close()
-        until_gone("process_request_thread")
+        with asked(port) as client:
+            assert client.recv(1)
+            # Close by a reset, as a browser does whose page is left while it loads.
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        until_gone()
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -131,9 +137,7 @@ def test_view_opens_the_page(opens, tmp_path, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", serve)
-    with pytest.raises(SystemExit) as caught:
-        main(["view", str(packed), *([] if opens else ["--no-open-browser"])])
-    assert caught.value.code == 0
+    assert run("view", packed, *([] if opens else ["--no-open-browser"])) == 0
     (line,) = capsys.readouterr().out.strip().splitlines()
     assert len(opened) == opens
     assert all(address in line for address in opened)
