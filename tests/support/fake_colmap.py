@@ -74,9 +74,8 @@ class FakeColmap:
         path.write_text(json.dumps(stored))
 
     def _camera(self, kind: str) -> Any:
-        return SimpleNamespace(
-            camera_id=1, width=16, height=12, has_prior_focal_length=True, mean_focal_length=lambda: 15.0, kind=kind
-        )
+        size = {"width": 16, "height": 12, "mean_focal_length": lambda: 15.0}
+        return SimpleNamespace(camera_id=1, has_prior_focal_length=True, kind=kind, **size)
 
     @property
     def Camera(self) -> Any:  # noqa: N802
@@ -120,40 +119,33 @@ class FakeColmap:
             (out / str(number) / "all.json").write_text(json.dumps(names))
 
     def Reconstruction(self, folder: Path) -> Any:  # noqa: N802
-        placed = json.loads((folder / "images.json").read_text())
-        images = []
-        for number, name in enumerate(json.loads((folder / "all.json").read_text())):
-            matrix = np.column_stack([np.eye(3), [number, 0, 0]])
-            pose = SimpleNamespace(matrix=lambda matrix=matrix: matrix)
-            images.append(
-                SimpleNamespace(
-                    name=name,
-                    has_pose=name in placed,
-                    num_points3D=3 if name in self.blind else 99,
-                    frame_id=number,
-                    camera_id=int(name.partition("/")[0][1:]),
-                    cam_from_world=lambda pose=pose: pose,
-                )
+        placed, names = (json.loads((folder / f"{which}.json").read_text()) for which in ("images", "all"))
+
+        def image(number: int, name: str) -> Any:
+            pose = SimpleNamespace(matrix=lambda: np.column_stack([np.eye(3), [number, 0, 0]]))
+            return SimpleNamespace(
+                name=name,
+                has_pose=name in placed,
+                num_points3D=3 if name in self.blind else 99,
+                frame_id=number,
+                camera_id=int(name.partition("/")[0][1:]),
+                cam_from_world=lambda: pose,
             )
 
-        def deregister(number: int) -> None:
-            images[number].has_pose = False
+        images = {number: image(number, name) for number, name in enumerate(names)}
 
         def write(to: Path) -> None:
-            posed = [one.name for one in images if one.has_pose]
+            posed = [one.name for one in images.values() if one.has_pose]
             (to / "images.json").write_text(json.dumps(posed))
 
-        cameras = {
-            one.camera_id: SimpleNamespace(width=16, height=12, params=np.array([15.0, 15, 8, 6, 0, 0, 0, 0]))
-            for one in images
-        }
+        lens = SimpleNamespace(width=16, height=12, params=np.array([15.0, 15, 8, 6, 0, 0, 0, 0]))
         point = SimpleNamespace(xyz=np.array([1.0, 2, 3]), color=np.array([10, 20, 30]))
         return SimpleNamespace(
-            images=dict(enumerate(images)),
-            cameras=cameras,
+            images=images,
+            cameras=dict.fromkeys((one.camera_id for one in images.values()), lens),
             points3D={1: point},
             num_points3D=lambda: 1,
-            deregister_frame=deregister,
+            deregister_frame=lambda number: setattr(images[number], "has_pose", False),
             write=write,
             compute_mean_reprojection_error=lambda: 0.5,
         )

@@ -24,6 +24,7 @@ from sundae_ns.train.pruning import PruningConfig
 
 
 def _points(n: int = 60) -> tuple[Tensor, Tensor]:
+    """The sparse cloud that models start from: places ``[n, 3]`` and colours in 0 to 255 ``[n, 3]``."""
     generator = torch.Generator().manual_seed(1)
     xyz = torch.randn(n, 3, generator=generator) * 0.5
     return xyz, torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
@@ -38,20 +39,14 @@ def _build(
     metadata: dict[str, Any] | None = None,
     **options: Any,
 ) -> SundaeModel:
+    """Make a model of 60 Gaussians, or ``n``, that prunes half of them after step 3, with a tiny head."""
+    small = {"mode": "residual", "size": "tiny", "num_features": 5, "pixel_unshuffle": 1}
+    usual = {"sh_degree": 1, "sh_degree_interval": 1, "num_downscales": 0, "background_color": "random"}
     config = SundaeModelConfig(
         pruning=PruningConfig(**{"prune_at": 3, "keep_ratio": 0.5, **(pruning or {})}),
-        head=HeadConfig(
-            **{"mode": "residual", "size": "tiny", "num_features": 5, "pixel_unshuffle": 1, **(head or {})}
-        ),
+        head=HeadConfig(**{**small, **(head or {})}),
         camera_optimizer=CameraOptimizerConfig(mode="off"),
-        **{
-            "sh_degree": 1,
-            "sh_degree_interval": 1,
-            "num_downscales": 0,
-            "background_color": "random",
-            "dense_start_views": 0,
-            **options,
-        },
+        **{**usual, "dense_start_views": 0, **options},
     )
     box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
     seeds = _points(n) if isinstance(seed_points, str) else seed_points
@@ -59,6 +54,7 @@ def _build(
 
 
 def _perturb(model: SundaeModel) -> SundaeModel:
+    """Give the head an output, and move on to where it is enabled."""
     if model.head is not None:
         with torch.no_grad():
             for value in model.head.parameters():
@@ -68,6 +64,7 @@ def _perturb(model: SundaeModel) -> SundaeModel:
 
 
 def _camera(width: int = 40, height: int = 32, shift: float = 0.0) -> Cameras:
+    """Make a camera at a distance of 3 that looks at the Gaussians."""
     pose = torch.eye(4)[None, :3].clone()
     pose[0, :, 3] = torch.tensor([shift, 0.1, 3.0])
     return Cameras(pose, fx=30.0, fy=30.0, cx=width / 2, cy=height / 2, width=width, height=height)
@@ -96,6 +93,7 @@ class FakeDatamanager:
 
 
 def _batch(width: int = 40, height: int = 32, channels: int = 3) -> dict[str, Tensor]:
+    """Make what the data manager gives for that camera: an image of noise ``[height, width, channels]``, uint8."""
     generator = torch.Generator().manual_seed(2)
     return {"image": torch.randint(0, 256, (height, width, channels), generator=generator, dtype=torch.uint8)}
 
@@ -153,34 +151,12 @@ class Training:
         return True
 
 
-@pytest.fixture
-def points() -> Callable[..., tuple[Tensor, Tensor]]:
-    """The sparse cloud that :func:`build` starts from: places ``[n, 3]`` and colours in 0 to 255 ``[n, 3]``."""
-    return _points
+def _fixture_of(function: Callable[..., Any]) -> Any:
+    """A fixture of the function's name that gives the function."""
+    return pytest.fixture(name=function.__name__.removeprefix("_"))(lambda: function)
 
 
-@pytest.fixture
-def build() -> Callable[..., SundaeModel]:
-    """Make a model of 60 Gaussians, or ``n``, that prunes half of them after step 3, with a tiny head."""
-    return _build
-
-
-@pytest.fixture
-def perturb() -> Callable[[SundaeModel], SundaeModel]:
-    """Give the head an output, and move on to where it takes part."""
-    return _perturb
-
-
-@pytest.fixture
-def camera() -> Callable[..., Cameras]:
-    """Make a camera at a distance of 3 that looks at the field."""
-    return _camera
-
-
-@pytest.fixture
-def batch() -> Callable[..., dict[str, Tensor]]:
-    """Make what the data manager gives for that camera: a picture of noise ``[height, width, channels]``, uint8."""
-    return _batch
+points, build, perturb, camera, batch = map(_fixture_of, (_points, _build, _perturb, _camera, _batch))
 
 
 @pytest.fixture
