@@ -19,7 +19,7 @@ from csv_rows import read_rows
 from nerfstudio.configs.method_configs import method_configs
 from PIL import Image
 
-from sundae_ns.core.errors import CheckpointError, DataError
+from sundae_ns.core.errors import DataError
 from sundae_ns.core.metrics import flip_available, quality_of
 from sundae_ns.io import checkpoint
 from sundae_ns.io.pack.packed_scene import write_scene
@@ -94,22 +94,6 @@ def test_a_capture_that_has_moved_is_found_or_named(tiny, tmp_path):
     assert load_model(run, data=tiny.scene).capture == tiny.scene
     shutil.copytree(tiny.scene, capture)
     assert load_model(run).capture == capture
-
-
-def test_the_share_kept_is_the_product_over_all_prunes(tiny, opened, copied):
-    assert opened.kept == pytest.approx(tiny.keep_ratio, abs=0.01)  # a whole number of Gaussians
-    prunes = [{"before": 200, "after": 50, "seconds": 1.0}, {"before": 80, "after": 40, "seconds": 0.5}]
-    (copied / "prune.json").write_text(json.dumps(prunes))
-    found = load_model(copied)
-    assert (found.kept, found.prune_s) == (0.125, 1.5)
-    (copied / "prune.json").unlink()
-    found = load_model(copied)
-    assert (found.kept, found.prune_s) == (None, None)
-
-
-def test_a_run_that_is_not_there(tmp_path):
-    with pytest.raises(CheckpointError, match="does not exist"):
-        load_model(tmp_path / "config.yml")
 
 
 # -------------------------------------------------------------------------------------------------------------- measure
