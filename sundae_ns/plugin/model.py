@@ -272,7 +272,7 @@ class SundaeModel(SplatfactoModel):
 
     def count_curve(self) -> list[CurvePoint]:
         """The curve by which trials have chosen the number of Gaussians; empty without them."""
-        return [point for one in self.train_callbacks if isinstance(one, Trials) for point in one.progress.curve()]
+        return [point for one in self.train_callbacks if isinstance(one, Trials) for point in one.curve()]
 
     # ----------------------------------------------------------------------------------------------------- training
 
@@ -464,13 +464,10 @@ class NerfstudioRun:
         self._hand_over()
         at = TrainingCallbackLocation
         return [
-            TrainingCallback([at.BEFORE_TRAIN_ITERATION], self._begin_step),
+            TrainingCallback([at.BEFORE_TRAIN_ITERATION], lambda step: setattr(self.state, "step", step)),
             TrainingCallback([at.AFTER_TRAIN_ITERATION], lambda step: self.act(self.model.train_callbacks)),
             TrainingCallback([at.AFTER_TRAIN], self._finish),
         ]
-
-    def _begin_step(self, step: int) -> None:
-        self.state.step = step
 
     def act(self, train_callbacks: Sequence[Callback]) -> None:
         """Let callbacks act after a step, in their order."""

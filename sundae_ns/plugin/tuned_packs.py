@@ -141,7 +141,11 @@ class RoundedTraining:
 
     def _run(self, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None) -> StepResult:
         """One step; all of its work is recorded."""
-        self._round()
+        with torch.no_grad():  # rounded in place, because recorded graphs read the parameters there
+            rounded = self._codecs.rounded({name: self.exact[name] for name in self._codecs.gaussians})
+            rounded |= self._codecs.rounded_head({name: self.exact[name] for name in self.head})
+            for name, value in rounded.items():
+                self.rounded[name].copy_(value)
         model = self._model
         loss, _, result = training_step(model.source, model.state, model.losses, inputs, settings)
         gradients = torch.autograd.grad(loss, list(self.rounded.values()), allow_unused=True)
@@ -160,14 +164,6 @@ class RoundedTraining:
         self.optimizer.found_inf = self._recordings.overflow(capacity)
         self.optimizer.step()
         return result
-
-    @torch.no_grad()
-    def _round(self) -> None:
-        """Round into the parameters in place, because recorded graphs read them there."""
-        gaussians = self._codecs.rounded({name: self.exact[name] for name in self._codecs.gaussians})
-        head = self._codecs.rounded_head({name: self.exact[name] for name in self.head})
-        for name, value in {**gaussians, **head}.items():
-            self.rounded[name].copy_(value)
 
     @torch.no_grad()
     def set_gradient(self, name: str, gradient: Tensor | None, of_rate: Tensor | None) -> None:

@@ -33,7 +33,7 @@ SEEN = 8  # Fewest sparse points that state a range
 LARGEST_ERROR, LARGEST_SHIFT = 0.1, 1.5
 """Largest relative difference of two depths that agree, and largest distance from the pixel that is come back to."""
 STEEPEST = 0.15  # Least cosine between the ray of a pixel and the normal of a plane
-_TILT = 0.766, 0.643  # Cosine and sine of 40 degrees, by which planes are turned
+_TURNED = ((0, 0, 1), (0.643, 0, 0.766), (-0.643, 0, 0.766), (0, 0.643, 0.766), (0, -0.643, 0.766))  # By 40 degrees
 _BATCH = 16  # Planes at a time
 _LOOKED_AT = 16  # Pixels examined for each wanted point: views do not agree on all, and even ones are chosen
 
@@ -83,7 +83,9 @@ class Sweep:
         rows, columns = (torch.arange(side, device=best.device) for side in best.shape)
         rays = photo.rays(rows[:, None], columns)
         lengths, correlations = rays.norm(dim=-1), _correlations(photo, others, rays, (1 / high, 1 / low))
-        for normal in _directions(photo.camera, self._up):
+        # Normals of planes in camera coordinates, away from it: those that face it or nearly, and the ground's.
+        ground = photo.camera.viewmat[:3, :3] @ -normalize(self._up, dim=0)
+        for normal in [*photo.camera.K.new_tensor(_TURNED), ground]:
             # A plane is normal . X = 1 / s, so a pixel has the inverse depth facing * s.
             facing = rays @ normal
             steep = facing > STEEPEST * lengths
@@ -197,13 +199,6 @@ def _neighbors(photos: Sequence[_Reduced], sparse: Tensor) -> list[tuple[list[in
         order = torch.argsort(shared, descending=True, stable=True)[: len(photos) - 1].tolist()
         neighbors.append(([j for j in order[:NEIGHBORS] if shared[j] > 0], order[:CONFIRMING]))
     return neighbors
-
-
-def _directions(camera: Camera, up: Tensor) -> list[Tensor]:
-    """Normals of the planes in camera coordinates, away from the camera: facing it, four turned ones, the ground."""
-    c, s = _TILT
-    fixed = [(0.0, 0.0, 1.0), (s, 0.0, c), (-s, 0.0, c), (0.0, s, c), (0.0, -s, c)]
-    return [*(camera.K.new_tensor(normal) for normal in fixed), camera.viewmat[:3, :3] @ -normalize(up, dim=0)]
 
 
 def _number_of_planes(photo: _Reduced, others: Sequence[_Reduced], normal: Tensor, ends: tuple[float, float]) -> int:

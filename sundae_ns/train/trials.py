@@ -5,7 +5,8 @@ pay:
 
 ``count``
     How many Gaussians the prune keeps (``pruning.keep_ratio`` left out), smaller ones in turn. Views are held out from
-    the first step: many Gaussians remember for long what they have seen once.
+    the first step: many Gaussians remember for long what they have seen once. Of few views every 4th is, fewer counts
+    are tried, and the one that loses least in PSNR and SSIM together is taken.
 ``tenth``
     If more than the usual share is chosen, that share is trained without and with a head: there it gains the sooner.
 ``head``
@@ -52,11 +53,11 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 
 log = logging.getLogger(__name__)
 
-SHARES = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)  # Of the Gaussians that are tried, about a factor of 2 apart
+SHARES: tuple[float, ...] = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)  # Of the Gaussians that are tried
+FEW_SHARES: tuple[float, ...] = SHARES[1:5]  # With few views, which all Gaussians overfit
 COUNT_SHARE = 0.02  # Length of a trial of a count, and of a window of a length, as a share of the schedule
-MANY_VIEWS = 32
-"""With fewer training views, those that could be held out are too few to compare counts. With as many, the length is
-not tried: captures of 43 views and more gain to the end."""
+MANY_VIEWS = 32  # With as many, the length is not tried: captures of 43 training views and more gain to the end
+FEWEST_TO_COUNT = 8  # Fewer training views cannot compare counts
 FEWEST_VIEWS = 6  # Fewer cannot judge a head
 MOST_CONTRIBUTING = 32  # Training views that the prune of a trial looks at
 MOST_TRIALS = 0.45  # Largest share of the steps after the prune that trials of counts, and of a head in them, may take
@@ -155,11 +156,6 @@ class Progress:
         """The candidates of a stage."""
         return [row for row in self.tried if row.stage == stage]
 
-    def curve(self) -> list[CurvePoint]:
-        """Expected quality over the counts that were tried, largest first, with a head if trials say that it pays."""
-        curve = choice.curve_of(self.of("count"))
-        return choice.with_head(curve, HeadGain.of(*self.of("tenth"))) if self.chosen.get("tenth") else curve
-
 
 class Trials(Callback):
     """Tries candidates for the number of Gaussians, the head, and the length of the training.
@@ -189,6 +185,7 @@ class Trials(Callback):
         self._mean = RunningMean()
         self._window = 1  # Steps of a trial of a count, and between two measurements of a length
         self._judges: list[int] = []  # Views that are held out for the trials of counts
+        self._few, self._shares = False, SHARES  # Whether training views are few, and what is tried
         self._folds: list[list[int]] = []  # Views that are held out for the trials of each head, one after another
         self._length = 1  # Steps of a trial of a head
         self._densification = densification
@@ -259,14 +256,17 @@ class Trials(Callback):
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
         self._window, indices = max(round(COUNT_SHARE * progress.steps), 1), run.view_indices()
         self._folds, self._length = choice.plan_heads(indices, progress.steps)
-        self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // choice.HELD_OUT_EVERY), 0)
+        self._few = num_views < MANY_VIEWS
+        self._shares = FEW_SHARES if self._few else SHARES
+        every = choice.FEW_HELD_OUT_EVERY if self._few else choice.HELD_OUT_EVERY
+        self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // every), 0)
         if self.config.decides and "count" not in progress.chosen:
-            steps, left = len(SHARES) * self._window, _steps_of(run) - self.config.prune_at
+            steps, left = len(self._shares) * self._window, _steps_of(run) - self.config.prune_at
             steps += 2 * self._length if self.decides_head else 0
             obstacles = {
                 "trials of counts need a single GPU": several,
                 "a warm start has seen all training views before": state.offset > 0,
-                f"{num_views} training views are too few to compare counts": num_views < MANY_VIEWS,
+                f"{num_views} training views are too few to compare counts": num_views < FEWEST_TO_COUNT,
                 "the steps after the prune are too few to compare counts": steps > MOST_TRIALS * left,
             }
             reason = next((reason for reason, holds in obstacles.items() if holds), None)
@@ -428,16 +428,21 @@ class Trials(Callback):
             f"{len(run.view_indices())} training views are held out"
         )
 
+    def curve(self) -> list[CurvePoint]:
+        """Expected quality over the counts that were tried, largest first, with a head if trials say that it pays."""
+        curve, tenth = choice.curve_of(self.progress.of("count"), few=self._few), self.progress.of("tenth")
+        return choice.with_head(curve, HeadGain.of(*tenth)) if self.progress.chosen.get("tenth") else curve
+
     @property
     def _tolerance(self) -> Tolerance:
-        return Tolerance.of_drop(self.config.max_drop)
+        return Tolerance.of_drop(self.config.max_drop, few=self._few)
 
     def _begin_counts(self, run: TrainingRun) -> None:
         state = run.state
         Pruner(state.gaussians, state.optimizers, [state.densification]).drop_nonfinite()
         self._densification.initialize(state)  # its statistics would not match the Gaussians that come back
         self.progress.full = run.source.total
-        self._announce(run, "how many Gaussians does the scene need?", len(SHARES), self._window, self._judges)
+        self._announce(run, "how many Gaussians does the scene need?", len(self._shares), self._window, self._judges)
         self.enable_head(state, False)
         self.keep("start", state, head=self.decides_head)
         self._try_count(run)
@@ -445,14 +450,14 @@ class Trials(Callback):
     def _try_count(self, run: TrainingRun) -> None:
         """Try the next count or, on the usual share, no head and then a head; or choose."""
         progress, state = self.progress, run.state
-        number, tenth, curve = len(progress.of("count")), progress.of("tenth"), progress.curve()
+        number, tenth, curve = len(progress.of("count")), progress.of("tenth"), self.curve()
         if len(tenth) == 2:
             progress.chosen["tenth"] = choice.head_pays(curve, HeadGain.of(*tenth), self._tolerance)
-            curve = progress.curve()
+            curve = self.curve()
         usual = kept_count(USUAL_SHARE, progress.full)
         promising = number == 0 or (curve and not choice.is_lost(curve[-1], self._tolerance))
-        if progress.stage != "tenth" and number < len(SHARES) and promising:
-            count, length = kept_count(SHARES[number], progress.full), self._window
+        if progress.stage != "tenth" and number < len(self._shares) and promising:
+            count, length = kept_count(self._shares[number], progress.full), self._window
             self._prune(run, count)
             notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + length)
             self.start(run, "count", length, self._judges, width=0)
@@ -491,7 +496,7 @@ class Trials(Callback):
         self._set_count(run, count)
         log.info("\n".join(["expected at the end, on held-out training views:", *curve_table(curve)]))
         log.info(f"keeping {count:,} of {progress.full:,} Gaussians: {reason}")
-        if choice.still_climbs(curve, self._tolerance):
+        if not self._few and choice.still_climbs(curve, self._tolerance):
             more = "a lower --pipeline.model.densify-grad-thresh makes more Gaussians, which the scene may need"
             log.info(f"quality still grows at the full count: {more}")
         run.log_scalars("Curve", {"chosen": count, "full": progress.full})

@@ -48,9 +48,8 @@ def tiny_run(
     config.vis, config.viewer.quit_on_train_completion = "tensorboard", True
     short = {"num_downscales": 0, "sh_degree": 1, "sh_degree_interval": 5, "warmup_length": 10**9}
     small = {"head.size": "tiny", "head.pixel_unshuffle": 1, "head.num_features": 5}
-    set_options(
-        config.pipeline.model, {**short, **small, "pruning.prune_at": PRUNE_AT, "evaluate_prune": False, **model}
-    )
+    pruned = {"pruning.keep_ratio": 0.1, "pruning.prune_at": PRUNE_AT, "evaluate_prune": False}
+    set_options(config.pipeline.model, {**short, **small, **pruned, **model})
     set_options(config, options)
     torch.manual_seed(7)
     config.save_config()
