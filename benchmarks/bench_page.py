@@ -109,7 +109,7 @@ def compared(scene: Path, side: int = SIDE, *, half: bool = False) -> dict[str, 
     with TemporaryDirectory() as folder:
         packed, html = Path(folder) / "a.sundae", Path(folder) / "a.html"
         small = write_changed(packed, scene, scaled(read_scene(scene), side))
-        write_page(html, scene_of(small), packed.read_bytes(), title=scene.stem)
+        write_page(html, (scene.stem, scene_of(small), packed.read_bytes()))
         images = truths(small)
         width, height = (int(length) for length in arrays_of_cameras(scene_of(small).cameras)["sizes"][0])
         row: dict[str, Any] = {"scene": scene.name, "bytes": scene.stat().st_size, "size": f"{width}x{height}"}

@@ -103,7 +103,7 @@ def python_verdict(path: Path) -> Verdict:
     try:
         packed = read_scene(path)
         scene = scene_of(packed)
-        page_of(scene, b"", title="a")
+        page_of(("a", scene, b""))
     except Exception as error:
         ours = isinstance(error, SundaeError) and "\n" not in str(error) and len(str(error)) < 600
         return Verdict(str(error) if ours else f"{type(error).__name__}: {error}", None, failed=not ours)

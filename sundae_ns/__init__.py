@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from sundae_ns.scene.cameras import cameras_of
     from sundae_ns.scene.compose import merge, transform
     from sundae_ns.scene.load_save import load, save
-    from sundae_ns.scene.page import show
+    from sundae_ns.scene.page import page, show
     from sundae_ns.scene.prune_scene import crop, prune, remove_floaters
     from sundae_ns.scene.scene import Rendering, Scene, measure, render
     from sundae_ns.scene.virtual_cameras import virtual_cameras
@@ -46,7 +46,7 @@ _MODULES = {
     "scene.cameras": "cameras_of",
     "scene.compose": "merge transform",
     "scene.load_save": "load save",
-    "scene.page": "show",
+    "scene.page": "page show",
     "scene.prune_scene": "crop prune remove_floaters",
     "scene.scene": "Rendering Scene measure render",
     "scene.virtual_cameras": "virtual_cameras",
@@ -55,7 +55,7 @@ _HOMES = {name: f"sundae_ns.{module}" for module, names in _MODULES.items() for 
 """Public names and the modules that hold them."""
 
 __all__ = ["Camera", "PruneRule", "Quality", "Rendering", "Scene", "SundaeError", "cameras_of", "crop", "distill"]
-__all__ += ["load", "measure", "merge", "prune", "remove_floaters", "render", "save", "show", "transform"]
+__all__ += ["load", "measure", "merge", "page", "prune", "remove_floaters", "render", "save", "show", "transform"]
 __all__ += ["virtual_cameras"]
 
 

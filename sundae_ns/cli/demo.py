@@ -61,7 +61,7 @@ def demo(
             finished = load_run(run)
             packed = packed_bytes(finished)
             write_bytes(out / "scene.sundae", packed)
-            write_page(out / "scene.html", finished, packed, title="sundae demo")
+            write_page(out / "scene.html", ("sundae demo", finished, packed))
 
     (prune,) = prunes_of(run)[-1:] or [{"before": measured.primitives, "after": measured.primitives}]
     metrics = {"psnr": 2, "ssim": 4, "lpips": 4}

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from sundae_ns.cli.inputs import Cleaning, copies_rows, open_packed, open_scene
+from sundae_ns.cli.inputs import Cleaning, copies_rows, name_of, open_packed, open_scene
 from sundae_ns.cli.options import (
     Direction,
     Flag,
@@ -40,6 +40,8 @@ from sundae_ns.scene.scene import Scene as Opened
 def export(
     scene: Scene,
     out: Out,
+    beside: tyro.conf.Positional[Path | None] = None,
+    views: tuple[str, ...] = (),
     upright: bool = False,
     start_view: str | None = None,
     up: Direction | None = None,
@@ -56,6 +58,8 @@ def export(
     Args:
         out: file to write; its suffix selects the format: .html, .ply or .glb (exact), .spz or .sog (quantised,
             much smaller). A name without a suffix is a folder of page and scene, for a web server.
+        beside: another scene, which the page shows beside the first one by the same camera.
+        views: views that the page names: NAME=LINK, each with a link that its button Copy link gives.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers; not for a warm start.
         start_view: what a page opens with: index of a stored camera, or a camera file as sundae render reads it; by
             default that of a packed scene, else the first camera.
@@ -70,7 +74,7 @@ def export(
     page = out.suffix.lower() in (".html", "") and not lod
     if out.suffix and not page:
         check_suffix(out, (*FORMATS, ".html"))
-    (check_file if out.suffix else check_folder)(out, reads=[*files_of(scene), data], overwrite=overwrite)
+    (check_file if out.suffix else check_folder)(out, reads=[*files_of(scene), beside, data], overwrite=overwrite)
     started = start_view is not None or up is not None
     if page:
         if upright:
@@ -82,9 +86,13 @@ def export(
         if started:
             opened = with_start(opened, start_view, up)
             packed = container.restated(packed, stated_start(opened))
-        size = write_page(out, opened, packed, title=out.resolve().stem)
+        second = () if beside is None else ((name_of(beside), *open_packed(beside, None)),)
+        named = {name: link for name, _, link in (word.partition("=") for word in views)}
+        size = write_page(out, (name_of(scene), opened, packed), *second, views=named)
         print(f"{out}: {size:,} bytes; {'open it in a browser' if out.suffix else 'serve it'}")
         return 0
+    if beside is not None or views:
+        raise ConfigError("only a page shows two scenes or named views; name it .html, or without a suffix")
     copies = copies_rows(scene, out)
     if copies and (upright or not cleaning.chosen):
         raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")

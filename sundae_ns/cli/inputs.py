@@ -22,6 +22,7 @@ from sundae_ns.io.formats import kind_of
 from sundae_ns.io.ply import has_own_columns
 from sundae_ns.scene.cameras import cameras_of
 from sundae_ns.scene.load_save import load, packed_file
+from sundae_ns.scene.page import packed_of
 from sundae_ns.scene.prune_scene import crop_mask, floater_mask
 from sundae_ns.scene.scene import Scene
 from sundae_ns.scene.virtual_cameras import VIEWS
@@ -83,9 +84,13 @@ def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     if not _is_run(path):
         return packed_file(path)
     scene = open_scene(path, data)
-    from sundae_ns.scene.packing import packed_bytes
+    return scene, packed_of(scene)
 
-    return scene, packed_bytes(scene)
+
+def name_of(path: Path) -> str:
+    """The name of a scene: that of its file; of a run, whose folder is CAPTURE/METHOD/TIME, that of its capture."""
+    folder = path.resolve() if path.is_dir() else path.resolve().parent
+    return (folder.parents[1].name or folder.name) if _is_run(path) else path.resolve().stem
 
 
 def _is_run(path: Path) -> bool:

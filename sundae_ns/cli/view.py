@@ -9,7 +9,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from sundae_ns.cli.inputs import open_packed
+from sundae_ns.cli.inputs import name_of, open_packed
 from sundae_ns.cli.options import Scene
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.scene.page import page_of
@@ -74,7 +74,7 @@ def view(scene: Scene, port: int = 0, open_browser: bool = True, data: Path | No
         open_browser: open the default browser; otherwise only print the address.
         data: folder of the capture of a run, if it moved.
     """
-    page = page_of(*open_packed(scene, data), title=scene.resolve().stem)
+    page = page_of((name_of(scene), *open_packed(scene, data)))
     with serve(page, port) as server, suppress(KeyboardInterrupt):
         address = f"http://127.0.0.1:{server.server_port}/"
         print(f"{scene} is shown at {address} until Ctrl-C", flush=True)

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 PAIRS = 1 << 18  # pairs of Gaussians whose overlap is computed at once; they take about 50 MiB
 ROWS = 1 << 16  # Gaussians whose matrices are computed at once; they take about 40 MiB
 # Rows and columns of the six entries of a symmetric matrix, diagonal first.
-_LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])
+LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -37,7 +37,7 @@ def entries_of(params: Mapping[str, Tensor]) -> Tensor:
     result = torch.empty(len(scales), 6, dtype=torch.float64, device=scales.device)
     for rows in chunks(len(scales)):
         matrices = covariances(scales[rows].double().exp(), quats[rows].double())
-        result[rows] = matrices[:, _LOWER[0], _LOWER[1]]
+        result[rows] = matrices[:, LOWER[0], LOWER[1]]
     return result
 
 
@@ -64,10 +64,8 @@ def quaternions(matrices: Tensor) -> Tensor:
 
 
 def scales_and_quaternions(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviations ``[N, 3]``, ascending, and unit quaternions ``[N, 4]`` of covariances ``[N, 3, 3]``.
-
-    Eigenvectors by Jacobi's method: LAPACK takes the matrices one by one, and CUDA's solver limits their number.
-    """
+    """Standard deviations ``[N, 3]``, ascending, and unit quaternions ``[N, 4]`` of covariances ``[N, 3, 3]``."""
+    # By Jacobi's method: LAPACK takes the matrices one by one, and CUDA's solver limits their number.
     a = [list(row.unbind(dim=1)) for row in matrices.unbind(dim=1)]
     v = [list(row.unbind(dim=1)) for row in torch.eye(3).to(matrices).expand_as(matrices).unbind(dim=1)]
     for _ in range(6):  # the error squares with each sweep, and five reach the rounding of float64
@@ -90,10 +88,7 @@ def scales_and_quaternions(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def mean_projected_area(scales: Tensor) -> Tensor:
-    """Mean projected area of ellipsoids with half axes ``[N, 3]`` over all directions, divided by pi ``[N]``.
-
-    It is a quarter of the surface area (Cauchy), by Thomsen's formula, which is exact to 1.1%.
-    """
+    """Mean projected area of ellipsoids with half axes ``[N, 3]``, divided by pi ``[N]`` (Cauchy; Thomsen, to 1.1%)."""
     exponent = 1.6075
     a, b, c = (scales / scales.amax(dim=1, keepdim=True)).pow(exponent).unbind(dim=1)
     return scales.amax(dim=1).square() * ((a * b + a * c + b * c) / 3).pow(1 / exponent)
@@ -124,13 +119,8 @@ def overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor, least
     return result
 
 
-def outer_entries(vectors: Tensor) -> Tensor:
-    """Entries of ``v v^T`` in the order of :func:`entries_of` ``[N, 6]``, of vectors ``[N, 3]``."""
-    return vectors[:, _LOWER[0]] * vectors[:, _LOWER[1]]
-
-
 def _cholesky(entries: Tensor, least_variance: float) -> tuple[Tensor, ...]:
-    """Cholesky factors ``[...]`` of symmetric matrices with entries ``[..., 6]``, both in the order of ``_LOWER``."""
+    """Cholesky factors ``[...]`` of symmetric matrices with entries ``[..., 6]``, both in the order of ``LOWER``."""
     # Written out, because the batched function calls LAPACK once per matrix. A pivot is never below the least
     # eigenvalue, so clamping at a lower bound of it repairs pivots of needles that rounding made too small.
     xx, yy, zz, yx, zx, zy = entries.unbind(dim=-1)

@@ -1,7 +1,4 @@
-"""Errors shown to users: one line each, the cause first and then the remedy, printed without a traceback.
-
-Each class also derives from the built-in exception that a caller would expect.
-"""
+"""Errors shown to users in one line, cause and remedy; each is also the built-in exception that a caller expects."""
 
 from __future__ import annotations
 

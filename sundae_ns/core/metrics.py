@@ -1,8 +1,4 @@
-"""Image metrics, each in one named variant.
-
-PSNR is over all pixels and channels, with a peak of 1. SSIM is pytorch_msssim's, as in splatfacto: an 11 x 11 Gaussian
-window with sigma 1.5, no padding ("valid"), averaged over pixels and colour channels.
-"""
+"""Image metrics, each in one named variant."""
 
 from __future__ import annotations
 
@@ -37,10 +33,7 @@ def check_pair(pred: Tensor, target: Tensor) -> None:
 
 
 def psnr(pred: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio ``-10 log10(MSE)``, in dB, a differentiable scalar; infinite for equal images.
-
-    Images ``[H, W, 3]`` in [0, 1] are not clamped. ``DataError`` if their shapes differ.
-    """
+    """Peak signal-to-noise ratio ``-10 log10(MSE)`` over all values of images ``[H, W, 3]`` in [0, 1], dB ``[]``."""
     check_pair(pred, target)
     return -10 * torch.log10(torch.mean((pred - target) ** 2))
 
@@ -64,7 +57,10 @@ def fitted_psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Ten
 
 
 def ssim(pred: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity (Wang et al. 2004), as :func:`psnr`; NaN if a side is shorter than the window."""
+    """Structural similarity (Wang et al. 2004) as in splatfacto; NaN if a side is shorter than the window.
+
+    By pytorch_msssim: an 11 x 11 Gaussian window with sigma 1.5, no padding, averaged over pixels and channels.
+    """
     check_pair(pred, target)
     if min(pred.shape[:2]) < SSIM_WINDOW:
         return pred.new_full((), float("nan"))
@@ -78,10 +74,7 @@ def flip_available() -> bool:
 
 @torch.no_grad()
 def flip(pred: Tensor, target: Tensor) -> Tensor | None:
-    """Mean FLIP error (Andersson et al. 2020) of two sRGB images ``[H, W, 3]``, in [0, 1]; lower is better.
-
-    By the authors' package, on the CPU and at 67 pixels per degree; None if it is not installed.
-    """
+    """Mean FLIP error (Andersson et al. 2020), in [0, 1], at 67 pixels per degree; None without its package."""
     check_pair(pred, target)
     if not flip_available():
         return None

@@ -41,7 +41,6 @@ from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerCon
 from sundae_ns.plugin.dataparsers import camera_of, check_capture
 from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import is_number
 from sundae_ns.scene.load_save import load, scene_of_checkpoint
 from sundae_ns.scene.packing import refusal
 from sundae_ns.scene.scene import Scene, unit
@@ -285,7 +284,7 @@ def stated_capture(stated: Any) -> tuple[DataParserConfig, float]:
     kind, options, scale = (stated.get(name) for name in ("parser", "options", "scale"))
     if kind not in _PARSERS or not isinstance(options, dict):
         raise PackError("the packed scene does not say how its capture is read; measure the run that was packed")
-    if not is_number(scale) or not 0 < scale <= 1:
+    if type(scale) not in (int, float) or not 0 < scale <= 1:
         raise refusal("an impossible scale of its images")
     parser: Any = _PARSERS[kind]()
     if hasattr(parser, "load_3D_points"):
@@ -305,7 +304,7 @@ def _is_possible(value: Any, default: Any, hint: Any) -> bool:
     if isinstance(default, Path):
         return isinstance(value, str) and _FOLDER.fullmatch(value) is not None
     if isinstance(default, float):
-        return is_number(value)
+        return type(value) in (int, float) and abs(value) < 1e308  # float64 holds it
     if isinstance(default, str):
         return value in (get_args(hint) if get_origin(hint) is Literal else _ALPHA_COLORS)
     return type(value) is type(default)

@@ -150,11 +150,7 @@ class Pruner:
         return sanitised.dropped
 
     def drop(self, mask: Tensor, *, at_most: float) -> int:
-        """Remove the Gaussians under a mask, bool ``[N]``, unless they are more than a share ``at_most``, below 1.
-
-        Returns:
-            Number of removed Gaussians.
-        """
+        """Remove the Gaussians under a mask, bool ``[N]``, unless more than ``at_most`` of all; returns how many."""
         count = int(mask.sum())
         if not 0 < count <= at_most * self.total:
             return 0

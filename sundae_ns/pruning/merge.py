@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from sundae_ns.core.covariance import chunks, entries_of, outer_entries, overlap
+from sundae_ns.core.covariance import LOWER, chunks, entries_of, overlap
 from sundae_ns.core.gaussians import as_gaussians, rgb_to_logit, sh_to_rgb
 from sundae_ns.core.merging import merge
 from sundae_ns.graph.graph import NeighborGraph, build_graph
@@ -141,7 +141,7 @@ class _Groups:
         share = (self.weight[goes] / total)[:, None]
         offset = self.mean[goes] - self.mean[stays]
         mixed = self.entries[stays] + share * (self.entries[goes] - self.entries[stays])
-        self.entries[stays] = mixed + share * (1 - share) * outer_entries(offset)
+        self.entries[stays] = mixed + share * (1 - share) * offset[:, LOWER[0]] * offset[:, LOWER[1]]
         self.mean[stays] += share * offset
         self.color[stays] += share * (self.color[goes] - self.color[stays])
         self.weight[stays] = total

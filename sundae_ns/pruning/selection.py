@@ -35,11 +35,7 @@ def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
 
 
 def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
-    """Inclusion probabilities ``p_i = min(1, c s_i)`` of positive finite scores ``[N]`` that sum to ``count``, 1 to N.
-
-    Returns:
-        Probabilities, float64 on the CPU ``[N]``; exactly 1 for Gaussians that are always included.
-    """
+    """Probabilities ``min(1, c s_i)`` of positive finite scores ``[N]``, which sum to ``count``; exactly 1 or below."""
     values = score.detach().to(device="cpu", dtype=torch.float64)
     # The largest is 1, so that sums do not overflow; none is 0, so that no sum is.
     values = (values / values.max()).clamp_min(LEAST_SHARE)

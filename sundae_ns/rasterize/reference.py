@@ -149,11 +149,9 @@ def composite(
 ) -> tuple[Tensor, Tensor]:
     """Blend opacities ``[N]`` and channels ``[N, C]`` to an image ``[H, W, C]`` and its alpha ``[H, W, 1]``.
 
-    ``means2d`` are centres in pixels ``[1, N, 2]``. With ``absgrad`` the backward pass sets their ``absgrad``
-    ``[1, N, 2]``: absolute gradients of each pixel with respect to the centre, summed (Ye et al., "AbsGS", 2024).
-
-    Raises:
-        MemoryExhaustedError: On a CPU, the lists of tiles are too long.
+    ``means2d`` are centres in pixels ``[1, N, 2]``. With ``absgrad`` the backward pass sets their ``absgrad`` ``[1, N,
+    2]``: absolute gradients of each pixel with respect to the centre, summed (Ye et al., "AbsGS", 2024).
+    ``MemoryExhaustedError`` if a CPU's lists of tiles are too long.
     """
     columns, rows = -(-width // BIN), -(-height // BIN)
     drawn = (projection.radii > 0) & (opacities >= MIN_ALPHA) & projection.conics.isfinite().all(dim=1)

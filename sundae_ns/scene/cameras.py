@@ -169,19 +169,10 @@ def is_frame(stated: Any) -> bool:
     return True
 
 
-def is_number(value: Any) -> bool:
-    """Whether a value of JSON is a number that float64 holds."""
-    try:
-        return type(value) in (int, float) and math.isfinite(value)
-    except OverflowError:
-        return False
-
-
 def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None) -> Scene:
     """The scene with another start view or up axis, as a user names them; None keeps that of the scene.
 
-    ``start_view`` is the index of a stored camera, or a file whose first camera it is (:func:`sundae_ns.cameras_of`).
-    ``ConfigError`` if there is no such camera or direction, ``DataError`` if the file holds none.
+    ``start_view`` is the index of a stored camera (else ``ConfigError``), or a file whose first camera it is.
     """
     if up is not None:
         scene = dataclasses.replace(scene, up=unit(up))
@@ -200,12 +191,11 @@ Array = NDArray[np.float64]
 
 
 def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float = 24.0) -> list[Camera]:
-    """Cameras of a film, one a frame, along a closed and smooth path at an even speed; upright, without roll.
+    """Cameras of a film, one a frame, along a closed, smooth path at an even speed of motion and turning, upright.
 
-    The path leads through up to eight stored cameras, from the start view, else the first, on the shortest way, and
-    looks where they look; with fewer than three cameras, on a circle around the middle. The speed is that of motion and
-    turning together. The scene's up axis, else the mean of its cameras', else z, is upwards. Lens and shape of the
-    images are those of the first camera, with at most 1,280 pixels a side. ``ConfigError`` for an impossible length.
+    It leads through up to eight stored cameras, from the start view, else the first, on the shortest way; with fewer
+    than three on a circle around the middle. Up is that of the scene, else the mean of its cameras', else z; lens and
+    shape are those of the first camera, with at most 1,280 pixels a side. ``ConfigError`` for an impossible length.
     """
     count = round(seconds * frames_per_second) if math.isfinite(seconds * frames_per_second) else 0
     if not (1 <= count <= MOST_FRAMES and seconds > 0):

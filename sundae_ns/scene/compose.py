@@ -29,8 +29,7 @@ def transform(
     Args:
         scene: to move; it does not change.
         rotation: R as a matrix ``[3, 3]`` or a wxyz quaternion ``[4]``; none by default.
-        scale: factor of all lengths.
-        translation: world units ``[3]``.
+        scale, translation: factor of all lengths; world units ``[3]``.
 
     Raises:
         ConfigError: the matrix is no rotation, or mirrors; the scale is not positive.
@@ -79,14 +78,11 @@ def transform(
 
 
 def merge(scenes: Iterable[Scene]) -> Scene:
-    """Several scenes as one, in the order given: their Gaussians and stored cameras.
+    """Several scenes, at least one, as one, in the order given: their Gaussians and stored cameras.
 
     All else is that of the first scene: device, background, start view, coordinates. Those of
     others are not changed (:func:`transform` does it), except for survey coordinates, which fit. Missing SH degrees are
     zero. A head stays if all scenes have the same one, as parts of a scene do.
-
-    Args:
-        scenes: at least one; they do not change.
 
     Raises:
         DataError: there is no scene, or heads, antialiasing, or the kinds of coordinates differ.

@@ -1,7 +1,6 @@
-"""Images of finished scenes for viewers: outputs that are computed on first access, and frames as recorded CUDA graphs.
+"""Images of finished scenes for viewers: outputs computed on first access, and frames as recorded CUDA graphs.
 
-A graph launches the many small kernels of a frame together. It reads its inputs where they were when it was recorded:
-the Gaussians, which may be trained meanwhile, the head's weights, and the tensors that hold camera and background.
+A graph reads its inputs where they were recorded: Gaussians, the head's weights, camera and background.
 """
 
 from __future__ import annotations

@@ -22,8 +22,7 @@ def random_quaternions(n: int, generator: torch.Generator | None = None) -> Tens
 
 def random_points(n: int, extent: float, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
     """Random points ``[n, 3]`` in a cube of side ``extent`` around the origin, and colours ``[n, 3]`` in [0, 1]."""
-    points = (torch.rand(n, 3, generator=generator) - 0.5) * extent
-    return points, torch.rand(n, 3, generator=generator)
+    return (torch.rand(n, 3, generator=generator) - 0.5) * extent, torch.rand(n, 3, generator=generator)
 
 
 def from_points(

@@ -19,7 +19,7 @@ from sundae_ns.io.config_file import find_config, model_options, orientation_of
 from sundae_ns.io.formats import FORMATS, kind_of
 from sundae_ns.io.ply import Marks
 from sundae_ns.scene.cameras import is_frame
-from sundae_ns.scene.page import write_page
+from sundae_ns.scene.page import packed_of, write_page
 from sundae_ns.scene.render import degree_in_use
 from sundae_ns.scene.scene import Scene
 
@@ -85,8 +85,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
 
     Raises:
         ConfigError: the suffix is not supported, or the format is not turned.
-        DataError, PackError: the format cannot store the scene.
-        StorageError: the disk is full or not writable.
+        DataError, PackError, StorageError: the format cannot store the scene; the disk is full or not writable.
 
     >>> import pathlib, tempfile, torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3))
@@ -105,21 +104,15 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
         if suffix in FORMATS:
             save_for_viewers(scene, path, upright=upright)
         elif suffix == ".html":
-            write_page(path, scene, _packed(scene), title=path.resolve().stem)
+            write_page(path, (path.resolve().stem, scene, packed_of(scene)))
         else:
-            write_bytes(path, _packed(scene))
-
-
-def _packed(scene: Scene) -> bytes:
-    from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other files do not
-
-    return packed_bytes(scene)
+            write_bytes(path, packed_of(scene))
 
 
 def packed_file(path: Path) -> tuple[Scene, bytes]:
     """A scene and the bytes of its packed file; a file that is not packed is packed with default settings."""
     scene = load(path)
-    return scene, path.read_bytes() if kind_of(path) == "packed" else _packed(scene)
+    return scene, path.read_bytes() if kind_of(path) == "packed" else packed_of(scene)
 
 
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> dict[str, Tensor]:

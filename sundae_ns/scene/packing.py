@@ -146,9 +146,8 @@ def refusal(reason: str) -> PackError:
 def sensitivity_of(scene: Scene, cameras: Sequence[Camera]) -> Sensitivity:
     """Effect of quantisation errors on images, which decides where a pack spends its bits; the scene is on the CPU.
 
-    A camera sees a Gaussian from few directions, so some combinations of harmonics hardly show. Derivatives of all
-    pixels are too many. With random signs r of the pixels, the mean square of the derivative of sum(r * image) is the
-    sum of the squared derivatives (Hutchinson, 1990). Cameras and signs are fixed, so that a run packs alike each time.
+    With random signs r of the pixels, the mean square of the derivative of sum(r * image) is the sum of the squared
+    derivatives (Hutchinson, 1990). Cameras and signs are fixed, so that a run packs alike each time.
     """
     rows = {}
     degree = scene.gaussians.sh_degree if scene.gaussians.encoding == "harmonics" else 0

@@ -9,50 +9,114 @@ from __future__ import annotations
 import base64
 import html
 import io
+import json
 import logging
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 
 from PIL import Image
 
-from sundae_ns.core.errors import MemoryExhaustedError, writing
+from sundae_ns.core.camera import Camera
+from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, writing
 from sundae_ns.core.files import write_bytes, write_text
 from sundae_ns.core.values import whole
 from sundae_ns.scene.cameras import camera_in_front
 from sundae_ns.scene.scene import Scene, image_of, render
+from sundae_ns.scene.virtual_cameras import middle_and_reach, usable
 
-SCENE_FILE = "scene.sundae"  # name of the scene in a folder
 LARGE = 10_000_000  # bytes of a page from which show() warns: notebooks load all of their outputs at once
 _log = logging.getLogger(__name__)
 
 
-def page_of(scene: Scene, packed: bytes, *, title: str) -> str:
-    """The HTML of a page that contains its scene; arguments as for :func:`write_page`."""
-    return _filled(scene, title, inline=base64.b64encode(packed).decode())
+View = Camera | int | str  # that a page names: a camera, the index of a stored one, or the link that the page copies
 
 
-def write_page(path: Path, scene: Scene, packed: bytes, *, title: str) -> int:
-    """Write the page of a scene as one file, or without a suffix as a folder for a web server; returns the bytes."""
+def page(scenes: Scene | Mapping[str, Scene], path: Path | str, *, views: Mapping[str, View] | None = None) -> None:
+    """Write the web page of a scene, or of two side by side that move together, as :func:`sundae_ns.save` writes one.
+
+    Args:
+        scenes: a scene, or up to two by the names that the page shows, in the same coordinates.
+        path: an ``.html`` file, or a folder for a web server, which is a name without a suffix.
+        views: by the names on their buttons: cameras, indices of cameras stored with the first scene, or links that
+            *Copy link* gives. *Play* leads through them.
+
+    Raises:
+        ConfigError: there is no such view, or there are more than two scenes.
+        PackError, StorageError: the format cannot store a scene; the disk is full or not writable.
+
+    >>> import pathlib, tempfile, torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3))
+    >>> path = pathlib.Path(tempfile.mkdtemp(), "both.html")
+    >>> sn.page({"before": scene, "after": scene[:25]}, path, views={"Front": 0})
+    """
+    path = Path(path)
+    named = {path.resolve().stem: scenes} if isinstance(scenes, Scene) else dict(scenes)
+    write_page(path, *((name, scene, packed_of(scene)) for name, scene in named.items()), views=views or {})
+
+
+Shown = tuple[str, Scene, bytes]  # a scene on a page: its name, itself, and its packed file
+
+
+def packed_of(scene: Scene) -> bytes:
+    """The packed file of a scene, with default settings."""
+    from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other files do not
+
+    return packed_bytes(scene)
+
+
+def page_of(*shown: Shown, views: Mapping[str, View] | None = None) -> str:
+    """The HTML of a page that contains its scenes; arguments as for :func:`write_page`."""
+    return _filled(shown, views or {}, [(base64.b64encode(packed).decode(), "") for *_, packed in shown])
+
+
+def write_page(path: Path, *shown: Shown, views: Mapping[str, View] | None = None) -> int:
+    """Write the page of one or two scenes as one file, or without a suffix as a folder; returns the bytes."""
     if path.suffix:
-        write_text(path, page_of(scene, packed, title=title))
+        write_text(path, page_of(*shown, views=views))
         return path.stat().st_size
-    page = _filled(scene, title, source=SCENE_FILE)
+    # The scenes first: a page without its scene shows an error.
+    files = {f"scene{i or ''}.sundae": packed for i, (*_, packed) in enumerate(shown)}
+    index = _filled(shown, views or {}, [("", name) for name in files])
     with writing(f"cannot write to {path}"):
         path.mkdir(parents=True, exist_ok=True)
-    # The scene first: a page without its scene shows an error.
-    write_bytes(path / SCENE_FILE, packed)
-    write_text(path / "index.html", page)
-    return sum((path / name).stat().st_size for name in (SCENE_FILE, "index.html"))
+    for name, packed in files.items():
+        write_bytes(path / name, packed)
+    write_text(path / "index.html", index)
+    return sum((path / name).stat().st_size for name in (*files, "index.html"))
 
 
-def _filled(scene: Scene, title: str, *, inline: str = "", source: str = "") -> str:
-    """The page with a scene in base64, or with the address of one."""
-    values = {"TITLE": html.escape(title), "POSTER": _poster(scene), "SOURCE": source, "SCENE": inline}
-    page = resources.files("sundae_ns.scene").joinpath("page.html").read_text(encoding="utf-8")
+def _filled(shown: Sequence[Shown], views: Mapping[str, View], contents: Sequence[tuple[str, str]]) -> str:
+    """The page with its scenes in base64, or with their addresses."""
+    if not 1 <= len(shown) <= 2:
+        raise ConfigError(f"a page of {len(shown)} scenes was asked for; give one or two")
+    links = json.dumps([(name, link_of(view, shown[0][1], name)) for name, view in views.items()])
+    places = [
+        f'<script type="application/octet-stream" class="scene" data-name="{html.escape(name)}"'
+        f' data-source="{source}">{inline}</script>'
+        for (name, *_), (inline, source) in zip(shown, contents, strict=True)
+    ]
+    values = {"TITLE": html.escape(" | ".join(name for name, *_ in shown)), "POSTER": _poster(shown[0][1])}
+    values |= {"VIEWS": links.replace("<", "\\u003c"), "SCENES": "\n".join(places)}
+    template = resources.files("sundae_ns.scene").joinpath("page.html").read_text(encoding="utf-8")
     # In one pass: a title may contain the name of another value.
-    return re.sub("@@([A-Z]+)@@", lambda name: values[name[1]], page)
+    return re.sub("@@([A-Z]+)@@", lambda name: values[name[1]], template)
+
+
+def link_of(view: View, scene: Scene, name: str) -> str:
+    """The part of an address that shows a view; ``ConfigError`` if there is none."""
+    if isinstance(view, Camera):
+        away = float((view.center.cpu().double() - middle_and_reach(usable(scene))[0]).norm())
+        ahead = [-max(away, 1e-6) * value for value in view.pose[:, 2].tolist()]
+        return f"#camera={','.join(f'{value:.7g}' for value in (*view.center.tolist(), *ahead))},1"
+    stops = max(len(scene.cameras), 1)
+    link = f"#camera={view + 1}" if isinstance(view, int) else f"#{view.rpartition('#')[2]}"
+    *place, stop = link.removeprefix("#camera=").split(",")
+    if not (link.startswith("#camera=") and len(place) in (0, 6) and stop.isdigit() and 0 < int(stop) <= stops):
+        raise ConfigError(f"view {name!r} is {view!r}; give a camera, an index below {stops}, or a link of the page")
+    return link
 
 
 def _poster(scene: Scene) -> str:
@@ -101,8 +165,7 @@ def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
         title: of the page, for screen readers too.
 
     Raises:
-        ConfigError: the height is no whole number of pixels.
-        PackError: the format cannot store the scene.
+        ConfigError, PackError: the height is no whole number of pixels; the format cannot store the scene.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3))
@@ -110,10 +173,8 @@ def show(scene: Scene, *, height: int = 480, title: str = "Scene") -> Embedded:
     Embedded(title='Scene', height=300)
     """
     height = whole(height, "height")
-    from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other pages do not
-
-    page = page_of(scene, packed_bytes(scene), title=title)
-    if len(page) > LARGE:
-        size = len(page) / 1e6
+    content = page_of((title, scene, packed_of(scene)))
+    if len(content) > LARGE:
+        size = len(content) / 1e6
         _log.warning("the notebook will hold a page of %.1f MB; prune the scene first, or save it as scene.html", size)
-    return Embedded(page, title, height)
+    return Embedded(content, title, height)

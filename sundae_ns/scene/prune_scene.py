@@ -51,20 +51,16 @@ def prune(
     """Keep the Gaussians that matter most to the cameras, and merge the others into them.
 
     Gaussians with NaN or meaningless infinite values are dropped first (:func:`.sanitise`). After a merge by pairs, a
-    few steps fit the kept ones to the scene's own images.
+    few steps fit the kept ones to the scene's own images. The new scene keeps the head, trained for all Gaussians.
 
     Args:
         scene: to prune; it does not change.
-        keep: share of the finite Gaussians to keep, in (0, 1].
+        keep: share of the finite Gaussians to keep, in (0, 1]: ``round(keep * N)``.
         count: number of Gaussians to keep, in place of a share; at least 1.
         cameras: cameras whose images the prune preserves; by default those stored with the scene, else
             :func:`sundae_ns.virtual_cameras`.
         rule: score, selection and merge; by default ``PruneRule()``.
         progress: show a progress bar on stderr.
-
-    Returns:
-        A scene of ``round(keep * N)`` or ``count`` Gaussians, on the same device. It keeps the head, which was
-        trained for all Gaussians.
 
     Raises:
         ConfigError: neither or both of ``keep`` and ``count`` are given, or they or an option are out of range.

@@ -72,10 +72,7 @@ def degree_in_use(sh_degree: int, active: int | None) -> int:
 
 
 class GaussianSource:
-    """The Gaussians of one process.
-
-    ``whole`` is False for a share of them, whose tensors are new each time; frames of it cannot be recorded.
-    """
+    """The Gaussians of one process; not ``whole``: a share, new tensors each time, whose frames are not recorded."""
 
     def __init__(self, gaussians: Gaussians, *, whole: bool = True) -> None:
         self.gaussians = gaussians
@@ -149,10 +146,7 @@ def scale_plan(camera: Camera, trained_focal: tuple[float, float] | None) -> Sca
 def draw(
     primitives: Mapping[str, Tensor], camera: Camera, background: Tensor, settings: RenderSettings, *, depth: bool
 ) -> tuple[dict[str, Any], Rasterization]:
-    """Splat colours, features and depth in one pass; ``primitives`` have ``features`` if the head is enabled.
-
-    Returns images as :func:`render_view` does. The head has not run, so ``rgb`` is ``base_rgb``.
-    """
+    """Splat colours, features if the head is enabled, and depth in one pass: the images of :func:`render_view`."""
     channels = primitives["colors"]
     if settings.head is not None:
         channels = torch.cat([channels, primitives[FEATURES]], dim=1)
@@ -164,10 +158,7 @@ def draw(
 
 
 def compensate(head: CompensationHead, base: Tensor, splatted: Rasterization, background: Tensor) -> Tensor:
-    """The corrected image of one splatting pass ``[H, W, 3]``, not clamped. Only this function runs the head.
-
-    ``base`` is the image without the head, ``splatted`` has no background. ``MemoryExhaustedError`` on a full CPU.
-    """
+    """The corrected image of one splatting pass ``[H, W, 3]``, not clamped. Only this function runs the head."""
     height, width = base.shape[:2]
     if base.device.type == "cpu":
         # The last level: its input from below and beside, both joined, and its output, in float32.

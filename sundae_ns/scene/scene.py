@@ -96,8 +96,7 @@ class Scene:
             raise DataError("some points are NaN or infinite; remove them, and their colours")
         if whole(sh_degree, "sh_degree", 0) > MAX_SH_DEGREE:
             raise ConfigError(f"sh_degree is {sh_degree}; give at most {MAX_SH_DEGREE}")
-        colors = colors.to(points.device)
-        return cls(Gaussians(from_points(points, colors, sh_degree=sh_degree, num_features=0)))
+        return cls(Gaussians(from_points(points, colors.to(points.device), sh_degree=sh_degree, num_features=0)))
 
     @classmethod
     @usual_defaults()

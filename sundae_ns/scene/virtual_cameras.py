@@ -54,8 +54,7 @@ def virtual_cameras(scene: Scene, n: int | None = None, *, seed: int = 0, size: 
         size: width and height of the images, pixels; by default 512, or ``16 sqrt(N)`` for fewer Gaussians.
 
     Raises:
-        ConfigError: ``n`` or ``size`` is no whole number of at least 1.
-        DataError: no Gaussian is finite.
+        ConfigError, DataError: ``n`` or ``size`` is no whole number of at least 1; no Gaussian is finite.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))

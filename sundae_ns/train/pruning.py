@@ -230,11 +230,7 @@ class ScheduledPruning(Callback):
         return self.config.due(run.state.pruning, run.state.schedule_step, run.source.total)
 
     def after_step(self, run: TrainingRun) -> None:
-        """Prune if it is due, evaluate, report, and restart the learning rates.
-
-        Raises:
-            SundaeError: the field cannot be pruned. A checkpoint is saved first.
-        """
+        """Prune if it is due, evaluate, report, and restart the learning rates; saves before a ``SundaeError``."""
         state, config, due = run.state, self.config, self.needs_all(run)
         # Growing peaks before culling.
         state.pruning["peak"] = max(state.pruning["peak"], state.densification.get("peak", 0))

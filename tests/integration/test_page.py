@@ -28,6 +28,7 @@ from sundae_ns.io.pack.packed_scene import read_scene, write_scene
 from sundae_ns.plugin.finished_runs import load_run
 from sundae_ns.scene.load_save import packed_file
 from sundae_ns.scene.packing import contents_of, stated_start
+from sundae_ns.scene.page import page as page_of_scene
 from sundae_ns.scene.page import page_of, write_page
 
 pytestmark = needs_chromium
@@ -99,8 +100,8 @@ def folder(tmp_path_factory):
     """A folder with the packed scene a.sundae, its page a.html, and its page as a folder, ``site``."""
     folder = tmp_path_factory.mktemp("page")
     scene = packed_file(write_kind(folder / "a.sundae", KINDS["residual"]))
-    write_page(folder / "a.html", *scene, title="a")
-    write_page(folder / "site", *scene, title="A b/c")
+    write_page(folder / "a.html", ("a", *scene))
+    write_page(folder / "site", ("A b/c", *scene))
     return folder
 
 
@@ -137,7 +138,7 @@ def check(page, packed, cameras):
 )
 def test_images_of_the_page_are_those_of_python(name, tmp_path):
     packed = write_kind(tmp_path / "a.sundae", KINDS[name])
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
+    write_page(tmp_path / "a.html", ("a", *packed_file(packed)))
     with opened((tmp_path / "a.html").as_uri()) as page:
         check(page, packed, [0, 1])
 
@@ -177,7 +178,7 @@ def test_the_head_in_half_precision(name, tmp_path):
 
 @in_browser
 def test_the_controls(folder):
-    server = serve(page_of(*packed_file(folder / "a.sundae"), title="a"), 0)
+    server = serve(page_of(("a", *packed_file(folder / "a.sundae"))), 0)
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
     def look(page):
@@ -240,7 +241,7 @@ def test_the_controls(folder):
 @in_browser
 def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(folder, tmp_path):
     plain, content = packed_file(folder / "a.sundae")
-    second = plain.views[1]
+    second = plain.cameras[1]
     free = second._replace(viewmat=second.viewmat + 0.05 * torch.eye(4)[[3, 3, 3, 3]])
     shots = {}
     for name, up, start, stop in (
@@ -249,7 +250,7 @@ def test_the_page_opens_at_the_start_view_and_turns_about_the_up_axis(folder, tm
         ("free", (0.0, 0.0, 1.0), free, "free"),
     ):
         scene = dataclasses.replace(plain, up=up, start=start)
-        write_page(tmp_path / "a.html", scene, container.restated(content, stated_start(scene)), title="a")
+        write_page(tmp_path / "a.html", ("a", scene, container.restated(content, stated_start(scene))))
         with opened((tmp_path / "a.html").as_uri(), flags=["--disable-features=WebGPU"]) as page:
             hidden = "for (const id of ['panel', 'message']) document.getElementById(id).style.visibility = 'hidden'"
             page.evaluate(f"{{ {hidden}; {TICKING} }}")  # the message of WebGL2 would take the drag
@@ -286,7 +287,7 @@ def test_a_hostile_file_ends_in_a_message(folder, tmp_path):
 @pytest.mark.parametrize("drawn", ["webgpu", "webgl"])
 def test_a_view_of_too_many_primitives_is_not_drawn(drawn, tmp_path):
     packed = write_bomb(tmp_path / "a.sundae")
-    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
+    write_page(tmp_path / "a.html", ("a", *packed_file(packed)))
     flags = browser.WEBGPU if drawn == "webgpu" else WEBGL
     with opened((tmp_path / "a.html").as_uri(), flags=flags, size=(640, 480)) as page:
         assert page.evaluate("sundae.drawn") == drawn
@@ -375,7 +376,7 @@ def test_fingers_turn_and_zoom(drawn, site):
 
 @in_browser
 def test_the_panel_of_a_phone(site):
-    with opened(site, flags=WEBGL, size=(390, 844)) as page:
+    with opened(site, flags=WEBGL, size=(640, 844)) as page:
         assert "W A S D" in page.evaluate("panel.innerText")
     with browser.Browser(CHROMIUM, 390, 844, WEBGL) as page:
         phone = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
@@ -383,15 +384,45 @@ def test_the_panel_of_a_phone(site):
         page.call("Emulation.setTouchEmulationEnabled", {"enabled": True, "maxTouchPoints": 2})
         page.open(site)
         browser.wait_for(lambda: page.evaluate("window.sundae?.state === 'ready'"), "the page", SECONDS)
+        height = "panel.getBoundingClientRect().height"
+        assert page.evaluate(height) < 60, "folded"
+        page.evaluate("panel.querySelector('summary').click()")
         hint = page.evaluate("panel.innerText")
+        assert hint.startswith("A b/c")
         assert "One finger turns" in hint
         assert "W A S D" not in hint
         assert "Fly" not in hint
-        height = "panel.getBoundingClientRect().height"
         assert 100 < page.evaluate(height) <= 844 / 3
-        assert page.evaluate("panel.scrollHeight <= panel.clientHeight")
-        page.evaluate("panel.querySelector('summary').click()")
-        assert page.evaluate(height) < 60
+        assert page.evaluate("[panel.scrollHeight <= panel.clientHeight, document.body.scrollWidth]") == [True, 390]
+
+
+@in_browser
+def test_two_scenes_named_views_and_a_path(folder, tmp_path):
+    """Without heads nothing is missing, so WebGL2 says nothing."""
+    whole = dataclasses.replace(packed_file(folder / "a.sundae")[0], head=None)
+    away = whole.cameras[0]._replace(viewmat=whole.cameras[0].viewmat + 0.1 * torch.eye(4)[[3, 3, 3, 3]])
+    page_of_scene({"whole": whole, "half": whole[::2]}, tmp_path / "a.html", views={"Far": away, "<b>Two": 1})
+    with opened((tmp_path / "a.html").as_uri(), flags=WEBGL, size=(640, 480)) as page:
+        assert page.evaluate("[sundae.message, document.title, message.hidden]") == ["", "whole | half", True]
+        assert page.evaluate("sundae.count") == [len(whole), len(whole[::2])]
+        assert page.evaluate("[...document.querySelectorAll('.name')].map((name) => name.textContent)") == [
+            *("whole", "half"),
+        ]
+        rested(page)
+        seen = rested(page)
+        assert np.abs(seen[:, :318] - seen[:, 322:]).mean() > 1
+        page.evaluate("views.children[1].click()")
+        browser.wait_for(lambda: page.evaluate(STOP) == "2 of 2", "the named camera", SECONDS)
+        page.evaluate("views.children[0].click()")
+        browser.wait_for(lambda: page.evaluate(STOP) == "free", "the named view", SECONDS)
+        rested(page)
+        page.evaluate("play.click()")
+        browser.wait_for(lambda: page.evaluate("play.textContent") == "Stop", "the path", SECONDS)
+        frames = page.evaluate("sundae.frames")
+        browser.wait_for(lambda: page.evaluate("sundae.frames") > frames + 4, "frames of the path", SECONDS)
+        page.evaluate("play.click()")
+        rested(page)
+        assert page.evaluate("[play.textContent, sundae.still]") == ["Play", True]
 
 
 @in_browser

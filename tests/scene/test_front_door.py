@@ -20,7 +20,7 @@ from sundae_ns.io.ply import write_ply
 
 ROOT = Path(__file__).parents[2]
 FUNCTIONS = ("crop", "load", "measure", "prune", "remove_floaters", "render", "save", "show", "cameras_of")
-FUNCTIONS += ("merge", "transform", "virtual_cameras")
+FUNCTIONS += ("merge", "page", "transform", "virtual_cameras")
 WITHOUT_NERFSTUDIO = """
 import sys, torch
 sys.modules["nerfstudio"] = None

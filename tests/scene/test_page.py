@@ -41,7 +41,7 @@ def packed(tmp_path_factory):
 
 def test_a_page_holds_the_scene_and_no_address(packed, tmp_path):
     out = tmp_path / "a.html"
-    assert write_page(out, *packed_file(packed), title="a <b> & c") == out.stat().st_size
+    assert write_page(out, ("a <b> & c", *packed_file(packed))) == out.stat().st_size
     page = out.read_text()
     (scene,) = re.findall(r'<script type="application/octet-stream"[^>]*>([^<]*)</script>', page)
     assert base64.b64decode(scene, validate=True) == packed.read_bytes()
@@ -53,7 +53,7 @@ def test_a_page_holds_the_scene_and_no_address(packed, tmp_path):
 
 
 def test_a_page_shows_the_first_camera_until_it_draws(packed):
-    (code,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page_of(*packed_file(packed), title="a"))
+    (code,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page_of(("a", *packed_file(packed))))
     found = np.asarray(Image.open(io.BytesIO(base64.b64decode(code))), dtype=np.float32)
     truth = np.asarray(render_first(packed_file(packed)[0]), dtype=np.float32)
     assert found.shape == truth.shape == (37, 50, 3)
@@ -84,10 +84,32 @@ def test_a_page_of_too_many_primitives_has_no_first_image(tmp_path, capsys, capl
 
 def test_a_folder_has_page_and_scene_apart(packed, tmp_path):
     out = tmp_path / "site"
-    assert write_page(out, *packed_file(packed), title="a") == sum(path.stat().st_size for path in out.iterdir())
+    assert write_page(out, ("a", *packed_file(packed))) == sum(path.stat().st_size for path in out.iterdir())
     assert (out / "scene.sundae").read_bytes() == packed.read_bytes()
     assert 'data-source="scene.sundae"></script>' in (out / "index.html").read_text()
-    write_page(out, *packed_file(packed), title="a")
+    write_page(out, ("a", *packed_file(packed)))
+
+
+def test_a_page_of_two_scenes_with_named_views(packed, tmp_path, capsys):
+    whole = sn.load(packed)
+    views = {"a </script>": 1, "b": whole.cameras[0], "c": "http://x/#camera=2"}
+    sn.page({"one": whole, "two": whole[::2]}, tmp_path / "both", views=views)
+    index = (tmp_path / "both" / "index.html").read_text()
+    assert re.findall(r'data-name="(\w+)" data-source="([\w.]+)"', index) == [
+        ("one", "scene.sundae"),
+        ("two", "scene1.sundae"),
+    ]
+    assert sn.load(tmp_path / "both" / "scene1.sundae").num_gaussians == len(whole[::2])
+    (named,) = re.findall(r'id="named">(.*)</script>', index)
+    links = dict(json.loads(named))
+    assert [links["a </script>"], links["c"]] == ["#camera=2"] * 2
+    *center, x, y, z, lens = map(float, links["b"].removeprefix("#camera=").split(","))
+    np.testing.assert_allclose(center, whole.cameras[0].center, rtol=1e-5)
+    assert np.dot([x, y, z], -whole.cameras[0].pose[:, 2].numpy()) == pytest.approx(np.linalg.norm([x, y, z]))
+    with pytest.raises(SystemExit) as caught:
+        main(["export", str(packed), str(packed), "-o", str(tmp_path / "a.html"), "--views", "Front=#camera=1"])
+    assert caught.value.code == 0, capsys.readouterr().err
+    assert "<title>a | a</title>" in (tmp_path / "a.html").read_text()
 
 
 def test_export_writes_pages(packed, tmp_path, capsys):
@@ -286,6 +308,20 @@ def test_the_page_counts_fragments_before_it_draws(tmp_path):
 
 
 @needs_node
+def test_a_phone_draws_what_covers_most(decode, tmp_path, monkeypatch):
+    monkeypatch.setenv("MOST", "20")
+    file = write_kind(tmp_path / "a.sundae", KINDS["residual"])
+    (found,) = decode(file)
+    gaussians = read_scene(file).gaussians
+    assert (found["count"], found["total"]) == (20, len(gaussians["means"]))
+    covered = gaussians["opacities"].sigmoid()[:, 0] * gaussians["scales"].sort(dim=1).values[:, 1:].sum(dim=1).exp()
+    rows = covered.topk(20).indices.sort().values
+    for name in ("means", "features"):
+        drawn = np.fromfile(f"{file}.{name}", np.float32).reshape(20, -1)
+        np.testing.assert_allclose(drawn, gaussians[name][rows], atol=1e-6)
+
+
+@needs_node
 def test_both_readers_give_the_same_verdicts():
     """A short version of ``python benchmarks/fuzz_packs.py``, from another seed."""
     tally, problems = fuzz_packs.run(150, seed=1_000_000)
@@ -311,7 +347,7 @@ def scene(tmp_path_factory):
 def test_the_page_in_the_frame_holds_the_scene(scene, tmp_path):
     frame = frame_of(sn.show(scene, height=321)._repr_html_())
     assert (frame["height"], frame["width"]) == ("321", "100%")
-    assert frame["srcdoc"] == page_of(scene, packed_bytes(scene), title="Scene")
+    assert frame["srcdoc"] == page_of(("Scene", scene, packed_bytes(scene)))
     (inside,) = re.findall(r'<script type="application/octet-stream"[^>]*>([^<]*)</script>', frame["srcdoc"])
     (tmp_path / "shown.sundae").write_bytes(base64.b64decode(inside, validate=True))
     sn.save(scene, tmp_path / "saved.sundae")

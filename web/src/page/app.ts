@@ -5,7 +5,8 @@ import type { Times } from "../drawer";
 import { PackError } from "../scene/container";
 import type { Scene } from "../scene/scene";
 import { viewOf, zoomed } from "../view";
-import { connect, type Elements, element, elements, write } from "./controls";
+import { onThisDevice } from "./budget";
+import { connect, type Elements, elements, write } from "./controls";
 import { type Frame, Loop } from "./loop";
 import { Navigation } from "./navigation";
 import { Stage } from "./stage";
@@ -26,6 +27,8 @@ export type Handle = {
   /** Images drawn so far, without those of a fade. */
   frames: number;
   cameras: number;
+  /** Gaussians that are drawn, of each scene. */
+  count: number[];
   /** Pixels of one camera of the capture, RGBA in bytes. */
   image: (camera: number, head: boolean, scale?: number) => Promise<{ width: number; height: number; pixels: string }>;
 };
@@ -36,9 +39,11 @@ const FRAMES = 10;
 const LOADED = 0.3;
 const DECODED = 0.9;
 
-/** The bytes of the scene: in the page itself, or in a file beside it. */
-async function sceneFile(onProgress: (share: number) => void): Promise<Uint8Array<ArrayBuffer>> {
-  const place = element<HTMLScriptElement>("scene");
+/** The bytes of a scene: in the page itself, or in a file beside it. */
+async function sceneFile(
+  place: HTMLScriptElement,
+  onProgress: (share: number) => void,
+): Promise<Uint8Array<ArrayBuffer>> {
   const source = place.dataset.source;
   if (!source) {
     const text = atob(place.textContent!.trim());
@@ -75,6 +80,7 @@ export async function start(program: string): Promise<void> {
     times: null,
     frames: 0,
     cameras: 0,
+    count: [],
     image: () => Promise.reject(new Error("the scene is not ready")),
   };
   Object.assign(window, { sundae: handle });
@@ -88,13 +94,18 @@ export async function start(program: string): Promise<void> {
     page.message.hidden = page.poster.hidden = false;
     page.stage.hidden = page.panel.hidden = page.progress.hidden = true;
   };
-  const progress = (from: number, to: number) => (share: number) => {
-    page.progress.value = from + share * (to - from);
-  };
+  const places = [...document.querySelectorAll<HTMLScriptElement>("script.scene")];
   try {
-    const file = await sceneFile(progress(0, LOADED));
-    const scene = await decode(file, program, progress(LOADED, DECODED));
-    await show(scene, page, handle, fail);
+    const scenes: Scene[] = [];
+    for (const [i, place] of places.entries()) {
+      const progress = (from: number, to: number) => (share: number) => {
+        page.progress.value = (i + from + share * (to - from)) / places.length;
+      };
+      const file = await sceneFile(place, progress(0, LOADED));
+      scenes.push(onThisDevice(await decode(file, program, progress(LOADED, DECODED))));
+    }
+    const names = places.map((place) => place.dataset.name ?? "");
+    await show(scenes, names, page, handle, fail);
     handle.state = "ready";
   } catch (error) {
     fail(error);
@@ -102,36 +113,68 @@ export async function start(program: string): Promise<void> {
 }
 
 const tooMany = (crowded: number): string =>
-  `This view is not drawn: ${Math.round(crowded).toLocaleString("en")} primitives cover each of its pixels, ` +
+  `This view is not drawn: ${Math.round(crowded).toLocaleString("en")} Gaussians cover each of its pixels, ` +
   "too many for this page or for this GPU.";
 
-/** Shows the scene, until `fail` is called. */
-async function show(scene: Scene, page: Elements, handle: Handle, fail: (error: unknown) => void): Promise<void> {
-  const stage = new Stage(scene, page.stage, () => loop.mark());
-  const navigation = new Navigation(scene, page.stage);
+/** A place for each scene, side by side, each with the name of its scene. */
+function halves(page: Elements, names: string[]): HTMLElement[] {
+  if (names.length === 1) return [page.half];
+  const copy = page.half.cloneNode(true) as HTMLElement;
+  return names.map((name, i) => {
+    const half = i ? copy : page.half;
+    half.append(Object.assign(document.createElement("span"), { className: "name", textContent: name }));
+    page.stage.append(half);
+    return half;
+  });
+}
+
+/** Shows the scenes by one camera, until `fail` is called. */
+async function show(
+  scenes: Scene[],
+  names: string[],
+  page: Elements,
+  handle: Handle,
+  fail: (error: unknown) => void,
+): Promise<void> {
+  const navigation = new Navigation(scenes[0]!, page.stage);
   const wanted = () => ({ scale: Number(page.scale.value) / 100, head: page.head.checked });
-  const told = follow(page, handle, stage, navigation);
-  const loop: Loop = new Loop(stage, navigation, page.stage, wanted, told);
-  navigation.onChange = () => loop.moved();
+  const places = halves(page, names);
+  const stages = scenes.map((scene, i) => new Stage(scene, places[i]!, () => loops[i]!.mark()));
+  const loops: Loop[] = stages.map((stage, i) => {
+    const told = follow(page, handle, stages, i, navigation);
+    return new Loop(stage, navigation, places[i]!, wanted, told);
+  });
+  const loop = loops[0]!;
+  navigation.onChange = () => {
+    for (const each of loops) each.moved();
+  };
   navigation.follow(location.hash);
-  Object.defineProperty(handle, "still", { get: () => loop.still });
-  await stage.open();
-  await loop.run(fail);
+  Object.defineProperty(handle, "still", { get: () => loops.every((each) => each.still) });
+  for (const stage of stages) await stage.open();
+  for (const each of loops) await each.run(fail);
   handle.firstImage = performance.now();
-  handle.cameras = scene.cameras.length;
+  handle.cameras = scenes[0]!.cameras.length;
+  handle.count = scenes.map(({ field }) => field.count);
   handle.image = async (camera, head, scale = 1) => {
     const { pixels, ...size } = await loop.image(zoomed(viewOf(navigation.stops[camera]!), scale), head);
     let text = "";
     for (let i = 0; i < pixels.length; i += 2 ** 14) text += String.fromCharCode(...pixels.subarray(i, i + 2 ** 14));
     return { ...size, pixels: btoa(text) };
   };
-  connect(page, navigation, loop);
+  connect(page, navigation, loops);
   page.panel.hidden = false;
   page.poster.hidden = page.progress.hidden = true;
 }
 
-/** What tells of each image: the handle, the message and the panel. */
-function follow(page: Elements, handle: Handle, stage: Stage, navigation: Navigation): (frame: Frame) => void {
+/** What tells of each image of a stage: the handle and the figures of the first one, message and panel of all. */
+function follow(
+  page: Elements,
+  handle: Handle,
+  stages: Stage[],
+  index: number,
+  navigation: Navigation,
+): (frame: Frame) => void {
+  const stage = stages[index]!;
   const spans: number[] = [];
   return ({ times, spent, moving }) => {
     // The first image also compiles shaders.
@@ -144,16 +187,21 @@ function follow(page: Elements, handle: Handle, stage: Stage, navigation: Naviga
       : [`splat ${splat.toFixed(1)} ms`, head ? `head ${head.toFixed(1)} ms` : ""];
     const reason = withoutHead ? "the view is too large for the head on this GPU" : "";
     const rate = spans.length ? `${fps.toFixed(fps < 10 ? 1 : 0)} fps` : "";
-    const parts = [rate, ...passes, reason];
-    write(page.stats, parts.filter(Boolean).join(" · "));
-    Object.assign(handle, { times, drawn: stage.drawn, message: stage.notice, frames: handle.frames + 1 });
-    const said = crowded ? tooMany(crowded) : stage.notice;
+    const parts = [rate, ...passes, reason, stage.left];
+    if (index === 0) {
+      write(page.stats, parts.filter(Boolean).join(" · "));
+      Object.assign(handle, { times, drawn: stage.drawn });
+    }
+    const notice = stages.map((each) => each.notice).find(Boolean) ?? "";
+    Object.assign(handle, { message: notice, frames: handle.frames + 1 });
+    const said = crowded ? tooMany(crowded) : notice;
     // A message that was closed stays closed.
     if (said !== page.said.textContent) {
       page.said.textContent = said;
       page.message.hidden = !said;
     }
-    page.headLabel.hidden = !stage.hasHead;
+    page.headLabel.hidden = !stages.some((each) => each.hasHead);
+    write(page.play, navigation.playing ? "Stop" : "Play");
     write(page.scaleValue, `${page.scale.value}%`);
     write(page.stop, navigation.stop === null ? "free" : `${navigation.stop + 1} of ${navigation.stops.length}`);
   };

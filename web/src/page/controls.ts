@@ -19,6 +19,8 @@ export const write = (place: HTMLElement, text: string): void => {
 
 export const elements = () => ({
   stage: element("stage"),
+  /** The place of a scene; another one beside it has a copy. */
+  half: document.querySelector<HTMLElement>(".half")!,
   poster: element<HTMLImageElement>("poster"),
   progress: element<HTMLProgressElement>("progress"),
   panel: element("panel"),
@@ -31,14 +33,19 @@ export const elements = () => ({
   scale: element<HTMLInputElement>("scale"),
   scaleValue: element<HTMLOutputElement>("scale-value"),
   stop: element<HTMLOutputElement>("stop"),
+  play: element("play"),
+  views: element("views"),
   stats: element("stats"),
 });
 
 export type Elements = ReturnType<typeof elements>;
 
-/** Connects the controls with the camera and the loop. */
-export function connect(page: Elements, navigation: Navigation, loop: Loop): void {
+/** Connects the controls with the camera and the loops, one for each scene. */
+export function connect(page: Elements, navigation: Navigation, loops: Loop[]): void {
   const { stops } = navigation;
+  const mark = (): void => {
+    for (const loop of loops) loop.mark();
+  };
   const visit = (step: number): void => navigation.visit((navigation.visited + step + stops.length) % stops.length);
   let timer: ReturnType<typeof setTimeout>;
   const tell = (text: string): void => {
@@ -66,9 +73,18 @@ export function connect(page: Elements, navigation: Navigation, loop: Loop): voi
     tell(copied ? "Link copied" : kept ? "The link is in the address bar" : "This browser does not allow to copy here");
   };
   const picture = async (): Promise<void> => {
-    const { width, height, pixels } = await loop.image(null, page.head.checked);
+    const images = await Promise.all(loops.map((loop) => loop.image(null, page.head.checked)));
+    const stacked = images.length > 1 && page.stage.clientHeight > page.stage.clientWidth;
+    const [across, down] = (["width", "height"] as const).map((side) => images.map((image) => image[side]));
+    const sum = (sides: number[]): number => sides.reduce((one, other) => one + other);
+    const [width, height] = stacked ? [Math.max(...across!), sum(down!)] : [sum(across!), Math.max(...down!)];
     const canvas = Object.assign(document.createElement("canvas"), { width, height });
-    canvas.getContext("2d")!.putImageData(new ImageData(pixels, width, height), 0, 0);
+    let [x, y] = [0, 0];
+    for (const image of images) {
+      canvas.getContext("2d")!.putImageData(new ImageData(image.pixels, image.width, image.height), x, y);
+      if (stacked) y += image.height;
+      else x += image.width;
+    }
     const blob = await new Promise<Blob | null>((resolve) => canvas.toBlob(resolve));
     const href = URL.createObjectURL(blob!);
     const download = `${document.title.replace(/[^\p{L}\p{N}.-]+/gu, "_") || "scene"}.png`;
@@ -90,14 +106,22 @@ export function connect(page: Elements, navigation: Navigation, loop: Loop): voi
     link: copyLink,
     picture: save,
     full: whole,
+    play: () => navigation.play(named.map(([, hash]) => hash)),
   };
+  const named: [string, string][] = JSON.parse(element("named").textContent || "[]");
+  for (const [name, hash] of named) {
+    const button = Object.assign(document.createElement("button"), { type: "button", textContent: name });
+    button.addEventListener("click", () => navigation.follow(hash));
+    page.views.append(button);
+  }
+  page.views.hidden = named.length === 0;
   for (const [id, act] of Object.entries(actions)) element(id).addEventListener("click", act);
   element("full").hidden = !document.fullscreenEnabled;
   element("close").addEventListener("click", () => {
     page.message.hidden = true;
   });
-  page.head.addEventListener("change", () => loop.mark());
-  page.scale.addEventListener("input", () => loop.mark());
+  page.head.addEventListener("change", mark);
+  page.scale.addEventListener("input", mark);
   page.fly.addEventListener("change", () => {
     navigation.fly = page.fly.checked;
   });
@@ -115,8 +139,8 @@ export function connect(page: Elements, navigation: Navigation, loop: Loop): voi
     keys[event.code]?.();
   });
   window.addEventListener("hashchange", () => navigation.follow(location.hash));
-  new ResizeObserver(() => loop.moved()).observe(page.stage);
+  new ResizeObserver(() => navigation.onChange()).observe(page.stage);
   page.stage.setAttribute("aria-label", `3D view of ${document.title}`);
-  // A small page keeps its view free.
-  if (page.stage.clientHeight >= 400) page.panel.setAttribute("open", "");
+  // A small page and a phone keep their view free.
+  if (page.stage.clientHeight >= 400 && page.stage.clientWidth > 600) page.panel.setAttribute("open", "");
 }

@@ -4,7 +4,7 @@ import { Matrix4, PerspectiveCamera, Vector3 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { Camera, Scene } from "../scene/scene";
 import { type View, viewOf } from "../view";
-import { linked, linkTo } from "./link";
+import { linked, linkTo, type Place } from "./link";
 
 /** Keys that move the camera, by its own axes: right, up, backwards. */
 const MOVES: Record<string, [number, number, number]> = {
@@ -29,6 +29,9 @@ const SPEED = 0.5;
 /** Angle that a key turns in a second, radian. */
 const TURN_SPEED = 1;
 const DEFAULT_FOV = 50;
+/** Seconds between two places of a path, and most places of one that nobody has named. */
+const LEG = 4;
+const MOST_PLACES = 8;
 
 const median = (values: number[]): number => values.sort((a, b) => a - b)[values.length >> 1] ?? 0;
 
@@ -77,6 +80,9 @@ export class Navigation {
   private flying = false;
   private lastMove = 0;
   private lens: Camera;
+  /** A closed path that plays, and the time in seconds since its first place. */
+  private path: Place[] = [];
+  private played = 0;
 
   /** Called when the camera has moved. */
   onChange = (): void => {};
@@ -117,6 +123,7 @@ export class Navigation {
     const matrix = new Matrix4().fromArray([...camera.pose, 0, 0, 0, 1]).transpose(); // rows to columns
     matrix.decompose(this.camera.position, this.camera.quaternion, new Vector3());
     this.lens = camera;
+    this.path = [];
     this.stop = index < 0 ? null : index;
     if (index >= 0) this.visited = index;
     this.aim();
@@ -138,18 +145,92 @@ export class Navigation {
       this.visit(found);
       return;
     }
-    this.visited = found.lens;
-    this.lens = this.stops[found.lens]!;
-    this.stop = null;
-    this.camera.position.fromArray(found.position);
-    this.controls.target.fromArray(found.ahead).add(this.camera.position);
-    this.controls.update();
+    this.path = [];
+    this.go(found);
     this.aim();
     this.onChange();
   }
 
-  /** Leaves a stop: from now on the controls hold the camera. */
+  private go({ position, ahead, lens }: Place): void {
+    this.visited = lens;
+    this.lens = this.stops[lens]!;
+    this.stop = null;
+    this.camera.position.fromArray(position);
+    this.controls.target.fromArray(ahead).add(this.camera.position);
+    this.controls.update();
+  }
+
+  get playing(): boolean {
+    return this.path.length > 0;
+  }
+
+  /** Plays a closed path through the places of links, else through stops, else around the middle; stops one that plays. */
+  play(links: string[]): void {
+    if (this.playing) {
+      this.path = [];
+      this.onChange();
+      return;
+    }
+    const named = links.map((hash) => linked(hash, this.stops.length)).filter((found) => found !== null);
+    const places = named.map((found) => (typeof found === "number" ? this.placeOf(found) : found));
+    this.path = places.length > 1 ? places : this.stops.length > 2 ? this.tour() : this.circle();
+    this.played = 0;
+    this.lastMove = performance.now();
+    this.onChange();
+  }
+
+  /** The place of a stop, which looks as far ahead as the middle of the scene is. */
+  private placeOf(lens: number): Place {
+    const { pose } = this.stops[lens]!;
+    const position = new Vector3(pose[3], pose[7], pose[11]);
+    const away = Math.max(position.distanceTo(this.middle), 1e-6);
+    const ahead = new Vector3(-pose[2]!, -pose[6]!, -pose[10]!).multiplyScalar(away);
+    return { position: position.toArray(), ahead: ahead.toArray(), lens };
+  }
+
+  /** Some stops, from the present one on always to the nearest that is left. */
+  private tour(): Place[] {
+    const stride = Math.ceil(this.stops.length / MOST_PLACES);
+    const left = this.stops.map((_, i) => i).filter((i) => (i - this.visited) % stride === 0);
+    const places = left.splice(left.indexOf(this.visited), 1).map((i) => this.placeOf(i));
+    const point = (place: Place): Vector3 => new Vector3(...place.position);
+    while (left.length) {
+      const here = point(places.at(-1)!);
+      const apart = left.map((i) => point(this.placeOf(i)).distanceTo(here));
+      places.push(this.placeOf(left.splice(apart.indexOf(Math.min(...apart)), 1)[0]!));
+    }
+    return places;
+  }
+
+  /** Places around the middle of the scene, as high and as far as the camera is. */
+  private circle(): Place[] {
+    const arm = this.camera.position.clone().sub(this.middle);
+    return Array.from({ length: MOST_PLACES }, (_, i) => {
+      const turned = arm.clone().applyAxisAngle(this.camera.up, (2 * Math.PI * i) / MOST_PLACES);
+      const position = turned.clone().add(this.middle).toArray();
+      return { position, ahead: turned.negate().toArray(), lens: this.visited };
+    });
+  }
+
+  /** The place on the path at the present time, on a smooth curve (Catmull and Rom). */
+  private along(): Place {
+    const { path } = this;
+    const leg = Math.floor(this.played / LEG);
+    const t = this.played / LEG - leg;
+    const weights = [t * (t * (2 - t) - 1), t * t * (3 * t - 5) + 2, t * (t * (4 - 3 * t) + 1), t * t * (t - 1)];
+    const near = weights.map((weight, i) => ({ weight, place: path[(leg + i + path.length - 1) % path.length]! }));
+    const mix = (of: "position" | "ahead"): [number, number, number] =>
+      [0, 1, 2].map((axis) => near.reduce((sum, { weight, place }) => sum + (weight / 2) * place[of][axis]!, 0)) as [
+        number,
+        number,
+        number,
+      ];
+    return { position: mix("position"), ahead: mix("ahead"), lens: near[1]!.place.lens };
+  }
+
+  /** Leaves a stop or a path: from now on the controls hold the camera. */
   private leave(): void {
+    this.path = [];
     if (this.stop === null) return;
     this.stop = null;
     this.controls.update();
@@ -189,11 +270,21 @@ export class Navigation {
     this.onChange();
   }
 
-  /** Moves by the pressed keys; returns whether the camera is still moving. */
+  /** Moves along the path or by the pressed keys; returns whether the camera is still moving. */
   move(now: number): boolean {
-    const seconds = Math.min((now - this.lastMove) / 1000, 0.1);
+    const seconds = Math.max(now - this.lastMove, 0) / 1000;
     this.lastMove = now;
+    if (this.playing) {
+      this.played += seconds;
+      this.go(this.along());
+      return true;
+    }
     if (this.pressed.size === 0) return false;
+    this.moveBy(Math.min(seconds, 0.1));
+    return true;
+  }
+
+  private moveBy(seconds: number): void {
     const step = new Vector3();
     for (const code of this.pressed) {
       step.add(new Vector3(...(MOVES[code] ?? [0, 0, 0])));
@@ -206,7 +297,6 @@ export class Navigation {
     this.camera.position.add(step);
     this.controls.target.add(step);
     this.controls.update();
-    return true;
   }
 
   /** The view of a canvas of some size, which shows at least what the camera of the last stop sees. */

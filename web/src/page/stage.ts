@@ -13,7 +13,7 @@ const CONTEXTS = 3;
 export class Stage {
   /** What draws: webgpu, webgl or image. */
   drawn: "webgpu" | "webgl" | "image" = "image";
-  /** Why base colours are shown; empty while WebGPU draws. */
+  /** Why base colours are shown; empty where nothing is missing. */
   notice = "";
   private drawer: Drawer | null = null;
   private device: GPUDevice | null = null;
@@ -79,7 +79,15 @@ export class Stage {
     this.drawer = painter;
     this.drawn = "webgl";
     this.onChange();
-    this.notice = `${reason}: base colours${this.scene.head ? "; the compensation head is not shown" : ""}.`;
+    // Without a head nothing is missing.
+    this.notice = this.scene.head ? `${reason}: base colours; the compensation head is not shown.` : "";
+  }
+
+  /** How many of the Gaussians of the file are drawn; empty for all. */
+  get left(): string {
+    const { total, field } = this.scene;
+    const [shown, all] = [field.count, total].map((n) => n.toLocaleString("en"));
+    return field.count < total ? `${shown} of ${all} Gaussians, for a phone` : "";
   }
 
   get hasHead(): boolean {

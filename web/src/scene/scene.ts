@@ -27,6 +27,8 @@ export type Camera = { pose: number[]; fx: number; fy: number; cx: number; cy: n
 
 export type Scene = {
   field: Field;
+  /** Gaussians of the file; a phone draws fewer. */
+  total: number;
   /** Length of a feature vector; 0 without features. */
   features: number;
   /** SH degree of the stored colours. */
@@ -72,6 +74,7 @@ export async function readScene(file: Uint8Array<ArrayBuffer>, onProgress: OnPro
   }
   return {
     field,
+    total: field.count,
     features: shape.features,
     degree,
     logits: stated.sh_degree === 0,
