@@ -9,6 +9,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from sundae_ns.core.covariance import covariances
+from sundae_ns.core.gaussians import sh_degree
+from sundae_ns.rasterize.reference import harmonic_basis
+
 
 def random_field(n: int = 600, degree: int = 2, features: int = 5, seed: int = 0) -> dict[str, Tensor]:
     """Parameters of ``n`` Gaussians, float32; quaternions are not normalised, and 0 leaves the features out."""
@@ -71,3 +75,28 @@ def assert_close(found: Mapping[str, Tensor], truth: Mapping[str, Tensor], toler
 def normal_points(n: int = 60, seed: int = 0) -> Tensor:
     """Points of a normal distribution, float64 ``[n, 3]``."""
     return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def assert_moved(
+    found: Mapping[str, Tensor],
+    truth: Mapping[str, Tensor],
+    turn: Tensor,
+    shift: Tensor | float = 0.0,
+    scale: float = 1.0,
+    atol: float = 1e-5,
+) -> None:
+    """Compare a field with another one that is turned, then shifted and scaled: centres, shapes and colours."""
+    directions = normalize(torch.randn(9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    shapes, colors = [], []
+    for field, seen in ((found, directions @ turn.T.double()), (truth, directions)):
+        shapes.append(covariances(field["scales"].double().exp(), field["quats"].double()))
+        rest = field["features_rest"].double()
+        basis = harmonic_basis(sh_degree(rest), seen)[:, 1:]
+        colors.append(torch.einsum("dk,nkc->ndc", basis, rest))
+    turn = turn.double()
+    means = scale * (truth["means"].double() @ turn.T + shift)
+    torch.testing.assert_close(found["means"].double(), means, rtol=0, atol=atol)
+    torch.testing.assert_close(shapes[0], scale**2 * turn @ shapes[1] @ turn.T, rtol=0, atol=atol)
+    torch.testing.assert_close(colors[0], colors[1], rtol=0, atol=atol)
+    for name in ("opacities", "features_dc"):
+        assert torch.equal(found[name], truth[name]), name

@@ -37,7 +37,7 @@ def compiled():
     entropy.encode_gaps(np.zeros(1, np.uint64), 1, 4)
 
 
-@given(st.integers(1, 300), st.integers(1, 6), st.integers(0, 2**16))
+@given(st.integers(0, 300), st.integers(1, 6), st.integers(0, 2**16))
 def test_numbers_come_back(n, width, seed):
     levels = levels_of(n, width, seed)
     near = entropy.neighbours_of(np.random.default_rng(seed).integers(0, 99, (n, 3)), 1 + seed % 50)
@@ -52,11 +52,6 @@ def test_codes_of_cells_come_back(n, bits, seed):
     codes[-1] = (1 << 3 * bits) - 1
     stream = entropy.encode_gaps(codes, block, bits)
     assert np.array_equal(entropy.decode_gaps(stream, n, block, bits), codes)
-
-
-def test_no_rows():
-    near = entropy.predecessors(0)
-    assert entropy.decode_levels(entropy.encode_levels(np.zeros((0, 1), np.int32), near), 1, near).shape == (0, 1)
 
 
 @pytest.mark.parametrize("scale", [0.02, 0.3, 4.0, 300.0])
