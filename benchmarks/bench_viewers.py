@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from harness.chromium import Browser, find_chromium, wait_for
 from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene
-from sundae_ns.scene.load_save import save_for_viewers
+from sundae_ns.scene.load_save import save_for_viewers, save_levels
 from sundae_ns.scene.packing import arrays_of_cameras, scene_of
 
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
@@ -47,7 +47,7 @@ READS = {
     "spark": ("ply", "spz"),
     "gaussianSplats3D": ("ply",),  # it has versions 1 and 2 of .spz; Spark and we have 3
     "three": ("glb",),
-    "playcanvas": ("ply", "sog", "glb"),
+    "playcanvas": ("ply", "sog", "glb", "lod"),
     "babylon": ("ply", "spz", "sog", "glb"),
 }
 """Kinds of our files by viewer."""
@@ -140,7 +140,7 @@ class Viewers:
 
 @contextmanager
 def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
-    """The viewers with an export of a scene; ``kind`` is ``ply``, ``spz``, ``sog`` or ``glb``."""
+    """The viewers with an export of a scene; ``kind`` is ``ply``, ``spz``, ``sog``, ``glb`` or ``lod``."""
     chromium = find_chromium()
     if chromium is None or not has_packages():
         sys.exit("no Chromium or no viewers here: apt-get install chromium, then make browser")
@@ -149,12 +149,16 @@ def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
         site = Path(folder)
         (site / "index.html").write_text(PAGE)
         bundled("viewers.ts", site / "viewers.js", "--minify")
-        save_for_viewers(scene_of(scene), site / f"a.{kind}")
+        file = "a/lod-meta.json" if kind == "lod" else f"a.{kind}"
+        if kind == "lod":
+            save_levels([scene_of(scene), scene_of(scene)[::10]], site / "a")
+        else:
+            save_for_viewers(scene_of(scene), site / file)
         with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=site)) as server:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             try:
                 with Browser(chromium, width, height) as page:
-                    yield Viewers(page, f"http://127.0.0.1:{server.server_port}/", scene, f"a.{kind}")
+                    yield Viewers(page, f"http://127.0.0.1:{server.server_port}/", scene, file)
             finally:
                 server.shutdown()
 
@@ -183,7 +187,7 @@ def rows(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="written by sundae pack")
-    parser.add_argument("--kind", choices=("ply", "spz", "sog", "glb"), default="ply", help="of the export")
+    parser.add_argument("--kind", choices=("ply", "spz", "sog", "glb", "lod"), default="ply", help="of the export")
     parser.add_argument("--side", type=int, default=SIDE, help="longest side of the images, pixels")
     parser.add_argument("--viewer", choices=READS, help="one viewer instead of all")
     parser.add_argument("--central", action="store_true", help="only Gaussians whose centres lie in all images")

@@ -51,6 +51,14 @@ export const showByPlayCanvas: Show = async (file, cameras, options) => {
   camera.camera.calculateProjection = (matrix: { set(values: number[]): void }) =>
     matrix.set(columns(projectionOf(place)));
   app.root.addChild(camera);
+  if (file.endsWith("lod-meta.json")) {
+    Object.assign(scene.gsplat, { lodRangeMin: 0, lodRangeMax: 0 }); // the finest level alone
+    let loaded = false;
+    app.systems.gsplat.on("frame:ready", (_camera: unknown, _layer: unknown, ready: boolean, loading: number) => {
+      loaded ||= ready && loading === 0;
+    });
+    while (!loaded) await afterFrames(() => app.tick(performance.now()));
+  }
   const images: string[] = [];
   for (place of cameras) {
     const { pose } = place;
