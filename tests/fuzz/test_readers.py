@@ -7,6 +7,7 @@ the interpreter records what a reader does (PEP 578).
 import io
 import json
 import os
+import shutil
 import stat
 import struct
 import sys
@@ -32,10 +33,10 @@ from small_captures import meta_of
 
 from sundae_ns.core.errors import PackError
 from sundae_ns.io import checkpoint
-from sundae_ns.io.formats import read_gaussian_file, read_gaussians, write_for_viewers
+from sundae_ns.io.formats import read_gaussian_file, read_gaussians, write_for_viewers, write_levels
 from sundae_ns.io.pack import container
 from sundae_ns.io.pack.packed_scene import PackedScene, read_scene, write_scene
-from sundae_ns.io.ply import read_ply, read_point_cloud, write_ply
+from sundae_ns.io.ply import Marks, read_ply, read_point_cloud, write_ply
 from sundae_ns.plugin.dataparsers import LightNerfstudioParser, check_capture
 from sundae_ns.scene.initialization import from_points
 
@@ -72,6 +73,11 @@ def read_cloud(path):
         from_points(points, rgb.float() / 255, sh_degree=1, num_features=0)
 
 
+def write_lod(path):
+    write_levels(path.parent / "lod", [small_field(60), small_field(20)], Marks())
+    Path(shutil.make_archive(str(path), "zip", path.parent / "lod")).rename(path)
+
+
 READERS = {
     **{
         name: (lambda path, write=write: write(path, small_field(60)), read_gaussian_file)
@@ -81,6 +87,7 @@ READERS = {
         f"a{suffix}": (lambda path: write_for_viewers(path, small_field(60)), read_gaussian_file)
         for suffix in (".spz", ".sog", ".glb")
     },
+    "lod.sog": (write_lod, read_gaussian_file),
     "four.spz": (lambda path: path.write_bytes(spz(small_field(60), 4, axes=8)), read_gaussian_file),
     "one.spz": (lambda path: path.write_bytes(spz(small_field(60), 1)), read_gaussian_file),
     "field.ply": (lambda path: FOREIGN["plain.ply"](path, small_field(20)), read_gaussians),
