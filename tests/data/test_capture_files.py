@@ -126,14 +126,11 @@ def written(folder, out):
 
 def test_photos_of_one_camera_share_a_folder(tmp_path):
     tall = gradient(24, 40)
-    for name, image, entries in (
-        ("a.jpg", None, {"model": "Phone", "focal": 4.2}),
-        ("b.jpg", None, {"model": "Phone", "focal": 9.0}),
-        ("c.jpg", tall, {"model": "Phone", "focal": 4.2}),
-        ("d.jpg", tall, {"model": "Phone", "focal": 4.2, "orientation": 6}),  # turned, it is as the first
-        ("e.png", None, {"model": "Other"}),
-    ):
-        photo(tmp_path / name, image=image or gradient(), **entries)
+    photo(tmp_path / "a.jpg", image=gradient(), model="Phone", focal=4.2)
+    photo(tmp_path / "b.jpg", image=gradient(), model="Phone", focal=9.0)
+    photo(tmp_path / "c.jpg", image=tall, model="Phone", focal=4.2)
+    photo(tmp_path / "d.jpg", image=tall, model="Phone", focal=4.2, orientation=6)  # turned, it is as the first
+    photo(tmp_path / "e.png", image=gradient(), model="Other")
     names = [f"c{camera}/frame_{number:05d}" for number, camera in enumerate((1, 2, 3, 1, 4), start=1)]
     assert names_of(find_photos(tmp_path)) == [*(f"{name}.jpg" for name in names[:4]), f"{names[4]}.png"]
 

@@ -36,7 +36,6 @@ def test_a_model_and_its_images(tmp_path, place, images, words):
     write_model(data / place, photos(data / images), (20, 16))
     assert is_posed(data)
     layout = posed_layout(data)
-    assert layout is not None
     assert layout.words == ["colmap", "--colmap-path", *words, "--downscale-factor", "1"]
     assert shlex.split(str(no_transforms(data)).split("`")[1]) == layout.words, "the advice is what sundae train adds"
 
@@ -48,7 +47,6 @@ def test_smaller_images_are_taken_where_there_are_some(tmp_path, made, factor):
     for one in made:
         photos(tmp_path / f"images_{one}", 3, (6000 // one, 40 // one))
     layout = posed_layout(tmp_path)
-    assert layout is not None
     assert layout.words[-1] == str(factor)
     (tmp_path / "transforms.json").write_text("{}")
     assert is_posed(tmp_path)
@@ -68,7 +66,6 @@ def test_a_capture_of_blender(tmp_path):
     data = blender(tmp_path / "lego")
     assert is_posed(data)
     layout = posed_layout(data)
-    assert layout is not None
     assert layout.description == "Blender layout: 2 training images, over white"
     assert (layout.words, layout.options[-1]) == (["blender-data"], "white")
     for missing in ("train/0.png", "transforms_val.json"):

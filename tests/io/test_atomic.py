@@ -75,7 +75,6 @@ def test_what_killed_processes_left_is_removed_and_what_others_write_stays(tmp_p
     waits = "with replacing(Path(sys.argv[1])) as f:\n    f.write_text('half')\n    print(f, flush=True)\n    input()\n"
     command = [sys.executable, "-c", ready + waits, str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout is not None
         partial = Path(other.stdout.readline().strip())
         longer = tmp_path / "[a].txt.ply.2.partial"
         longer.touch()

@@ -32,7 +32,6 @@ def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):
     run = tmp_path / "runs" / "a"
     other = subprocess.Popen([sys.executable, "-c", HOLDER, run], stdout=subprocess.PIPE)
     try:
-        assert other.stdout is not None
         other.stdout.readline()
         for path in (run, tmp_path / "runs" / ".." / "runs" / "a"):
             with pytest.raises(StorageError, match=f"^process {other.pid} on .* trains in .*; .*--timestamp$"):

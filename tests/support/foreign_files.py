@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -144,7 +144,7 @@ def write_gsplat(path: Path, gaussians: Mapping[str, Tensor], **others: object) 
 
 
 def write_checkpoint(
-    path: Path | IO[bytes],
+    path: Path,
     gaussians: Mapping[str, Tensor],
     extra: Mapping[str, Any] = MappingProxyType({}),
     **others: object,

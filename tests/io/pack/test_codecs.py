@@ -50,7 +50,6 @@ def test_a_file_holds_the_values_rounded_in_training(tmp_path, config):
     fitted, codecs = fit_scene(full_scene(), config)
     g = torch.Generator().manual_seed(1)
     moved = {name: value + 0.02 * torch.randn(value.shape, generator=g) for name, value in fitted.gaussians.items()}
-    assert codecs.head is not None
     head = {name: 1.1 * value for name, value in fitted.head.items()}
     write_fitted(tmp_path / "a.sundae", PackedScene(moved, head), codecs)
     found = read_scene(tmp_path / "a.sundae")
@@ -94,8 +93,6 @@ def test_other_steps_keep_grids_and_bases(tmp_path):
             assert isinstance(found, quantize.Transform)
             assert torch.equal(found.basis, codec.basis)
             assert torch.equal(found.mean, codec.mean)
-    assert codecs.head is not None
-    assert other.head is not None
     # Half of the largest weight, not eight tenths.
     torch.testing.assert_close(other.head.rows["a.weight"], 5 * codecs.head.rows["a.weight"])
     same = codecs.with_steps(present, moved.gaussians, moved.head)
@@ -145,7 +142,6 @@ def test_weights_that_show_less_are_coarser_at_the_same_total_error():
     errors, sizes = [], []
     for sensitivity in (None, Sensitivity({}, shown)):
         _, codecs = fit_scene(replace(original, sensitivity=sensitivity), PackConfig(head_step=0.02))
-        assert codecs.head is not None
         moved = {name: codecs.head.rounded(name, value) - value for name, value in head.items()}
         errors.append(sum(float((shown[name] * moved[name].square().sum((2, 3))).sum()) for name in head))
         levels = codecs.head.encode(head)[1]
