@@ -345,13 +345,10 @@ def train_a_step(data):
     """Train one step with the head, and evaluate the test views."""
     datamanager = load(data)
     config = SundaeModelConfig(head=HeadConfig(mode="residual", size="tiny"), num_random=50, num_downscales=0)
-    metadata = datamanager.train_dataset.metadata
-    points = metadata.get("points3D_xyz")
+    dataset = datamanager.train_dataset
+    points = [dataset.metadata[f"points3D_{name}"] for name in ("xyz", "rgb") if "points3D_xyz" in dataset.metadata]
     model = config.setup(
-        scene_box=datamanager.train_dataset.scene_box,
-        num_train_data=VIEWS,
-        metadata=metadata,
-        seed_points=None if points is None else (points, metadata["points3D_rgb"]),
+        scene_box=dataset.scene_box, num_train_data=VIEWS, metadata=dataset.metadata, seed_points=points or None
     )
     model.train()
     model.step = config.pruning.prune_at + 1

@@ -11,27 +11,15 @@ import torch
 from damage import INSIDE
 from documents import GONE, put
 from limits import refused, verdict
-from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
-from nerfstudio.data.scene_box import SceneBox
+from models import _build
 from nerfstudio.engine.optimizers import Optimizers
 from torch.amp import GradScaler
 
 from sundae_ns.core.errors import SundaeError
-from sundae_ns.head.head import HeadConfig
 from sundae_ns.io.formats import read_gaussians
 from sundae_ns.plugin.distributed import Ranks
-from sundae_ns.plugin.model import SundaeModelConfig
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.plugin.trainer import SundaeTrainer
-
-
-def small_model():
-    points = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
-    config = SundaeModelConfig(
-        head=HeadConfig(size="tiny", num_features=5), camera_optimizer=CameraOptimizerConfig(mode="off"), sh_degree=1
-    )
-    box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
-    return config.setup(scene_box=box, num_train_data=4, metadata={}, seed_points=(points, points * 255))
 
 
 class Pipeline(torch.nn.Module):
@@ -39,7 +27,7 @@ class Pipeline(torch.nn.Module):
 
     def __init__(self):
         super().__init__()
-        self._model = small_model()
+        self._model = _build(n=30)
         outputs = SimpleNamespace(dataparser_transform=torch.eye(4)[:3], dataparser_scale=1.0)
         self.datamanager = SimpleNamespace(train_dataparser_outputs=outputs)
 
