@@ -127,12 +127,8 @@ def _write_levels(scene: Opened, out: Path, upright: bool) -> int:
     levels = [scene.to(fastest_device())]
     with progress_bar() as bar:
         task = bar.add_task("Levels of detail", total=None)
-
-        def after_step(done: int, total: int) -> bool:
-            bar.update(task, completed=done, total=total)
-            return True
-
-        for level, psnr in levels_of(levels[0], scene.cameras, after_step):
+        trained = levels_of(levels[0], scene.cameras, lambda i, n: bar.update(task, completed=i, total=n))
+        for level, psnr in trained:
             print(f"{level.num_gaussians:,} Gaussians: {psnr:.2f} dB against the full scene, on cameras of no step")
             levels.append(level)
     save_levels(levels, out, upright=upright)

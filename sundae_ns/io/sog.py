@@ -202,6 +202,8 @@ def _scene(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Mark
 
 def _finest_level(path: Path, entry: Entry, size: int) -> tuple[dict[str, Tensor], Marks]:
     meta = parsed_json(entry(STREAMED))
+    if (version := meta.get("version", 1)) != 1:
+        raise DataError(f"{path} has version {version} of streamed SOG, this program reads 1; update it")
     files, nodes = dict[str, list[tuple[int, int]]](), [meta["tree"]]
     while nodes:
         node = nodes.pop()

@@ -126,8 +126,8 @@ class Distillation:
         )
 
     @usual_defaults()
-    def train(self, after_step: Callable[[int, int], bool]) -> bool:
-        """Decide on the head, if that is due, and train the steps that are left, while ``after_step`` returns True.
+    def train(self, after_step: Callable[[int, int], object]) -> bool:
+        """Decide on the head, if that is due, and train the steps that are left, until ``after_step`` returns False.
 
         It gets the number of steps so far and of all. Returns whether all steps were trained.
         """
@@ -139,7 +139,7 @@ class Distillation:
             self.step = done
             if self.steps - done < 0.1 * self.steps and done % AVERAGED_EVERY == 0:
                 self._mean.count_in(weights_of(self.state))
-            return after_step(2 * trial + done, total) or done == self.steps
+            return after_step(2 * trial + done, total) is not False or done == self.steps
 
         with naming_full_memory(lambda: self.state.gaussians.num_gaussians):
             if trial and not self._try_head(trial, lambda done: after_step(done, total)):
@@ -149,7 +149,7 @@ class Distillation:
         self._mean.replace(weights_of(self.state))
         return True
 
-    def _optimise(self, steps: int, first: int, on_step: Callable[[int], bool]) -> bool:
+    def _optimise(self, steps: int, first: int, on_step: Callable[[int], object]) -> bool:
         """Train; step ``i`` of ``steps`` is a function of both, so that a resumed training repeats it."""
         sparse = sparse_factor(self.state.gaussians.num_gaussians)
 
@@ -160,7 +160,7 @@ class Distillation:
 
         return optimise(self._train_step, self.state.optimizers, steps, factor, first=first, on_step=on_step)
 
-    def _try_head(self, steps: int, on_step: Callable[[int], bool]) -> bool:
+    def _try_head(self, steps: int, on_step: Callable[[int], object]) -> bool:
         """Train without and with the head from the same start, and keep the head if it pays; False if interrupted."""
         state, quality = self.state, list[float]()
         assert state.head is not None
@@ -301,7 +301,7 @@ def distill(
 
 
 def levels_of(
-    scene: Scene, cameras: Sequence[Camera] = (), after_step: Callable[[int, int], bool] = lambda *_: True
+    scene: Scene, cameras: Sequence[Camera] = (), after_step: Callable[[int, int], object] = lambda *_: None
 ) -> Iterator[tuple[Scene, float]]:
     """The levels of detail below a scene, :data:`LEVELS`, and the PSNR of each on held-out cameras, dB.
 

@@ -263,6 +263,7 @@ HOSTILE = {
     "three levels": (lambda files: zipped({"a.sog": zipped({"b.sog": zipped(files)})}), "0 meta.json and 1 .sog"),
     "two scenes": (lambda files: zipped({"a.sog": zipped(files), "b.sog": b""}), "0 meta.json and 2 .sog"),
     "streamed, without a tree": (_streamed(), "'tree'"),
+    "another version of levels": (_streamed((0, 150), version=2), "has version 2 of streamed SOG"),
     "leaves that share Gaussians": (_streamed((0, 100), (99, 51)), "leaves share Gaussians of 0/meta.json"),
     "a leaf beyond its chunk": (_streamed((100, 51)), "leaves share Gaussians of 0/meta.json, or it has fewer"),
     "a negative leaf": (_streamed((-50, 50)), "leaves share Gaussians of 0/meta.json"),
