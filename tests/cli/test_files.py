@@ -45,9 +45,7 @@ def test_export_of_a_packed_scene(tmp_path, mode):
     assert ("SplatRenderMode: mip" in PlyData.read(tmp_path / "a.ply").comments) == (mode == "antialiased")
 
 
-def test_export_of_levels_of_detail(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_export_of_levels_of_detail(tmp_path, capsys, monkeypatch):
     for name, value in {"LEVEL_STEPS": {"cpu": 2}, "CAMERAS": 16, "SIDES": {"cpu": 32}}.items():
         monkeypatch.setattr(f"sundae_ns.plugin.distill.{name}", value)
     write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": MODEL}))
