@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from colmap_models import write_model
+from PIL import Image
 
 from sundae_ns.cli import main
 
@@ -25,7 +26,9 @@ ELSEWHERE = {
     "ns-train sundae --machine.num-devices 2": "needs two GPUs; plugin/test_whole_runs.py trains on two",
 }
 """Commands that do not run here, by how they start, with the reason and the test that covers them."""
-NAMES = {"$RUN": "RUN", "capture": "CAPTURE", "RUN_OR_PACK_OR_PLY": "other.ply", "FILE": "other.ply", "...": ""}
+NAMES = {"$RUN": "RUN", "capture": "CAPTURE", "...": "", "after.sundae": "scene.sundae"}
+NAMES |= dict.fromkeys(("RUN_OR_PACK_OR_PLY", "FILE", "scene.ply", "before.ply"), "other.ply")
+NAMES["Detail=#camera=..."] = "Detail=#camera=2"
 SHORTER = {"--finetune": "2", "--view": "2", "--width": "32", "--height": "24", "--train-views": "6"}
 """Values that suit a small run and a small scene."""
 MORE = {"prune": ["--num-cameras", "4"], "distill": ["--steps", "4"], "render": ["--width", "32"]}
@@ -98,7 +101,11 @@ def run_and_capture(tiny, tmp_path, monkeypatch):
     shutil.copytree(tiny.scene, "CAPTURE")
     shutil.copytree("CAPTURE/images", "CAPTURE/images_2")
     images = sorted(path.name for path in Path("CAPTURE/images").iterdir())
-    write_model(Path("CAPTURE/sparse/0"), images, (48, 48))
+    for model in ("sparse/0", "colmap/sparse/0"):
+        write_model(Path("CAPTURE", model), images, (48, 48))
+    Path("CAPTURE/masks").mkdir()
+    for name in images:
+        Image.new("L", (48, 48), 255).save(Path("CAPTURE/masks", name).with_suffix(".png"))
     with pytest.raises(SystemExit):
         main(["export", "RUN", "-o", "other.ply"])
 
