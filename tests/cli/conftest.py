@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from fake_colmap import FakeColmap
 from run_commands import PHOTOS, Commands, photo
-from short_prunes import short_prunes  # noqa: F401
+from short_prunes import short_distillation, short_prunes  # noqa: F401
 
 from sundae_ns.io import run_folder
 

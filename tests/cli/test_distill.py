@@ -23,6 +23,7 @@ def source(tmp_path):
     return tmp_path / "a.ply"
 
 
+@pytest.mark.usefixtures("short_distillation")
 def test_an_interrupted_distillation_goes_on(source, capsys, monkeypatch):
     out = source.with_name("b.spz")
     words = (source, "-o", out, "--keep", "0.5", "--steps", "6", "--no-head")
@@ -33,7 +34,6 @@ def test_an_interrupted_distillation_goes_on(source, capsys, monkeypatch):
         if i == 3:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("sundae_ns.plugin.distill.CAMERAS", 8)
     monkeypatch.setattr(Distillation, "_train_step", interrupted)
     assert run(*words) == 130
     assert "saved step 4 of 6" in capsys.readouterr().err

@@ -45,9 +45,8 @@ def test_export_of_a_packed_scene(tmp_path, mode):
     assert ("SplatRenderMode: mip" in PlyData.read(tmp_path / "a.ply").comments) == (mode == "antialiased")
 
 
-def test_export_of_levels_of_detail(tmp_path, capsys, monkeypatch):
-    for name, value in {"LEVEL_STEPS": {"cpu": 2}, "CAMERAS": 16, "SIDES": {"cpu": 32}}.items():
-        monkeypatch.setattr(f"sundae_ns.plugin.distill.{name}", value)
+@pytest.mark.usefixtures("short_distillation")
+def test_export_of_levels_of_detail(tmp_path, capsys):
     write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": MODEL}))
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "b", "--lod") == 0
     assert json.loads((tmp_path / "b" / "lod-meta.json").read_text())["counts"] == [200, 100, 50, 20]
@@ -127,11 +126,11 @@ def test_prune_does_not_change_kept_rows(tmp_path, options, capsys, caplog):
     assert np.array_equal(kept, more[kept["label"]])
 
 
+@pytest.mark.usefixtures("short_distillation")
 @pytest.mark.parametrize("name", FOREIGN)
 def test_every_command_reads_files_of_other_programs(tmp_path, monkeypatch, caplog, name):
     """In folders that do not exist yet."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sundae_ns.plugin.distill.CAMERAS", 8)
     truth = KSPLAT if name == "a.ksplat" else small_field()
     FOREIGN[name](Path(name), truth)
     colors = read_gaussian_file(Path(name))[0].gaussians["features_dc"]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import pytest
 import yaml
-from short_prunes import short_prunes  # noqa: F401
+from short_prunes import short_distillation, short_prunes  # noqa: F401
 from trial_runs import set_options, tidy
 
 from harness.still_life import write_still_life

@@ -62,7 +62,7 @@ def test_no_command_is_forgotten():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.usefixtures("hostile", "short_prunes")
+@pytest.mark.usefixtures("hostile", "short_prunes", "short_distillation")
 def test_no_command_runs_it(command, monkeypatch):
     asked = []
 
@@ -80,7 +80,6 @@ def test_no_command_runs_it(command, monkeypatch):
 
     monkeypatch.setattr("sundae_ns.cli.run.run_command", start)
     monkeypatch.setattr("sundae_ns.cli.demo.run_command", start)
-    monkeypatch.setattr("sundae_ns.plugin.distill.CAMERAS", 8)
     monkeypatch.setattr("sundae_ns.cli.train.run_command", start)
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", stop)
     with pytest.raises(SystemExit):

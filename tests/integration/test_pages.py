@@ -59,11 +59,10 @@ def commands_of(page, *programs):
             yield [word for word in words if word] + MORE.get(words[1], [])
 
 
-@pytest.mark.usefixtures("short_prunes")
+@pytest.mark.usefixtures("short_prunes", "short_distillation")
 @pytest.mark.parametrize("page", [page for page in PAGES if list(commands_of(page))], ids=lambda page: page.name)
 def test_commands_run_as_they_stand(page, tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sundae_ns.plugin.distill.CAMERAS", 8)
     monkeypatch.setattr("sundae_ns.cli.render.SECONDS", 1)
     shutil.copytree(tiny.folder, "RUN")
     shutil.copytree(tiny.scene, "CAPTURE")

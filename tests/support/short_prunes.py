@@ -21,3 +21,10 @@ def short_prunes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(pruning.REFIT_STEPS, "cpu", STEPS)
     monkeypatch.setitem(virtual.VIEWS, "cpu", VIEWS)
     monkeypatch.setattr(virtual, "SIDE", SIDE)
+
+
+@pytest.fixture
+def short_distillation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Distillation and levels of detail by few small views, and levels by two steps."""
+    for name, value in {"LEVEL_STEPS": {"cpu": 2}, "CAMERAS": 8, "SIDES": {"cpu": 32}}.items():
+        monkeypatch.setattr(f"sundae_ns.plugin.distill.{name}", value)
