@@ -310,12 +310,11 @@ def prune() -> list[str]:
         device = "" if row["tool"] == "splat-transform" else "cpu" if row["device"] == "cpu" else "gpu"
         cells.setdefault((row["capture"], float(row["share"])), {})[row["rule"], row["training"], device] = pair
     captures = dict.fromkeys(capture for capture, _ in cells)
-    made = [
-        [f"{capture}, {share:.0%}", *(cells.get((capture, share), {}).get(name, "") for name in PRUNES)]
-        for capture in captures
-        for share in (0.5, 0.1)
-    ]
-    return table(["capture, kept", *PRUNES.values()], made)
+    made = []
+    for capture in captures:
+        halves, tenths = (cells.get((capture, share), {}) for share in (0.5, 0.1))
+        made.append([capture, *("<br>".join([halves.get(name, "-"), tenths.get(name, "-")]) for name in PRUNES)])
+    return table(["capture, 50% and 10% kept", *PRUNES.values()], made, words=1)
 
 
 def library() -> list[str]:

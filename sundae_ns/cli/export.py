@@ -58,7 +58,7 @@ def export(
     Args:
         out: file to write; its suffix selects the format: .html, .ply or .glb (exact), .spz or .sog (quantised,
             much smaller). A name without a suffix is a folder of page and scene, for a web server.
-        beside: another scene, which the page shows beside the first one by the same camera.
+        beside: another scene, which the page shows as it is beside the first one, by the same camera.
         views: views that the page names: NAME=LINK, each with a link that its button Copy link gives.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers; not for a warm start.
         start_view: what a page opens with: index of a stored camera, or a camera file as sundae render reads it; by
