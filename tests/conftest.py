@@ -30,10 +30,8 @@ Once = Callable[[str, Callable[[Path], None]], Path]
 gc.set_threshold(100_000)
 
 ALL_SEEDS = os.environ.get("SUNDAE_ALL_SEEDS") == "1"
-_FIRST = ("integration/test_commands.py", "plugin/test_whole_runs.py", "integration", "plugin", "cli")
-"""Long files and folders with long files, the longest first. Workers that start with these end together.
-
-While one worker trains the tiny run, which most of tests/integration waits for, another needs something else to do."""
+_FIRST = ("integration/test_trials.py", "plugin/test_whole_runs.py", "integration", "plugin", "cli")
+"""Long files and folders with long files, the longest first. Workers that start with these end together."""
 
 # Definitions that a GPU's compiler has built in, and a setter of the block index. A block has one thread here, so
 # memory that threads of a block share is filled before it is read, and a warp of one lane exchanges with itself.
