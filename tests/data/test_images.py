@@ -90,10 +90,6 @@ def grey16(path):
     Image.fromarray(np.asarray(patches().convert("L"), np.uint16) * 257).save(path)
 
 
-def palette(path):
-    patches().quantize(64).save(path)
-
-
 def with_profile(mode, space):
     icc = space if isinstance(space, bytes) else profile(space)
     return lambda path: patches().convert(mode).save(path, icc_profile=icc)
@@ -109,7 +105,7 @@ def _grey():
 
 TYPES = {
     "16 bits": (grey16, "L", _grey),
-    "a palette": (palette, "RGB", _same),
+    "a palette": (lambda path: patches().quantize(64).save(path), "RGB", _same),
     "grey and alpha": (lambda path: patches().convert("LA").save(path), "RGBA", _grey),
     "CMYK": (
         lambda path: patches().convert("CMYK").save(path, format="TIFF"),

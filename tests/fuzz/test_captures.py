@@ -7,9 +7,7 @@ import re
 import shutil
 import struct
 import zlib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
@@ -29,8 +27,6 @@ from sundae_ns.core.errors import DataError
 from sundae_ns.data.colmap import check_colmap
 from sundae_ns.head.head import HeadConfig
 from sundae_ns.plugin.model import SundaeModelConfig
-
-Change = Callable[[dict[str, Any]], object]
 
 
 def rewrite(data, changes):
@@ -275,13 +271,9 @@ def bomb(width, height):
     return lambda path: path.write_bytes(content)
 
 
-def _saved(kind, size=(WIDTH, HEIGHT)):
-    return lambda path: Image.new(kind, size).save(path)
-
-
 IMAGES = {
     "floats": (lambda path: Image.new("F", SIZE).save(path, format="TIFF"), "pixels of type F"),
-    "one pixel": (_saved("RGB", (1, 1)), "1 x 1 px but its camera says"),
+    "one pixel": (lambda path: Image.new("RGB", (1, 1)).save(path), "1 x 1 px but its camera says"),
     "empty": (lambda path: path.write_bytes(b""), "cannot identify image file"),
     "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
     "missing": (lambda path: path.unlink(), "does not exist|none"),

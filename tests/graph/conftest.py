@@ -1,16 +1,11 @@
 """Hard point sets for neighbour searches."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
 from fields import normal_points
-from torch import Tensor
 
 from sundae_ns.graph import neighbors
-
-Cloud = Callable[[int], Tensor]
 
 
 def _clusters(n):
@@ -52,10 +47,6 @@ def _sphere(n):
     return points
 
 
-def _line(n):
-    return torch.linspace(-1, 1, n, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-
-
 CLOUDS = {
     "normal": normal_points,
     "clusters": _clusters,
@@ -64,7 +55,7 @@ CLOUDS = {
     "all at one spot": lambda n: torch.full((n, 3), 0.1, dtype=torch.float64),
     "lattice": _lattice,
     "sphere": _sphere,
-    "line": _line,
+    "line": lambda n: torch.linspace(-1, 1, n, dtype=torch.float64)[:, None] * torch.eye(3, dtype=torch.float64)[0],
     "plane": lambda n: normal_points(n) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64),
     "two clusters 1e6 apart": lambda n: normal_points(n) + torch.arange(n)[:, None] % 2 * 1e6,
     "far from the origin": lambda n: normal_points(n) + 1e5,

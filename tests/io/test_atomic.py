@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -38,8 +39,8 @@ def test_an_error_while_writing_leaves_the_old_file(tmp_path):
     write_text(tmp_path / "a.txt", "old")
 
     def fail():
-        with replacing(tmp_path / "a.txt") as partial:
-            partial.write_text("half")
+        with replacing(tmp_path / "a.txt") as unfinished:
+            unfinished.write_text("half")
             assert (tmp_path / "a.txt").read_text() == "old"
             raise KeyboardInterrupt
 
@@ -75,23 +76,20 @@ def test_what_killed_processes_left_is_removed_and_what_others_write_stays(tmp_p
     waits = "with replacing(Path(sys.argv[1])) as f:\n    f.write_text('half')\n    print(f, flush=True)\n    input()\n"
     command = [sys.executable, "-c", ready + waits, str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
-        partial = Path(other.stdout.readline().strip())
+        unfinished = Path(other.stdout.readline().strip())
         longer = tmp_path / "[a].txt.ply.2.partial"
         longer.touch()
         write_text(path, "new")
-        assert partial.read_text() == "half"
+        assert unfinished.read_text() == "half"
         other.kill()
     write_text(path, "newer")
     assert sorted(os.listdir(tmp_path)) == ["[a].txt", longer.name]
 
 
-def write_noise(path):
-    write_image(path, Image.effect_noise((400, 300), 100))
-
-
 @pytest.mark.parametrize("name", ["a.ply", "a.png", "a.jpg", "a.webp"])
 def test_full_disk(tmp_path, name):
-    write = write_noise if name != "a.ply" else lambda path: write_ply(path, small_field(1000))
+    noise, field = Image.effect_noise((400, 300), 100), small_field(1000)
+    write = partial(write_ply, params=field) if name == "a.ply" else partial(write_image, image=noise)
     (tmp_path / name).write_text("old")
     with small_disk(10_000), pytest.raises(StorageError, match=rf"cannot write .*{name}: .*ulimit") as caught:
         write(tmp_path / name)

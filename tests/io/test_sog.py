@@ -4,7 +4,6 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -199,9 +198,6 @@ def _lie(content, name, size):
             if data[start + header : start + header + len(name)] == name:
                 data[start + at : start + at + 4] = size.to_bytes(4, "little")
     return bytes(data)
-
-
-Make = Callable[[dict[str, bytes]], bytes]
 
 
 def _meta(**changes):
