@@ -1,9 +1,6 @@
 """The cache of CUDA graphs, and the recording of one; users of recorded graphs have tests of their own."""
 
-from __future__ import annotations
-
 import gc
-from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 
 import pytest
@@ -15,7 +12,7 @@ from sundae_ns.cuda.cuda_graphs import MAX_GRAPHS, RECORD_AT, GraphCache, record
 
 
 @pytest.fixture
-def eager_collector() -> Iterator[None]:
+def eager_collector():
     """Run the garbage collector at almost every allocation."""
     before = gc.get_threshold()
     gc.set_threshold(1, 1, 1)
@@ -23,12 +20,12 @@ def eager_collector() -> Iterator[None]:
     gc.set_threshold(*before)
 
 
-def test_a_key_repeated_in_a_row_is_recorded_once() -> None:
-    cache: GraphCache[str] = GraphCache()
-    made: list[str] = []
+def test_a_key_repeated_in_a_row_is_recorded_once():
+    cache = GraphCache()
+    made = []
 
-    def get(key: str) -> str | None:
-        def make() -> str:
+    def get(key):
+        def make():
             made.append(key)
             return f"graph of {key}"
 
@@ -43,8 +40,8 @@ def test_a_key_repeated_in_a_row_is_recorded_once() -> None:
     assert made == ["a"]
 
 
-def test_the_least_recently_used_graph_is_dropped() -> None:
-    cache: GraphCache[int] = GraphCache()
+def test_the_least_recently_used_graph_is_dropped():
+    cache = GraphCache()
     for key in range(MAX_GRAPHS):
         for _ in range(RECORD_AT):
             cache.get(key, lambda key=key: key)
@@ -63,7 +60,7 @@ def test_the_least_recently_used_graph_is_dropped() -> None:
 
 @pytest.mark.parametrize("fails", [False, True])
 @pytest.mark.parametrize("enabled", [True, False])
-def test_no_garbage_collection_during_a_recording(enabled: bool, fails: bool) -> None:
+def test_no_garbage_collection_during_a_recording(enabled, fails):
     try:
         if not enabled:
             gc.disable()
@@ -79,11 +76,11 @@ def test_no_garbage_collection_during_a_recording(enabled: bool, fails: bool) ->
         gc.enable()
 
 
-def test_a_failed_recording_restores_stream_and_generator(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_recording_restores_stream_and_generator(monkeypatch):
     current = "main"
 
     @contextmanager
-    def stream(side: str) -> Iterator[None]:
+    def stream(side):
         nonlocal current
         before, current = current, side
         try:
@@ -94,27 +91,27 @@ def test_a_failed_recording_restores_stream_and_generator(monkeypatch: pytest.Mo
     class Capture:
         """Like torch's: a failure at its end leaves its stream current."""
 
-        def __init__(self, graph: object, *, stream: str, **_: object) -> None:
+        def __init__(self, graph, *, stream, **_):
             self.stream = stream
 
-        def __enter__(self) -> None:
+        def __enter__(self):
             nonlocal current
             current = self.stream
 
-        def __exit__(self, *_: object) -> None:
+        def __exit__(self, *_):
             assert not gc.isenabled()
             raise RuntimeError("operation failed due to a previous error during capture\nand more lines")
 
     class Generator:
         """Like torch's: a failed recording leaves it refusing to draw, but copies from before still draw."""
 
-        def __init__(self) -> None:
+        def __init__(self):
             self.drawn_from = "now"
 
-        def clone_state(self) -> str:
+        def clone_state(self):
             return "before"
 
-        def graphsafe_set_state(self, state: str) -> None:
+        def graphsafe_set_state(self, state):
             self.drawn_from = state
 
     generator = Generator()
@@ -124,7 +121,7 @@ def test_a_failed_recording_restores_stream_and_generator(monkeypatch: pytest.Mo
         monkeypatch.setattr(torch.cuda, name, stand_in)
     monkeypatch.setattr(cuda_graphs, "_side_stream", lambda device: "side")
     monkeypatch.setattr(cuda_graphs, "_abandoned", failed := [])
-    ended: list[object] = []
+    ended = []
     monkeypatch.setattr(torch._C, "_cuda_endAllocateToPool", lambda *of: ended.append(of), raising=False)
     with pytest.raises(
         BackendError, match=r"as a CUDA graph: operation failed due to a previous error during capture$"
@@ -136,7 +133,7 @@ def test_a_failed_recording_restores_stream_and_generator(monkeypatch: pytest.Mo
     assert len(failed) == 1
     assert gc.isenabled()
 
-    def too_much() -> None:
+    def too_much():
         raise torch.cuda.OutOfMemoryError("no room")
 
     with pytest.raises(torch.cuda.OutOfMemoryError, match="no room"):  # not the error that follows from it
@@ -145,18 +142,18 @@ def test_a_failed_recording_restores_stream_and_generator(monkeypatch: pytest.Mo
 
 
 @pytest.mark.gpu
-def test_a_graph_in_the_garbage_does_not_break_a_recording(eager_collector: None) -> None:
+def test_a_graph_in_the_garbage_does_not_break_a_recording(eager_collector):
     device, values = torch.device("cuda"), torch.arange(8.0, device="cuda")
 
-    def plus(summand: float) -> torch.Tensor:
+    def plus(summand):
         return values + summand
 
     with warm_up(device):
         plus(1.0)
     others = [record(lambda: plus(1.0), device)]
 
-    def run() -> torch.Tensor:
-        ring: list[object] = [others.pop()]
+    def run():
+        ring = [others.pop()]
         ring.append(ring)
         del ring
         assert len([[] for _ in range(1000)]) == 1000  # allocations that trigger the collector
@@ -168,11 +165,11 @@ def test_a_graph_in_the_garbage_does_not_break_a_recording(eager_collector: None
 
 
 @pytest.mark.gpu
-def test_later_work_is_not_affected_by_a_failed_recording() -> None:
+def test_later_work_is_not_affected_by_a_failed_recording():
     device, values = torch.device("cuda"), torch.arange(8.0, device="cuda")
     before = torch.cuda.current_stream()
 
-    def total() -> torch.Tensor:
+    def total():
         return (values + 1).sum()
 
     with warm_up(device):

@@ -3,20 +3,14 @@
 A block has one thread on the CPU: only the tests on a GPU cover shared memory and the sum over threads.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 import torch
 from pytorch_msssim import SSIM
-from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import BackendError, DataError, SundaeError
 from sundae_ns.cuda import adam, loss, sweep
-from sundae_ns.cuda.kernels import Launch, kernels_where_possible
+from sundae_ns.cuda.kernels import kernels_where_possible
 from sundae_ns.cuda.loss import fused_loss
 from sundae_ns.train import plane_sweep
 from sundae_ns.train.state import Photo
@@ -24,20 +18,20 @@ from sundae_ns.train.step import image_losses
 
 
 @pytest.fixture(autouse=True)
-def on_cpu(request: pytest.FixtureRequest, load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def on_cpu(request, load_on_cpu, monkeypatch):
     if not request.node.get_closest_marker("gpu"):
         for module in (adam, loss, sweep):
             monkeypatch.setattr(module, "load_kernels", load_on_cpu)
 
 
 @pytest.mark.parametrize("module", [adam, loss, sweep])
-def test_it_compiles_for_gpus(module: Any, compile_for_gpu: Callable[..., bytes]) -> None:
+def test_it_compiles_for_gpus(module, compile_for_gpu):
     for architecture in ("sm_75", "sm_90"):
         assert compile_for_gpu(f"{module.__name__.split('.')[-1]}.cu", architecture, module.OPTIONS)
 
 
-def test_missing_kernels_are_reported_once(caplog: pytest.LogCaptureFixture) -> None:
-    def refuse(_: torch.device) -> dict[str, Launch]:
+def test_missing_kernels_are_reported_once(caplog):
+    def refuse(_):
         raise BackendError("NVRTC fails: update torch")
 
     assert [kernels_where_possible(refuse, torch.device("cuda"), "it is slow") for _ in range(2)] == [None, None]
@@ -47,7 +41,7 @@ def test_missing_kernels_are_reported_once(caplog: pytest.LogCaptureFixture) -> 
 # ---------------------------------------------------------------------------------------------------------------- Adam
 
 
-def test_adam_follows_torch() -> None:
+def test_adam_follows_torch():
     """Over gradients of all sizes, with vanishing ones, and with a rate that changes."""
     n, betas = 1000, (0.9, 0.999)
     value = torch.randn(n)
@@ -69,7 +63,7 @@ def test_adam_follows_torch() -> None:
     torch.testing.assert_close(square.double(), state["exp_avg_sq"], rtol=1e-4, atol=1e-20)
 
 
-def test_a_skipped_step_of_adam_changes_nothing() -> None:
+def test_a_skipped_step_of_adam_changes_nothing():
     tensors = [torch.ones(1000) for _ in range(4)]
     before = [value.clone() for value in tensors]
     ones, rate = torch.ones(()), torch.tensor(0.1)
@@ -85,7 +79,7 @@ def test_a_skipped_step_of_adam_changes_nothing() -> None:
 SIZES = [(11, 11), (11, 300), (12, 43), (26, 42), (27, 43), (64, 97)]
 
 
-def images(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+def images(height, width, seed=0):
     """An image near its target, and the target, with edges and flat parts."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(height, width, 3, generator=generator).mul(3).round() / 3
@@ -94,7 +88,7 @@ def images(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     return (target + 0.1 * noise).clamp(0, 1), target
 
 
-def exact_loss(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+def exact_loss(image, target, weight):
     """Loss and gradient by convolutions in float64."""
     image, ssim = image.double().requires_grad_(), SSIM(data_range=1.0, channel=3)
     ssim.win = ssim.win.to(image)  # moving the module leaves its window where it was
@@ -103,7 +97,7 @@ def exact_loss(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Te
     return value.detach(), gradient
 
 
-def our_loss(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+def our_loss(image, target, weight):
     image = image.clone().requires_grad_()
     value, _ = fused_loss(image, target, weight)
     (gradient,) = torch.autograd.grad(value, image)
@@ -112,7 +106,7 @@ def our_loss(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tens
 
 @pytest.mark.parametrize(("size", "scale"), [*((size, 1.0) for size in SIZES), *(((30, 47), 10.0**k) for k in (-4, 4))])
 @pytest.mark.parametrize("weight", [0.2, 1.0])
-def test_the_loss_and_its_gradient(size: tuple[int, int], scale: float, weight: float) -> None:
+def test_the_loss_and_its_gradient(size, scale, weight):
     pair = [scale * value for value in images(*size)]
     value, gradient = our_loss(*pair, weight)
     expected, expected_gradient = exact_loss(*pair, weight)
@@ -122,13 +116,12 @@ def test_the_loss_and_its_gradient(size: tuple[int, int], scale: float, weight: 
 
 
 @pytest.mark.parametrize("size", SIZES[::2])
-def test_base_colours_strides_and_a_weight_of_its_own_for_l1(size: tuple[int, int]) -> None:
+def test_base_colours_strides_and_a_weight_of_its_own_for_l1(size):
     image, target = images(*size)
     base = images(*size, seed=1)[0]
     expected, expected_gradient = our_loss(image, target, 0.2)
     leaves = [value.permute(1, 0, 2).contiguous().permute(1, 0, 2).requires_grad_() for value in (image, base)]
     value, base_loss = fused_loss(leaves[0], target, 0.2, leaves[1])
-    assert base_loss is not None
     assert not value._is_view()
     assert torch.equal(value, expected)
     assert base_loss.item() == pytest.approx((base - target).abs().mean().item(), rel=1e-5)
@@ -139,7 +132,7 @@ def test_base_colours_strides_and_a_weight_of_its_own_for_l1(size: tuple[int, in
     torch.testing.assert_close(expected - alone, 0.8 * (image - target).abs().mean())
 
 
-def test_nan_propagates() -> None:
+def test_nan_propagates():
     image, target = images(30, 47)
     image[15, 20, 1] = torch.nan
     value, gradient = our_loss(image, target, 0.2)
@@ -149,13 +142,12 @@ def test_nan_propagates() -> None:
     base = target.clone()
     base[20, 25, 2] = torch.nan
     value, base_loss = fused_loss(target, target, 0.2, base.requires_grad_())
-    assert base_loss is not None
     assert value.isfinite()
     assert base_loss.isnan()
     assert torch.autograd.grad(base_loss, base)[0].isnan().sum() == 1
 
 
-def test_small_losses_are_accurate() -> None:
+def test_small_losses_are_accurate():
     """They are not computed as differences of two large sums."""
     image, target = images(64, 97)
     near = target + 1e-3 * (image - target)
@@ -179,12 +171,12 @@ ZEROS = torch.zeros(40, 30, 3)
         (ZEROS, ZEROS, ZEROS[1:]),
     ],
 )
-def test_unsupported_images_are_refused(arguments: tuple[Tensor, ...]) -> None:
+def test_unsupported_images_are_refused(arguments):
     with pytest.raises(DataError, match=r"pass float32 \[H, W, 3\] of one size, at least 11 px per side"):
         fused_loss(*arguments[:2], 0.2, *arguments[2:])
 
 
-def test_no_second_gradient_and_none_for_the_target() -> None:
+def test_no_second_gradient_and_none_for_the_target():
     image, target = (value.requires_grad_() for value in images(20, 30))
     with pytest.raises(SundaeError, match="no second derivative"):
         torch.autograd.grad(fused_loss(image, target, 0.2)[0], image, create_graph=True)
@@ -193,12 +185,11 @@ def test_no_second_gradient_and_none_for_the_target() -> None:
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("size", [*SIZES, (1061, 1893)])
-def test_the_loss_on_a_gpu(size: tuple[int, int]) -> None:
+def test_the_loss_on_a_gpu(size):
     image, target = (value.cuda().requires_grad_(n == 0) for n, value in enumerate(images(*size)))
     base = images(*size, seed=1)[0].cuda().requires_grad_()
     ssim = SSIM(data_range=1.0, channel=3)
     value, base_loss = image_losses(image, base, target, ssim, 0.2)
-    assert base_loss is not None
     assert "_Loss" in type(value.grad_fn).__name__
     gradient, grad_base = torch.autograd.grad(value + base_loss, (image, base))
     expected, expected_gradient = exact_loss(image.detach(), target, 0.2)
@@ -218,7 +209,7 @@ def test_the_loss_on_a_gpu(size: tuple[int, int]) -> None:
 # --------------------------------------------------------------------------------------------------------- plane sweep
 
 
-def reduced(height: int, width: int, x: float, device: str = "cpu") -> plane_sweep._Reduced:
+def reduced(height, width, x, device="cpu"):
     """A view from ``x`` along the z axis, a little turned, of random blobs."""
     generator = torch.Generator().manual_seed(height)
     image = torch.nn.functional.interpolate(
@@ -233,7 +224,7 @@ def reduced(height: int, width: int, x: float, device: str = "cpu") -> plane_swe
     return plane_sweep._reduced(Photo(camera, image.permute(1, 2, 0).contiguous().to(device), None), 1000)
 
 
-def scores(device: str = "cpu") -> Tensor:
+def scores(device="cpu"):
     """Correlations with two images of other sizes; some planes leave them, and some lie behind them."""
     photo = reduced(35, 50, 0.0, device)
     others = [reduced(40, 45, 0.4, device), reduced(21, 70, -0.7, device)]
@@ -243,12 +234,12 @@ def scores(device: str = "cpu") -> Tensor:
     return plane_sweep._correlations(photo, others, rays, (-0.1, 1.7))(facing, planes)
 
 
-def share_apart(ours: Tensor, expected: Tensor) -> float:
+def share_apart(ours, expected):
     """Share of the correlations that differ; single pixels may lie on the other side of an image's border."""
     return float(((ours - expected).abs() > 1e-3).float().mean())
 
 
-def test_it_correlates_as_pytorch_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_correlates_as_pytorch_does(monkeypatch):
     expected = scores()
     monkeypatch.setattr(plane_sweep, "kernels_where_possible", lambda *_: sweep.sweep_kernels(torch.device("cpu")))
     assert share_apart(scores(), expected) < 1e-3
@@ -257,6 +248,6 @@ def test_it_correlates_as_pytorch_does(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.gpu
-def test_on_a_gpu_it_correlates_as_on_a_cpu() -> None:
+def test_on_a_gpu_it_correlates_as_on_a_cpu():
     assert sweep.sweep_kernels(torch.device("cuda"))
     assert share_apart(scores("cuda").cpu(), scores()) < 1e-3

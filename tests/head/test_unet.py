@@ -1,7 +1,5 @@
 """The U-Net: the paper's size, any image size, gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -9,7 +7,7 @@ from sundae_ns.head.head import SIZES
 from sundae_ns.head.unet import UNet
 
 
-def test_the_papers_size_and_a_limited_width() -> None:
+def test_the_papers_size_and_a_limited_width():
     net = UNet(3, 3, SIZES["regular"][0])
     assert 4 * sum(p.numel() for p in net.parameters()) / 2**20 == pytest.approx(30, rel=0.04)
     net = UNet(3, 3, 8, max_width=16)
@@ -19,7 +17,7 @@ def test_the_papers_size_and_a_limited_width() -> None:
 
 @pytest.mark.parametrize("unshuffle", [1, 2, 4])
 @pytest.mark.parametrize(("height", "width"), [(30, 30), (31, 47), (1, 1), (64, 5)])
-def test_any_size(unshuffle: int, height: int, width: int) -> None:
+def test_any_size(unshuffle, height, width):
     image = torch.rand(1, 5, height, width)
     out = UNet(5, 3, 4, pixel_unshuffle=unshuffle)(image)
     assert out.shape == (1, 3, height, width)
@@ -28,7 +26,7 @@ def test_any_size(unshuffle: int, height: int, width: int) -> None:
     assert torch.equal(zero(image), torch.zeros_like(out))
 
 
-def test_padding_affects_the_edge_only() -> None:
+def test_padding_affects_the_edge_only():
     """An image cropped to an odd size keeps its values far from the crop."""
     net = UNet(3, 3, 8)
     image = torch.rand(1, 3, 128, 128)
@@ -38,13 +36,13 @@ def test_padding_affects_the_edge_only() -> None:
     assert not torch.allclose(cropped[..., -4:, -4:], full[..., 113:117, 111:115], atol=1e-6)
 
 
-def test_gradcheck() -> None:
+def test_gradcheck():
     net = UNet(2, 1, 2).double()
     image = torch.rand(1, 2, 9, 11, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(net, (image,), fast_mode=True)
 
 
-def test_coarse_levels_reach_far() -> None:
+def test_coarse_levels_reach_far():
     """The receptive field is larger than that of the finest level's own convolutions."""
     torch.manual_seed(1)
     image = torch.zeros(1, 1, 64, 64, requires_grad=True)

@@ -1,12 +1,8 @@
 """Ranks that run the checks of a file, models of Gaussians made in memory, and a small capture to parse."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from forked import run
@@ -15,19 +11,19 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from harness.still_life import write_still_life
-from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.plugin.datamanager import SundaeDatamanagerConfig
 
 RANKS = 2
 LIMIT = 600
 """Seconds that a program may take on a busy machine."""
 
 
-def _run_ranks(file: str, folder: Path) -> None:
+def _run_ranks(file, folder):
     # A missing result fails by name.
     print(run(Path(__file__).with_name("rank.py"), file, RANKS, folder, LIMIT)[1])
 
 
-def _passed(folder: Path, name: str) -> None:
+def _passed(folder, name):
     for rank in range(RANKS):
         path = folder / f"rank{rank}.json"
         assert path.exists(), f"rank {rank} did not come to an end"
@@ -36,58 +32,48 @@ def _passed(folder: Path, name: str) -> None:
 
 
 @pytest.fixture(scope="session")
-def run_ranks() -> Callable[[str, Path], None]:
+def run_ranks():
     """Run the checks of a file on two ranks, which write their results into a folder."""
     return _run_ranks
 
 
 @pytest.fixture(scope="session")
-def passed() -> Callable[[Path, str], None]:
+def passed():
     """Assert that every rank has passed a check."""
     return _passed
 
 
-Load = Callable[..., SundaeDatamanager]
-
-
 @pytest.fixture(scope="session")
-def still_life(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def still_life(tmp_path_factory):
     out = tmp_path_factory.mktemp("still_life") / "scene"
     return write_still_life(out, train_views=10, test_views=2, width=24, height=24, points=80, samples=1)
 
 
 @pytest.fixture
-def capture(still_life: Path, tmp_path: Path) -> Path:
+def capture(still_life, tmp_path):
     return Path(shutil.copytree(still_life, tmp_path / "capture"))
 
 
 @pytest.fixture
-def load() -> Load:
+def load():
     """Parses a capture as ``ns-train`` does, with nerfstudio's parser replaced by ours."""
 
-    def parse(
-        data: Path,
-        *,
-        colmap: str | None = None,
-        robust: bool = True,
-        manager: dict[str, Any] | None = None,
-        **options: Any,
-    ) -> SundaeDatamanager:
+    def parse(data, *, colmap=None, robust=True, manager=None, **options):
         if colmap is None:
-            parser: Any = NerfstudioDataParserConfig(load_3D_points=True, **options)
+            parser = NerfstudioDataParserConfig(load_3D_points=True, **options)
         else:
             parser = ColmapDataParserConfig(colmap_path=Path(colmap), downscale_factor=1, **options)
-        more: Any = {"cache_images_type": "uint8", "robust_frame": robust, **(manager or {})}
+        more = {"cache_images_type": "uint8", "robust_frame": robust, **(manager or {})}
         return SundaeDatamanagerConfig(data=data, dataparser=parser, **more).setup(device="cpu", test_mode="val")
 
     return parse
 
 
 @pytest.fixture
-def edit() -> Callable[..., None]:
+def edit():
     """Changes entries of a ``transforms.json``; None removes one."""
 
-    def change(data: Path, **changes: Any) -> None:
+    def change(data, **changes):
         meta = {**json.loads((data / "transforms.json").read_text()), **changes}
         (data / "transforms.json").write_text(json.dumps({k: v for k, v in meta.items() if v is not None}))
 

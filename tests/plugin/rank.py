@@ -4,8 +4,6 @@ The file's ``checks(FOLDER)`` run in their order; the error of each, or "", is w
 forked off a process that has imported the file, so that they do not import nerfstudio themselves.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import multiprocessing
@@ -13,7 +11,6 @@ import sys
 import time
 import traceback
 from pathlib import Path
-from types import ModuleType
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))  # as pytest does
 
@@ -21,17 +18,15 @@ import torch
 import torch.distributed as dist
 
 
-def imported(file: str) -> ModuleType:
+def imported(file):
     spec = importlib.util.spec_from_file_location(Path(file).stem, file)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[module.__name__] = module  # dataclasses look their module up by name
     spec.loader.exec_module(module)
     return module
 
 
-def go_through(module: ModuleType, rank: int, ranks: int, folder: Path) -> None:
+def go_through(module, rank, ranks, folder):
     dist.init_process_group("gloo", init_method=f"file://{folder / 'meeting'}", rank=rank, world_size=ranks)
     results = {}
     for name, check in module.checks(folder).items():
@@ -47,7 +42,7 @@ def go_through(module: ModuleType, rank: int, ranks: int, folder: Path) -> None:
         dist.destroy_process_group()
 
 
-def main(file: str, ranks: int, folder: Path, seconds: float) -> None:
+def main(file, ranks, folder, seconds):
     torch.set_num_threads(1)
     module, fork = imported(file), multiprocessing.get_context("fork")
     programs = [fork.Process(target=go_through, args=(module, rank, ranks, folder)) for rank in range(ranks)]

@@ -1,13 +1,9 @@
 """The datamanager: an order that resumes, views held back, images cached without CUDA, bad captures named."""
 
-from __future__ import annotations
-
 import math
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -20,14 +16,12 @@ from PIL import Image
 from small_captures import meta_of
 
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanager, SundaeDatamanagerConfig, check_cameras
+from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanagerConfig, check_cameras
 
 VIEWS, SIDE = 10, 24
-Load = Callable[..., SundaeDatamanager]
-Edit = Callable[..., None]
 
 
-def test_the_order_is_a_function_of_seed_and_step(still_life: Path, load: Load) -> None:
+def test_the_order_is_a_function_of_seed_and_step(still_life, load):
     first, again, other = (load(still_life, manager={"train_cameras_sampling_seed": seed}) for seed in (42, 42, 7))
     order = [first.view_of_step(step) for step in range(40)]
     passes = [tuple(order[i : i + VIEWS]) for i in range(0, len(order), VIEWS)]
@@ -39,13 +33,12 @@ def test_the_order_is_a_function_of_seed_and_step(still_life: Path, load: Load) 
     assert [other.view_of_step(step) for step in range(40)] != order
 
 
-def test_next_train_serves_the_view_of_the_step(still_life: Path, load: Load) -> None:
+def test_next_train_serves_the_view_of_the_step(still_life, load):
     made = load(still_life)
     for step in range(VIEWS):
         camera, batch = made.next_train(step)
         index = made.view_of_step(step)
         assert camera.shape == (1,)
-        assert camera.metadata is not None
         assert camera.metadata["cam_idx"] == index
         assert torch.equal(camera.camera_to_worlds[0], made.train_dataset.cameras.camera_to_worlds[index])
         assert batch["image"].dtype == torch.uint8
@@ -55,9 +48,7 @@ def test_next_train_serves_the_view_of_the_step(still_life: Path, load: Load) ->
         assert (made.next_train(step)[0].metadata or {})["cam_idx"] == made.view_of_step(step + 1)
 
 
-def test_held_back_views_are_not_trained_on_and_are_loaded_when_their_turn_comes(
-    still_life: Path, load: Load, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_held_back_views_are_not_trained_on_and_are_loaded_when_their_turn_comes(still_life, load, monkeypatch):
     made = load(still_life)
     assert (made.holdout_indices, list(made.cameras([]))) == ([], [])
     made.hold_back([5, 2])
@@ -71,7 +62,7 @@ def test_held_back_views_are_not_trained_on_and_are_loaded_when_their_turn_comes
     assert batch["image_idx"] == 2
     assert torch.equal(camera.camera_to_worlds[0], made.train_dataset.cameras.camera_to_worlds[2])
     assert batch["image"].shape == (SIDE, SIDE, 3)
-    moved: list[int] = []
+    moved = []
     monkeypatch.setattr(made, "_camera", moved.append)
     rest = made.cameras(made.holdout_indices)
     assert moved == []
@@ -79,7 +70,7 @@ def test_held_back_views_are_not_trained_on_and_are_loaded_when_their_turn_comes
     assert moved == [2]
 
 
-def test_masks_come_with_the_views_that_they_belong_to(capture: Path, load: Load, edit: Edit) -> None:
+def test_masks_come_with_the_views_that_they_belong_to(capture, load, edit):
     frames = meta_of(capture)["frames"]
     (capture / "masks").mkdir()
     for number, frame in enumerate(frames):
@@ -97,20 +88,18 @@ def test_masks_come_with_the_views_that_they_belong_to(capture: Path, load: Load
     edit(capture, k1=0.3, k2=0.1)
     # Before anything else has read the images, which undistortion crops.
     for camera, cropped in load(capture).training_views():
-        assert cropped is not None
         assert cropped.shape == (int(camera.height), int(camera.width), 1)
         assert cropped.shape != (SIDE, SIDE, 1), "undistortion cuts nothing off"
 
 
-def test_a_round_lens_has_masks_of_its_own(capture: Path, load: Load, edit: Edit) -> None:
+def test_a_round_lens_has_masks_of_its_own(capture, load, edit):
     edit(capture, camera_model="FISHEYE624", distortion_params=[0.01] + [0.0] * 11, fisheye_crop_radius=7.0)
     for camera, mask in load(capture).training_views():
-        assert mask is not None
         assert mask.shape == (int(camera.height), int(camera.width), 1)
         assert not mask.all()
 
 
-def test_cpu_cache_without_cuda(still_life: Path, load: Load, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cpu_cache_without_cuda(still_life, load, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     made = load(still_life, manager={"cache_images": "cpu"})
     images = [batch["image"] for batch in (*made.cached_train, *made.cached_eval)]
@@ -118,12 +107,10 @@ def test_cpu_cache_without_cuda(still_life: Path, load: Load, monkeypatch: pytes
     assert not any(image.is_pinned() for image in images)
 
 
-def test_images_that_do_not_fit_on_the_gpu_stay_in_main_memory(
-    still_life: Path, load: Load, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    places: list[str] = []
+def test_images_that_do_not_fit_on_the_gpu_stay_in_main_memory(still_life, load, monkeypatch, capsys):
+    places = []
 
-    def cached(self: Any, split: str, cache_images_device: str) -> list[Any]:
+    def cached(self, split, cache_images_device):
         places.append(cache_images_device)
         return []
 
@@ -138,15 +125,13 @@ def test_images_that_do_not_fit_on_the_gpu_stay_in_main_memory(
     assert "the train images need more than half of the free GPU memory" in " ".join(capsys.readouterr().out.split())
 
 
-def test_image_of_another_size_is_named(capture: Path, load: Load) -> None:
+def test_image_of_another_size_is_named(capture, load):
     Image.new("RGB", (18, SIDE)).save(sorted((capture / "images").iterdir())[1])
     with pytest.raises(DataError, match=r"frame_00002\.png is 18 x 24 px but its camera says 24 x 24"):
         load(capture).next_train(0)
 
 
-def test_undistorted_test_views_are_not_checked_against_their_cropped_cameras(
-    capture: Path, load: Load, edit: Edit
-) -> None:
+def test_undistorted_test_views_are_not_checked_against_their_cropped_cameras(capture, load, edit):
     edit(capture, k1=0.3, k2=0.1)
     made = load(capture)
     # nerfstudio's viewer loads the test views first.
@@ -154,7 +139,7 @@ def test_undistorted_test_views_are_not_checked_against_their_cropped_cameras(
     assert len(made.cached_train) == VIEWS
 
 
-def test_images_may_differ_where_each_has_its_own_camera(capture: Path, load: Load, edit: Edit) -> None:
+def test_images_may_differ_where_each_has_its_own_camera(capture, load, edit):
     frames = meta_of(capture)["frames"]
     for index, frame in enumerate(frames):
         size = (20 + 2 * index, 16)
@@ -165,7 +150,7 @@ def test_images_may_differ_where_each_has_its_own_camera(capture: Path, load: Lo
 
 
 @pytest.mark.usefixtures("open3d")
-def test_point_cloud_as_nerfstudio_reads_it(still_life: Path, load: Load) -> None:
+def test_point_cloud_as_nerfstudio_reads_it(still_life, load):
     config = NerfstudioDataParserConfig(data=still_life, load_3D_points=True)
     theirs = Nerfstudio(config).get_dataparser_outputs("train").metadata
     ours = load(still_life).train_dataparser_outputs.metadata
@@ -175,12 +160,12 @@ def test_point_cloud_as_nerfstudio_reads_it(still_life: Path, load: Load) -> Non
     assert ours["points3D_rgb"].dtype == torch.uint8
 
 
-def test_point_cloud_needs_no_open3d(still_life: Path, load: Load, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_point_cloud_needs_no_open3d(still_life, load, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     assert len(load(still_life).train_dataparser_outputs.metadata["points3D_xyz"]) == 80
 
 
-def test_frame_of_the_capture_goes_to_the_model(still_life: Path, load: Load) -> None:
+def test_frame_of_the_capture_goes_to_the_model(still_life, load):
     made = load(still_life)
     transform, scale = made.train_dataset.metadata[DATASET_FRAME]
     pose = torch.tensor(meta_of(still_life)["frames"][0]["transform_matrix"])
@@ -189,7 +174,7 @@ def test_frame_of_the_capture_goes_to_the_model(still_life: Path, load: Load) ->
     assert distances.min() < 1e-5
 
 
-def test_missing_point_cloud(capture: Path, load: Load, edit: Edit) -> None:
+def test_missing_point_cloud(capture, load, edit):
     (capture / "sparse_pc.ply").unlink()
     with pytest.raises(DataError, match=r"sparse_pc\.ply does not exist; .*ply_file_path"):
         load(capture)
@@ -207,16 +192,14 @@ def test_missing_point_cloud(capture: Path, load: Load, edit: Edit) -> None:
         ("other", "gone", "correct data in the run's config.yml"),
     ],
 )
-def test_what_is_no_capture_says_how_to_make_one_of_it(
-    tmp_path: Path, load: Load, file: str, data: str, advice: str
-) -> None:
+def test_what_is_no_capture_says_how_to_make_one_of_it(tmp_path, load, file, data, advice):
     (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / file).touch()
     with pytest.raises(DataError, match=advice):
         load(tmp_path / data)
 
 
-def cameras(*, focal: float = 20.0, mirrored: bool = False, spread: float = 1.0, outlier: float = 0.0) -> Cameras:
+def cameras(*, focal=20.0, mirrored=False, spread=1.0, outlier=0.0):
     poses = torch.eye(4)[None, :3].repeat(6, 1, 1)
     poses[:, :, 3] = spread * torch.randn(6, 3, generator=torch.Generator().manual_seed(0))
     poses[4, 0, 0] = -1.0 if mirrored else 1.0
@@ -235,7 +218,7 @@ NAMES = [Path(f"{index}.png") for index in range(6)]
         ({"focal": 1e9}, r"no lens has; give the focal length in pixels"),
     ],
 )
-def test_cameras_that_cannot_be(options: dict[str, Any], cause: str) -> None:
+def test_cameras_that_cannot_be(options, cause):
     with pytest.raises(DataError, match=cause) as caught:
         check_cameras(cameras(**options), NAMES)
     assert "\n" not in str(caught.value)
@@ -251,14 +234,12 @@ def test_cameras_that_cannot_be(options: dict[str, Any], cause: str) -> None:
         ({"outlier": 1e11}, "the camera of 4.png is .* times as far away as most .1 of 6"),
     ],
 )
-def test_cameras_that_make_no_good_scene(
-    options: dict[str, Any], cause: str | None, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_cameras_that_make_no_good_scene(options, cause, caplog):
     check_cameras(cameras(**options), NAMES)
     assert [bool(cause and re.search(cause, line)) for line in caplog.messages] == [True] * bool(cause)
 
 
-def test_alpha_is_named(capture: Path, load: Load, capsys: Any) -> None:
+def test_alpha_is_named(capture, load, capsys):
     load(capture).next_train(0)
     assert "alpha" not in capsys.readouterr().out
     for path in sorted((capture / "images").iterdir())[:3]:
@@ -274,7 +255,7 @@ def test_alpha_is_named(capture: Path, load: Load, capsys: Any) -> None:
 
 
 @pytest.mark.parametrize("way", ["transparent", "masked", "transparent where it is not masked"])
-def test_images_that_show_nothing(capture: Path, load: Load, edit: Edit, way: str) -> None:
+def test_images_that_show_nothing(capture, load, edit, way):
     meta = meta_of(capture)
     for path in sorted((capture / "images").iterdir()):
         with Image.open(path) as opened:
@@ -298,11 +279,11 @@ def test_images_that_show_nothing(capture: Path, load: Load, edit: Edit, way: st
         load(capture).next_train(0)
 
 
-def test_a_question_without_a_terminal(still_life: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_question_without_a_terminal(still_life, monkeypatch):
     """What nerfstudio's COLMAP parser asks if images_2 is missing."""
     monkeypatch.setattr("sundae_ns.plugin.datamanager.check_capture", lambda *_, **__: None)
 
-    def ask(*_: Any, **__: Any) -> None:
+    def ask(*_, **__):
         raise EOFError
 
     monkeypatch.setattr(ColmapDataParserConfig().__class__, "setup", ask)
@@ -327,9 +308,7 @@ def test_a_question_without_a_terminal(still_life: Path, monkeypatch: pytest.Mon
         ({}, {"scale_factor": -1.0}, "--scale-factor is -1.0; give a positive number"),
     ],
 )
-def test_captures_and_options_that_cannot_be_used(
-    capture: Path, load: Load, edit: Edit, edits: dict[str, Any], options: dict[str, Any], cause: str
-) -> None:
+def test_captures_and_options_that_cannot_be_used(capture, load, edit, edits, options, cause):
     edit(capture, **edits)
     with pytest.raises((ConfigError, DataError), match=cause) as caught:
         load(capture, **options).next_train(0)
@@ -337,9 +316,7 @@ def test_captures_and_options_that_cannot_be_used(
 
 
 @pytest.mark.parametrize("scaled", [True, False])
-def test_cameras_at_one_place_have_no_scale(
-    capture: Path, load: Load, edit: Edit, caplog: pytest.LogCaptureFixture, scaled: bool
-) -> None:
+def test_cameras_at_one_place_have_no_scale(capture, load, edit, caplog, scaled):
     frames = meta_of(capture)["frames"]
     edit(capture, frames=[{**frame, "transform_matrix": frames[0]["transform_matrix"]} for frame in frames])
     if scaled:
@@ -350,7 +327,7 @@ def test_cameras_at_one_place_have_no_scale(
         assert "all cameras stand at one place" in caplog.text
 
 
-def test_what_needs_test_views_says_so(capture: Path, load: Load, edit: Edit) -> None:
+def test_what_needs_test_views_says_so(capture, load, edit):
     """ns-eval asks for batches, ns-render for cameras; training and ns-viewer need neither."""
     edit(capture, val_filenames=[], test_filenames=[])
     made = load(capture)

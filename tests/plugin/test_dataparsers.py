@@ -1,13 +1,9 @@
 """Captures as our parsers read them: stray cameras, survey coordinates, scales, clouds and images."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,21 +21,19 @@ from sundae_ns.plugin.finished_runs import datamanager_of, describe_capture
 from sundae_ns.scene.cameras import cameras_of
 from sundae_ns.scene.scene import Scene
 
-Load = Callable[..., Any]
-Edit = Callable[..., None]
 SURVEY = np.array([431_250.25, 5_412_330.5, 212.125])
 """Coordinates of a place in UTM, metres."""
 
 
-def said(capsys: Any) -> str:
+def said(capsys):
     return " ".join(capsys.readouterr().out.split())
 
 
-def names_of(data: Path) -> list[str]:
+def names_of(data):
     return sorted(path.name for path in (data / "images").iterdir())
 
 
-def moved(data: Path, offset: np.ndarray, edit: Edit) -> None:
+def moved(data, offset, edit):
     """Shift cameras and cloud, with double numbers."""
     frames = meta_of(data)["frames"]
     for frame in frames:
@@ -54,7 +48,7 @@ def moved(data: Path, offset: np.ndarray, edit: Edit) -> None:
     PlyData([PlyElement.describe(wide, "vertex")]).write(str(data / "sparse_pc.ply"))
 
 
-def stray(data: Path, times: float, edit: Edit, *, index: int = 4) -> str:
+def stray(data, times, edit, *, index=4):
     """Put one training camera so many times as far from the middle; returns its image's name."""
     meta = meta_of(data)
     centres = np.array([np.array(frame["transform_matrix"])[:3, 3] for frame in meta["frames"]])
@@ -68,27 +62,25 @@ def stray(data: Path, times: float, edit: Edit, *, index: int = 4) -> str:
     return Path(frame["file_path"]).name
 
 
-def without(data: Path, index: int, edit: Edit) -> None:
+def without(data, index, edit):
     meta = meta_of(data)
     name = meta["frames"].pop(index)["file_path"]
     lists = {key: [file for file in meta[key] if file != name] for key in meta if key.endswith("_filenames")}
     edit(data, frames=meta["frames"], **lists)
 
 
-def cameras_by_name(made: Any) -> dict[str, Any]:
+def cameras_by_name(made):
     names = [path.name for path in made.train_dataset.image_filenames]
     return dict(zip(names, made.train_dataset.cameras.camera_to_worlds, strict=True))
 
 
-def points_of(made: Any) -> torch.Tensor:
-    points: torch.Tensor = made.train_dataparser_outputs.metadata["points3D_xyz"]
+def points_of(made):
+    points = made.train_dataparser_outputs.metadata["points3D_xyz"]
     return points
 
 
 @pytest.mark.parametrize("times", [20.0, 100.0, 3000.0, 1e9])
-def test_a_stray_camera_does_not_shrink_the_scene(
-    capture: Path, tmp_path: Path, load: Load, edit: Edit, capsys: Any, times: float
-) -> None:
+def test_a_stray_camera_does_not_shrink_the_scene(capture, tmp_path, load, edit, capsys, times):
     name = stray(capture, times, edit)
     made = load(capture)
     printed = said(capsys)
@@ -108,7 +100,7 @@ def test_a_stray_camera_does_not_shrink_the_scene(
     assert float(found[name][:, 3].norm()) > 0.5 * times
 
 
-def test_a_stray_test_view_is_named(capture: Path, load: Load, edit: Edit, capsys: Any) -> None:
+def test_a_stray_test_view_is_named(capture, load, edit, capsys):
     held_out = {Path(name).name for name in meta_of(capture)["val_filenames"]}
     name = stray(capture, 100.0, edit, index=3)
     assert name in held_out
@@ -119,9 +111,7 @@ def test_a_stray_test_view_is_named(capture: Path, load: Load, edit: Edit, capsy
     assert float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].abs().max()) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_earlier_runs_keep_the_frame_that_they_were_trained_in(
-    capture: Path, load: Load, edit: Edit, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_earlier_runs_keep_the_frame_that_they_were_trained_in(capture, load, edit, tmp_path, caplog):
     """A run that is resumed in other coordinates is named."""
     stray(capture, 100.0, edit)
     made = load(capture, robust=False)
@@ -140,9 +130,7 @@ def test_earlier_runs_keep_the_frame_that_they_were_trained_in(
 
 @pytest.mark.parametrize("offset", [np.zeros(3), SURVEY])
 @pytest.mark.parametrize("times", [1.0, 300.0])
-def test_cameras_of_a_capture_in_the_coordinates_of_a_run(
-    capture: Path, load: Load, edit: Edit, tmp_path: Path, times: float, offset: np.ndarray
-) -> None:
+def test_cameras_of_a_capture_in_the_coordinates_of_a_run(capture, load, edit, tmp_path, times, offset):
     """``cameras_of`` finds them by the transform that the run states."""
     if times > 1:
         stray(capture, times, edit)
@@ -159,14 +147,14 @@ def test_cameras_of_a_capture_in_the_coordinates_of_a_run(
     assert float(nearest.min(dim=1).values.max()) < limit
 
 
-def test_a_packed_scene_is_measured_in_the_frame_of_its_training(capture: Path, edit: Edit) -> None:
+def test_a_packed_scene_is_measured_in_the_frame_of_its_training(capture, edit):
     stray(capture, 100.0, edit)
     parser = NerfstudioDataParserConfig(load_3D_points=True)
     places = {}
     for robust in (True, False):
         manager = SundaeDatamanagerConfig(data=capture, dataparser=parser, robust_frame=robust)
         stated = json.loads(json.dumps(describe_capture(manager)))
-        again = datamanager_of(SimpleNamespace(meta={"capture": stated}), capture)  # type: ignore[arg-type]
+        again = datamanager_of(SimpleNamespace(meta={"capture": stated}), capture)
         assert again.robust_frame is robust
         made = again.setup(device="cpu", test_mode="test").train_dataset.cameras.camera_to_worlds
         places[robust] = float(made[:, :, 3].norm(dim=1).median())
@@ -174,9 +162,7 @@ def test_a_packed_scene_is_measured_in_the_frame_of_its_training(capture: Path, 
 
 
 @pytest.mark.parametrize("scale", [0.01, 7.5])
-def test_a_scale_in_the_rotations_is_none_of_the_cameras(
-    capture: Path, still_life: Path, load: Load, edit: Edit, scale: float
-) -> None:
+def test_a_scale_in_the_rotations_is_none_of_the_cameras(capture, still_life, load, edit, scale):
     frames = meta_of(capture)["frames"]
     for frame in frames:
         pose = np.array(frame["transform_matrix"])
@@ -189,9 +175,7 @@ def test_a_scale_in_the_rotations_is_none_of_the_cameras(
 
 
 @pytest.mark.parametrize("change", [{(0, 0): 2.0}, {(0, 1): 0.5}], ids=["stretched", "sheared"])
-def test_axes_that_are_no_rotation_are_refused(
-    capture: Path, load: Load, edit: Edit, change: dict[tuple[int, int], float]
-) -> None:
+def test_axes_that_are_no_rotation_are_refused(capture, load, edit, change):
     frames = meta_of(capture)["frames"]
     spoilt = np.eye(4)
     for place, value in change.items():
@@ -202,7 +186,7 @@ def test_axes_that_are_no_rotation_are_refused(
         load(capture)
 
 
-def test_a_panorama_with_one_step_aside_keeps_its_scale(capture: Path, load: Load, edit: Edit, capsys: Any) -> None:
+def test_a_panorama_with_one_step_aside_keeps_its_scale(capture, load, edit, capsys):
     """All cameras but one stand within centimetres; the points are as far as that one, so it is no stray."""
     meta = meta_of(capture)
     rng = np.random.default_rng(0)
@@ -216,9 +200,7 @@ def test_a_panorama_with_one_step_aside_keeps_its_scale(capture: Path, load: Loa
     assert "times as far away" not in capsys.readouterr().out
 
 
-def test_survey_coordinates_train_as_those_near_the_origin(
-    capture: Path, still_life: Path, load: Load, edit: Edit
-) -> None:
+def test_survey_coordinates_train_as_those_near_the_origin(capture, still_life, load, edit):
     near = load(still_life)
     moved(capture, SURVEY, edit)
     far = load(capture)
@@ -229,9 +211,7 @@ def test_survey_coordinates_train_as_those_near_the_origin(
 
 
 @pytest.mark.parametrize("applied", [None, [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]])
-def test_survey_coordinates_come_back_from_the_transform_of_a_run(
-    capture: Path, load: Load, edit: Edit, tmp_path: Path, applied: Any
-) -> None:
+def test_survey_coordinates_come_back_from_the_transform_of_a_run(capture, load, edit, tmp_path, applied):
     moved(capture, SURVEY, edit)
     edit(capture, applied_transform=applied)
     outputs = load(capture).train_dataparser_outputs
@@ -249,7 +229,7 @@ def test_survey_coordinates_come_back_from_the_transform_of_a_run(
     np.testing.assert_allclose(again[:, :, 3].numpy(), expected, atol=1e-5)
 
 
-def test_survey_coordinates_that_shall_not_be_centred_are_refused(capture: Path, load: Load, edit: Edit) -> None:
+def test_survey_coordinates_that_shall_not_be_centred_are_refused(capture, load, edit):
     moved(capture, SURVEY, edit)
     with pytest.raises(
         DataError, match=r"stand 5\.41e\+06 from the origin.* 0\.5 apart; leave out --center-method none"
@@ -257,7 +237,7 @@ def test_survey_coordinates_that_shall_not_be_centred_are_refused(capture: Path,
         load(capture, center_method="none")
 
 
-def test_a_cloud_that_was_rounded_before_is_named(capture: Path, load: Load, edit: Edit, capsys: Any) -> None:
+def test_a_cloud_that_was_rounded_before_is_named(capture, load, edit, capsys):
     moved(capture, SURVEY, edit)
     load(capture)
     assert "sparse_pc.ply has float32 coordinates" not in capsys.readouterr().out
@@ -269,10 +249,10 @@ def test_a_cloud_that_was_rounded_before_is_named(capture: Path, load: Load, edi
 
 
 @pytest.mark.parametrize("axes", [True, False])
-def test_a_colmap_model_in_survey_coordinates(capture: Path, load: Load, axes: bool) -> None:
+def test_a_colmap_model_in_survey_coordinates(capture, load, axes):
     names = names_of(capture)
     write_model(capture / "sparse" / "0", names, (24, 24))
-    options: dict[str, Any] = {"assume_colmap_world_coordinate_convention": axes}
+    options = {"assume_colmap_world_coordinate_convention": axes}
     near = load(capture, colmap="sparse/0", **options)
     write_model(capture / "sparse" / "0", names, (24, 24), origin=tuple(SURVEY))
     far = load(capture, colmap="sparse/0", **options)
@@ -284,7 +264,7 @@ def test_a_colmap_model_in_survey_coordinates(capture: Path, load: Load, axes: b
     torch.testing.assert_close(point, points_of(near)[1].double(), atol=1e-6, rtol=0)
 
 
-def test_a_stray_camera_of_a_colmap_model(capture: Path, load: Load) -> None:
+def test_a_stray_camera_of_a_colmap_model(capture, load):
     names = names_of(capture)
     write_model(capture / "sparse" / "0", names, (24, 24))
     usual = load(capture, colmap="sparse/0")
@@ -294,13 +274,13 @@ def test_a_stray_camera_of_a_colmap_model(capture: Path, load: Load) -> None:
     assert float(points_of(made).abs().max()) > 0.2 * float(points_of(usual).abs().max())
 
 
-def cloud_of(made: Any) -> tuple[torch.Tensor, torch.Tensor]:
+def cloud_of(made):
     metadata = made.train_dataparser_outputs.metadata
     return metadata["points3D_xyz"], metadata["points3D_rgb"]
 
 
 @pytest.mark.parametrize("scale", [0.1, 25.0])
-def test_applied_scale_leaves_the_cloud_beside_its_cameras(capture: Path, load: Load, edit: Edit, scale: float) -> None:
+def test_applied_scale_leaves_the_cloud_beside_its_cameras(capture, load, edit, scale):
     plain = load(capture)
     edit(capture, applied_scale=scale)
     made = load(capture)
@@ -313,7 +293,7 @@ def test_applied_scale_leaves_the_cloud_beside_its_cameras(capture: Path, load: 
     torch.testing.assert_close(moved, cloud_of(plain)[0][:5], atol=1e-5, rtol=0)
 
 
-def test_colours_of_a_cloud_reach_the_model(capture: Path, load: Load) -> None:
+def test_colours_of_a_cloud_reach_the_model(capture, load):
     _, expected = cloud_of(load(capture))
     vertex = PlyData.read(str(capture / "sparse_pc.ply"))["vertex"].data
     names = ("x", "y", "z", "red", "green", "blue")
@@ -323,7 +303,7 @@ def test_colours_of_a_cloud_reach_the_model(capture: Path, load: Load) -> None:
     assert torch.equal(cloud_of(load(capture))[1], expected)
 
 
-def test_a_cloud_that_the_views_do_not_show_is_named(capture: Path, load: Load, capsys: Any) -> None:
+def test_a_cloud_that_the_views_do_not_show_is_named(capture, load, capsys):
     load(capture)
     assert "show no point" not in capsys.readouterr().out
     path = capture / "sparse_pc.ply"
@@ -337,7 +317,7 @@ def test_a_cloud_that_the_views_do_not_show_is_named(capture: Path, load: Load, 
     )
 
 
-def test_an_old_capture_takes_the_cloud_of_its_colmap_model(capture: Path, load: Load, edit: Edit) -> None:
+def test_an_old_capture_takes_the_cloud_of_its_colmap_model(capture, load, edit):
     """Made before ns-process-data wrote clouds; nerfstudio asks, and writes into the capture."""
     (capture / "sparse_pc.ply").unlink()
     edit(capture, ply_file_path=None)
@@ -365,7 +345,7 @@ def test_an_old_capture_takes_the_cloud_of_its_colmap_model(capture: Path, load:
 
 
 @pytest.mark.parametrize("colmap", [None, "sparse/0"])
-def test_masks_beside_the_images(capture: Path, load: Load, edit: Edit, capsys: Any, colmap: str | None) -> None:
+def test_masks_beside_the_images(capture, load, edit, capsys, colmap):
     if colmap is not None:
         write_model(capture / colmap, names_of(capture), (24, 24))
     load(capture, colmap=colmap)
@@ -383,7 +363,7 @@ def test_masks_beside_the_images(capture: Path, load: Load, edit: Edit, capsys: 
     assert "is not used" not in said(capsys)
 
 
-def test_a_larger_model_beside_the_given_one(capture: Path, load: Load, capsys: Any) -> None:
+def test_a_larger_model_beside_the_given_one(capture, load, capsys):
     names = names_of(capture)
     write_model(capture / "sparse" / "0", names[:4], (24, 24))
     write_model(capture / "sparse" / "1", names, (24, 24))
@@ -396,7 +376,7 @@ def test_a_larger_model_beside_the_given_one(capture: Path, load: Load, capsys: 
         load(capture, colmap="colmap/sparse/0")
 
 
-def test_a_missing_image_is_named_with_the_one_beside_it(capture: Path, load: Load, edit: Edit) -> None:
+def test_a_missing_image_is_named_with_the_one_beside_it(capture, load, edit):
     frames = meta_of(capture)["frames"]
     first, last = (capture / frames[index]["file_path"] for index in (0, -1))
     last.rename(last.with_name(last.name + ".png"))
@@ -413,7 +393,7 @@ def test_a_missing_image_is_named_with_the_one_beside_it(capture: Path, load: Lo
         load(capture, colmap="sparse/0")
 
 
-def as_photos(data: Path, edit: Edit, orientation: int, *, size: tuple[int, int] = (24, 16)) -> None:
+def as_photos(data, edit, orientation, *, size=(24, 16)):
     """Turn the images of a capture into JPEG files with an EXIF entry, of another shape than their cameras state."""
     frames = meta_of(data)["frames"]
     for frame in frames:
@@ -424,12 +404,12 @@ def as_photos(data: Path, edit: Edit, orientation: int, *, size: tuple[int, int]
             image.convert("RGB").resize(size).save(path.with_suffix(".jpg"), exif=entries, quality=95)
         path.unlink()
         frame["file_path"] = str(Path(frame["file_path"]).with_suffix(".jpg"))
-    gone: dict[str, Any] = dict.fromkeys(("train_filenames", "val_filenames", "test_filenames"))
+    gone = dict.fromkeys(("train_filenames", "val_filenames", "test_filenames"))
     edit(data, frames=frames, **{**gone, "w": size[1], "h": size[0], "cx": size[1] / 2, "cy": size[0] / 2})
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
-def test_photos_are_turned_as_their_cameras_see_them(capture: Path, load: Load, edit: Edit, orientation: int) -> None:
+def test_photos_are_turned_as_their_cameras_see_them(capture, load, edit, orientation):
     as_photos(capture, edit, orientation)
     made = load(capture)
     assert len(made.cached_train) > 5
@@ -440,7 +420,7 @@ def test_photos_are_turned_as_their_cameras_see_them(capture: Path, load: Load, 
         assert np.array_equal(batch["image"].numpy(), seen)
 
 
-def test_photos_of_the_size_of_their_cameras_stay(capture: Path, load: Load, edit: Edit) -> None:
+def test_photos_of_the_size_of_their_cameras_stay(capture, load, edit):
     """Also those of a program that has estimated the cameras of the pixels as they are stored."""
     as_photos(capture, edit, 6)
     edit(capture, w=24, h=16, cx=12.0, cy=8.0)
@@ -458,16 +438,14 @@ def test_photos_of_the_size_of_their_cameras_stay(capture: Path, load: Load, edi
         (1, (23, 16), "--downscale-rounding-mode round"),
     ],
 )
-def test_photos_that_fit_neither_way(
-    capture: Path, load: Load, edit: Edit, orientation: int, size: tuple[int, int], advice: str
-) -> None:
+def test_photos_that_fit_neither_way(capture, load, edit, orientation, size, advice):
     as_photos(capture, edit, orientation)
     edit(capture, w=size[0], h=size[1])
     with pytest.raises(DataError, match=f"24 x 16 px but its camera says {size[0]} x {size[1]}; .*{advice}"):
         load(capture).next_train(0)
 
 
-def test_masks_of_turned_photos(capture: Path, load: Load, edit: Edit) -> None:
+def test_masks_of_turned_photos(capture, load, edit):
     as_photos(capture, edit, 6)
     frames = meta_of(capture)["frames"]
     mask = Image.new("L", (16, 24), 255)

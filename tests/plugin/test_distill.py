@@ -1,9 +1,6 @@
 """Distillation of a scene into a smaller one."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +11,7 @@ from sundae_ns.plugin.distill import Distillation
 
 
 @pytest.fixture(scope="module")
-def ball() -> sn.Scene:
+def ball():
     """Points on a sphere, coloured in patches."""
     generator = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(1500, 3, generator=generator), dim=1)
@@ -24,14 +21,14 @@ def ball() -> sn.Scene:
 
 
 @pytest.fixture(scope="module")
-def cameras() -> list[sn.Camera]:
+def cameras():
     turns = torch.arange(12) * 0.5
     eyes = torch.stack([2.5 * turns.cos(), 2.5 * turns.sin(), turns.sin()], dim=1)
     return [sn.Camera.look_at(eye, (0, 0, 0), width=40, height=40) for eye in eyes]
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-3])
-def test_it_is_better_than_the_prune_alone(size: float, ball: sn.Scene, cameras: list[sn.Camera]) -> None:
+def test_it_is_better_than_the_prune_alone(size, ball, cameras):
     """Also for a scene that the near plane would hide; other cameras than those of the steps judge."""
     gaussians = ball.gaussians.replaced(
         {"means": ball.gaussians["means"] * size, "scales": ball.gaussians["scales"] + math.log(size)}
@@ -49,7 +46,7 @@ def test_it_is_better_than_the_prune_alone(size: float, ball: sn.Scene, cameras:
     assert quality > base + 2
 
 
-def test_it_is_the_same_for_a_seed_and_for_every_default_dtype(ball: sn.Scene, cameras: list[sn.Camera]) -> None:
+def test_it_is_the_same_for_a_seed_and_for_every_default_dtype(ball, cameras):
     found = []
     for seed, dtype in ((0, torch.float32), (0, torch.float64), (1, torch.float32)):
         torch.set_default_dtype(dtype)
@@ -63,9 +60,7 @@ def test_it_is_the_same_for_a_seed_and_for_every_default_dtype(ball: sn.Scene, c
     assert not torch.equal(found[0], found[2])
 
 
-def test_a_head_is_kept_only_where_it_pays(
-    ball: sn.Scene, cameras: list[sn.Camera], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_head_is_kept_only_where_it_pays(ball, cameras, monkeypatch):
     monkeypatch.setattr("sundae_ns.train.choice.LEAST_GAIN", 1000.0)
     made = Distillation(ball, keep=0.1, cameras=cameras, steps=20)
     assert made.train(lambda *_: True)
@@ -84,13 +79,11 @@ def test_a_head_is_kept_only_where_it_pays(
 
 
 @pytest.mark.parametrize("head", [False, True])
-def test_a_resumed_training_ends_as_an_uninterrupted_one(
-    head: bool, ball: sn.Scene, cameras: list[sn.Camera], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_training_ends_as_an_uninterrupted_one(head, ball, cameras, tmp_path, monkeypatch):
     for name in ("LEAST_GAIN", "GAIN_PER_DOUBLING"):
         monkeypatch.setattr(f"sundae_ns.train.choice.{name}", -1000.0)
 
-    def begun() -> Distillation:
+    def begun():
         return Distillation(ball, keep=0.1, cameras=cameras, steps=20, head=head)
 
     whole, first, second = begun(), begun(), begun()
@@ -110,7 +103,7 @@ def test_a_resumed_training_ends_as_an_uninterrupted_one(
         begun().load(tmp_path / "partial")
 
 
-def test_impossible_options_are_refused(ball: sn.Scene) -> None:
+def test_impossible_options_are_refused(ball):
     with pytest.raises(ConfigError, match="steps is 0"):
         sn.distill(ball, steps=0)
     with pytest.raises(ConfigError, match="keep is 2"):

@@ -3,13 +3,9 @@
 ``rank.py`` runs the checks of this file on each rank; the tests read their results.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -17,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from photographed import COUNT, batch_of, begin, image_of, update
 from splat_inputs import geometry
-from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from sundae_ns.core.camera import Camera
@@ -37,10 +32,10 @@ COLORS = ColorSettings(REFERENCE)
 N, RANKS = 90, 2
 
 
-def gaussians(n: int = N) -> dict[str, Tensor]:
+def gaussians(n=N):
     generator = torch.Generator().manual_seed(3)
 
-    def normal(*shape: int) -> Tensor:
+    def normal(*shape):
         return torch.randn(n, *shape, generator=generator, dtype=torch.float64)
 
     return {
@@ -54,12 +49,12 @@ def gaussians(n: int = N) -> dict[str, Tensor]:
     }
 
 
-def gaussians_of(values: dict[str, Tensor], start: int = 0, end: int = N) -> Gaussians:
-    rows: Any = ParameterDict({name: Parameter(value[start:end].clone()) for name, value in values.items()})
+def gaussians_of(values, start=0, end=N):
+    rows = ParameterDict({name: Parameter(value[start:end].clone()) for name, value in values.items()})
     return Gaussians(rows)
 
 
-def camera(rank: int, *, behind: bool = False) -> Camera:
+def camera(rank, *, behind=False):
     """Cameras that differ in all: position, size and intrinsics."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = torch.tensor([0.4 * rank, -0.1, 2.5])
@@ -70,7 +65,7 @@ def camera(rank: int, *, behind: bool = False) -> Camera:
     return Camera(pose, K, width, height, focal)
 
 
-def draw(source: GaussianSource, camera: Camera) -> Any:
+def draw(source, camera):
     params = source.primitives(camera, COLORS, features=True)
     inputs = Inputs(
         *(params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid().squeeze(-1)),
@@ -85,12 +80,12 @@ def draw(source: GaussianSource, camera: Camera) -> Any:
     return shown
 
 
-def loss_of(shown: Any, rank: int) -> Tensor:
+def loss_of(shown, rank):
     weights = torch.randn(shown.colors.shape, generator=torch.Generator().manual_seed(rank), dtype=torch.float64)
     return (shown.colors * weights).mean() + shown.depth.mean() + shown.alpha.square().mean()
 
 
-def state_of(gaussians: Gaussians, **running: Any) -> TrainingState:
+def state_of(gaussians, **running):
     """A field in training whose moments say to which row they belong."""
     state = TrainingState(gaussians, torch.nn.ModuleDict(), densification=running, densify_until=10)
     state.pruning = {"pruned_at": -1, "num_prunes": 0, "peak": 0}
@@ -102,7 +97,7 @@ def state_of(gaussians: Gaussians, **running: Any) -> TrainingState:
     return state
 
 
-def check_drawing(rank: int) -> None:
+def check_drawing(rank):
     """Images, gradients and statistics of two ranks are those of one process for both images."""
     for behind in (False, True):  # then rank 1 sees nothing, and takes part
         start, end = ((0, 60), (60, N))[rank]
@@ -117,11 +112,10 @@ def check_drawing(rank: int) -> None:
 
         whole = GaussianSource(gaussians_of(gaussians()))
         both = [draw(whole, cam) for cam in cameras]
-        (sum(loss_of(image, index) for index, image in enumerate(both)) / RANKS).backward()  # type: ignore[union-attr]
+        (sum(loss_of(image, index) for index, image in enumerate(both)) / RANKS).backward()
         for image in ("colors", "depth", "alpha"):
             torch.testing.assert_close(getattr(shown, image), getattr(both[rank], image), rtol=0, atol=1e-14)
         for name, value in whole.gaussians.items():
-            assert value.grad is not None
             torch.testing.assert_close(source.gaussians[name].grad, value.grad[start:end], rtol=1e-10, atol=1e-14)
         norms, counts, radii = torch.zeros(3, N, dtype=torch.float64)
         for image, cam in zip(both, cameras):
@@ -142,10 +136,10 @@ class Halving(Callback):
     done = False
     calls = 0
 
-    def needs_all(self, run: Any) -> bool:
+    def needs_all(self, run):
         return not self.done
 
-    def after_step(self, run: Any) -> None:
+    def after_step(self, run):
         self.calls += 1
         if not self.done:
             state, mask = run.state, torch.arange(N) % 2 == 0
@@ -153,26 +147,26 @@ class Halving(Callback):
             state.pruning["num_prunes"] = 1
         self.done = True
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self):
         return {"done": self.done}
 
-    def load_state_dict(self, state: Any, saved: Any) -> None:
+    def load_state_dict(self, state, saved):
         self.done = saved["done"]
 
 
-def shared(rank: int, state: TrainingState) -> tuple[Ranks, Any]:
+def shared(rank, state):
     ranks, model = (
         Ranks(rank, RANKS),
         SimpleNamespace(state=state, train_callbacks=[], source=GaussianSource(state.gaussians)),
     )
     model.device = torch.device("cpu")
-    optimizers: Any = SimpleNamespace(parameters={})
+    optimizers = SimpleNamespace(parameters={})
     ranks.share(model, SimpleNamespace(rank=0), optimizers)
     assert all(held[0] is state.gaussians[name] for name, held in optimizers.parameters.items())
     return ranks, model
 
 
-def check_gathering(rank: int) -> None:
+def check_gathering(rank):
     """A prune by the first rank: rows move with their moments and statistics, in order; notes are shared."""
     values = gaussians() if rank == 0 else {name: value + 1 for name, value in gaussians().items()}
     state = state_of(gaussians_of(values), grad2d=torch.arange(N), radii=None, peak=40 + rank)
@@ -199,7 +193,7 @@ def check_gathering(rank: int) -> None:
             assert torch.equal(state.gaussians["means"], gaussians()["means"][::2])
 
 
-def check_an_empty_shard(rank: int) -> None:
+def check_an_empty_shard(rank):
     """Fewer Gaussians than ranks: a rank without any renders those of the other, and takes a step."""
     alone = GaussianSource(gaussians_of(gaussians()))
     seen = int(draw(alone, camera(0)).radii.argmax())
@@ -215,7 +209,7 @@ def check_an_empty_shard(rank: int) -> None:
         state.optimizers[name].step()
 
 
-def check_optimizers(rank: int) -> None:
+def check_optimizers(rank):
     """The head's gradients are averaged, Gaussians step by the scaled rate, and the groups keep their numbers."""
     torch.manual_seed(0)
     head = CompensationHead(HeadConfig(mode="residual", size="tiny")).to(memory_format=torch.channels_last)
@@ -227,7 +221,7 @@ def check_optimizers(rank: int) -> None:
         gradients.append(torch.randn_like(value))
         value.grad = gradients[-1] * (0.5 if rank == 0 else 1.5)
     means.grad = torch.ones_like(means)
-    optimizers.optimizer_scaler_step_some(torch.amp.GradScaler(enabled=False), list(config))  # type: ignore[attr-defined]
+    optimizers.optimizer_scaler_step_some(torch.amp.GradScaler(enabled=False), list(config))
     for value, gradient in zip(head.parameters(), gradients):
         torch.testing.assert_close(value.grad, gradient)
     torch.testing.assert_close(means.detach(), torch.full_like(means, -0.01 * math.sqrt(RANKS)))
@@ -235,7 +229,7 @@ def check_optimizers(rank: int) -> None:
     assert (group["lr"], group["betas"]) == (0.01, (0.9, 0.999))
 
 
-def check_gains_of_photos(rank: int) -> None:
+def check_gains_of_photos(rank):
     """All ranks divide photos by the same gains, from what both have measured."""
     gains, run = begin()
     gains.total = _summed
@@ -249,14 +243,14 @@ def check_gains_of_photos(rank: int) -> None:
     assert state["gains"].std() > 0.05
 
 
-def checks(_: Path) -> dict[str, Callable[[int], None]]:
+def checks(_):
     """The checks of each rank, in this order."""
     every = (check_drawing, check_gathering, check_an_empty_shard, check_optimizers, check_gains_of_photos)
     return {check.__name__: check for check in every}
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: Callable[[str, Path], None]) -> Path:
+def folder(tmp_path_factory, run_ranks):
     """Results of two ranks that ran all checks, once for all tests."""
     folder = tmp_path_factory.mktemp("ranks")
     run_ranks(__file__, folder)
@@ -264,7 +258,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: Callable[[str, P
 
 
 @pytest.mark.parametrize("name", checks(Path()))
-def test_two_ranks(folder: Path, name: str, passed: Callable[[Path, str], None]) -> None:
+def test_two_ranks(folder, name, passed):
     passed(folder, name)
 
 
@@ -272,7 +266,7 @@ def test_two_ranks(folder: Path, name: str, passed: Callable[[Path, str], None])
     seed=st.integers(0, 10**6),
     shape=st.sampled_from([(64, 48, 50.0, 32.0, 2.0), (300, 20, 20.0, -40.0, 6.0)]),
 )
-def test_all_rendered_gaussians_may_be_seen(seed: int, shape: tuple[int, int, float, float, float]) -> None:
+def test_all_rendered_gaussians_may_be_seen(seed, shape):
     """Centres all around a camera, some of them very near; sizes over four decades."""
     width, height, focal, cx, most = shape
     generator = torch.Generator().manual_seed(seed)
@@ -290,7 +284,7 @@ def test_all_rendered_gaussians_may_be_seen(seed: int, shape: tuple[int, int, fl
     assert 0 < seen.sum() < most * drawn.sum()
 
 
-def test_nan_depth_is_not_seen() -> None:
+def test_nan_depth_is_not_seen():
     means = torch.tensor([[0.0, 0.0, 2.0], [torch.nan, 0.0, 2.0], [0.0, 0.0, torch.nan], [0.0, 0.0, 0.0]])
     (seen,) = may_be_seen(
         means, torch.full((4, 3), -2.3), torch.eye(4)[None], torch.eye(3)[None], torch.full((1, 2), 10.0)

@@ -1,12 +1,8 @@
 """Lenses: each camera trains with its own, undistorted as what it is, or is refused with the way out."""
 
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,17 +18,15 @@ from sundae_ns.data.lenses import COLMAP_LENSES, lens_of
 from sundae_ns.plugin.dataparsers import check_projection
 from sundae_ns.scene.cameras import cameras_of
 
-Load = Callable[..., Any]
-Edit = Callable[..., None]
 FOCAL = 15.0
 """Of a round lens that sees 92 degrees across 24 px."""
 
 
-def names_of(data: Path) -> list[str]:
+def names_of(data):
     return sorted(path.name for path in (data / "images").iterdir())
 
 
-def images_of(made: Any) -> list[torch.Tensor]:
+def images_of(made):
     return [batch["image"] for batch in made.cached_train]
 
 
@@ -52,9 +46,7 @@ def images_of(made: Any) -> list[torch.Tensor]:
     ],
 )
 @pytest.mark.parametrize("place", ["top", "one frame"])
-def test_other_projections_are_refused(
-    capture: Path, load: Load, edit: Edit, model: str, help_: str, place: str
-) -> None:
+def test_other_projections_are_refused(capture, load, edit, model, help_, place):
     frames = meta_of(capture)["frames"]
     if place == "one frame":
         frames[3]["camera_model"] = model
@@ -68,7 +60,7 @@ def test_other_projections_are_refused(
 
 
 @pytest.mark.parametrize("kind", [kind for kind in CameraType if kind != CameraType.PERSPECTIVE])
-def test_cameras_of_a_path_with_other_projections_are_refused(kind: CameraType) -> None:
+def test_cameras_of_a_path_with_other_projections_are_refused(kind):
     camera = Cameras(torch.eye(4)[None, :3], 20.0, 20.0, 10.0, 8.0, 20, 16, camera_type=kind)
     with pytest.raises(DataError, match=f"of type {kind.name.lower()}, and only perspective images"):
         check_projection(camera)
@@ -78,7 +70,7 @@ def test_cameras_of_a_path_with_other_projections_are_refused(kind: CameraType) 
 # ----------------------------------------------------------------------------------------------------------- fisheye
 
 
-def undistorted(path: Path, distortion: tuple[float, float, float, float]) -> np.ndarray:
+def undistorted(path, distortion):
     """The perspective image of a fisheye photo, by OpenCV alone."""
     image = np.array(Image.open(path).convert("RGB"))
     size = image.shape[1], image.shape[0]
@@ -89,8 +81,8 @@ def undistorted(path: Path, distortion: tuple[float, float, float, float]) -> np
     return cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR)
 
 
-def fisheye(data: Path, edit: Edit, **entries: Any) -> None:
-    none: dict[str, Any] = dict.fromkeys(("k1", "k2", "p1", "p2"))
+def fisheye(data, edit, **entries):
+    none = dict.fromkeys(("k1", "k2", "p1", "p2"))
     edit(data, **{"camera_model": "OPENCV_FISHEYE", "fl_x": FOCAL, "fl_y": FOCAL, **none, **entries})
 
 
@@ -108,9 +100,7 @@ def fisheye(data: Path, edit: Edit, **entries: Any) -> None:
         ({"camera_model": "RADIAL_FISHEYE", "k1": 0.02, "k2": 0.01}, (0.02, 0.01, 0.0, 0.0)),
     ],
 )
-def test_a_fisheye_lens_is_undistorted_as_one(
-    capture: Path, load: Load, edit: Edit, entries: dict[str, Any], distortion: tuple[float, float, float, float]
-) -> None:
+def test_a_fisheye_lens_is_undistorted_as_one(capture, load, edit, entries, distortion):
     fisheye(capture, edit, **entries)
     made = load(capture)
     for path, image in zip(made.train_dataset.image_filenames, images_of(made), strict=True):
@@ -123,7 +113,7 @@ def test_a_fisheye_lens_is_undistorted_as_one(
 
 @pytest.mark.parametrize("focal", [6.0, 14.0, 15.5])
 @pytest.mark.parametrize("k1", [0.0, -0.02, 0.05])
-def test_a_lens_that_sees_the_half_space(capture: Path, load: Load, edit: Edit, focal: float, k1: float) -> None:
+def test_a_lens_that_sees_the_half_space(capture, load, edit, focal, k1):
     """Its photos show the direction of each ray; the perspective images of their middles must show the same."""
     size = 48
     y, x = (np.mgrid[:size, :size] + 0.5 - size / 2) / focal
@@ -153,9 +143,7 @@ def test_a_lens_that_sees_the_half_space(capture: Path, load: Load, edit: Edit, 
     "entries",
     [{"p1": 1.0}, {"k4": -90000.0}, {"camera_model": "OPENCV_FISHEYE", "k1": -3.0}, {"k1": 300.0, "k2": 1e9}],
 )
-def test_a_distortion_that_leaves_no_image_is_refused(
-    capture: Path, load: Load, edit: Edit, entries: dict[str, Any]
-) -> None:
+def test_a_distortion_that_leaves_no_image_is_refused(capture, load, edit, entries):
     edit(capture, **entries)
     with pytest.raises(
         DataError, match=r"frame_\d+\.png (has a distortion that leaves no image|cannot be undist)"
@@ -165,7 +153,7 @@ def test_a_distortion_that_leaves_no_image_is_refused(
     assert "\n" not in str(caught.value)
 
 
-def test_the_lens_of_each_frame(capture: Path, load: Load, edit: Edit) -> None:
+def test_the_lens_of_each_frame(capture, load, edit):
     """As ns-process-data writes it for several cameras: model and distortion in the frames alone."""
     meta = meta_of(capture)
     shared = {key: meta[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
@@ -208,7 +196,7 @@ FOUR, TWELVE = [0.1, 0.02, 0.0, 0.0], [0.5] * 12
         ({"camera_model": "FISHEYE624"}, {}, "FISHEYE624 needs distortion_params of 12 numbers, not 0"),
     ],
 )
-def test_the_lens_of_a_frame(top: dict[str, Any], frame: dict[str, Any], distortion: tuple[float, ...] | str) -> None:
+def test_the_lens_of_a_frame(top, frame, distortion):
     if isinstance(distortion, str):
         with pytest.raises(DataError, match=distortion):
             lens_of(top, frame, "frame 0")
@@ -221,19 +209,17 @@ def test_the_lens_of_a_frame(top: dict[str, Any], frame: dict[str, Any], distort
     "distortion",
     [(0.0, 0.0, 0.0, 0.05, 0.0, 0.0), (-0.2, 0.08, -0.02, 0.004, 0.0, 0.0), (0.1, -0.05, 0.02, 0.01, 0.01, -0.02)],
 )
-def test_four_radial_coefficients(
-    capture: Path, load: Load, edit: Edit, distortion: tuple[float, ...], place: str
-) -> None:
+def test_four_radial_coefficients(capture, load, edit, distortion, place):
     """As Metashape and RealityScan write them; the photo's colours are its own pixel coordinates."""
     width, height, focal = 60, 40, 40.0
     v, u = np.mgrid[:height, :width]
     for path in (capture / "images").iterdir():
         Image.fromarray(np.stack([4 * u, 6 * v, 0 * u], axis=2).astype(np.uint8)).save(path)
     named = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion, strict=True))
-    entries: dict[str, Any] = {"distortion_params": list(distortion)} if place == "params" else named
+    entries = {"distortion_params": list(distortion)} if place == "params" else named
     lens = {"fl_x": focal, "fl_y": focal, "cx": 29.0, "cy": 21.0, "w": width, "h": height}
     frames = meta_of(capture)["frames"]
-    gone: dict[str, Any] = dict.fromkeys(named)
+    gone = dict.fromkeys(named)
     if place == "frames":
         edit(capture, frames=[{**frame, **lens, **entries} for frame in frames], **gone)
     else:
@@ -258,9 +244,9 @@ def test_four_radial_coefficients(
     assert least < 2
 
 
-def test_an_angle_of_view_gives_the_focal_length(capture: Path, load: Load, edit: Edit) -> None:
+def test_an_angle_of_view_gives_the_focal_length(capture, load, edit):
     known = meta_of(capture)
-    gone: dict[str, Any] = dict.fromkeys(("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model"))
+    gone = dict.fromkeys(("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model"))
     edit(capture, camera_angle_x=2 * math.atan(12 / known["fl_x"]), **gone)
     cameras = load(capture).train_dataset.cameras
     assert float(cameras.fx[0]) == float(cameras.fy[0]) == pytest.approx(known["fl_x"], rel=1e-6)
@@ -276,7 +262,7 @@ def test_an_angle_of_view_gives_the_focal_length(capture: Path, load: Load, edit
 # ------------------------------------------------------------------------------------------------------------ COLMAP
 
 CENTRE = [12.0, 12.0]
-READ: dict[str, tuple[list[float], tuple[float, ...], CameraType]] = {
+READ = {
     "SIMPLE_RADIAL": ([20, *CENTRE, 0.1], (0.1, 0, 0, 0, 0, 0), CameraType.PERSPECTIVE),
     "OPENCV": ([20, 20, *CENTRE, 0.1, 0.2, 0.3, 0.4], (0.1, 0.2, 0, 0, 0.3, 0.4), CameraType.PERSPECTIVE),
     "OPENCV_FISHEYE": ([20, 20, *CENTRE, 0.1, 0.2, 0.3, 0.4], (0.1, 0.2, 0.3, 0.4, 0, 0), CameraType.FISHEYE),
@@ -297,7 +283,7 @@ READ: dict[str, tuple[list[float], tuple[float, ...], CameraType]] = {
 }
 
 
-def write_text_cameras(model: Path, name: str, params: list[float]) -> None:
+def write_text_cameras(model, name, params):
     """Replace the cameras of a binary model by a text; nerfstudio reads either all text or all binary."""
     (model / "cameras.bin").unlink()
     (model / "cameras.txt").write_text(f"1 {name} 24 24 {' '.join(map(str, params))}\n")
@@ -307,7 +293,7 @@ def write_text_cameras(model: Path, name: str, params: list[float]) -> None:
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
 @pytest.mark.parametrize("name", READ)
-def test_colmap_lenses_that_train(capture: Path, load: Load, name: str, text: bool) -> None:
+def test_colmap_lenses_that_train(capture, load, name, text):
     params, distortion, kind = READ[name]
     write_model(capture / "sparse" / "0", names_of(capture), (24, 24), lenses=[(COLMAP_LENSES[name][0], params)])
     if text:
@@ -333,9 +319,7 @@ def test_colmap_lenses_that_train(capture: Path, load: Load, name: str, text: bo
     ],
 )
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
-def test_colmap_lenses_that_are_refused(
-    capture: Path, load: Load, name: str, params: list[float], help_: str, text: bool
-) -> None:
+def test_colmap_lenses_that_are_refused(capture, load, name, params, help_, text):
     write_model(capture / "sparse" / "0", names_of(capture), (24, 24), lenses=[(COLMAP_LENSES[name][0], params)])
     if text:
         write_text_cameras(capture / "sparse" / "0", name, params)
@@ -345,7 +329,7 @@ def test_colmap_lenses_that_are_refused(
     assert "image_undistorter" not in str(caught.value) or name != "EQUIRECTANGULAR"
 
 
-def test_two_kinds_of_lenses_of_a_colmap_model(capture: Path, load: Load) -> None:
+def test_two_kinds_of_lenses_of_a_colmap_model(capture, load):
     pinhole, round_lens = (1, [20.0, 20.0, *CENTRE]), (5, [FOCAL, FOCAL, *CENTRE, 0.02, 0.0, 0.0, 0.0])
     write_model(capture / "sparse" / "0", names_of(capture), (24, 24), lenses=[pinhole, round_lens])
     made = load(capture, colmap="sparse/0")
@@ -366,7 +350,7 @@ LENS = {"fl_x": 33.0, "fl_y": 33.5, "cx": 12.25, "cy": 11.75, "w": 24, "h": 24}
 OPENCV = {"camera_model": "OPENCV"}
 AXES = {"applied_transform": [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]}
 METASHAPE = {**LENS, "k1": 0.02, "k2": -0.01, "k3": 0.001, "k4": 0.0, "p1": 1e-4, "p2": 1e-4}
-WRITERS: dict[str, tuple[dict[str, Any], Callable[[int], dict[str, Any]]]] = {
+WRITERS = {
     "ns-process-data": (
         {**LENS, **OPENCV, **AXES, "k1": 0.01, "k2": -0.01, "p1": 1e-4, "p2": 2e-4},
         lambda index: {"colmap_im_id": index + 1},
@@ -391,7 +375,7 @@ WRITERS: dict[str, tuple[dict[str, Any], Callable[[int], dict[str, Any]]]] = {
 
 
 @pytest.mark.parametrize("writer", WRITERS)
-def test_files_of_other_programs(capture: Path, load: Load, writer: str) -> None:
+def test_files_of_other_programs(capture, load, writer):
     top, entries = WRITERS[writer]
     frames = [
         {"file_path": frame["file_path"], "transform_matrix": frame["transform_matrix"], **entries(index)}
@@ -427,7 +411,7 @@ def test_files_of_other_programs(capture: Path, load: Load, writer: str) -> None
         ("colmap/sparse/0", ["project.ini"]),  # ns-process-data
     ],
 )
-def test_models_of_colmap(capture: Path, load: Load, place: str, beside: list[str]) -> None:
+def test_models_of_colmap(capture, load, place, beside):
     write_model(capture / place, names_of(capture), (24, 24), lenses=[(2, [33.0, 12.0, 12.0, 0.02])])
     for name in beside:
         (capture / place / name).write_bytes(bytes(8))

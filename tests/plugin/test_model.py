@@ -1,18 +1,12 @@
 """The model: what it is to nerfstudio, its checkpoints, prunes and metrics."""
 
-from __future__ import annotations
-
 import re
 import weakref
-from collections.abc import Callable
 from copy import deepcopy
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 import torchmetrics.image
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor
 
@@ -20,14 +14,10 @@ from sundae_ns.core.camera import crop_image
 from sundae_ns.core.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.core.gaussians import Gaussians, sh_to_rgb
 from sundae_ns.core.metrics import psnr
-from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.pruning.decision import decide
 
-Build = Callable[..., SundaeModel]
-TrainingOf = Callable[[SundaeModel], Any]
 
-
-def test_it_is_a_splatfacto_whose_groups_have_features_and_head(build: Build) -> None:
+def test_it_is_a_splatfacto_whose_groups_have_features_and_head(build):
     model = build()
     assert isinstance(model, SplatfactoModel)
     groups = model.get_param_groups()
@@ -45,13 +35,13 @@ def test_it_is_a_splatfacto_whose_groups_have_features_and_head(build: Build) ->
         ({"use_bilateral_grid": True}, "bilateral"),
     ],
 )
-def test_options_that_cannot_work(build: Build, options: dict[str, Any], cause: str) -> None:
+def test_options_that_cannot_work(build, options, cause):
     with pytest.raises(ConfigError, match=cause) as caught:
         build(**options)
     assert "\n" not in str(caught.value)
 
 
-def test_gsplat_without_cuda(build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gsplat_without_cuda(build, training_of, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     model = build(rasterizer="gsplat")
     with pytest.raises(BackendError, match="CUDA is not available") as caught:
@@ -60,14 +50,12 @@ def test_gsplat_without_cuda(build: Build, training_of: TrainingOf, monkeypatch:
     assert build(rasterizer="auto").backend.name == "cpu"
 
 
-def saved(model: SundaeModel, path: Path) -> dict[str, Any]:
+def saved(model, path):
     torch.save(model.state_dict(), path)
     return torch.load(path, weights_only=True)
 
 
-def test_round_trip_into_another_count_keeps_optimizers_alive(
-    build: Build, training_of: TrainingOf, tmp_path: Path
-) -> None:
+def test_round_trip_into_another_count_keeps_optimizers_alive(build, training_of, tmp_path):
     source = training_of(build())
     for step in range(5):
         source.step(step)
@@ -84,8 +72,8 @@ def test_round_trip_into_another_count_keeps_optimizers_alive(
     assert target.model.state.pruning == source.model.state.pruning
     assert target.model.state.head_enabled
     for (_, ours), (_, theirs) in zip(
-        target.model.head.named_parameters(),  # type: ignore[union-attr]
-        source.model.head.named_parameters(),  # type: ignore[union-attr]
+        target.model.head.named_parameters(),
+        source.model.head.named_parameters(),
         strict=True,
     ):
         assert torch.equal(ours, theirs)
@@ -102,7 +90,7 @@ def test_round_trip_into_another_count_keeps_optimizers_alive(
         torch.testing.assert_close(value, source.model.gauss_params[name])
 
 
-def test_state_of_densification_is_kept(build: Build, training_of: TrainingOf, tmp_path: Path) -> None:
+def test_state_of_densification_is_kept(build, training_of, tmp_path):
     source = training_of(build())
     source.step(0)
     assert source.model.state.densification["grad2d"].any()
@@ -112,7 +100,7 @@ def test_state_of_densification_is_kept(build: Build, training_of: TrainingOf, t
     assert target.state.densification["scene_scale"] == source.model.state.densification["scene_scale"]
 
 
-def _stock(state: dict[str, Any]) -> dict[str, Any]:
+def _stock(state):
     return {k: v for k, v in state.items() if k.startswith("gauss_params.") and not k.endswith(".features")}
 
 
@@ -127,9 +115,7 @@ def _stock(state: dict[str, Any]) -> dict[str, Any]:
         ({"sh_degree": 2}, None, "features_rest"),
     ],
 )
-def test_other_checkpoints_are_refused_and_nothing_changes(
-    build: Build, options: dict[str, Any], change: Callable[[dict[str, Any]], dict[str, Any]] | None, cause: str
-) -> None:
+def test_other_checkpoints_are_refused_and_nothing_changes(build, options, change, cause):
     state = build(n=25, **options).state_dict()
     model = build()
     before = {name: value.detach().clone() for name, value in model.named_parameters()}
@@ -148,7 +134,7 @@ GROWTH = {"warmup_length": 0, "refine_every": 3, "reset_alpha_every": 100, "dens
 """A step of growth every third step."""
 
 
-def test_continuous_pruning_and_densification_share_a_field(build: Build, training_of: TrainingOf) -> None:
+def test_continuous_pruning_and_densification_share_a_field(build, training_of):
     span = {"mode": "continuous", "start": 4, "stop": 12, "every": 4, "target_gaussians": 40, "max_gaussians": 70}
     model = build(head={"start_at": 2}, pruning=span, stop_split_at=14, **GROWTH)
     training = training_of(model)
@@ -172,9 +158,7 @@ def test_continuous_pruning_and_densification_share_a_field(build: Build, traini
     assert model.state.head_enabled
 
 
-def test_continuous_pruning_merges_and_leaves_adam_in_order(
-    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_continuous_pruning_merges_and_leaves_adam_in_order(build, training_of, capsys):
     model = build(pruning={"mode": "continuous", "start": 4, "stop": 10, "every": 4}, stop_split_at=9, **GROWTH)
     training = training_of(model)
     training.train_callbacks["densification"].strategy.pause_refine_after_reset = 0
@@ -194,7 +178,7 @@ def test_continuous_pruning_merges_and_leaves_adam_in_order(
 
 
 @pytest.mark.parametrize("prune_at", [0, 4])
-def test_nothing_grows_after_the_prune(build: Build, training_of: TrainingOf, prune_at: int) -> None:
+def test_nothing_grows_after_the_prune(build, training_of, prune_at):
     """Not even where the prune is the first thing that happens, as it may be after a warm start."""
     model = build(pruning={"prune_at": prune_at}, stop_split_at=14, **GROWTH)
     training, counts = training_of(model), []
@@ -207,7 +191,7 @@ def test_nothing_grows_after_the_prune(build: Build, training_of: TrainingOf, pr
     assert counts[-1] == round(0.5 * (N if prune_at == 0 else counts[prune_at - 1]))
 
 
-def test_a_prune_merges_colours(build: Build, training_of: TrainingOf, datamanager: Any) -> None:
+def test_a_prune_merges_colours(build, training_of, datamanager):
     """Without harmonics the first band holds logits of colours; prunes work on the colours."""
     model = build(sh_degree=0)
     training = training_of(model)
@@ -219,21 +203,13 @@ def test_a_prune_merges_colours(build: Build, training_of: TrainingOf, datamanag
     )
     count = model.num_points // 2
     expected = decide(harmonics, model.config.pruning, count, model.contribution(datamanager, count)).values
-    assert expected is not None
     training.act("pruning", 3)
     assert torch.equal(model.means, expected["means"])
     found = model.gauss_params["features_dc"].detach().sigmoid()
     torch.testing.assert_close(found, sh_to_rgb(expected["features_dc"]), rtol=0, atol=2e-3)
 
 
-Perturb = Callable[[SundaeModel], SundaeModel]
-MakeCamera = Callable[..., Cameras]
-MakeBatch = Callable[..., dict[str, Tensor]]
-
-
-def test_metrics_with_and_without_the_head(
-    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_metrics_with_and_without_the_head(build, perturb, camera, batch, monkeypatch):
     model = perturb(build()).eval()
     monkeypatch.setattr(model.lpips, "_failed", True)
     with torch.no_grad():
@@ -252,9 +228,7 @@ def test_metrics_with_and_without_the_head(
     assert torch.isfinite(torch.tensor(model.get_image_metrics_and_images(outputs, batch(channels=4))[0]["psnr"]))
 
 
-def test_metrics_of_a_step_cost_nothing_until_they_are_looked_at(
-    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_metrics_of_a_step_cost_nothing_until_they_are_looked_at(build, perturb, camera, batch, monkeypatch):
     model = perturb(build()).train()
     outputs, asked = model.get_outputs(camera()), []
     monkeypatch.setattr("sundae_ns.plugin.model.psnr", lambda *pictures: asked.append(pictures) or psnr(*pictures))
@@ -272,13 +246,11 @@ def test_metrics_of_a_step_cost_nothing_until_they_are_looked_at(
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_late_metrics_are_of_the_step_they_were_asked_in(
-    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, training: bool
-) -> None:
+def test_late_metrics_are_of_the_step_they_were_asked_in(build, perturb, camera, batch, training):
     options = {"num_downscales": 2, "resolution_schedule": 3000, "background_color": "black"}
     model = perturb(build(**options)).train(training)
 
-    def asked() -> Any:
+    def asked():
         with torch.no_grad():
             return model.get_metrics_dict(model.get_outputs(camera()), batch())
 
@@ -289,8 +261,8 @@ def test_late_metrics_are_of_the_step_they_were_asked_in(
     assert [float(later[name]) for name in ("psnr", "psnr_base")] == expected
 
 
-def test_lpips_is_not_built_and_not_saved(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
+def test_lpips_is_not_built_and_not_saved(build, monkeypatch):
+    def refuse(*_, **__):
         raise AssertionError("LPIPS was built")
 
     monkeypatch.setattr(torchmetrics.image.LearnedPerceptualImagePatchSimilarity, "__init__", refuse)

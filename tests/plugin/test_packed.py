@@ -1,10 +1,7 @@
 """Runs as packed scenes: what is stored, what is not, and headers with false claims."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -14,7 +11,6 @@ from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConf
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
-from torch import Tensor
 
 from sundae_ns.core.errors import CheckpointError, DataError, PackError
 from sundae_ns.head.head import CompensationHead, HeadConfig
@@ -32,10 +28,8 @@ from sundae_ns.plugin.finished_runs import (
 from sundae_ns.scene.initialization import from_points
 from sundae_ns.scene.packing import contents_of, scene_of
 
-Json = dict[str, Any]
 
-
-def gaussians(degree: int = 1, features: int = 5) -> dict[str, Tensor]:
+def gaussians(degree=1, features=5):
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(60, 3, generator=generator) - 0.5
     made = from_points(points, points + 0.5, sh_degree=degree, num_features=features, generator=generator)
@@ -43,13 +37,13 @@ def gaussians(degree: int = 1, features: int = 5) -> dict[str, Tensor]:
     return made
 
 
-def head() -> dict[str, Tensor]:
+def head():
     torch.manual_seed(1)
     state = CompensationHead(HeadConfig(size="tiny", num_features=5)).state_dict()
     return {name: value + 0.05 * torch.randn_like(value) for name, value in state.items()}
 
 
-def cameras(n: int = 3) -> dict[str, Tensor]:
+def cameras(n=3):
     pose = torch.eye(4)[:3]
     pose[2, 3] = 2.0
     poses = pose.repeat(n, 1, 1)
@@ -61,7 +55,7 @@ def cameras(n: int = 3) -> dict[str, Tensor]:
     }
 
 
-def meta() -> Json:
+def meta():
     return {
         "source": {"method": "sundae", "step": 30000},
         "model": {
@@ -76,17 +70,16 @@ def meta() -> Json:
     }
 
 
-def scene() -> PackedScene:
+def scene():
     return PackedScene(gaussians(), head(), cameras(), meta())
 
 
-def test_a_packed_scene_becomes_a_model() -> None:
+def test_a_packed_scene_becomes_a_model():
     truth = scene()
     model = model_of(scene_of(truth))
     found = {name: value.detach() for name, value in model.gauss_params.items()}
     assert torch.equal(found.pop("features_rest")[:, :3], truth.gaussians["features_rest"])
     assert all(torch.equal(value, truth.gaussians[name]) for name, value in found.items())
-    assert model.head is not None
     assert all(torch.equal(value, truth.head[name]) for name, value in model.head.state_dict().items())
     assert model.state.head_enabled
     assert model.state.trained_focal == (40.0, 41.0)
@@ -95,7 +88,7 @@ def test_a_packed_scene_becomes_a_model() -> None:
 
 @pytest.mark.parametrize("parser", ["colmap", "nerfstudio-data"])
 @pytest.mark.parametrize("kind", ["missing", "empty", "images"])
-def test_a_folder_without_a_capture_is_refused(tmp_path: Path, kind: str, parser: str) -> None:
+def test_a_folder_without_a_capture_is_refused(tmp_path, kind, parser):
     capture = tmp_path / "capture"
     if kind != "missing":
         capture.mkdir()
@@ -107,7 +100,7 @@ def test_a_folder_without_a_capture_is_refused(tmp_path: Path, kind: str, parser
         datamanager_of(scene_of(found), capture)
 
 
-LIES: dict[str, Json] = {
+LIES = {
     "no model": {"model": None},
     "a model of text": {"model": "yes"},
     "a huge degree": {"model": {"sh_degree": 10**6}},
@@ -127,7 +120,7 @@ LIES: dict[str, Json] = {
 }
 
 
-def merged(base: Json, changes: Json) -> Json:
+def merged(base, changes):
     made = dict(base)
     for name, value in changes.items():
         both = isinstance(value, dict) and isinstance(base.get(name), dict)
@@ -136,7 +129,7 @@ def merged(base: Json, changes: Json) -> Json:
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_headers_that_lie_are_refused(lie: str) -> None:
+def test_headers_that_lie_are_refused(lie):
     stated = merged(meta(), LIES[lie])
     with pytest.raises(PackError):
         scene_of(PackedScene(gaussians(), head(), cameras(), stated))
@@ -151,7 +144,7 @@ def test_headers_that_lie_are_refused(lie: str) -> None:
         BlenderDataParserConfig(alpha_color=None),
     ],
 )
-def test_the_options_of_a_capture_survive(parser: Any) -> None:
+def test_the_options_of_a_capture_survive(parser):
     if hasattr(parser, "load_3D_points"):
         parser.load_3D_points = False
     manager = SundaeDatamanagerConfig(dataparser=parser, camera_res_scale_factor=0.5)
@@ -161,7 +154,7 @@ def test_the_options_of_a_capture_survive(parser: Any) -> None:
     assert vars(found) == vars(parser)
 
 
-def test_captures_that_are_not_described() -> None:
+def test_captures_that_are_not_described():
     for parser in (
         BlenderDataParserConfig(alpha_color="pink"),
         ColmapDataParserConfig(images_path=Path("/elsewhere/images")),
@@ -191,7 +184,7 @@ def test_captures_that_are_not_described() -> None:
         ("blender-data", "ply_path", ["a.ply"]),
     ],
 )
-def test_impossible_options_of_a_capture(parser: str, name: str, values: list[Any]) -> None:
+def test_impossible_options_of_a_capture(parser, name, values):
     for value in values:
         with pytest.raises(PackError, match="an impossible option"):
             stated_capture({"parser": parser, "options": {name: value}, "scale": 1.0})
@@ -200,13 +193,13 @@ def test_impossible_options_of_a_capture(parser: str, name: str, values: list[An
 # ------------------------------------------------------------------------------------------------------- runs to pack
 
 
-def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path, dict[str, Tensor]]:
+def run_folder(folder, method, step, **model):
     """The folder of a run at a step, as ns-train writes it, without the training."""
     config = copy.deepcopy(all_methods[method])
     for name, value in model.items():
         setattr(config.pipeline.model, name, value)
     truth = gaussians(degree=2, features=0 if method == "splatfacto" else 5)
-    state: Json = {f"gauss_params.{name}": value for name, value in truth.items()}
+    state = {f"gauss_params.{name}": value for name, value in truth.items()}
     state["device_indicator_param"] = torch.zeros(0)
     if method != "splatfacto":
         made = config.pipeline.model.setup(
@@ -230,7 +223,7 @@ def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path
     return folder, truth
 
 
-def test_a_packed_run_holds_what_its_images_need(tmp_path: Path) -> None:
+def test_a_packed_run_holds_what_its_images_need(tmp_path):
     run, truth = run_folder(tmp_path / "run", "sundae-tiny", 1100)
     found = contents_of(load_run(run, max_cameras=0))
     assert set(found.gaussians) == set(truth)
@@ -244,7 +237,7 @@ def test_a_packed_run_holds_what_its_images_need(tmp_path: Path) -> None:
     assert contents_of(load_run(run / "config.yml", max_cameras=0)).meta == found.meta
 
 
-def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path: Path) -> None:
+def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path):
     run, truth = run_folder(tmp_path / "run", "sundae-tiny", 30, sh_degree_interval=20)
     found = contents_of(load_run(run, max_cameras=0))
     assert found.head == {}
@@ -253,7 +246,7 @@ def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path: Path) ->
     assert model_of(scene_of(found)).config.sh_degree == 1
 
 
-def test_a_run_of_splatfacto(tmp_path: Path) -> None:
+def test_a_run_of_splatfacto(tmp_path):
     run, truth = run_folder(tmp_path / "run", "splatfacto", 29999, sh_degree=2, rasterize_mode="antialiased")
     found = contents_of(load_run(run, max_cameras=0))
     assert found.head == {}
@@ -261,7 +254,7 @@ def test_a_run_of_splatfacto(tmp_path: Path) -> None:
     assert found.meta["model"]["rasterize_mode"] == "antialiased"
 
 
-def test_runs_that_cannot_be_packed(tmp_path: Path) -> None:
+def test_runs_that_cannot_be_packed(tmp_path):
     with pytest.raises(CheckpointError, match="cannot be read"):
         contents_of(load_run(tmp_path / "nothing"))
     (tmp_path / "config.yml").write_text("a: [1")
@@ -289,6 +282,6 @@ def test_runs_that_cannot_be_packed(tmp_path: Path) -> None:
         ([{"before": "many", "after": 1, "seconds": "long"}], (None, None)),
     ],
 )
-def test_figures_are_those_of_all_prunes(prunes: list[dict[str, Any]], figures: tuple[float | None, ...]) -> None:
+def test_figures_are_those_of_all_prunes(prunes, figures):
     for value, expected in zip(kept_and_seconds(prunes), figures, strict=True):
         assert value == (None if expected is None else pytest.approx(expected))

@@ -1,7 +1,5 @@
 """Saving and finding checkpoints: whole ones only, and a full disk costs none."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import random
@@ -11,7 +9,6 @@ import zipfile
 from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import forked
 import numpy as np
@@ -33,20 +30,20 @@ from sundae_ns.train.progress import Interruption
 from sundae_ns.train.schedules import set_schedule
 
 
-def state(step: int, n: int = 50) -> dict[str, Any]:
+def state(step, n=50):
     return {"step": step, "pipeline": {"_model.gauss_params.means": torch.full((n, 3), float(step))}}
 
 
-def name(step: int) -> str:
+def name(step):
     return f"step-{step:09d}.ckpt"
 
 
-def saved(folder: Path, *steps: int) -> None:
+def saved(folder, *steps):
     for step in steps:
         checkpoint.write(state(step), folder / name(step))
 
 
-def test_what_is_saved_is_loaded_and_the_newest_is_by_step(tmp_path: Path) -> None:
+def test_what_is_saved_is_loaded_and_the_newest_is_by_step(tmp_path):
     models = tmp_path / "nerfstudio_models"
     saved(models, 999, 1_000_000_000)
     (models / "step-best.ckpt").write_text("a user's own file")
@@ -59,7 +56,7 @@ def test_what_is_saved_is_loaded_and_the_newest_is_by_step(tmp_path: Path) -> No
     assert torch.equal(loaded["pipeline"]["_model.gauss_params.means"], torch.full((50, 3), 999.0))
 
 
-def flip(path: Path) -> None:
+def flip(path):
     """One bit of a tensor, which torch would load without a word."""
     content = bytearray(path.read_bytes())
     with zipfile.ZipFile(path) as archive:
@@ -70,7 +67,7 @@ def flip(path: Path) -> None:
 
 
 @pytest.mark.parametrize("harm", [lambda path: path.write_bytes(b""), flip], ids=["empty", "flipped"])
-def test_what_is_not_whole_is_passed_over(tmp_path: Path, harm: Any) -> None:
+def test_what_is_not_whole_is_passed_over(tmp_path, harm):
     saved(tmp_path, 10, 20, 30)
     harm(tmp_path / name(30))
     path, passed_over = checkpoint.newest_whole(tmp_path)
@@ -87,10 +84,10 @@ def test_what_is_not_whole_is_passed_over(tmp_path: Path, harm: Any) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_full_disk_leaves_the_older_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_the_older_checkpoint(tmp_path, monkeypatch):
     saved(tmp_path, 10)
 
-    def full(state: Any, file: Any) -> None:
+    def full(state, file):
         file.write(b"half")
         raise OSError(28, "No space left on device")
 
@@ -102,13 +99,13 @@ def test_a_full_disk_leaves_the_older_checkpoint(tmp_path: Path, monkeypatch: py
     assert checkpoint.newest_whole(tmp_path)[0] == tmp_path / name(10)
 
 
-def test_no_right_to_write_and_nothing_saved_before(tmp_path: Path) -> None:
+def test_no_right_to_write_and_nothing_saved_before(tmp_path):
     (tmp_path / "models").write_text("a file where the folder should be")
     with pytest.raises(StorageError, match="no older checkpoint"):
         saved(tmp_path / "models", 10)
 
 
-def test_nerfstudio_finds_its_newest_beside_a_killed_save(tmp_path: Path) -> None:
+def test_nerfstudio_finds_its_newest_beside_a_killed_save(tmp_path):
     """nerfstudio's own commands read a step off every name in the folder."""
     saved(tmp_path, 10, 20)
     killed = tmp_path / checkpoint._PARTIAL.format(os.getpid())
@@ -119,8 +116,8 @@ def test_nerfstudio_finds_its_newest_beside_a_killed_save(tmp_path: Path) -> Non
     assert sorted(os.listdir(tmp_path)) == [name(10), name(20), name(30)]
 
 
-def test_random_numbers_go_on_where_they_were_left(tmp_path: Path) -> None:
-    def draw() -> list[Any]:
+def test_random_numbers_go_on_where_they_were_left(tmp_path):
+    def draw():
         return [random.random(), random.gauss(0, 1), np.random.rand(), np.random.randn(), torch.randn(3).tolist()]
 
     draw()
@@ -138,7 +135,7 @@ def test_random_numbers_go_on_where_they_were_left(tmp_path: Path) -> None:
         (torch.zeros(50, 3), zipfile.ZIP_DEFLATED, "unpack to more"),
     ],
 )
-def test_bombs(tmp_path: Path, means: torch.Tensor, packing: int, cause: str) -> None:
+def test_bombs(tmp_path, means, packing, cause):
     torch.save({"step": 1, "pipeline": {"_model.gauss_params.means": means}}, tmp_path / name(1))
     with zipfile.ZipFile(tmp_path / name(1)) as source, zipfile.ZipFile(tmp_path / name(2), "w", packing) as target:
         for entry in source.namelist():
@@ -147,7 +144,7 @@ def test_bombs(tmp_path: Path, means: torch.Tensor, packing: int, cause: str) ->
         checkpoint.read(tmp_path / name(2))
 
 
-def test_a_second_training_in_a_folder_changes_nothing_there(tmp_path: Path) -> None:
+def test_a_second_training_in_a_folder_changes_nothing_there(tmp_path):
     config = deepcopy(sundae_tiny.config)
     config.output_dir, config.experiment_name, config.timestamp = tmp_path, "a", "now"
     run = config.get_base_dir()
@@ -162,7 +159,7 @@ def test_a_second_training_in_a_folder_changes_nothing_there(tmp_path: Path) -> 
     assert sorted(os.listdir(run)) == ["config.yml", "training.lock"]
 
 
-def test_config_in_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+def test_config_in_a_folder_that_cannot_be_made(tmp_path):
     config = SundaeTrainerConfig(method_name="m", experiment_name="e", timestamp="t", output_dir=tmp_path)
     config.set_timestamp()  # the user's own stays
     config.save_config()
@@ -183,17 +180,15 @@ def test_config_in_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
         (ConnectionResetError(104, "reset"), ConnectionResetError, "reset"),
     ],
 )
-def test_faults_while_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, kind: type[Exception], cause: str
-) -> None:
-    def fail(_: Any) -> None:
+def test_faults_while_training(tmp_path, monkeypatch, error, kind, cause):
+    def fail(_):
         raise error
 
     monkeypatch.setattr(Trainer, "train", fail)
     made = SundaeTrainer.__new__(SundaeTrainer)
     made.base_dir, made._interruption = tmp_path, Interruption(lambda: None)
-    viewer: Any = SimpleNamespace(ready=False, render_statemachines={})
-    machine = viewer.render_statemachines[0] = RenderStateMachine(viewer, 1.0, None)  # type: ignore[arg-type]
+    viewer = SimpleNamespace(ready=False, render_statemachines={})
+    machine = viewer.render_statemachines[0] = RenderStateMachine(viewer, 1.0, None)
     machine.start()
     made.viewer_state = viewer
     with pytest.raises(kind, match=cause):
@@ -226,7 +221,7 @@ STOPPED = "raise ProcessExitedException('rank', error_index=1, error_pid=2, exit
         ("ns-train", "raise ProcessExitedException('process 1 ended', 1, 7, -9, 'SIGKILL')", 1, False),
     ],
 )
-def test_how_commands_of_nerfstudio_end(tmp_path: Path, program: str, error: str, code: int, traceback: bool) -> None:
+def test_how_commands_of_nerfstudio_end(tmp_path, program, error, code, traceback):
     variables = {"SUNDAE_TRACEBACK": "1"} if "with a traceback" in error else {}
     (tmp_path / "program").write_text(HOOK.format(program=program, error=error, variables=variables))
     ended, printed = forked.run(tmp_path / "program")
@@ -238,16 +233,16 @@ def test_how_commands_of_nerfstudio_end(tmp_path: Path, program: str, error: str
     assert "SIGKILL" not in error or printed.startswith("sundae: rank 1 ended (killed by SIGKILL)")
 
 
-def configured(tmp_path: Path, *words: str) -> Any:
+def configured(tmp_path, *words):
     """The configuration of ``ns-train sundae`` with these options, and its schedule."""
     arguments = ["sundae", "--output-dir", str(tmp_path), "--experiment-name", "e", *words]
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)  # type: ignore[call-overload]
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)
     config.timestamp = "t"
     set_schedule(config, all_methods.get(str(config.method_name)), arguments)
     return config
 
 
-def test_the_number_of_steps_alone_sets_the_schedule(tmp_path: Path) -> None:
+def test_the_number_of_steps_alone_sets_the_schedule(tmp_path):
     words = ("--max-num-iterations", "3000", "--pipeline.model.stop-split-at", "15000")
     config = configured(tmp_path, *words)
     model = config.pipeline.model
@@ -259,7 +254,7 @@ def test_the_number_of_steps_alone_sets_the_schedule(tmp_path: Path) -> None:
             configured(tmp_path, option, "0")
 
 
-def test_a_fine_tune_takes_the_place_of_the_last_steps(tmp_path: Path) -> None:
+def test_a_fine_tune_takes_the_place_of_the_last_steps(tmp_path):
     tuned = ("--finetune-steps", "1500")
     config = configured(tmp_path, *tuned)
     assert (config.max_num_iterations, config.schedule_length) == (28500, 30000)
@@ -282,7 +277,7 @@ def test_a_fine_tune_takes_the_place_of_the_last_steps(tmp_path: Path) -> None:
         configured(tmp_path, "--finetune-steps", "0")
 
 
-def test_a_resumed_run_has_the_schedule_of_its_config(tmp_path: Path) -> None:
+def test_a_resumed_run_has_the_schedule_of_its_config(tmp_path):
     run = configured(tmp_path, "--max-num-iterations", "3000", "--pipeline.model.pruning.prune-at", "1000")
     run.save_config()
     folder = run.get_base_dir()
@@ -308,8 +303,8 @@ def test_a_resumed_run_has_the_schedule_of_its_config(tmp_path: Path) -> None:
     assert alone.pipeline.model.pruning.prune_at == 12000, "nothing says how long the run was meant to be"
 
 
-def test_the_schedule_is_logged_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=["sundae", "--max-num-iterations", "3000"])  # type: ignore[call-overload]
+def test_the_schedule_is_logged_and_saved(tmp_path, monkeypatch, capsys):
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=["sundae", "--max-num-iterations", "3000"])
     config.output_dir, config.experiment_name, config.timestamp = Path("outputs"), "e", "t"
     config.pipeline.datamanager.data = Path("capture")
     monkeypatch.setattr(sys, "argv", ["ns-train", "sundae", "--max-num-iterations", "3000"])

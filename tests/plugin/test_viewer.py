@@ -1,16 +1,12 @@
 """The preview of a prune in the viewer: what it shows, and that it changes nothing."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Iterator
 from types import SimpleNamespace
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 import torch
 from models import FakeDatamanager, Training, _build, _camera, _perturb, as_the_viewer
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
@@ -18,20 +14,18 @@ from torch import Tensor
 
 import sundae_ns.plugin.viewer
 import sundae_ns.pruning.decision
-from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.plugin.viewer import RuleName, ViewerControls, previewed_rule
 from sundae_ns.pruning.decision import Pruner
-from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import response
 from sundae_ns.scene.render import GaussianSource, render_view
 from sundae_ns.train.curve import CurvePoint, expected_change
 from sundae_ns.train.pruning import UNPRUNED, prune_when_due
 
 N = 90
-RULES: tuple[RuleName, ...] = get_args(RuleName)
+RULES = get_args(RuleName)
 
 
-def camera(shift: float = 0.0) -> Cameras:
+def camera(shift=0.0):
     return _camera(32, 24, shift)
 
 
@@ -40,37 +34,37 @@ class Views(FakeDatamanager):
 
     asked = 0
 
-    def training_views(self) -> Iterator[tuple[Cameras, Tensor | None]]:
+    def training_views(self):
         self.asked += 1
         return super().training_views()
 
 
-def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:
+def build(n=N, **pruning):
     """A model whose head takes part, as a viewer has set it up."""
     model, cameras = _perturb(_build(n=n, pruning=pruning, background_color="black")), Views()
     pipeline = SimpleNamespace(model=model, datamanager=cameras)
-    model.viewer_controls.control._setup(SimpleNamespace(pipeline=pipeline, viser_server=None))  # type: ignore[arg-type]
+    model.viewer_controls.control._setup(SimpleNamespace(pipeline=pipeline, viser_server=None))
     return model.eval(), cameras
 
 
-def shown(model: SundaeModel, rule: RuleName, keep_ratio: float) -> Tensor | None:
+def shown(model, rule, keep_ratio):
     model.viewer_controls.rule.value, model.viewer_controls.keep_ratio.value = rule, keep_ratio
     preview = as_the_viewer(model.viewer_controls.preview)
     return None if preview is None else preview.decision.mask
 
 
-def picture(model: SundaeModel) -> dict[str, Any]:
+def picture(model):
     return model.get_outputs_for_camera(camera())
 
 
-def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    def equal(one: Any, other: Any) -> bool:
+def same(a, b):
+    def equal(one, other):
         return torch.equal(one, other) if isinstance(one, Tensor) else one == other
 
     return a.keys() == b.keys() and all(equal(a[name], b[name]) for name in a)
 
 
-def test_the_viewer_finds_slider_and_menu() -> None:
+def test_the_viewer_finds_slider_and_menu():
     model, _ = build()
     found = dict(parse_object(SimpleNamespace(model=model), ViewerElement, "Custom Elements"))
     assert found["Custom Elements/model/viewer_controls/keep_ratio"] is model.viewer_controls.keep_ratio
@@ -79,7 +73,7 @@ def test_the_viewer_finds_slider_and_menu() -> None:
     assert not [name for name in model.state_dict() if "viewer_controls" in name]
 
 
-def test_the_slider_tells_what_fewer_primitives_lose() -> None:
+def test_the_slider_tells_what_fewer_primitives_lose():
     points = [CurvePoint(n, None, 30.0, 0.9, loss, loss / 40, 0.0, 0.0) for n, loss in ((N, 0.0), (N // 3, 0.6))]
     model, _ = build()
     controls = ViewerControls(model.state, model.config.pruning, model.contribution, lambda: points)
@@ -98,18 +92,16 @@ def test_the_slider_tells_what_fewer_primitives_lose() -> None:
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("keep_ratio", [0.01, 0.1, 0.37, 0.99])
-def test_exactly_the_share_is_shown(rule: RuleName, keep_ratio: float) -> None:
+def test_exactly_the_share_is_shown(rule, keep_ratio):
     model, _ = build()
     mask = shown(model, rule, keep_ratio)
-    assert mask is not None
     assert mask.shape == (N,)
     assert int(mask.sum()) == max(1, round(keep_ratio * N))
     again = shown(build()[0], rule, keep_ratio)
-    assert again is not None
     assert torch.equal(mask, again)
 
 
-PRUNES: list[dict[str, Any]] = [
+PRUNES = [
     {},
     {"redistribution": "none", "seed": 3},
     {"score": "response", "selection": "band", "signal": "positions", "edges": "centres", "redistribution": "none"},
@@ -118,7 +110,7 @@ PRUNES: list[dict[str, Any]] = [
 
 @torch.no_grad()
 @pytest.mark.parametrize("options", PRUNES, ids=lambda options: options.get("score", "default"))
-def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None:
+def test_what_is_shown_is_what_the_prune_leaves(options):
     model, cameras = build(**options)
     model.viewer_controls.keep_ratio.value = 0.2
     preview = as_the_viewer(model.viewer_controls.preview)
@@ -130,9 +122,8 @@ def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None
         Pruner(model.state.gaussians, optimizers),
         dict(UNPRUNED),
         model.config.pruning.prune_at,
-        lambda count: model.contribution(cameras, count),  # type: ignore[arg-type]
+        lambda count: model.contribution(cameras, count),
     )
-    assert report is not None
     assert report["after"] == int(preview.decision.mask.sum()) == 18
     assert all(torch.equal(value, preview.gaussians[name]) for name, value in model.state.gaussians.items())
     # A merge and growth show in the picture too.
@@ -141,14 +132,11 @@ def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None
     assert torch.equal(seen["rgb"], left["rgb"])
 
 
-def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
+def test_the_rules_of_the_menu_rank_by_what_they_say():
     model, _ = build()
     known = response(model.state.gaussians, previewed_rule(model.config.pruning, "band: both"))
     masks = {rule: shown(model, rule, 0.2) for rule in RULES}
     high, low, both = (masks[rule] for rule in ("band: high", "band: low", "band: both"))
-    assert high is not None
-    assert low is not None
-    assert both is not None
     assert known[high].min() >= known[~high].max()
     assert known[low].max() <= known[~low].min()
     assert torch.equal(both, (both & high) | (both & low))
@@ -160,12 +148,11 @@ def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
     ):
         busy, _ = build(**{"stop": 20000, **options})
         mask = shown(busy, "as configured", 0.2)
-        assert mask is not None
-        assert torch.equal(mask, masks["as configured"])  # type: ignore[arg-type]
+        assert torch.equal(mask, masks["as configured"])
 
 
 @torch.no_grad()
-def test_a_crop_box_cuts_the_preview_too() -> None:
+def test_a_crop_box_cuts_the_preview_too():
     model, _ = build()
     model.viewer_controls.keep_ratio.value = 0.5
     preview = as_the_viewer(model.viewer_controls.preview)
@@ -182,7 +169,7 @@ def test_a_crop_box_cuts_the_preview_too() -> None:
 
 @torch.no_grad()
 @pytest.mark.parametrize("rule", RULES)
-def test_only_the_viewer_sees_the_preview_and_only_while_it_is_on(rule: RuleName) -> None:
+def test_only_the_viewer_sees_the_preview_and_only_while_it_is_on(rule):
     """On, it shows base colours; it changes neither the model nor what training and evaluation see."""
     model, cameras = build()
     controls, before = model.viewer_controls, picture(model)
@@ -210,12 +197,12 @@ def test_only_the_viewer_sees_the_preview_and_only_while_it_is_on(rule: RuleName
 
 
 @pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def calls(monkeypatch):
     """Sizes of the fields whose graph was built, by the preview or by a decision."""
-    seen: list[int] = []
+    seen = []
     original = sundae_ns.plugin.viewer.gaussian_graph
 
-    def counted(params: Any, rule: PruneRule) -> Any:
+    def counted(params, rule):
         seen.append(len(params["means"]))
         return original(params, rule)
 
@@ -224,7 +211,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seen
 
 
-def test_graph_and_views_are_used_once_a_field(calls: list[int]) -> None:
+def test_graph_and_views_are_used_once_a_field(calls):
     model, cameras = build()
     for rule in RULES:
         for keep_ratio in (0.1, 0.2, 0.3):
@@ -234,32 +221,29 @@ def test_graph_and_views_are_used_once_a_field(calls: list[int]) -> None:
     assert cameras.asked == 3
 
 
-def test_a_changed_field_is_scored_anew(calls: list[int]) -> None:
+def test_a_changed_field_is_scored_anew(calls):
     model, cameras = build()
     first = shown(model, "band: high", 0.2)
     with torch.no_grad():
         model.means[:45] *= 3  # the same tensor, other values
     second = shown(model, "band: high", 0.2)
     assert calls == [N, N]
-    assert first is not None
-    assert second is not None
     assert not torch.equal(first, second)
     other, _ = build(70)
     model.load_state_dict(other.state_dict())
     third = shown(model, "as configured", 0.2)
-    assert third is not None
     assert third.shape == (70,)
     assert calls == [N, N, 70]
     assert cameras.asked == 1
 
 
-def test_a_prune_in_training_is_seen_and_a_step_is_not(calls: list[int]) -> None:
+def test_a_prune_in_training_is_seen_and_a_step_is_not(calls):
     model, _ = build()
     model.step, training, kept = 0, Training(model), []
     for step in range(5):
         training.step(step)
         model.eval()
-        kept.append(int(shown(model, "band: both", 0.2).sum()))  # type: ignore[union-attr]
+        kept.append(int(shown(model, "band: both", 0.2).sum()))
     after = model.num_points
     assert after == 45
     assert kept == [18, 18, 18, 9, 9]
@@ -267,7 +251,7 @@ def test_a_prune_in_training_is_seen_and_a_step_is_not(calls: list[int]) -> None
 
 
 @torch.no_grad()
-def test_a_rule_that_cannot_be_applied_shows_everything_and_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rule_that_cannot_be_applied_shows_everything_and_says_so_once(capsys):
     few, _ = build(1)  # a graph needs two
     before = picture(few)
     few.viewer_controls.rule.value, few.viewer_controls.keep_ratio.value = "band: high", 0.5

@@ -14,11 +14,9 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import forked
 import pytest
@@ -41,10 +39,9 @@ NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest"
 STEPS, KEEP, PRUNE_AT, SAVED_AT = 40, 0.4, 32, 26
 
 
-def configured(folder: Path, name: str) -> SundaeTrainerConfig:
+def configured(folder, name):
     """A short run on a small scene: it densifies at image 24, prunes at 32, and then enables the head."""
     config = copy.deepcopy(sundae_tiny.config)
-    assert isinstance(config, SundaeTrainerConfig)
     config.machine.device_type = "cpu"
     config.machine.num_devices = RANKS
     config.output_dir, config.experiment_name, config.timestamp = folder, name, "now"
@@ -53,7 +50,7 @@ def configured(folder: Path, name: str) -> SundaeTrainerConfig:
     config.vis = "tensorboard"
     config.viewer.quit_on_train_completion = True
     config.pipeline.datamanager.data = folder / "scene"
-    model: Any = config.pipeline.model
+    model = config.pipeline.model
     model.rasterizer = "reference"
     model.pruning.prune_at, model.pruning.keep_ratio = PRUNE_AT, KEEP
     model.warmup_length, model.refine_every, model.stop_split_at = 4, 6, PRUNE_AT
@@ -62,7 +59,7 @@ def configured(folder: Path, name: str) -> SundaeTrainerConfig:
     return config
 
 
-def frozen(folder: Path, name: str) -> SundaeTrainerConfig:
+def frozen(folder, name):
     """One batch at rates of 0 from the saved warm-up, and a prune: any number of ranks prunes the same field.
 
     Half of each image is masked; a prune that ignores the masks keeps other Gaussians.
@@ -71,7 +68,7 @@ def frozen(folder: Path, name: str) -> SundaeTrainerConfig:
     config.max_num_iterations = RANKS
     config.steps_per_eval_image = 1000
     config.pipeline.datamanager.data = folder / "masked"
-    model: Any = config.pipeline.model
+    model = config.pipeline.model
     model.warm_start = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
     model.evaluate_prune = False
     for group in config.optimizers.values():
@@ -79,15 +76,15 @@ def frozen(folder: Path, name: str) -> SundaeTrainerConfig:
     return config
 
 
-def models(folder: Path, name: str) -> Path:
+def models(folder, name):
     return folder / name / "sundae-tiny" / "now" / "nerfstudio_models"
 
 
-def train(config: SundaeTrainerConfig, rank: int, ranks: int) -> SundaeTrainer:
+def train(config, rank, ranks):
     from nerfstudio.utils import profiler, writer
 
     torch.manual_seed(config.machine.seed + rank)
-    trainer: SundaeTrainer = config.setup(local_rank=rank, world_size=ranks)
+    trainer = config.setup(local_rank=rank, world_size=ranks)
     trainer.setup()
     trainer.train()
     writer.EVENT_WRITERS.clear()
@@ -97,7 +94,7 @@ def train(config: SundaeTrainerConfig, rank: int, ranks: int) -> SundaeTrainer:
     return trainer
 
 
-def check_training(rank: int, folder: Path) -> None:
+def check_training(rank, folder):
     """A run of two ranks, from a viewer's command; both end with the same head and schedules, and balanced shards."""
     averaging.AVERAGED_EVERY = 1
     config = configured(folder, "train")
@@ -105,7 +102,7 @@ def check_training(rank: int, folder: Path) -> None:
     config.vis = "viewer+tensorboard"
     trainer = train(config, rank, RANKS)
     assert (trainer.config.vis, config.vis) == ("tensorboard", "viewer+tensorboard")
-    model: Any = trainer.pipeline.model
+    model = trainer.pipeline.model
     weights = torch.cat([value.detach().flatten() for value in model.head.parameters()])
     every = [torch.empty_like(weights) for _ in range(RANKS)]
     dist.all_gather(every, weights)
@@ -120,14 +117,14 @@ def check_training(rank: int, folder: Path) -> None:
     assert decays[0]["pruned_at"] == PRUNE_AT
 
 
-def check_frozen(rank: int, folder: Path) -> None:
+def check_frozen(rank, folder):
     train(frozen(folder, "two"), rank, RANKS)
 
 
-def check_few(rank: int, folder: Path) -> None:
+def check_few(rank, folder):
     """A field of one Gaussian trains, is saved and resumed, with nothing on one rank."""
     config = frozen(folder, "few")
-    model: Any = config.pipeline.model
+    model = config.pipeline.model
     model.pruning.keep_ratio = 1e-6
     train(config, rank, RANKS)
     config = frozen(folder, "few again")
@@ -135,10 +132,10 @@ def check_few(rank: int, folder: Path) -> None:
     config.max_num_iterations = 2 * RANKS
     trainer = train(config, rank, RANKS)
     assert trainer.step == 3 * RANKS - 1
-    assert trainer.model.source.sizes == [0, 1]  # type: ignore[attr-defined]
+    assert trainer.model.source.sizes == [0, 1]
 
 
-def checks(folder: Path) -> dict[str, Callable[[int], None]]:
+def checks(folder):
     """The checks of each rank, in this order."""
     return {check.__name__: partial(check, folder=folder) for check in (check_training, check_frozen, check_few)}
 
@@ -155,20 +152,20 @@ class HitTrainerConfig(SundaeTrainerConfig):
 class HitTrainer(SundaeTrainer):
     """Killed, as the system does when memory is short, or interrupted."""
 
-    def train_iteration(self, step: int) -> Any:
-        at, number = self.config.hit  # type: ignore[attr-defined]
+    def train_iteration(self, step):
+        at, number = self.config.hit
         if step == at and dist.get_rank() == 1:
             os.kill(os.getpid(), number)
         return super().train_iteration(step)
 
 
-def train_rank(rank: int, meeting: Path, config: Any) -> None:
+def train_rank(rank, meeting, config):
     dist.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=RANKS)
     train(config, rank, RANKS)
     dist.destroy_process_group()
 
 
-def main(folder: Path, name: str) -> None:
+def main(folder, name):
     """Two ranks resume from a checkpoint, and one is killed; or one gets SIGINT, which ends this program."""
     torch.set_num_threads(1)
     config = HitTrainerConfig(**{k: v for k, v in vars(configured(folder, name)).items() if k != "_target"})
@@ -196,7 +193,7 @@ if __name__ == "__main__":
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: Callable[[str, Path], None]) -> Path:
+def folder(tmp_path_factory, run_ranks):
     """Runs of two ranks, trained once for all tests."""
     folder = tmp_path_factory.mktemp("ranks")
     from harness.still_life import write_still_life  # not above: ranks import this file without pytest's paths
@@ -214,11 +211,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: Callable[[str, P
 
 
 @pytest.mark.parametrize("name", checks(Path()))
-def test_two_ranks(folder: Path, name: str, passed: Callable[[Path, str], None]) -> None:
+def test_two_ranks(folder, name, passed):
     passed(folder, name)
 
 
-def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
+def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder):
     (report,) = json.loads((models(folder, "train").parent / "prune.json").read_text())
     assert report["step"] == PRUNE_AT
     assert report["after"] == round(KEEP * report["before"])
@@ -240,7 +237,7 @@ def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
     assert extra["running"]["pruning"]["pruned_at"] == PRUNE_AT
 
 
-def test_the_prune_is_that_of_one_process(folder: Path) -> None:
+def test_the_prune_is_that_of_one_process(folder):
     """The same Gaussians of the same field stay, with the same values."""
     one = train(frozen(folder, "one"), 0, 1)
     two = checkpoint.read(models(folder, "two") / f"step-{RANKS - 1:09d}.ckpt")["pipeline"]
@@ -248,7 +245,7 @@ def test_the_prune_is_that_of_one_process(folder: Path) -> None:
         assert torch.equal(value.detach(), two[f"_model.gauss_params.{name}"]), name
 
 
-def test_one_process_resumes_a_run_of_two(folder: Path) -> None:
+def test_one_process_resumes_a_run_of_two(folder):
     config = configured(folder, "alone")
     config.load_checkpoint = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
     config.max_num_iterations = PRUNE_AT - SAVED_AT + 1
@@ -258,7 +255,7 @@ def test_one_process_resumes_a_run_of_two(folder: Path) -> None:
     assert trainer.optimizers.schedulers["means"].last_epoch == trainer.step + 1
 
 
-def test_a_killed_rank_ends_all_with_one_line(folder: Path) -> None:
+def test_a_killed_rank_ends_all_with_one_line(folder):
     """It resumes on two ranks first, from a checkpoint of two."""
     code, printed = forked.run(Path(__file__), folder, "dies")
     assert code == 0, printed
@@ -267,7 +264,7 @@ def test_a_killed_rank_ends_all_with_one_line(folder: Path) -> None:
     assert not (models(folder, "dies") / f"step-{SAVED_AT + STEPS:09d}.ckpt").exists()
 
 
-def test_ranks_stop_together_and_save_when_one_gets_a_signal(folder: Path) -> None:
+def test_ranks_stop_together_and_save_when_one_gets_a_signal(folder):
     code, printed = forked.run(Path(__file__), folder, "stops")
     assert code == 130, printed
     assert printed.count("--load-dir") == 1, "the first rank says how to resume"
@@ -308,14 +305,11 @@ if __name__ == "__main__":
         (signal.SIGTERM, False, "Saving config", False),  # there are no ranks yet
     ],
 )
-def test_signals_to_the_command_of_two_ranks(
-    folder: Path, tmp_path: Path, number: signal.Signals, whole_group: bool, after: str, saves: bool
-) -> None:
+def test_signals_to_the_command_of_two_ranks(folder, tmp_path, number, whole_group, after, saves):
     (tmp_path / "ns-train").write_text(ON_CPUS)
     options = "--timestamp now --vis tensorboard --machine.num-devices 2 --machine.device-type cpu"
     words = ["sundae-tiny", "--data", str(folder / "scene"), "--output-dir", str(tmp_path), *options.split()]
     with forked.started(tmp_path / "ns-train", *words) as (process, output):
-        assert process.pid is not None
         assert any(after in line for line in output)
         (os.killpg if whole_group else os.kill)(process.pid, number)
         said = output.read()
@@ -342,15 +336,13 @@ def test_signals_to_the_command_of_two_ranks(
         ({"machine.num_devices": 3}, "is 3 and there are 2 GPUs; give --machine.num-devices 2"),
     ],
 )
-def test_what_several_ranks_cannot_do_is_refused_before_anything_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], words: str
-) -> None:
+def test_what_several_ranks_cannot_do_is_refused_before_anything_is_written(tmp_path, monkeypatch, options, words):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     config = configured(tmp_path, "refused")
     config.machine.device_type = "cuda"
     for name, value in options.items():
         *owners, last = name.split(".")
-        owner: Any = config
+        owner = config
         for part in owners:
             owner = getattr(owner, part)
         setattr(owner, last, value)
@@ -359,7 +351,7 @@ def test_what_several_ranks_cannot_do_is_refused_before_anything_is_written(
     assert not config.get_base_dir().exists()
 
 
-def test_one_process_is_left_as_it_is() -> None:
+def test_one_process_is_left_as_it_is():
     ranks, config = distributed.Ranks(), object()
     assert ranks.configured(config) is config
     assert ranks.agreed(15, 3) == 15
@@ -367,7 +359,7 @@ def test_one_process_is_left_as_it_is() -> None:
         assert first
 
 
-def test_an_error_of_sundae_in_a_rank_keeps_its_message() -> None:
+def test_an_error_of_sundae_in_a_rank_keeps_its_message():
     class Raised(Exception):
         error_index = 1
 
@@ -379,7 +371,7 @@ def test_an_error_of_sundae_in_a_rank_keeps_its_message() -> None:
 
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-def test_ns_train_on_two_gpus(tmp_path: Path) -> None:
+def test_ns_train_on_two_gpus(tmp_path):
     """The command of users; the run opens on one GPU like any other."""
     from nerfstudio.utils.eval_utils import eval_setup
 

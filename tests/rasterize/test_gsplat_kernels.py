@@ -1,16 +1,11 @@
 """Our kernels in gsplat's pipeline: the CUDA source, compiled for the CPU, against the reference in float64."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from sundae_ns.core.errors import SundaeError
 from sundae_ns.rasterize import gsplat_backend, gsplat_kernels, interface
@@ -19,18 +14,16 @@ from sundae_ns.rasterize.gsplat_kernels import TILE, Capacity, GsplatLists, Spla
 from sundae_ns.rasterize.interface import harmonic_colors, select_backend
 from sundae_ns.rasterize.reference import Projection, composite
 
-Gaussians = dict[str, Tensor]
-
 
 @pytest.fixture(autouse=True)
-def on_cpu(load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def on_cpu(load_on_cpu, monkeypatch):
     monkeypatch.setattr(gsplat_kernels, "load_kernels", load_on_cpu)
     monkeypatch.setattr(gsplat_kernels, "LANES", 1)
     for module in (gsplat_backend, interface):
         monkeypatch.setattr(module, "check_kernels_take", lambda _: None)
 
 
-def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_compile_for_gpus(compile_for_gpu, monkeypatch):
     monkeypatch.setattr(gsplat_kernels, "LANES", 32)
     for dtype in (torch.int16, torch.int32):
         compile_for_gpu("tiles.cu", "sm_75", gsplat_kernels.listing_options(dtype))
@@ -39,7 +32,7 @@ def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes], monkeyp
         compile_for_gpu("blending.cu", architecture, gsplat_kernels.blending_options(channels, absgrad=absgrad))
 
 
-def test_second_derivatives_are_refused() -> None:
+def test_second_derivatives_are_refused():
     primitives = ellipses(5, 20, 20, largest=2.0)
     leaves = leaves_of(primitives, torch.float32)
     image, _ = blend(*leaves.values(), every_tile(primitives, 20, 20, spare=0), False)
@@ -53,24 +46,14 @@ def test_second_derivatives_are_refused() -> None:
 # --------------------------------------------------------------------------------------------------------------- tiles
 
 
-def ellipses(
-    n: int,
-    width: int,
-    height: int,
-    *,
-    largest: float = 4.0,
-    power: int = 1,
-    opacity: float = 1.0,
-    channels: int = 3,
-    seed: int = 0,
-) -> Gaussians:
+def ellipses(n, width, height, *, largest=4.0, power=1, opacity=1.0, channels=3, seed=0):
     """Footprints in and around an image, float64: of all shapes, some opaque, some too faint to be blended.
 
     Variances of their axes are up to ``10 ** largest`` square pixels; a higher ``power`` makes most of them faint.
     """
     generator = torch.Generator().manual_seed(seed)
 
-    def uniform(*shape: int) -> Tensor:
+    def uniform(*shape):
         return torch.rand(*shape, generator=generator).double()
 
     angle, sides = uniform(n) * 6.3, 10 ** (uniform(2, n) * (largest + 1) - 1)
@@ -89,7 +72,7 @@ def ellipses(
     }
 
 
-def gaussians(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Gaussians:
+def gaussians(n, width, height, *, largest=4.0, seed=0):
     """Ellipses in float32, up to needles across the image, with radii; some are culled, and some equally deep."""
     made = ellipses(n, width, height, largest=largest, power=3, seed=seed)
     radii = (3 * (made["covariances"][:, 0] + made["covariances"][:, 2]).sqrt()).ceil().int()
@@ -99,7 +82,7 @@ def gaussians(n: int, width: int, height: int, *, largest: float = 4.0, seed: in
     return {**fields, "radii": radii}
 
 
-def in_square(primitives: Gaussians, column: int, row: int, columns: int, rows: int) -> Tensor:
+def in_square(primitives, column, row, columns, rows):
     """Whether gsplat's square of each Gaussian contains a tile ``[N]``."""
     radii = primitives["radii"].float().view(len(primitives["depths"]), -1).expand(-1, 2) / TILE
     low = (primitives["means2d"] / TILE - radii).floor().clamp(min=0).minimum(torch.tensor([columns, rows]))
@@ -108,7 +91,7 @@ def in_square(primitives: Gaussians, column: int, row: int, columns: int, rows: 
     return (radii > 0).all(dim=1) & (low <= at).all(dim=1) & (high > at).all(dim=1)
 
 
-def most_alpha(primitives: Gaussians, column: int, row: int, width: int, height: int) -> Tensor:
+def most_alpha(primitives, column, row, width, height):
     """Largest alpha of each Gaussian over the pixels of a tile, float64 ``[N]``."""
     ys, xs = torch.meshgrid(
         torch.arange(row * TILE, min(row * TILE + TILE, height)) + 0.5,
@@ -122,7 +105,7 @@ def most_alpha(primitives: Gaussians, column: int, row: int, width: int, height:
     return (primitives["opacities"][:, None].double() * (-exponents).exp()).amax(dim=1)
 
 
-def by_tile(primitives: Gaussians, width: int, height: int, capacity: Capacity | None = None) -> list[Tensor]:
+def by_tile(primitives, width, height, capacity=None):
     splats = Splats(**{name: value[None] for name, value in primitives.items()})
     lists = tile_lists(splats, width, height, capacity=capacity or Capacity())
     ends = [*lists.starts.flatten()[1:].tolist(), len(lists.primitives)]
@@ -131,7 +114,7 @@ def by_tile(primitives: Gaussians, width: int, height: int, capacity: Capacity |
 
 
 @pytest.mark.parametrize(("width", "height"), [(150, 100), (1, 1), (400, 37), (20, 700)])
-def test_all_blended_primitives_are_listed_and_hardly_any_others(width: int, height: int) -> None:
+def test_all_blended_primitives_are_listed_and_hardly_any_others(width, height):
     primitives = gaussians(300, width, height, largest=5.5)
     columns, rows = -(-width // TILE), -(-height // TILE)
     needed = listed = squares = 0
@@ -152,7 +135,7 @@ def test_all_blended_primitives_are_listed_and_hardly_any_others(width: int, hei
 
 
 @given(seed=st.integers(0, 10**6), largest=st.sampled_from([1.0, 4.0, 7.0]), shift=st.sampled_from([0.0, 3000.0]))
-def test_needles_far_away_are_not_dropped(seed: int, largest: float, shift: float) -> None:
+def test_needles_far_away_are_not_dropped(seed, largest, shift):
     width, height = 70, 50
     primitives = gaussians(40, width, height, largest=largest, seed=seed)
     primitives["means2d"] += shift * torch.randn(40, 2, generator=torch.Generator().manual_seed(seed))
@@ -165,7 +148,7 @@ def test_needles_far_away_are_not_dropped(seed: int, largest: float, shift: floa
         assert not (blended & ~torch.zeros(40, dtype=torch.bool).index_fill(0, found, True)).any()
 
 
-def test_least_exponent_between_two_tiles() -> None:
+def test_least_exponent_between_two_tiles():
     """A faint needle across the gap between two tiles reaches the tile on the far side of the border."""
     primitives = gaussians(1, 64, 64)
     c, s = math.cos(1.7074472511921694), math.sin(1.7074472511921694)
@@ -178,7 +161,7 @@ def test_least_exponent_between_two_tiles() -> None:
     assert len(by_tile(primitives, 64, 64)[2 * 4 + 1]) == 1
 
 
-def test_nan_is_left_to_gsplat() -> None:
+def test_nan_is_left_to_gsplat():
     primitives = gaussians(20, 64, 64)
     primitives["radii"][:] = 100
     primitives["conics"][3], primitives["opacities"][5], primitives["conics"][7] = torch.nan, torch.nan, 0.0
@@ -186,7 +169,7 @@ def test_nan_is_left_to_gsplat() -> None:
         assert {3, 5, 7} <= set(found.tolist())
 
 
-def test_radii_per_axis() -> None:
+def test_radii_per_axis():
     primitives = gaussians(200, 150, 100)
     per_axis = {**primitives, "radii": primitives["radii"][:, None].repeat(1, 2)}
     assert all(
@@ -197,7 +180,7 @@ def test_radii_per_axis() -> None:
         assert in_square(per_axis, tile % 10, tile // 10, 10, 7)[found].all()
 
 
-def test_capacity_keeps_the_lists_and_reports_the_number_of_pairs() -> None:
+def test_capacity_keeps_the_lists_and_reports_the_number_of_pairs():
     primitives, capacity = gaussians(200, 150, 100), Capacity()
     exact = by_tile(primitives, 150, 100, capacity)
     (needed,) = capacity.needed
@@ -212,7 +195,7 @@ def test_capacity_keeps_the_lists_and_reports_the_number_of_pairs() -> None:
     assert int(short.needed[0]) == int(needed)
 
 
-def test_more_tiles_than_16_bits_count() -> None:
+def test_more_tiles_than_16_bits_count():
     primitives = gaussians(5, 30, 30)
     primitives["means2d"] = torch.tensor([[3275.0 * TILE, 5.0]] * 5)
     found = by_tile(primitives, 3300 * TILE, 10 * TILE)
@@ -224,7 +207,7 @@ def test_more_tiles_than_16_bits_count() -> None:
 NAMES = ("means2d", "conics", "colors", "opacities")
 
 
-def every_tile(primitives: Gaussians, width: int, height: int, spare: int) -> GsplatLists:
+def every_tile(primitives, width, height, spare):
     """Every Gaussian in every tile, by depth, and a tile below the image with ``spare`` pairs."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     order = primitives["depths"].argsort(stable=True).int()
@@ -233,7 +216,7 @@ def every_tile(primitives: Gaussians, width: int, height: int, spare: int) -> Gs
     return GsplatLists(width, height, starts.view(1, -1, columns), pairs)
 
 
-def expected(primitives: Gaussians, leaves: Gaussians, width: int, height: int, absgrad: bool) -> tuple[Tensor, Tensor]:
+def expected(primitives, leaves, width, height, absgrad):
     n = len(primitives["depths"])
     radii = torch.full((n,), 10_000, dtype=torch.int32)  # no squares: every tile
     compensations, covariances = torch.ones(n).double(), primitives["covariances"]
@@ -243,7 +226,7 @@ def expected(primitives: Gaussians, leaves: Gaussians, width: int, height: int, 
     return composite(leaves["means2d"], projection, *blended, width, height, absgrad=absgrad)
 
 
-def leaves_of(primitives: Gaussians, dtype: torch.dtype) -> Gaussians:
+def leaves_of(primitives, dtype):
     return {name: primitives[name][None].to(dtype, copy=True).requires_grad_() for name in NAMES}
 
 
@@ -258,9 +241,7 @@ def leaves_of(primitives: Gaussians, dtype: torch.dtype) -> Gaussians:
     ],
 )
 @pytest.mark.parametrize("opacity", [0.3, 1.0], ids=["faint", "opaque"])
-def test_image_and_gradients_match_the_reference(
-    n: int, channels: int, width: int, height: int, absgrad: bool, opacity: float
-) -> None:
+def test_image_and_gradients_match_the_reference(n, channels, width, height, absgrad, opacity):
     primitives = ellipses(n, width, height, largest=2.0, channels=channels, opacity=opacity)
     ours, exact = leaves_of(primitives, torch.float32), leaves_of(primitives, torch.float64)
     lists = every_tile(primitives, width, height, spare=7 if absgrad else 0)
@@ -274,14 +255,12 @@ def test_image_and_gradients_match_the_reference(
         (torch.cat([images, alphas], dim=-1) * weights).sum().backward()
     pairs = [(ours[name].grad, exact[name].grad) for name in NAMES]
     if absgrad:
-        pairs.append((ours["means2d"].absgrad, exact["means2d"].absgrad))  # type: ignore[attr-defined]
+        pairs.append((ours["means2d"].absgrad, exact["means2d"].absgrad))
     for found, truth in pairs:
-        assert found is not None
-        assert truth is not None
         assert (found - truth).norm() <= 1e-4 * truth.norm() + 1e-6
 
 
-def test_gradients_flow_into_some_inputs_only() -> None:
+def test_gradients_flow_into_some_inputs_only():
     primitives = ellipses(30, 20, 20, largest=2.0)
     ours = {name: primitives[name][None].float() for name in NAMES}
     ours["colors"].requires_grad_()
@@ -292,7 +271,7 @@ def test_gradients_flow_into_some_inputs_only() -> None:
     assert gradient.sum() > 0
 
 
-def test_an_empty_list_leaves_the_background() -> None:
+def test_an_empty_list_leaves_the_background():
     ours = leaves_of(ellipses(5, 20, 20, largest=2.0), torch.float32)
     lists = GsplatLists(20, 20, torch.zeros(1, 2, 2, dtype=torch.int32), torch.zeros(0, dtype=torch.int32))
     image, alpha = blend(*ours.values(), lists, False)
@@ -305,7 +284,7 @@ def test_an_empty_list_leaves_the_background() -> None:
 # ------------------------------------------------------------------------------------------------------------- colours
 
 
-def colors_inputs() -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def colors_inputs():
     """Centres, a camera's centre, and coefficients of degree 4.
 
     Some colours are negative, and one centre is the camera's.
@@ -317,7 +296,7 @@ def colors_inputs() -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 @pytest.mark.parametrize("degree", range(5))
 @pytest.mark.parametrize("each", [False, True], ids=["one place", "a place each"])
-def test_colors_and_gradients_match_the_reference(degree: int, each: bool) -> None:
+def test_colors_and_gradients_match_the_reference(degree, each):
     means, center, dc, rest = colors_inputs()
     center = center + torch.randn(300, 3) if each else center
     rest = rest[:, : max((degree + 1) ** 2 - 1, 8)]  # some coefficients are of higher degrees
@@ -333,16 +312,15 @@ def test_colors_and_gradients_match_the_reference(degree: int, each: bool) -> No
     (found * weights).sum().backward()
     (expected * weights).sum().backward()
     for one, other in zip(ours, exact, strict=True):
-        assert one.grad is not None
         # The constant harmonic does not depend on the place.
         gradient = torch.zeros_like(other) if other.grad is None else other.grad
         torch.testing.assert_close(one.grad.double(), gradient, rtol=1e-4, atol=5e-5)
 
 
-def test_harmonics_that_are_not_recorded_are_gsplats(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_harmonics_that_are_not_recorded_are_gsplats(monkeypatch):
     """A GPU on which our kernels do not compile can still use gsplat's, and an error of gsplat's is raised."""
 
-    def refuse(*_: Any) -> Tensor:
+    def refuse(*_):
         raise RuntimeError("no kernel image")
 
     monkeypatch.setattr("gsplat.spherical_harmonics", refuse)

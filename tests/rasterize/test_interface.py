@@ -1,29 +1,23 @@
 """Choice of a backend, the errors users see, and bounds of a view: terabytes are refused, real views are not."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from splat_inputs import blending_weights, inputs_of, rasterize, rasterize_cameras, several_views
-from torch import Tensor
 
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, MemoryExhaustedError
 from sundae_ns.rasterize import interface
 from sundae_ns.rasterize import types as limits
 from sundae_ns.rasterize.cpu import backend as backend_of_cpu
 from sundae_ns.rasterize.cpu import tiles
-from sundae_ns.rasterize.interface import BackendName, select_backend, spherical_harmonics
+from sundae_ns.rasterize.interface import select_backend, spherical_harmonics
 
 REFERENCE = select_backend("reference", "cpu")
 
 
-def _arguments(n: int = 3) -> dict:
+def _arguments(n=3):
     return {
         "means": torch.ones(n, 3),
         "quats": torch.ones(n, 4),
@@ -38,7 +32,7 @@ def _arguments(n: int = 3) -> dict:
     }
 
 
-def test_without_numba_auto_takes_the_reference() -> None:
+def test_without_numba_auto_takes_the_reference():
     """In a fresh interpreter that cannot import numba; selected by name, the backend raises the cause."""
     code = """
 import sys
@@ -66,9 +60,7 @@ except BackendError as error:
         ("gsplat", "cuda:0", True, "its kernels do not run", "reference"),
     ],
 )
-def test_a_backend_that_cannot_run_is_one_line_and_auto_falls_back(
-    name: BackendName, device: str, gpu: bool, message: str, instead: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_backend_that_cannot_run_is_one_line_and_auto_falls_back(name, device, gpu, message, instead, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
     monkeypatch.setattr(interface, "_kernel_problem", lambda: "its kernels do not run")
     with pytest.raises(BackendError, match=f"{message}; or use the backend 'reference'$") as caught:
@@ -77,13 +69,13 @@ def test_a_backend_that_cannot_run_is_one_line_and_auto_falls_back(
     assert select_backend("auto", device).name == instead
 
 
-def test_unknown_backend() -> None:
+def test_unknown_backend():
     with pytest.raises(ConfigError, match="auto, gsplat, cpu or reference"):
-        select_backend("vulkan", "cpu")  # type: ignore[arg-type]
+        select_backend("vulkan", "cpu")
 
 
 @pytest.mark.parametrize(("chosen", "missing"), [("'auto', 'cpu'", "gsplat"), ("'reference', 'cpu'", "numba")])
-def test_selecting_does_not_import_other_backends(chosen: str, missing: str) -> None:
+def test_selecting_does_not_import_other_backends(chosen, missing):
     code = (
         f"import sys; from sundae_ns.rasterize.interface import select_backend; select_backend({chosen}); "
         f"sys.exit(any(name.split('.')[0] == '{missing}' for name in sys.modules))"
@@ -105,21 +97,21 @@ def test_selecting_does_not_import_other_backends(chosen: str, missing: str) -> 
         ("width", 0, "empty"),
     ],
 )
-def test_wrong_arguments(name: str, value: object, message: str) -> None:
+def test_wrong_arguments(name, value, message):
     arguments = _arguments()
     arguments[name] = value
     with pytest.raises(DataError, match=message):
         rasterize(**arguments)
 
 
-def test_wrong_harmonics() -> None:
+def test_wrong_harmonics():
     with pytest.raises(DataError, match="degree 5"):
         spherical_harmonics(5, torch.ones(2, 3), torch.ones(2, 36, 3), backend=REFERENCE)
     with pytest.raises(DataError, match="needs"):
         spherical_harmonics(2, torch.ones(2, 3), torch.ones(2, 8, 3), backend=REFERENCE)
 
 
-def test_blending_weights_with_pixel_weights() -> None:
+def test_blending_weights_with_pixel_weights():
     arguments = {**_arguments(), "scales": torch.full((3, 3), 0.3), "opacities": torch.full((3,), 0.5), "height": 5}
     arguments.pop("colors")
     left = torch.zeros(5, 4)
@@ -135,7 +127,7 @@ def test_blending_weights_with_pixel_weights() -> None:
 
 
 @pytest.mark.parametrize("name", ["cpu", "reference"])
-def test_several_views_are_those_of_single_passes(name: BackendName) -> None:
+def test_several_views_are_those_of_single_passes(name):
     shared, cameras = several_views()
     options = {"width": 40, "height": 30, "antialiased": True, "backend": select_backend(name, "cpu")}
     images = rasterize_cameras(**shared, **cameras, **options)
@@ -154,7 +146,7 @@ def test_several_views_are_those_of_single_passes(name: BackendName) -> None:
         ({"colors": torch.ones(3, 49, 4)}, r"colors has shape \[49, 4\]; pass \[50, C\]"),
     ],
 )
-def test_wrong_views(change: dict, message: str) -> None:
+def test_wrong_views(change, message):
     shared, cameras = several_views()
     with pytest.raises(DataError, match=message):
         rasterize_cameras(**shared, **{**cameras, **change}, width=4, height=4, backend=REFERENCE)
@@ -165,9 +157,7 @@ def test_wrong_views(change: dict, message: str) -> None:
 BACKENDS = ("cpu", "reference")
 
 
-def camera(
-    count: int, size: int, scale: float, *, spread: float = 0.0, backend: str = "reference", **options: Any
-) -> Tensor:
+def camera(count, size, scale, *, spread=0.0, backend="reference", **options):
     """The image of faint Gaussians in front of a camera."""
     torch.manual_seed(0)
     means = torch.cat([spread * (torch.rand(count, 2) - 0.5), torch.full((count, 1), 2.0)], dim=1)
@@ -185,7 +175,7 @@ def camera(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_more_primitives_than_in_any_scene_are_refused(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_primitives_than_in_any_scene_are_refused(backend, monkeypatch):
     monkeypatch.setattr(limits, "MOST_PER_TILE", 100)
     monkeypatch.setattr(limits, "ALWAYS", 0)
     bins = {"cpu": 64, "reference": 16}[backend]
@@ -200,7 +190,7 @@ def test_more_primitives_than_in_any_scene_are_refused(backend: str, monkeypatch
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_small_image_of_many_primitives_is_drawn(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_small_image_of_many_primitives_is_drawn(backend, monkeypatch):
     """A large scene from far away, or as a thumbnail; large Gaussians take little too, whatever their lists."""
     assert camera(20_000, 40, 20.0, backend=backend).shape == (40, 40, 1)
     monkeypatch.setattr(limits, "ALWAYS", 0)
@@ -209,23 +199,23 @@ def test_a_small_image_of_many_primitives_is_drawn(backend: str, monkeypatch: py
     assert camera(60_000, 16, 1e-3, backend=backend).max() > 0
 
 
-def test_a_training_whose_lists_exceed_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_whose_lists_exceed_the_memory_is_refused(monkeypatch):
     monkeypatch.setattr(limits, "_NEGLIGIBLE", 0)
     monkeypatch.setattr(limits, "available_memory", lambda: 1_000_000)
     with pytest.raises(MemoryExhaustedError, match="pairs of a tile and a Gaussian take .* GB, but .* are available"):
         camera(1000, 64, 20.0, training=True)
 
 
-def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch):
     """Full-screen Gaussians beside lines in one row of tiles: the lists of each region fit the limit."""
     count, most, regions, lists = 60, 400, [], tiles.tile_lists
 
-    def limited(*arguments: Any) -> Iterator[tiles.Lists]:
+    def limited(*arguments):
         for region in lists(*arguments):
             regions.append(region)
             yield region
 
-    def drawn() -> list[Tensor]:
+    def drawn():
         torch.manual_seed(0)
         values = {
             "means": torch.cat([torch.rand(count, 2) - 0.5, torch.full((count, 1), 2.0)], dim=1).requires_grad_(),
@@ -241,7 +231,7 @@ def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch: pytest.Monkey
         )
         (ours.colors * torch.rand(52, 80, 3) + ours.alpha).sum().backward()
         grads = [values[name].grad for name in ("means", "opacities", "colors")]
-        return [ours.colors, ours.alpha, *grads, ours.info["means2d"].absgrad]  # type: ignore[list-item]
+        return [ours.colors, ours.alpha, *grads, ours.info["means2d"].absgrad]
 
     once = drawn()
     monkeypatch.setattr(tiles, "MOST_PAIRS", most)
@@ -261,7 +251,7 @@ def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_defaults_of_torch_do_not_matter(name: BackendName) -> None:
+def test_defaults_of_torch_do_not_matter(name):
     shared, cameras = several_views()
     inputs = inputs_of(
         **shared,
@@ -279,18 +269,17 @@ def test_defaults_of_torch_do_not_matter(name: BackendName) -> None:
     finally:
         torch.set_default_dtype(torch.float32)
         torch.set_default_device(None)
-    assert ours.depth is not None
     for value, same in ((ours.colors, expected.colors), (ours.depth, expected.depth), (ours.radii, expected.radii)):
-        assert torch.equal(value, same)  # type: ignore[arg-type]
+        assert torch.equal(value, same)
 
 
-def test_images_that_exceed_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_that_exceed_the_memory_are_refused(monkeypatch):
     monkeypatch.setattr(limits, "available_memory", lambda: 1 << 30)
     with pytest.raises(MemoryExhaustedError, match=r"images of 65,536 x 65,536 pixels take 274\.9 GB, but 1\.1 GB are"):
         camera(10, 65_536, 1e-3)
 
 
-def test_the_memory_is_that_of_machine_and_control_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_memory_is_that_of_machine_and_control_group(tmp_path, monkeypatch):
     memory = tmp_path / "meminfo"
     monkeypatch.setattr(limits, "_PROCESS", tmp_path)
     monkeypatch.setattr(limits, "_CONTROL_GROUP", tmp_path)

@@ -1,12 +1,8 @@
 """Compiled loops: SIMD lanes against numpy, the pixel rows of a Gaussian against all pixels, and compilation."""
 
-from __future__ import annotations
-
 import sys
 import time
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any
 
 import numba
 import numpy as np
@@ -37,7 +33,7 @@ DTYPES = [np.float32, np.float64]
 
 
 @compiled
-def _try_all(a: Any, b: Any, whole: Any, out: Any, count: Any) -> Any:
+def _try_all(a, b, whole, out, count):
     x, y = load(a, 0), load(b, 0)
     store(out, 0 * WIDTH, x + y)
     store(out, 1 * WIDTH, 1.5 - x)
@@ -54,7 +50,7 @@ def _try_all(a: Any, b: Any, whole: Any, out: Any, count: Any) -> Any:
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_lanes_match_numpy(dtype: Any) -> None:
+def test_lanes_match_numpy(dtype):
     generator = np.random.default_rng(0)
     a, b = generator.normal(size=(2, WIDTH)).astype(dtype)
     whole, count, out = np.arange(WIDTH, dtype=np.int32), np.zeros(WIDTH, np.int32), np.zeros(10 * WIDTH, dtype)
@@ -75,13 +71,13 @@ def test_lanes_match_numpy(dtype: Any) -> None:
 
 
 @compiled
-def _apply_exp_negative(x: Any, out: Any) -> None:
+def _apply_exp_negative(x, out):
     for place in range(0, len(x), WIDTH):
         store(out, place, exp_negative(load(x, place)))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_exp_negative_is_within_one_and_a_half_units_in_the_last_place(dtype: Any) -> None:
+def test_exp_negative_is_within_one_and_a_half_units_in_the_last_place(dtype):
     x = np.concatenate([np.linspace(0, 80, 2**16 - WIDTH), np.linspace(0, 1e-6, WIDTH)]).astype(dtype)
     out = np.empty_like(x)
     _apply_exp_negative(x, out)
@@ -92,7 +88,7 @@ def test_exp_negative_is_within_one_and_a_half_units_in_the_last_place(dtype: An
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_every_blended_pixel_is_listed_and_few_others(dtype: torch.dtype) -> None:
+def test_every_blended_pixel_is_listed_and_few_others(dtype):
     """Round Gaussians, oblique needles, and some that the image's edge cuts off."""
     generator = torch.Generator().manual_seed(0)
     n, width, height = 400, 70, 50
@@ -135,18 +131,16 @@ parallel_for(loop, 3, out)
 """
 
 
-def test_cached_code_is_renewed_when_a_constant_of_another_module_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cached_code_is_renewed_when_a_constant_of_another_module_changes(tmp_path, monkeypatch):
     source = tmp_path / "loop.py"
     source.write_text(LOOP)
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
 
-    def run(size: int) -> tuple[list[float], int]:
+    def run(size):
         module = ModuleType("sizes_of_this_test")
-        module.SIZE = size  # type: ignore[attr-defined]
+        module.SIZE = size
         monkeypatch.setitem(sys.modules, "sizes_of_this_test", module)
-        made: dict[str, Any] = {"__name__": "loop"}
+        made = {"__name__": "loop"}
         exec(compile(LOOP, str(source), "exec"), made)
         return made["out"].tolist(), sum(made["loop"].stats.cache_hits.values())
 
@@ -155,16 +149,14 @@ def test_cached_code_is_renewed_when_a_constant_of_another_module_changes(
     assert run(2) == ([2.0, 2.0, 2.0], 0)
 
 
-def test_compiles_without_a_cache_folder() -> None:
+def test_compiles_without_a_cache_folder():
     """numba finds no folder for a function without a file, as if neither package nor home were writable."""
-    made: dict[str, Any] = {}
+    made = {}
     exec(compile("def double(x):\n    return 2 * x", "<nowhere>", "exec"), made)
     assert parallel.compiled(made["double"])(4) == 8
 
 
-def test_a_notice_is_printed_for_long_compilation(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_notice_is_printed_for_long_compilation(monkeypatch, capsys):
     monkeypatch.setattr(parallel, "_noticed", [])
     monkeypatch.setattr(parallel, "_NOTICE_AFTER", 0.05)
     monkeypatch.setattr(parallel, "_ready", set())
@@ -172,10 +164,10 @@ def test_a_notice_is_printed_for_long_compilation(
     class Loop:
         """As numba's: it counts the calls that found no code on disk."""
 
-        def __init__(self, seconds: float, misses: int) -> None:
+        def __init__(self, seconds, misses):
             self.seconds, self.stats = seconds, SimpleNamespace(cache_misses={"types": misses} if misses else {})
 
-        def __call__(self, begin: int, end: int) -> None:
+        def __call__(self, begin, end):
             time.sleep(self.seconds if begin == end else 0.0)
 
     slow = Loop(0.5, misses=1)

@@ -1,11 +1,8 @@
 """Projection and harmonics against gsplat's own torch functions: values and gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from splat_inputs import geometry
-from torch import Tensor
 
 from sundae_ns.core.covariance import rotation_matrices
 from sundae_ns.rasterize.reference import ReferenceBackend, harmonic_basis, project
@@ -15,7 +12,7 @@ gsplat_torch = pytest.importorskip("gsplat.cuda._torch_impl")
 WIDTH, HEIGHT = 70, 50
 
 
-def _primitives(n: int = 400) -> list[Tensor]:
+def _primitives(n=400):
     torch.manual_seed(0)
     # Off-axis and near ones too, so that the limit on the slope is active for many.
     means = (torch.rand(n, 3, dtype=torch.float64) - 0.5) * torch.tensor([6.0, 6.0, 4.0]) + torch.tensor([0, 0, 2.2])
@@ -24,7 +21,7 @@ def _primitives(n: int = 400) -> list[Tensor]:
     return [means, quats, scales]
 
 
-def _camera() -> tuple[Tensor, Tensor]:
+def _camera():
     angle = torch.tensor(0.3, dtype=torch.float64)
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[0, 0] = viewmat[2, 2] = angle.cos()
@@ -34,18 +31,18 @@ def _camera() -> tuple[Tensor, Tensor]:
     return viewmat, K
 
 
-def _gradients(outputs: list[Tensor], inputs: list[Tensor]) -> list[Tensor]:
+def _gradients(outputs, inputs):
     torch.manual_seed(1)
     loss = sum((output * torch.rand_like(output)).sum() for output in outputs)
     return list(torch.autograd.grad(loss, inputs))
 
 
-def _worst(ours: Tensor, theirs: Tensor) -> float:
+def _worst(ours, theirs):
     """Largest deviation, relative where values exceed one."""
     return ((ours - theirs).abs() / theirs.abs().clamp(min=1)).max().item()
 
 
-def test_covariance_matches_gsplat() -> None:
+def test_covariance_matches_gsplat():
     _, quats, scales = _primitives()
     inputs = [quats.requires_grad_(), scales.requires_grad_()]
     root = rotation_matrices(quats) * scales[:, None, :]
@@ -58,7 +55,7 @@ def test_covariance_matches_gsplat() -> None:
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_projection_matches_gsplat(antialiased: bool) -> None:
+def test_projection_matches_gsplat(antialiased):
     inputs = [value.requires_grad_() for value in _primitives()]
     means, quats, scales = inputs
     viewmat, K = _camera()
@@ -86,7 +83,7 @@ def test_projection_matches_gsplat(antialiased: bool) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_harmonics_match_gsplat(degree: int) -> None:
+def test_harmonics_match_gsplat(degree):
     torch.manual_seed(2)
     directions = torch.randn(200, 3, dtype=torch.float64, requires_grad=True)
     coeffs = torch.randn(200, 25, 3, dtype=torch.float64, requires_grad=True)
@@ -98,7 +95,7 @@ def test_harmonics_match_gsplat(degree: int) -> None:
         assert _worst(a, b) < 1e-13  # measured: 3.1e-15
 
 
-def test_harmonics_are_orthonormal() -> None:
+def test_harmonics_are_orthonormal():
     """The mean over the sphere of a product of two harmonics is 1 / 4 pi if they are the same, else 0."""
     torch.manual_seed(3)
     nodes, weights = torch.linalg.eigh(_legendre_jacobi(8))
@@ -111,7 +108,7 @@ def test_harmonics_are_orthonormal() -> None:
     torch.testing.assert_close(gram, torch.eye(25, dtype=torch.float64) / (4 * torch.pi), rtol=0, atol=1e-13)
 
 
-def _legendre_jacobi(n: int) -> Tensor:
+def _legendre_jacobi(n):
     k = torch.arange(1, n, dtype=torch.float64)
     off = k / (4 * k * k - 1).sqrt()
     return torch.diag(off, 1) + torch.diag(off, -1)

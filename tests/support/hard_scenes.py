@@ -1,19 +1,14 @@
 """Scenes that are hard to render, before activation and in float32 numbers, so that both precisions render the same."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 
 import torch
-from torch import Tensor
 
 NEAR = 2.0**-6
 """A float32 number, so that a Gaussian can lie on the plane in both precisions."""
-Scene = dict[str, Tensor]
 
 
-def scene(n: int = 300, seed: int = 0) -> Scene:
+def scene(n=300, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return {
         "means": (torch.rand(n, 3, generator=generator) - 0.5) * 2 + torch.tensor([0.0, 0.0, 3.0]),
@@ -24,7 +19,7 @@ def scene(n: int = 300, seed: int = 0) -> Scene:
     }
 
 
-def with_values(rows: slice, **values: float | list[float]) -> Scene:
+def with_values(rows, **values):
     """The scene with other values in some rows."""
     made = scene()
     for name, value in values.items():
@@ -35,7 +30,7 @@ def with_values(rows: slice, **values: float | list[float]) -> Scene:
 HALF, ALL = slice(150), slice(None)
 
 
-def around_the_near_plane() -> Scene:
+def around_the_near_plane():
     """Gaussians on the plane, one step of float32 before and behind it, on the camera, and behind it."""
     made = scene()
     near = torch.tensor(NEAR)
@@ -46,14 +41,14 @@ def around_the_near_plane() -> Scene:
     return made
 
 
-def on_one_pixel(logit: float | None = None) -> Scene:
+def on_one_pixel(logit=None):
     made = scene(10_000)
     made["means"][:, :2] *= 1e-3
     made["scales"] -= 1.0
     return made if logit is None else {**made, "opacities": torch.full((10_000,), logit)}
 
 
-def huge_at_the_near_plane() -> Scene:
+def huge_at_the_near_plane():
     made = scene(40)
     made["means"][:, 2] = torch.linspace(-0.02, 0.03, 40)
     made["scales"][::2] = math.log(1e3)
@@ -62,7 +57,7 @@ def huge_at_the_near_plane() -> Scene:
 
 # Scene, image size, and the bounds on the errors of the image and of the worst gradient. Measured worst cases: 9.9e-7
 # and 9.3e-6, except where noted.
-CASES: dict[str, tuple[Callable[[], Scene], int, float, float]] = {
+CASES = {
     "ordinary": (scene, 48, 5e-6, 2e-5),
     "scales of 1e-8": (lambda: with_values(HALF, scales=math.log(1e-8)), 48, 5e-6, 2e-5),
     "scales of 1e3": (lambda: with_values(HALF, scales=math.log(1e3)), 48, 5e-6, 2e-5),

@@ -1,10 +1,6 @@
 """A model on the CPU, of a field made in memory, and what trains and shows it without nerfstudio's trainer."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable, Iterator
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -15,30 +11,21 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCall
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils import writer
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
-from torch import Tensor
 
 from sundae_ns.head.head import HeadConfig
-from sundae_ns.plugin.model import NerfstudioRun, SundaeModel, SundaeModelConfig
+from sundae_ns.plugin.model import SundaeModelConfig
 from sundae_ns.plugin.optimizer_configs import FusedAdamConfig
 from sundae_ns.train.pruning import PruningConfig
 
 
-def _points(n: int = 60) -> tuple[Tensor, Tensor]:
+def _points(n=60):
     """The sparse cloud that models start from: places ``[n, 3]`` and colours in 0 to 255 ``[n, 3]``."""
     generator = torch.Generator().manual_seed(1)
     xyz = torch.randn(n, 3, generator=generator) * 0.5
     return xyz, torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
 
 
-def _build(
-    *,
-    n: int = 60,
-    seed_points: Any = "some",
-    head: dict[str, Any] | None = None,
-    pruning: dict[str, Any] | None = None,
-    metadata: dict[str, Any] | None = None,
-    **options: Any,
-) -> SundaeModel:
+def _build(*, n=60, seed_points="some", head=None, pruning=None, metadata=None, **options):
     """Make a model of 60 Gaussians, or ``n``, that prunes half of them after step 3, with a tiny head."""
     small = {"mode": "residual", "size": "tiny", "num_features": 5, "pixel_unshuffle": 1}
     usual = {"sh_degree": 1, "sh_degree_interval": 1, "num_downscales": 0, "background_color": "random"}
@@ -53,7 +40,7 @@ def _build(
     return config.setup(scene_box=box, num_train_data=4, metadata=metadata or {}, seed_points=seeds)
 
 
-def _perturb(model: SundaeModel) -> SundaeModel:
+def _perturb(model):
     """Give the head an output, and move on to where it is enabled."""
     if model.head is not None:
         with torch.no_grad():
@@ -63,7 +50,7 @@ def _perturb(model: SundaeModel) -> SundaeModel:
     return model
 
 
-def _camera(width: int = 40, height: int = 32, shift: float = 0.0) -> Cameras:
+def _camera(width=40, height=32, shift=0.0):
     """Make a camera at a distance of 3 that looks at the Gaussians."""
     pose = torch.eye(4)[None, :3].clone()
     pose[0, :, 3] = torch.tensor([shift, 0.1, 3.0])
@@ -75,24 +62,24 @@ class FakeDatamanager:
 
     eval_dataset = None
     place = (0, 1)
-    holdout_indices: tuple[int, ...] = ()
+    holdout_indices = ()
     train_indices = (0, 1, 2)
 
-    mask: Tensor | None = None
+    mask = None
     """Of each view."""
 
     @property
-    def cached_train(self) -> list[dict[str, Tensor]]:
+    def cached_train(self):
         return [_batch() for _ in self.train_indices]
 
-    def cameras(self, indices: Iterable[int]) -> Iterator[tuple[Cameras, dict[str, Tensor]]]:
+    def cameras(self, indices):
         yield from ((_camera(shift=(-0.5, 0.0, 0.5)[index]), _batch()) for index in indices)
 
-    def training_views(self) -> Iterator[tuple[Cameras, Tensor | None]]:
+    def training_views(self):
         yield from ((_camera(shift=shift), self.mask) for shift in (-0.5, 0.0, 0.5))
 
 
-def _batch(width: int = 40, height: int = 32, channels: int = 3) -> dict[str, Tensor]:
+def _batch(width=40, height=32, channels=3):
     """Make what the data manager gives for that camera: an image of noise ``[height, width, channels]``, uint8."""
     generator = torch.Generator().manual_seed(2)
     return {"image": torch.randint(0, 256, (height, width, channels), generator=generator, dtype=torch.uint8)}
@@ -101,7 +88,7 @@ def _batch(width: int = 40, height: int = 32, channels: int = 3) -> dict[str, Te
 class Training:
     """Steps a model as nerfstudio's trainer does, without one."""
 
-    def __init__(self, model: SundaeModel, trainer: Any = None) -> None:
+    def __init__(self, model, trainer=None):
         self.model = model
         groups = model.get_param_groups()
         kinds = dict.fromkeys(groups, FusedAdamConfig(lr=5e-3)) | {
@@ -110,25 +97,25 @@ class Training:
         self.optimizers = Optimizers({name: {"optimizer": kinds[name], "scheduler": None} for name in groups}, groups)
         pipeline = SimpleNamespace(datamanager=FakeDatamanager(), model=model)
         self.callbacks = model.get_training_callbacks(
-            TrainingCallbackAttributes(self.optimizers, None, pipeline, trainer)  # type: ignore[arg-type]
+            TrainingCallbackAttributes(self.optimizers, None, pipeline, trainer)
         )
 
     @property
-    def train_callbacks(self) -> dict[str, Any]:
+    def train_callbacks(self):
         """The extensions by name."""
         return {callback.name: callback for callback in self.model.train_callbacks}
 
-    def act(self, name: str, step: int) -> None:
+    def act(self, name, step):
         """Let one extension act after a step, and no other."""
         self.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step)
-        run: NerfstudioRun = self.callbacks[0].func.__self__  # type: ignore[attr-defined]
+        run = self.callbacks[0].func.__self__
         run.act([self.train_callbacks[name]])
 
-    def run_callbacks(self, location: TrainingCallbackLocation, step: int) -> None:
+    def run_callbacks(self, location, step):
         for callback in self.callbacks:
             callback.run_callback_at_location(step, location=location)
 
-    def step(self, step: int) -> dict[str, Tensor]:
+    def step(self, step):
         self.model.train()
         self.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step)
         self.optimizers.zero_grad_all()
@@ -139,7 +126,7 @@ class Training:
         self.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step)
         return losses
 
-    def live(self) -> bool:
+    def live(self):
         """Whether model, optimizers and nerfstudio's own list hold the same tensors, with moments of their shape."""
         for name, value in self.model.gauss_params.items():
             (held,) = self.optimizers.optimizers[name].param_groups[0]["params"]
@@ -151,7 +138,7 @@ class Training:
         return True
 
 
-def _fixture_of(function: Callable[..., Any]) -> Any:
+def _fixture_of(function):
     """A fixture of the function's name that gives the function."""
     return pytest.fixture(name=function.__name__.removeprefix("_"))(lambda: function)
 
@@ -160,32 +147,32 @@ points, build, perturb, camera, batch = map(_fixture_of, (_points, _build, _pert
 
 
 @pytest.fixture
-def datamanager() -> FakeDatamanager:
+def datamanager():
     return FakeDatamanager()
 
 
 @pytest.fixture
-def training_of() -> Callable[..., Training]:
+def training_of():
     """Set up the training of a model, and of what stands for a trainer if need be, which then goes step by step."""
     return Training
 
 
 @pytest.fixture(autouse=True)
-def no_leftovers() -> Iterator[None]:
+def no_leftovers():
     yield
     writer.EVENT_STORAGE.clear()
 
 
-def as_the_viewer(call: Callable[[], Any]) -> Any:
+def as_the_viewer(call):
     """What a function returns to a thread of the viewer."""
-    found: list[Any] = []
+    found = []
 
     class Renderer(RenderStateMachine):
-        def run(self) -> None:
+        def run(self):
             with torch.no_grad():
                 found.append(call())
 
-    thread = Renderer(None, 1.0, None)  # type: ignore[arg-type]
+    thread = Renderer(None, 1.0, None)
     thread.start()
     thread.join()
     return found[0]

@@ -1,59 +1,46 @@
 """A field that is right, photos of it by cameras on a ring, and the measurement of their gains."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.train.exposure import FIRST_STEPS, REFRESHED_EVERY, ExposureCompensation
-from sundae_ns.train.state import TrainingRun
 
 COUNT = 48
 ANGLES = torch.arange(COUNT) * 2 * math.pi / COUNT
 
 
-def ring(count: int = COUNT) -> list[Camera]:
+def ring(count=COUNT):
     """Cameras on a circle that look at its middle."""
     angles = torch.arange(count) * 2 * math.pi / count
     return [Camera.look_at((3 * math.cos(a), 3 * math.sin(a), 1.0), (0, 0, 0), width=64, height=48) for a in angles]
 
 
-def run_of(cameras: list[Camera], *, ranks: int = 1) -> TrainingRun:
+def run_of(cameras, *, ranks=1):
     indices = list(range(len(cameras)))
     shown = [SimpleNamespace(camera=camera, mask=None) for camera in cameras]
     members = {"view_indices": lambda: indices, "training_views": lambda: shown, "images_per_step": ranks}
     return SimpleNamespace(state=SimpleNamespace(step=0), **members)
 
 
-def begin(mode: Literal["auto", "on", "off"] = "on") -> tuple[ExposureCompensation, TrainingRun]:
+def begin(mode="on"):
     gains, run = ExposureCompensation(COUNT, mode), run_of(ring())
     gains.before_training(run)
     return gains, run
 
 
-def image_of(index: int) -> Tensor:
+def image_of(index):
     """What the field shows of a view, dark enough that no photo is clipped."""
     return 0.1 + 0.4 * torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(index))
 
 
-def batch_of(index: int, channels: int = 3) -> dict[str, Any]:
+def batch_of(index, channels=3):
     return {"image_idx": index, "image": torch.zeros(48, 64, channels, dtype=torch.uint8)}
 
 
-def measure(
-    gains: ExposureCompensation,
-    run: TrainingRun,
-    photos: Callable[[int], Tensor],
-    rounds: int = 12,
-    *,
-    late: bool = True,
-) -> None:
+def measure(gains, run, photos, rounds=12, *, late=True):
     """Steps that see each photo once between two updates. The field is right, and does not change.
 
     Late ones are at the step from which ``auto`` decides.
@@ -66,7 +53,7 @@ def measure(
         update(gains, run, late=late)
 
 
-def update(gains: ExposureCompensation, run: TrainingRun, *, late: bool = True) -> None:
+def update(gains, run, *, late=True):
     run.state.step = -(-(FIRST_STEPS if late else 1) // REFRESHED_EVERY) * REFRESHED_EVERY - 1
     gains.after_step(run)
     run.state.step = 0

@@ -1,44 +1,37 @@
 """Arguments of the rasterisers by keyword."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import torch
-from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.rasterize import interface
-from sundae_ns.rasterize.types import Backend, Inputs, Rasterization
+from sundae_ns.rasterize.types import Inputs
 
 
-def inputs_of(*, viewmat: Tensor, K: Tensor, width: int, height: int, **values: Any) -> Inputs:
+def inputs_of(*, viewmat, K, width, height, **values):
     """Inputs with a camera of these values; opacities and colours are 1 by default."""
     ones = values["means"].new_ones(len(values["means"]), 1)
     return Inputs(camera=Camera(viewmat, K, width, height, 1.0), **{"opacities": ones[:, 0], "colors": ones, **values})
 
 
-def geometry(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int
-) -> Inputs:
+def geometry(means, quats, scales, viewmat, K, width, height):
     """Inputs of a projection."""
     return inputs_of(means=means, quats=quats, scales=scales, viewmat=viewmat, K=K, width=width, height=height)
 
 
-def rasterize(*, backend: Backend, **values: Any) -> Rasterization:
+def rasterize(*, backend, **values):
     return interface.rasterize(inputs_of(**values), backend=backend)
 
 
-def rasterize_cameras(*, viewmats: Tensor, Ks: Tensor, backend: Backend, **values: Any) -> Tensor:
+def rasterize_cameras(*, viewmats, Ks, backend, **values):
     inputs = inputs_of(viewmat=torch.eye(4), K=torch.eye(3), **values)
     return interface.rasterize_cameras(inputs, viewmats, Ks, backend=backend)
 
 
-def blending_weights(*, backend: Backend, pixels: Tensor | None = None, **values: Any) -> Tensor:
+def blending_weights(*, backend, pixels=None, **values):
     return interface.blending_weights(inputs_of(**values), pixels, backend=backend)
 
 
-def several_views(n: int = 50, channels: int = 4) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def several_views(n=50, channels=4):
     """Gaussians, and three views of them: colours, transforms and intrinsics as ``rasterize_cameras`` takes them."""
     generator = torch.Generator().manual_seed(0)
     shared = {

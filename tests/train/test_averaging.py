@@ -1,10 +1,6 @@
 """The mean of the weights over the last steps."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -17,18 +13,16 @@ from sundae_ns.train.build import check
 LAST = 99
 
 
-def run_of(state: Any, *, images: int = 1, last: int = LAST, length: int = LAST + 1) -> Any:
+def run_of(state, *, images=1, last=LAST, length=LAST + 1):
     return SimpleNamespace(state=state, last_step=last, schedule_length=length, images_per_step=images)
 
 
 @pytest.fixture
-def state(build: Callable[..., Any]) -> Any:
+def state(build):
     return build(n=20).state
 
 
-def train(
-    state: Any, mean: Averaging, steps: range, *, seen: list[torch.Tensor] | None = None, last: int = LAST
-) -> None:
+def train(state, mean, steps, *, seen=None, last=LAST):
     """Steps that change the weights at random."""
     for step in steps:
         state.step = step
@@ -40,31 +34,31 @@ def train(
         mean.after_step(run_of(state, last=last))
 
 
-def test_the_last_weights_become_the_mean(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_last_weights_become_the_mean(state, monkeypatch):
     monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
-    seen: list[torch.Tensor] = []
+    seen = []
     train(state, Averaging(0.09, settled_at=0), range(LAST + 1), seen=seen)
     assert len(seen) == 4
     torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
 
 
-def test_a_mean_that_an_interruption_has_cut_short_is_dropped(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mean_that_an_interruption_has_cut_short_is_dropped(state, monkeypatch):
     """A run that stops in its last part and is resumed for a longer one ends with weights of the end alone."""
     monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
     first, longer = Averaging(0.3, settled_at=0), Averaging(0.09, settled_at=0)
     train(state, first, range(90))
     assert first.state_dict()["count"] > 0
     longer.load_state_dict(state, first.state_dict())
-    seen: list[torch.Tensor] = []
+    seen = []
     train(state, longer, range(80, LAST + 1), seen=seen)
     torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
 
 
-def test_no_mean_of_fields_that_differ(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_mean_of_fields_that_differ(state, monkeypatch):
     """After a prune, or a return to an earlier field, only the weights since then count."""
     monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
     for change in ("prune", "return"):
-        seen: list[torch.Tensor] = []
+        seen = []
         mean = Averaging(0.3, settled_at=0)
         train(state, mean, range(91))
         if change == "prune":
@@ -77,7 +71,7 @@ def test_no_mean_of_fields_that_differ(state: Any, monkeypatch: pytest.MonkeyPat
         torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
 
 
-def test_unfinished_schedules_and_growing_fields_keep_their_weights(state: Any) -> None:
+def test_unfinished_schedules_and_growing_fields_keep_their_weights(state):
     for mean, length in ((Averaging(0.1, settled_at=1000), LAST + 1), (Averaging(0.1, settled_at=0), 2 * LAST)):
         state.step = LAST
         before = state.gaussians["means"].detach().clone()
@@ -85,7 +79,7 @@ def test_unfinished_schedules_and_growing_fields_keep_their_weights(state: Any) 
         assert torch.equal(state.gaussians["means"], before)
 
 
-def test_a_longer_training_goes_on_from_the_last_weights(state: Any) -> None:
+def test_a_longer_training_goes_on_from_the_last_weights(state):
     """Not from their mean, which does not belong to the state of the optimizers."""
     mean, again = Averaging(0.5, settled_at=0), Averaging(0.5, settled_at=0)
     train(state, mean, range(LAST))
@@ -101,10 +95,10 @@ def test_a_longer_training_goes_on_from_the_last_weights(state: Any) -> None:
     assert not again.state_dict()["replaced"]
 
 
-def test_a_first_part_ends_with_the_mean_of_its_last_steps(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_first_part_ends_with_the_mean_of_its_last_steps(state, monkeypatch):
     """As far as it reaches into the share: what is packed from there on begins at the mean."""
     monkeypatch.setattr(averaging, "AVERAGED_EVERY", 2)
-    seen: list[torch.Tensor] = []
+    seen = []
     mean = Averaging(0.09, settled_at=0)
     train(state, mean, range(96), seen=seen, last=95)
     assert len(seen) == 3
@@ -112,13 +106,13 @@ def test_a_first_part_ends_with_the_mean_of_its_last_steps(state: Any, monkeypat
     assert mean.state_dict()["replaced"]
 
 
-def test_a_rank_without_primitives(state: Any) -> None:
+def test_a_rank_without_primitives(state):
     for value in state.gaussians.values():
         value.data = value.data[:0].clone()
     train(state, Averaging(1.0, settled_at=0), range(LAST - 9, LAST))
 
 
-def test_ranks_do_not_save_the_mean_of_their_shard(state: Any) -> None:
+def test_ranks_do_not_save_the_mean_of_their_shard(state):
     mean = Averaging(1.0, settled_at=0)
     mean.before_training(run_of(state, images=2))
     train(state, mean, range(20))
@@ -134,7 +128,7 @@ def test_ranks_do_not_save_the_mean_of_their_shard(state: Any) -> None:
         ("use_bilateral_grid", True, "no bilateral grid"),
     ],
 )
-def test_options_that_cannot_be(build: Callable[..., Any], option: str, value: float, words: str) -> None:
+def test_options_that_cannot_be(build, option, value, words):
     config = build(n=5).config
     setattr(config, option, value)
     with pytest.raises(ConfigError, match=words):

@@ -1,13 +1,9 @@
 """What is chosen by measurements of held-out views, where no recorded trial in test_golden_trials.py shows it."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Sequence
 
 import pytest
 import torch
-from torch import Tensor
 
 from sundae_ns.core.metrics import MOST_PSNR, psnr, ssim
 from sundae_ns.train.choice import (
@@ -29,24 +25,22 @@ from sundae_ns.train.choice import (
 from sundae_ns.train.curve import CurvePoint
 from sundae_ns.train.trials import view_quality
 
-Views = list[list[float]]
 
-
-def point(count: int, psnr_loss: float = 0.0, ssim_loss: float = 0.0, size: int | None = None) -> CurvePoint:
+def point(count, psnr_loss=0.0, ssim_loss=0.0, size=None):
     return CurvePoint(count, size, 30 - psnr_loss, 0.9 - ssim_loss, psnr_loss, ssim_loss, 0.0, 0.0)
 
 
-def test_views_count_by_their_pixels() -> None:
+def test_views_count_by_their_pixels():
     rows = [Tried("count", 100, "plain", 9, [[1e-9, 0, 0.9, few], [100, 0, 0.9, 30.0]]) for few in (30.0, 20.0)]
     assert curve_of(rows)[1].psnr_loss == pytest.approx(0, abs=1e-6)
 
 
-def test_where_no_count_is_best_in_both_figures_the_one_that_loses_least_is_taken() -> None:
+def test_where_no_count_is_best_in_both_figures_the_one_that_loses_least_is_taken():
     losses = [(0.5, 0), (0, 0.006), (0.5, 0.03), (1, 0.1)]
     assert choose([point(n, *loss) for n, loss in zip((1000, 400, 200, 100), losses, strict=True)], Tolerance()) == 400
 
 
-def test_few_views_take_the_least_sum_of_what_was_measured() -> None:
+def test_few_views_take_the_least_sum_of_what_was_measured():
     """In tolerances of 0.1 dB and 0.003; what smaller counts gain later is not added."""
     measured = {400: (20.0, 0.700), 200: (20.2, 0.697), 100: (20.4, 0.695), 50: (20.41, 0.680)}
     rows = [Tried("count", n, "plain", 9, [[9, 0, similarity, psnr]]) for n, (psnr, similarity) in measured.items()]
@@ -56,18 +50,18 @@ def test_few_views_take_the_least_sum_of_what_was_measured() -> None:
     assert choose(curve, Tolerance.of_drop(0.4, few=True)) < 400  # a drop that was asked for is kept in both figures
 
 
-def test_a_budget_in_bytes_is_in_proportion_to_the_one_size_that_is_known() -> None:
+def test_a_budget_in_bytes_is_in_proportion_to_the_one_size_that_is_known():
     assert affordable([point(1000, size=16000)], 8000) == pytest.approx(500, abs=1)
 
 
-def test_a_head_must_be_worth_its_bytes_in_the_fields_that_would_be_kept() -> None:
+def test_a_head_must_be_worth_its_bytes_in_the_fields_that_would_be_kept():
     """0.4 dB for each doubling of the bytes of the scene without one, by what it gains among as many Gaussians."""
     curve = [point(1000, size=10_000), point(400, size=4000), point(200, 0.5, 0.02, size=2000)]
     kept, plain = choose(with_head(curve, HeadGain(100, 0.3, 0.01)), Tolerance()), choose(curve, Tolerance())
     assert 200 < kept < plain <= 400
     gained = 0.3 * (100 / kept) ** 0.4  # 0.17 to 0.23 dB
 
-    def pays(features: int | None, psnr: float = 0.3, ssim: float = 0.01, ssim_db: float | None = 0.4) -> bool:
+    def pays(features, psnr=0.3, ssim=0.01, ssim_db=0.4):
         return head_pays(curve, HeadGain(100, psnr, ssim, ssim_db, features, head=0), Tolerance())
 
     # Bytes of the features of 100 Gaussians; of the field these take 1,000.
@@ -84,8 +78,8 @@ def test_a_head_must_be_worth_its_bytes_in_the_fields_that_would_be_kept() -> No
     assert not pays(10, psnr=math.inf)
 
 
-def test_the_gain_of_a_head_in_ssim_is_in_decibels_of_its_distance_from_one() -> None:
-    def trial(decibels: float, similarity: float) -> Tried:
+def test_the_gain_of_a_head_in_ssim_is_in_decibels_of_its_distance_from_one():
+    def trial(decibels, similarity):
         return Tried("tenth", 10, "plain", 9, [[100.0, decibels, similarity]])
 
     gain = HeadGain.of(trial(30.0, 0.9), trial(30.5, 0.95))
@@ -94,7 +88,7 @@ def test_the_gain_of_a_head_in_ssim_is_in_decibels_of_its_distance_from_one() ->
 
 
 @pytest.mark.parametrize(("views", "held_out"), [(12, 2), (16, 2), (43, 5), (73, 9), (105, 13), (255, 16), (2000, 16)])
-def test_an_eighth_of_the_views_is_held_out_within_limits(views: int, held_out: int) -> None:
+def test_an_eighth_of_the_views_is_held_out_within_limits(views, held_out):
     (fold,), length = plan_heads(range(views), 30000)
     assert length == 1200
     assert len(set(fold)) == held_out <= MOST_HELD_OUT
@@ -106,7 +100,7 @@ def test_an_eighth_of_the_views_is_held_out_within_limits(views: int, held_out: 
 
 
 @pytest.mark.parametrize("views", [6, 9, 11])
-def test_with_few_views_two_are_held_out_in_turn(views: int) -> None:
+def test_with_few_views_two_are_held_out_in_turn(views):
     ((first,), (second,)), length = plan_heads([10 * i for i in range(views)], 30000)
     assert length == 600
     assert first != second
@@ -115,19 +109,19 @@ def test_with_few_views_two_are_held_out_in_turn(views: int) -> None:
 
 @pytest.mark.parametrize("views", [6, 12, 255])
 @pytest.mark.parametrize("steps", [1000, 7000, 18000, 30000, 60000])
-def test_deciding_costs_at_most_a_tenth_of_the_steps(views: int, steps: int) -> None:
+def test_deciding_costs_at_most_a_tenth_of_the_steps(views, steps):
     folds, length = plan_heads(range(views), steps)
     # The trial of one candidate continues.
     assert (len(HEADS) * len(folds) - 1) * length <= 0.1 * steps
 
 
 @pytest.mark.parametrize(("steps", "length"), [(7000, 350), (18000, 900), (30000, 1200), (60000, 2400)])
-def test_short_runs_have_longer_trials_for_their_length(steps: int, length: int) -> None:
+def test_short_runs_have_longer_trials_for_their_length(steps, length):
     """In a trial of 720 steps, 500 of them a rise, a head on bonsai showed 0.08 of the 1.8 dB that it gains."""
     assert plan_heads(range(255), steps)[1] == length
 
 
-def best_of(measured: Sequence[Views], *, folds: int = 1, sizes: Sequence[int] = (100, 110, 120)) -> str:
+def best_of(measured, *, folds=1, sizes=(100, 110, 120)):
     """The best head of trials; bytes of the candidates count little."""
     rows = [Tried("head", 9, HEADS[i // folds], 9, views, [sizes[i // folds], 0]) for i, views in enumerate(measured)]
     return best_head(rows, folds)
@@ -147,9 +141,7 @@ def best_of(measured: Sequence[Views], *, folds: int = 1, sizes: Sequence[int] =
         ((0.5, 0.01), (0.9, float("nan")), "head"),
     ],
 )
-def test_a_candidate_must_gain_over_the_cheaper_ones_and_must_not_lose_ssim(
-    head: tuple[float, float], features: tuple[float, float] | None, best: str
-) -> None:
+def test_a_candidate_must_gain_over_the_cheaper_ones_and_must_not_lose_ssim(head, features, best):
     # Two folds; the second view has more pixels and is harder.
     measured = [
         [[float(pixels), decibels + gain[0], 0.7 + gain[1]]]
@@ -160,32 +152,32 @@ def test_a_candidate_must_gain_over_the_cheaper_ones_and_must_not_lose_ssim(
 
 
 @pytest.mark.parametrize(("gain", "size", "best"), [(0.41, 200, "head"), (0.39, 200, "plain"), (0.39, 190, "head")])
-def test_a_candidate_that_takes_more_bytes_must_gain_more(gain: float, size: int, best: str) -> None:
+def test_a_candidate_that_takes_more_bytes_must_gain_more(gain, size, best):
     measured = [[[10.0, 20.0, 0.5]], [[10.0, 20.0 + gain, 0.5]]]
     assert best_of(measured, sizes=(100, size, 400)) == best
 
 
-def test_views_of_heads_count_by_their_pixels() -> None:
+def test_views_of_heads_count_by_their_pixels():
     # A gain of 1 dB on few pixels does not outweigh a loss on many.
     plain, head = [[10.0, 20.0, 0.5], [990.0, 20.0, 0.5]], [[10.0, 21.0, 0.6], [990.0, 19.99, 0.6]]
     assert best_of([plain, head]) == "plain"
 
 
 @pytest.fixture
-def pair() -> tuple[Tensor, Tensor]:
+def pair():
     generator = torch.Generator().manual_seed(3)
     target = torch.rand(24, 32, 3, generator=generator)
     return (target + 0.1 * torch.rand(24, 32, 3, generator=generator)).clamp(0, 1), target
 
 
-def test_without_a_mask_it_is_that_of_the_whole_image(pair: tuple[Tensor, Tensor]) -> None:
+def test_without_a_mask_it_is_that_of_the_whole_image(pair):
     found = view_quality(*pair, None)
     assert found.pixels == 24 * 32
     assert found.psnr == pytest.approx(float(psnr(*pair)))
     assert found.ssim == pytest.approx(float(ssim(*pair)))
 
 
-def test_only_pixels_under_the_mask_count(pair: tuple[Tensor, Tensor]) -> None:
+def test_only_pixels_under_the_mask_count(pair):
     image, target = pair
     mask = torch.zeros(24, 32, dtype=torch.bool)
     mask[:, :16] = True
@@ -200,18 +192,18 @@ def test_only_pixels_under_the_mask_count(pair: tuple[Tensor, Tensor]) -> None:
     assert abs(found.ssim - half) < 0.3 * abs(whole - half)
 
 
-def test_views_count_by_their_pixels_and_a_masked_view_not_at_all(pair: tuple[Tensor, Tensor]) -> None:
+def test_views_count_by_their_pixels_and_a_masked_view_not_at_all(pair):
     assert view_quality(*pair, torch.zeros(24, 32, dtype=torch.bool)).pixels == 0
     assert mean_quality([HeldOutQuality(300, 20.0, 0.5), HeldOutQuality(100, 40.0, 0.9)]) == (25.0, pytest.approx(0.6))
 
 
-def test_an_exact_image_is_finite_and_a_broken_one_is_not(pair: tuple[Tensor, Tensor]) -> None:
+def test_an_exact_image_is_finite_and_a_broken_one_is_not(pair):
     image, target = pair
     assert view_quality(target, target, None).psnr == MOST_PSNR
     assert not math.isfinite(view_quality(torch.full_like(image, math.nan), target, None).psnr)
 
 
-def test_an_image_smaller_than_the_window_of_ssim_has_a_psnr(pair: tuple[Tensor, Tensor]) -> None:
+def test_an_image_smaller_than_the_window_of_ssim_has_a_psnr(pair):
     image, target = (one[:8] for one in pair)
     found = view_quality(image, target, None)
     assert found.ssim == 0

@@ -1,10 +1,6 @@
 """Training, pruning, graph and head give the same bits whatever torch's default dtype is."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable
 from types import SimpleNamespace
-from typing import Any
 
 import photographed
 import prunes
@@ -32,26 +28,26 @@ EYES = [torch.tensor([x, 0.2 * x, 4.0]) for x in (0.0, 0.3, 0.6)]
 CAMERAS = [Camera.look_at(eye, torch.zeros(3), width=40, height=33) for eye in EYES]
 
 
-def head() -> Iterable[Any]:
+def head():
     torch.manual_seed(0)
     net = CompensationHead(HeadConfig(size="tiny", num_features=5))
     crops = [torch.tensor(training_crop(700, 500, 9000, seed, mirror=True)) for seed in range(9)]
     return *net.parameters(), net(IMAGE[..., :3], IMAGE[..., :8], IMAGE[..., 8:]), *crops
 
 
-def decisions() -> Iterable[Any]:
+def decisions():
     rules = (PruneRule(), PruneRule(selection="pairs"), band_rule(PruneRule(), 0.5))
     weights = torch.linspace(0, 1, 300, dtype=torch.float32)
     found = [prune_gaussians(FIELD, rule, 40, weights) for rule in rules]
     return [value for pruned in found for value in (pruned.decision.mask, *pruned.gaussians.values())]
 
 
-def sweep() -> Iterable[Any]:
+def sweep():
     found = Sweep([Photo(camera, IMAGE[..., :3], None) for camera in CAMERAS], POINTS, 32)
     return [found.add(index) for index in range(3)] + list(found.points(1000))
 
 
-def exposure() -> Iterable[Any]:
+def exposure():
     gains = ExposureCompensation(len(PHOTOS), "on")
     gains.before_training(RUN)
     for index, photo in enumerate(PHOTOS):
@@ -60,7 +56,7 @@ def exposure() -> Iterable[Any]:
     return [value for value in gains.state_dict().values() if isinstance(value, Tensor)]
 
 
-def growth(model: Any) -> Iterable[Any]:
+def growth(model):
     """A step that splits Gaussians, and steps on buffers before and after it."""
     state, step = model.state, RecordedStep(model.losses, record=False)
     state.optimizers = {name: torch.optim.Adam([value]) for name, value in state.gaussians.items()}
@@ -79,14 +75,14 @@ def growth(model: Any) -> Iterable[Any]:
     return state.gaussians.values()
 
 
-MADE: dict[str, Callable[[], Iterable[Any]]] = {
+MADE = {
     **{one.__name__: one for one in (head, decisions, sweep, exposure)},
     "graph": lambda: (build_graph(POINTS).weights, high_pass(build_graph(POINTS), POINTS)),
 }
 
 
 @pytest.mark.parametrize("name", [*MADE, "growth"])
-def test_the_default_dtype_changes_nothing(name: str, build: Callable[..., Any]) -> None:
+def test_the_default_dtype_changes_nothing(name, build):
     results = []
     for dtype in (torch.float32, torch.float64):
         torch.manual_seed(0)

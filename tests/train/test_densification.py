@@ -1,7 +1,5 @@
 """Growing under a cap: which Gaussians grow, and that the count is never above it."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch.nn import Parameter
@@ -14,13 +12,13 @@ FIELD = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opa
 N = 40
 
 
-def gaussians(n: int = N) -> tuple[dict[str, Parameter], dict[str, Adam]]:
+def gaussians(n=N):
     params = {name: Parameter(torch.randn(n, *shape)) for name, shape in FIELD.items()}
     params["opacities"].data.fill_(1.0)
     return params, {name: Adam([value], lr=0.01) for name, value in params.items()}
 
 
-def test_the_highest_gradients_grow() -> None:
+def test_the_highest_gradients_grow():
     gradients = torch.tensor([0.9, 0.1, 0.8, 0.7, 0.0, 0.6])
     radii = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.9, 0.0])
     state = {"grad2d": gradients * 2, "count": torch.full((6,), 2.0), "radii": radii.clone()}
@@ -30,14 +28,14 @@ def test_the_highest_gradients_grow() -> None:
     assert (state["radii"] <= 0.05).all()
 
 
-def test_room_enough_changes_nothing() -> None:
+def test_room_enough_changes_nothing():
     gradients = torch.tensor([0.9, 0.1, 0.8, 0.7, 0.0, 0.6])
     state = {"grad2d": gradients.clone(), "count": torch.ones(6), "radii": None}
     limit_growth(state, torch.arange(6) % 2 == 0, 4, threshold=0.5, radius=0.05)
     assert torch.equal(state["grad2d"], gradients)
 
 
-def test_one_that_is_duplicated_and_split_takes_two_places() -> None:
+def test_one_that_is_duplicated_and_split_takes_two_places():
     state = {"grad2d": torch.tensor([0.9, 0.8, 0.7]), "count": torch.ones(3), "radii": torch.tensor([0.9, 0.0, 0.9])}
     limit_growth(state, torch.tensor([True, True, False]), 3, threshold=0.5, radius=0.05)
     assert (state["grad2d"] > 0.5).tolist() == [True, True, False]
@@ -46,7 +44,7 @@ def test_one_that_is_duplicated_and_split_takes_two_places() -> None:
 
 @pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.parametrize(("cap", "expected"), [(None, 2 * N), (N + 7, N + 7), (N, N), (N - 5, N)])
-def test_densification_stops_at_the_cap(cap: int | None, expected: int, wide: bool) -> None:
+def test_densification_stops_at_the_cap(cap, expected, wide):
     """Also where small ones are wide on the screen, which gsplat duplicates and splits at once."""
     params, optimizers = gaussians()
     params["scales"].data[: N // 2] = -9.0
@@ -69,7 +67,7 @@ def test_densification_stops_at_the_cap(cap: int | None, expected: int, wide: bo
 
 
 @pytest.mark.parametrize("absgrad", [False, True])
-def test_statistics_are_those_of_gsplat(absgrad: bool) -> None:
+def test_statistics_are_those_of_gsplat(absgrad):
     """Of three views, with Gaussians that are not drawn."""
     strategy = CappedStrategy(refine_scale2d_stop_iter=100, absgrad=absgrad)
     params = {"means": torch.zeros(50, 3)}
@@ -79,7 +77,7 @@ def test_statistics_are_those_of_gsplat(absgrad: bool) -> None:
         centers, radii = torch.zeros(1, 50, 2), torch.randint(0, 30, (1, 50))
         grads = torch.randn(1, 50, 2)
         if absgrad:
-            centers.absgrad = grads.abs()  # type: ignore[attr-defined]
+            centers.absgrad = grads.abs()
         else:
             centers.grad = grads
         shaped = radii[..., None].expand(-1, -1, 2) if is_gsplat_1_5() else radii
@@ -91,7 +89,7 @@ def test_statistics_are_those_of_gsplat(absgrad: bool) -> None:
         torch.testing.assert_close(ours[name], theirs[name])
 
 
-def test_statistics_of_radii_by_axis() -> None:
+def test_statistics_of_radii_by_axis():
     running = {"grad2d": torch.zeros(3), "count": torch.zeros(3), "radii": torch.zeros(3)}
     count_view(running, torch.ones(3, 2), torch.tensor([[4, 8], [0, 8], [2, 2]]), 80, 40)
     assert running["count"].tolist() == [1, 0, 1]

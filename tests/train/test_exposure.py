@@ -1,39 +1,31 @@
 """Exposure compensation: what differs from the neighbours is taken out, what the place explains is not."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 from photographed import ANGLES, COUNT, batch_of, begin, image_of, measure, ring, run_of, update
-from torch import Tensor
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train import exposure
 from sundae_ns.train.exposure import LEAST_PHOTOS, ExposureCompensation, places
-from sundae_ns.train.state import TrainingRun, TrainingState
 
-Build = Callable[..., SundaeModel]
-ON_CPU = cast(TrainingState, SimpleNamespace(device=torch.device("cpu")))
+ON_CPU = SimpleNamespace(device=torch.device("cpu"))
 
 
-def found(gains: ExposureCompensation) -> Tensor:
+def found(gains):
     """The gains that photos are divided by ``[COUNT, 3]``."""
     white = torch.ones(48, 64, 3)
     return torch.stack([(1 / gains.balanced(white, batch_of(index)))[0, 0] for index in range(COUNT)])
 
 
-def random_gains(spread: float, seed: int) -> Tensor:
+def random_gains(spread, seed):
     return torch.exp(spread * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(seed)))
 
 
-def test_photos_that_differ_from_their_neighbours_are_evened_out() -> None:
+def test_photos_that_differ_from_their_neighbours_are_evened_out():
     true, (gains, run) = random_gains(0.2, 0), begin()
     measure(gains, run, lambda index: image_of(index) * true[index])
     left = true.log() - found(gains).log()
@@ -41,14 +33,14 @@ def test_photos_that_differ_from_their_neighbours_are_evened_out() -> None:
     assert float(found(gains).log().mean(dim=0).abs().max()) < 1e-3, "the light of the whole field stays"
 
 
-def test_light_that_changes_with_the_place_stays_in_the_photos() -> None:
+def test_light_that_changes_with_the_place_stays_in_the_photos():
     true = torch.exp(0.2 * torch.sin(ANGLES))[:, None].expand(-1, 3)
     gains, run = begin()
     measure(gains, run, lambda index: image_of(index) * true[index])
     assert found(gains).log().abs().max() < 0.02
 
 
-def test_differences_no_larger_than_a_fields_own_errors_stay_in_the_photos() -> None:
+def test_differences_no_larger_than_a_fields_own_errors_stay_in_the_photos():
     """So a capture whose light does not change is trained as without gains, to the bit."""
     true = random_gains(0.8 * exposure.NOISE, 0)
     gains, run = begin()
@@ -56,19 +48,19 @@ def test_differences_no_larger_than_a_fields_own_errors_stay_in_the_photos() -> 
     assert torch.equal(found(gains), torch.ones(COUNT, 3))
 
 
-def test_gains_settle_whatever_they_were_at_first() -> None:
+def test_gains_settle_whatever_they_were_at_first():
     """They are measured against photos that were divided by them: an error must not feed itself."""
     true = random_gains(0.2, 1)
     ends = []
     for first in (1.0, 1.5):
         gains, run = begin()
-        measure(gains, run, lambda index, first=first: image_of(index) * first * true[index], rounds=1)  # type: ignore[misc]
+        measure(gains, run, lambda index, first=first: image_of(index) * first * true[index], rounds=1)
         measure(gains, run, lambda index: image_of(index) * true[index], rounds=30)
         ends.append(found(gains))
     torch.testing.assert_close(ends[0], ends[1], rtol=1e-3, atol=1e-3)
 
 
-def test_clipped_and_masked_pixels_do_not_count() -> None:
+def test_clipped_and_masked_pixels_do_not_count():
     gains, run = begin()
     one = batch_of(5)
     photo, mask = image_of(5) * 1.3, torch.ones(48, 64, 1)
@@ -84,7 +76,7 @@ def test_clipped_and_masked_pixels_do_not_count() -> None:
 
 
 @pytest.mark.parametrize("spoilt", [torch.zeros(48, 64, 3), torch.full((48, 64, 3), math.nan), torch.ones(48, 64, 3)])
-def test_a_photo_that_says_nothing_has_no_gain(spoilt: Tensor) -> None:
+def test_a_photo_that_says_nothing_has_no_gain(spoilt):
     gains, run = begin()
     measure(gains, run, lambda index: spoilt if index == 7 else image_of(index), rounds=3)
     state = gains.state_dict()
@@ -93,9 +85,7 @@ def test_a_photo_that_says_nothing_has_no_gain(spoilt: Tensor) -> None:
     torch.testing.assert_close(found(gains), torch.ones(COUNT, 3), rtol=1e-4, atol=1e-4)
 
 
-def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alone(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alone(capsys):
     photo, (gains, run) = image_of(0), begin()
     measure(gains, run, lambda index: image_of(index) * (1 + index % 2))
     assert gains.balanced(photo, batch_of(0)) is not photo
@@ -105,7 +95,7 @@ def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alo
     gains.observe(photo, photo, None, batch_of(0, channels=4))
     assert torch.equal(gains.state_dict()["sums"], before["sums"])
     for mode in ("on", "auto", "off"):
-        few = ExposureCompensation(LEAST_PHOTOS - 1, mode)  # type: ignore[arg-type]
+        few = ExposureCompensation(LEAST_PHOTOS - 1, mode)
         few.before_training(run_of(ring(LEAST_PHOTOS - 1)))
         few.observe(photo, few.balanced(photo * 2, batch_of(0)), None, batch_of(0))
         update(few, run)
@@ -115,13 +105,13 @@ def test_photos_with_an_alpha_channel_few_photos_and_the_option_off_are_left_alo
     assert " ".join(capsys.readouterr().out.split()).count("31 training photos are too few") == 1
 
 
-def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
+def test_a_resumed_training_goes_on_as_one_that_was_never_stopped():
     true = random_gains(0.2, 2)
 
-    def photos(index: int) -> Tensor:
+    def photos(index):
         return image_of(index) * true[index]
 
-    def half(gains: ExposureCompensation, run: TrainingRun) -> None:
+    def half(gains, run):
         measure(gains, run, photos, rounds=2)
         gains.observe(image_of(3), gains.balanced(photos(3), batch_of(3)), None, batch_of(3))
 
@@ -142,7 +132,7 @@ def test_a_resumed_training_goes_on_as_one_that_was_never_stopped() -> None:
         assert torch.equal(found(fresh), torch.ones(COUNT, 3))
 
 
-def test_ranks_add_up_what_each_has_measured() -> None:
+def test_ranks_add_up_what_each_has_measured():
     gains, run = begin()
     gains.total = lambda sums: sums * 1.0 + elsewhere
     elsewhere = torch.zeros(COUNT, 2, 3)
@@ -152,7 +142,7 @@ def test_ranks_add_up_what_each_has_measured() -> None:
     assert gains.state_dict()["measured"][8].abs().max() < 1e-6
 
 
-def test_cameras_at_one_place_are_apart_by_what_they_see() -> None:
+def test_cameras_at_one_place_are_apart_by_what_they_see():
     eye = torch.zeros(3)
     cameras = [Camera.look_at(eye, (math.cos(a), math.sin(a), 0.0)) for a in ANGLES]
     cameras += [Camera.look_at((4.0, 0.0, 0.0), (9.0, 0.0, 0.0))]
@@ -162,9 +152,7 @@ def test_cameras_at_one_place_are_apart_by_what_they_see() -> None:
     assert apart[0] > 0.01
 
 
-def test_training_compares_with_the_balanced_photo_and_evaluation_with_the_true_one(
-    build: Build, batch: Callable[..., dict[str, Any]], camera: Callable[..., Any]
-) -> None:
+def test_training_compares_with_the_balanced_photo_and_evaluation_with_the_true_one(build, batch, camera):
     model, photo = build(exposure_compensation="on"), {**batch(), "image_idx": 2}
     gains = model.exposure_compensation.state_dict()
     gains["gains"][2] = torch.tensor([0.5, 1.0, 2.0])
@@ -179,10 +167,10 @@ def test_training_compares_with_the_balanced_photo_and_evaluation_with_the_true_
     torch.testing.assert_close(model.target(photo, background), true)
 
 
-def test_auto_divides_photos_of_changing_light_from_the_decision_on() -> None:
+def test_auto_divides_photos_of_changing_light_from_the_decision_on():
     true = random_gains(0.15, 3)
 
-    def photos(index: int) -> Tensor:
+    def photos(index):
         return image_of(index) * true[index]
 
     gains, run = begin("auto")
@@ -203,7 +191,7 @@ def test_auto_divides_photos_of_changing_light_from_the_decision_on() -> None:
 
 
 @pytest.mark.parametrize("differences", ["even light", "three photos", "the place"])
-def test_auto_leaves_a_capture_of_even_light_alone_and_measures_no_more(differences: str) -> None:
+def test_auto_leaves_a_capture_of_even_light_alone_and_measures_no_more(differences):
     """So it is trained as without gains, to the bit. A few photos in other light are no change of exposure."""
     true = {
         "even light": random_gains(0.8 * exposure.NOISE, 0),
@@ -220,19 +208,19 @@ def test_auto_leaves_a_capture_of_even_light_alone_and_measures_no_more(differen
     assert all(torch.equal(gains.state_dict()[name], before[name]) for name in ("sums", "counts", "gains"))
 
 
-def test_a_decision_is_resumed_and_an_option_replaces_it() -> None:
+def test_a_decision_is_resumed_and_an_option_replaces_it():
     gains, run = begin("auto")
     measure(gains, run, lambda index: image_of(index) * (1 + index % 2))
     saved = gains.state_dict()
     for mode, divides in (("auto", True), ("on", True), ("off", False)):
-        other, _ = begin(mode)  # type: ignore[arg-type]
+        other, _ = begin(mode)
         other.load_state_dict(ON_CPU, saved)
         assert other.state_dict()["divides"] is divides
         photo = image_of(1)
         assert (other.balanced(photo, batch_of(1)) is not photo) is divides
 
 
-def test_the_end_says_what_was_taken_out(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_end_says_what_was_taken_out(capsys):
     gains, run = begin()
     gains.finish(run)
     assert "as bright as those beside them" in " ".join(capsys.readouterr().out.split())

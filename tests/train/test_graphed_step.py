@@ -1,48 +1,38 @@
 """Steps that a recording would replay, run kernel by kernel on the CPU, beside nerfstudio's."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
-from torch import Tensor
 
 from sundae_ns.core.surgery import change_parameter
-from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train import graphed_step as capture
 from sundae_ns.train.graphed_step import Buffers, RecordedStep, StepRecordings, start_moments, trained_parameters
-
-Build = Callable[..., SundaeModel]
-TrainingOf = Callable[..., Any]
 
 
 class Recorded:
     """Trains a model by whole steps on buffers."""
 
-    def __init__(self, training: Any, camera: Any, batch: dict[str, Tensor]) -> None:
+    def __init__(self, training, camera, batch):
         self.training, self.model = training, training.model
         self.camera, self.batch = camera, batch
         self.recorded = RecordedStep(self.model.losses, record=self.model.device.type == "cuda")
 
-    def step(self, step: int) -> dict[str, Tensor]:
+    def step(self, step):
         self.model.train()
         self.training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step)
         inputs = self.model.step_inputs(self.camera, self.batch)
         result = self.recorded(self.model.state, inputs, self.model.render_settings(training=True))
         self.training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step)
-        assert result is not None
         return result.losses
 
 
 @pytest.fixture
-def both(build: Build, training_of: TrainingOf, camera: Any, batch: Any) -> Callable[..., tuple[Any, Recorded]]:
+def both(build, training_of, camera, batch):
     """Make two trainings of equal models: by steps of nerfstudio's trainer, and by whole steps on buffers."""
 
-    def make(device: str = "cpu", **options: Any) -> tuple[Any, Recorded]:
+    def make(device="cpu", **options):
         models = []
         for _ in range(2):
             torch.manual_seed(0)
@@ -73,7 +63,7 @@ GROWTH = {
     ],
     ids=["densify", "absgrad", "no-head", "logits"],
 )
-def test_both_train_the_same_field(both: Callable[..., tuple[Any, Recorded]], options: dict[str, Any]) -> None:
+def test_both_train_the_same_field(both, options):
     """Through growth, resets of opacities, the prune and the head."""
     usual, recorded = both(**options)
     counts = []
@@ -117,12 +107,10 @@ def test_both_train_the_same_field(both: Callable[..., tuple[Any, Recorded]], op
     [(GROWTH, 12), ({**GROWTH, "use_absgrad": True}, 12), ({"sh_degree": 0}, 8)],
     ids=["densify", "absgrad", "logits"],
 )
-def test_replayed_steps_train_the_same_field(
-    both: Callable[..., tuple[Any, Recorded]], options: dict[str, Any], alike: int
-) -> None:
+def test_replayed_steps_train_the_same_field(both, options, alike):
     """Gradients are summed in any order, and Adam turns the signs of vanishing ones into steps: fields drift apart."""
     usual, recorded = both("cuda", **options)
-    late: dict[str, list[tuple[float, float]]] = {}
+    late = {}
     for step in range(40):
         torch.manual_seed(step)
         expected = usual.step(step)
@@ -141,9 +129,7 @@ def test_replayed_steps_train_the_same_field(
 
 
 @pytest.mark.gpu
-def test_a_step_without_room_for_its_pairs_changes_nothing(
-    both: Callable[..., tuple[Any, Recorded]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_without_room_for_its_pairs_changes_nothing(both, monkeypatch):
     monkeypatch.setattr(capture, "SPARE_PAIRS", 0.5)
     _, recorded = both("cuda", pruning={"mode": "off"})
     recorded.step(0)
@@ -161,20 +147,20 @@ def test_a_step_without_room_for_its_pairs_changes_nothing(
     assert not torch.equal(recorded.model.gauss_params["means"], before["means"])
 
 
-def test_more_image_sizes_than_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_image_sizes_than_recordings(monkeypatch):
     """The last sizes run kernel by kernel until a recording has not been used for long; recording would take longer."""
     recordings, made = StepRecordings(), []
 
-    def recorded(*arguments: Any) -> SimpleNamespace:
+    def recorded(*arguments):
         made.append(arguments[-1])
         return SimpleNamespace(pairs=arguments[-1])
 
     monkeypatch.setattr(recordings, "_recorded", recorded)
     recordings._most_on_host = torch.tensor(5)
 
-    def ask(kind: int) -> Any:
+    def ask(kind):
         recordings._steps += 1
-        return recordings._recording(None, None, None, kind, None)  # type: ignore[arg-type]
+        return recordings._recording(None, None, None, kind, None)
 
     sizes = capture.MAX_RECORDINGS
     for _ in range(3):
@@ -188,9 +174,7 @@ def test_more_image_sizes_than_recordings(monkeypatch: pytest.MonkeyPatch) -> No
     assert len(recordings._recordings) == sizes
 
 
-def test_the_field_lies_in_the_buffers_and_unseen_rows_stay_as_they_are(
-    both: Callable[..., tuple[Any, Recorded]],
-) -> None:
+def test_the_field_lies_in_the_buffers_and_unseen_rows_stay_as_they_are(both):
     _, recorded = both(**GROWTH)
     for step in range(7):
         recorded.step(step)
@@ -206,9 +190,7 @@ def test_the_field_lies_in_the_buffers_and_unseen_rows_stay_as_they_are(
     assert recorded.model.gauss_params["means"].abs().max() < 100
 
 
-def test_buffers_are_new_only_when_the_field_does_not_fit(
-    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_buffers_are_new_only_when_the_field_does_not_fit(build, training_of, monkeypatch):
     training = training_of(build(n=60))
     monkeypatch.setattr(capture, "SPARE", 1.25)
     state = training.model.state

@@ -1,50 +1,36 @@
 """What a training starts from: sparse points, random ones, a finished scene, or a plane sweep."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable
 from copy import deepcopy
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 from foreign_files import FOREIGN, small_field
-from nerfstudio.cameras.cameras import Cameras
-from torch import Tensor
 
 from sundae_ns.core.errors import CheckpointError
 from sundae_ns.core.gaussians import sh_to_rgb
 from sundae_ns.io.coordinates import similarity
 from sundae_ns.io.ply import write_ply
 from sundae_ns.plugin.datamanager import DATASET_FRAME
-from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train import initialize
 from sundae_ns.train.initialize import FEWEST_POINTS
 
-Build = Callable[..., SundaeModel]
-Points = Callable[[], tuple[Tensor, Tensor]]
-MakeCamera = Callable[..., Cameras]
-TrainingOf = Callable[[SundaeModel], Any]
 Capsys = pytest.CaptureFixture[str]
 N = 60  # Gaussians of a model that is built without a count
 
 
-def said(capsys: Capsys) -> str:
+def said(capsys):
     return " ".join(capsys.readouterr().out.split())
 
 
-def colors_of(model: SundaeModel, camera: Cameras) -> Tensor:
+def colors_of(model, camera):
     """Colours of the Gaussians as the camera sees them ``[N, 3]``."""
     settings = model.render_settings(training=False)
     return model.source.primitives(model.camera_of(camera), settings, features=False)["colors"].detach()
 
 
 @pytest.mark.parametrize("seed_points", [None, (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))])
-def test_without_a_sparse_cloud_points_are_random(
-    build: Build, training_of: TrainingOf, seed_points: Any, capsys: Capsys
-) -> None:
+def test_without_a_sparse_cloud_points_are_random(build, training_of, seed_points, capsys):
     model = build(seed_points=seed_points, num_random=40, random_scale=2.0)
     assert model.num_points == 40
     assert model.means.abs().max() <= 1
@@ -53,36 +39,32 @@ def test_without_a_sparse_cloud_points_are_random(
 
 
 @pytest.mark.parametrize(("n", "warned"), [(FEWEST_POINTS - 1, True), (FEWEST_POINTS, False)])
-def test_who_has_hardly_any_points_hears_that_photos_do_not_overlap(
-    build: Build, training_of: TrainingOf, n: int, warned: bool, capsys: Capsys
-) -> None:
+def test_who_has_hardly_any_points_hears_that_photos_do_not_overlap(build, training_of, n, warned, capsys):
     model = build(seed_points=(torch.rand(n, 3), torch.full((n, 3), 99, dtype=torch.uint8)))
     training_of(model)
     assert (f"only {n} sparse points" in said(capsys)) == warned
 
 
-def test_a_cloud_above_the_cap_is_cut_before_the_first_step(
-    build: Build, training_of: TrainingOf, capsys: Capsys
-) -> None:
+def test_a_cloud_above_the_cap_is_cut_before_the_first_step(build, training_of, capsys):
     model = build(pruning={"mode": "continuous", "max_gaussians": 25})
     assert model.num_points == 25
     training_of(model)
     assert "starting from 25 of them" in said(capsys)
 
 
-def _ply(build: Build, path: Path, degree: int = 1, **options: Any) -> dict[str, Tensor]:
+def _ply(build, path, degree=1, **options):
     params = {name: value.detach() for name, value in build(sh_degree=degree).gauss_params.items()}
     params["features_rest"] = torch.randn_like(params["features_rest"])
     write_ply(path, params, **options)
     return params
 
 
-def _frame() -> tuple[Tensor, float]:
+def _frame():
     turn = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     return torch.cat([turn, torch.tensor([[0.1], [0.2], [0.3]])], dim=1), 0.5
 
 
-def test_a_ply_of_the_capture_is_moved_into_the_model(build: Build, tmp_path: Path) -> None:
+def test_a_ply_of_the_capture_is_moved_into_the_model(build, tmp_path):
     params = _ply(build, tmp_path / "a.ply")
     model = build(warm_start=tmp_path / "a.ply", metadata={DATASET_FRAME: _frame()})
     expected = similarity(params, *_frame())
@@ -93,7 +75,7 @@ def test_a_ply_of_the_capture_is_moved_into_the_model(build: Build, tmp_path: Pa
     torch.testing.assert_close(as_is.means.detach(), params["means"])
 
 
-def test_a_ply_of_the_capture_needs_to_know_the_way(build: Build, training_of: TrainingOf, tmp_path: Path) -> None:
+def test_a_ply_of_the_capture_needs_to_know_the_way(build, training_of, tmp_path):
     _ply(build, tmp_path / "a.ply")
     with pytest.raises(CheckpointError, match="warm-start-frame model") as caught:
         training_of(build(warm_start=tmp_path / "a.ply"))
@@ -101,9 +83,7 @@ def test_a_ply_of_the_capture_needs_to_know_the_way(build: Build, training_of: T
 
 
 @pytest.mark.parametrize("name", [name for name in FOREIGN if name not in ("colors.ply", "a.ksplat")])
-def test_files_of_other_programs_start_a_model(
-    build: Build, training_of: TrainingOf, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_files_of_other_programs_start_a_model(build, training_of, tmp_path, name, caplog):
     """gsplat's trainer normalises a capture in a way of its own, which its file does not state."""
     given = small_field(50)
     given["scales"][3, 0] = -torch.inf  # a flat Gaussian
@@ -124,9 +104,7 @@ def test_files_of_other_programs_start_a_model(
     assert len(sanitised) == (name != "a.compressed.ply")
 
 
-def test_a_finished_run_opens_without_what_it_started_from(
-    build: Build, training_of: TrainingOf, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_finished_run_opens_without_what_it_started_from(build, training_of, tmp_path, capsys):
     """Training without the warm start is refused in one line; loading the run's checkpoint needs it no more."""
     _ply(build, tmp_path / "a.ply")
     state = build(warm_start=tmp_path / "a.ply", warm_start_frame="model").state_dict()
@@ -145,9 +123,7 @@ def test_a_finished_run_opens_without_what_it_started_from(
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-def test_colours_are_those_of_the_cloud_and_of_the_warm_start(
-    build: Build, points: Points, camera: MakeCamera, tmp_path: Path, degree: int
-) -> None:
+def test_colours_are_those_of_the_cloud_and_of_the_warm_start(build, points, camera, tmp_path, degree):
     xyz, rgb = points()
     model = build(sh_degree=degree, seed_points=(xyz, rgb))
     shown = colors_of(model, camera())
@@ -161,7 +137,7 @@ def test_colours_are_those_of_the_cloud_and_of_the_warm_start(
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_a_warm_start_of_another_sh_degree(build: Build, tmp_path: Path, degree: int) -> None:
+def test_a_warm_start_of_another_sh_degree(build, tmp_path, degree):
     params = _ply(build, tmp_path / "a.ply", degree=degree)
     model = build(warm_start=tmp_path / "a.ply", warm_start_frame="model", sh_degree=1)
     rest = model.gauss_params["features_rest"].detach()
@@ -171,7 +147,7 @@ def test_a_warm_start_of_another_sh_degree(build: Build, tmp_path: Path, degree:
     assert not rest[:, shared:].any()
 
 
-def test_a_warm_start_prunes_at_its_first_step(build: Build, training_of: TrainingOf, tmp_path: Path) -> None:
+def test_a_warm_start_prunes_at_its_first_step(build, training_of, tmp_path):
     _ply(build, tmp_path / "a.ply")
     training = training_of(build(warm_start=tmp_path / "a.ply", warm_start_frame="model", pruning={"prune_at": 15000}))
     training.step(0)
@@ -188,16 +164,15 @@ class FakeSweep:
     """Finds points at a known place, of a known colour."""
 
     longest, wanted, most = 0, 0, FOUND
-    seen: Tensor
 
-    def __init__(self, photos: Iterable[Any], sparse: Tensor, longest: int) -> None:
+    def __init__(self, photos, sparse, longest):
         self.photos, self.swept = list(photos), set[int]()
         FakeSweep.longest, FakeSweep.seen = longest, sparse
 
-    def add(self, index: int) -> None:
+    def add(self, index):
         self.swept.add(index)
 
-    def points(self, wanted: int) -> tuple[Tensor, Tensor]:
+    def points(self, wanted):
         assert self.swept == {0, 1, 2}
         FakeSweep.wanted = wanted
         place = torch.arange(3.0 * self.most).reshape(-1, 3) / self.most + 5
@@ -205,18 +180,16 @@ class FakeSweep:
 
 
 @pytest.fixture(autouse=True)
-def fake(monkeypatch: pytest.MonkeyPatch) -> None:
+def fake(monkeypatch):
     monkeypatch.setattr(initialize, "Sweep", FakeSweep)
     monkeypatch.setattr(FakeSweep, "most", FOUND)
 
 
-def few(build: Build, **options: Any) -> SundaeModel:
+def few(build, **options):
     return build(**{"dense_start_views": 24, **options})
 
 
-def test_the_field_starts_from_both_clouds(
-    build: Build, training_of: TrainingOf, points: Callable[..., Any], capsys: Capsys
-) -> None:
+def test_the_field_starts_from_both_clouds(build, training_of, points, capsys):
     model = few(build, sh_degree=1)
     alone = model.scales.detach().clone()
     training = training_of(model)
@@ -244,14 +217,14 @@ def test_the_field_starts_from_both_clouds(
         {"seed_points": None, "num_random": 60},
     ],
 )
-def test_other_fields_stay_as_they_are(build: Build, training_of: TrainingOf, options: dict[str, Any]) -> None:
+def test_other_fields_stay_as_they_are(build, training_of, options):
     model = few(build, **options)
     before = model.means.detach().clone()
     training_of(model)
     assert torch.equal(before, model.means)
 
 
-def test_a_resumed_run_goes_on_with_its_own_field(build: Build, training_of: TrainingOf) -> None:
+def test_a_resumed_run_goes_on_with_its_own_field(build, training_of):
     training = training_of(few(build))
     training.step(0)
     saved = deepcopy(training.model.state_dict())
@@ -262,9 +235,7 @@ def test_a_resumed_run_goes_on_with_its_own_field(build: Build, training_of: Tra
     assert torch.equal(model.means.detach(), saved["gauss_params.means"])
 
 
-def test_more_points_than_wanted_are_thinned_evenly(
-    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_points_than_wanted_are_thinned_evenly(build, training_of, monkeypatch):
     monkeypatch.setattr(FakeSweep, "most", 900)
     monkeypatch.setitem(initialize.FILLED, "cpu", 60 + 90)
     model = few(build)
@@ -276,9 +247,7 @@ def test_more_points_than_wanted_are_thinned_evenly(
 
 
 @pytest.mark.parametrize(("filled", "most", "swept"), [(60, 3, False), (61, 2, False), (100, 3, True)])
-def test_a_cpu_sweeps_few_views_of_a_sparse_cloud(
-    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch, filled: int, most: int, swept: bool
-) -> None:
+def test_a_cpu_sweeps_few_views_of_a_sparse_cloud(build, training_of, monkeypatch, filled, most, swept):
     monkeypatch.setattr(initialize, "MOST_ON_CPU", most)
     monkeypatch.setitem(initialize.FILLED, "cpu", filled)
     model = few(build)
@@ -286,9 +255,7 @@ def test_a_cpu_sweeps_few_views_of_a_sparse_cloud(
     assert model.num_points == 60 + swept * FOUND
 
 
-def test_photos_are_the_training_images_with_their_views_and_masks(
-    build: Build, training_of: TrainingOf, batch: Callable[..., dict[str, Tensor]], camera: Callable[..., Any]
-) -> None:
+def test_photos_are_the_training_images_with_their_views_and_masks(build, training_of, batch, camera):
     """Transparent pixels are masked too."""
     run = training_of(build()).callbacks[0].func.__self__
     photos = list(run.photos())

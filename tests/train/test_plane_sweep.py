@@ -1,12 +1,7 @@
 """The plane sweep on images of a painted wall, the plane y = 0."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import pytest
 import torch
-from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.train import plane_sweep
@@ -16,7 +11,7 @@ from sundae_ns.train.state import Photo
 SIDE, FOCAL = 72, 77.0
 
 
-def paint(points: Tensor) -> Tensor:
+def paint(points):
     """Colours ``[N, 3]`` of points of the wall: sums of waves of many lengths."""
     generator = torch.Generator().manual_seed(0)
     waves = torch.randn(2, 40, generator=generator) * torch.logspace(0, 1, 40)
@@ -25,7 +20,7 @@ def paint(points: Tensor) -> Tensor:
     return (0.5 + 1.6 * values).clamp(0, 1)
 
 
-def photo(eye: tuple[float, float, float]) -> Photo:
+def photo(eye):
     camera = Camera.look_at(torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), width=SIDE, height=SIDE)
     camera = camera._replace(K=torch.tensor([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1.0]]))
     y, x = torch.meshgrid(torch.arange(SIDE) + 0.5, torch.arange(SIDE) + 0.5, indexing="ij")
@@ -36,32 +31,32 @@ def photo(eye: tuple[float, float, float]) -> Photo:
 
 
 @pytest.fixture(scope="module")
-def capture() -> tuple[list[Photo], Tensor]:
+def capture():
     """Three neighbouring photos of the wall, from the side and from above, and sparse points."""
     photos = [photo(eye) for eye in ((-1.2, -3.4, 0.8), (-0.3, -3.6, 1.3), (0.6, -3.3, 0.4))]
     across = 2 * torch.rand(200, 2, generator=torch.Generator().manual_seed(1)) - 1
     return photos, torch.stack([across[:, 0], torch.zeros(200), across[:, 1]], dim=1)
 
 
-def points_of(photos: list[Photo], sparse: Tensor, longest: int = SIDE, wanted: int = SIDE**2) -> tuple[Tensor, Tensor]:
+def points_of(photos, sparse, longest=SIDE, wanted=SIDE**2):
     sweep = Sweep(photos, sparse, longest)
     for index in range(len(photos)):
         sweep.add(index)
     return sweep.points(wanted)
 
 
-def gaps(photos: list[Photo], points: Tensor) -> Tensor:
+def gaps(photos, points):
     """Distance of points to the wall along the rays from the three cameras, over their distance ``[N]``."""
     eyes = torch.stack([photo.camera.center for photo in photos])
     return (points[:, 1] / (points[None, :, 1] - eyes[:, None, 1])).abs().amin(dim=0)
 
 
 @pytest.fixture(scope="module")
-def swept(capture: tuple[list[Photo], Tensor]) -> tuple[Tensor, Tensor]:
+def swept(capture):
     return points_of(*capture)
 
 
-def test_points_lie_on_the_surfaces(capture: tuple[list[Photo], Tensor], swept: tuple[Tensor, Tensor]) -> None:
+def test_points_lie_on_the_surfaces(capture, swept):
     """Measured: 5,700 points (37% of the pixels), 1.0% off in the median; three quarters are within 2.2%."""
     points, colours = swept
     assert len(points) == len(colours) > 4000
@@ -70,7 +65,7 @@ def test_points_lie_on_the_surfaces(capture: tuple[list[Photo], Tensor], swept: 
     assert float(errors.quantile(0.75)) < 0.04
 
 
-def test_colours_are_those_of_the_images(capture: tuple[list[Photo], Tensor], swept: tuple[Tensor, Tensor]) -> None:
+def test_colours_are_those_of_the_images(capture, swept):
     """Measured: in one of the photos the point is that colour, 0.011 off in the median (channels swapped: 0.05)."""
     points, colours = swept
     errors = torch.full((len(points),), torch.inf)
@@ -82,9 +77,7 @@ def test_colours_are_those_of_the_images(capture: tuple[list[Photo], Tensor], sw
     assert float(errors.median()) < 0.025
 
 
-def test_of_more_points_than_wanted_an_even_part_is_found(
-    capture: tuple[list[Photo], Tensor], swept: tuple[Tensor, Tensor]
-) -> None:
+def test_of_more_points_than_wanted_an_even_part_is_found(capture, swept):
     points, colours = points_of(*capture, wanted=100)
     assert 100 < len(points) == len(colours) < 100 * plane_sweep._LOOKED_AT
     found, whole = torch.cat([points, colours], dim=1), torch.cat(swept, dim=1)
@@ -94,7 +87,7 @@ def test_of_more_points_than_wanted_an_even_part_is_found(
     assert torch.allclose(points.mean(dim=0), swept[0].mean(dim=0), atol=0.05 * float(swept[0].std()))
 
 
-def test_masked_pixels_give_no_points(capture: tuple[list[Photo], Tensor]) -> None:
+def test_masked_pixels_give_no_points(capture):
     photos, sparse = capture
     left = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     left[:, : SIDE // 2] = True
@@ -104,13 +97,13 @@ def test_masked_pixels_give_no_points(capture: tuple[list[Photo], Tensor]) -> No
     assert not (depth[:, SIDE // 2 :] > 0).any()
 
 
-def shown(photos: list[Photo], targets: list[Tensor]) -> list[Photo]:
+def shown(photos, targets):
     return [photo._replace(target=target) for photo, target in zip(photos, targets, strict=True)]
 
 
 FLAT = torch.full((SIDE, SIDE, 3), 0.4)
 NOISE = torch.rand(3, SIDE, SIDE, 3, generator=torch.Generator().manual_seed(0))  # its own in each image
-SILENT: dict[str, Callable[[list[Photo], Tensor], tuple[list[Photo], Tensor]]] = {
+SILENT = {
     "flat": lambda photos, sparse: (shown(photos, [FLAT] * 3), sparse),
     "one photo": lambda photos, sparse: (photos[:1], sparse),
     "none": lambda photos, sparse: ([], sparse),
@@ -121,14 +114,14 @@ SILENT: dict[str, Callable[[list[Photo], Tensor], tuple[list[Photo], Tensor]]] =
 
 
 @pytest.mark.parametrize("name", SILENT)
-def test_what_says_nothing_gives_no_points(capture: tuple[list[Photo], Tensor], name: str) -> None:
+def test_what_says_nothing_gives_no_points(capture, name):
     points, colours = points_of(*SILENT[name](*capture))
     assert points.shape == colours.shape
     assert len(points) <= 0.03 * 3 * SIDE * SIDE
     assert torch.isfinite(points).all()
 
 
-def test_sums_of_patches_are_those_of_pooling() -> None:
+def test_sums_of_patches_are_those_of_pooling():
     image = torch.rand(2, 1, 11, 9)
     crop = plane_sweep.WINDOW
     pooled = torch.nn.functional.avg_pool2d(image, crop, stride=1, padding=crop // 2) * crop**2

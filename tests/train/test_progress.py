@@ -1,7 +1,5 @@
 """Lines of progress, signals, the command that resumes, and which run a command opens."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal
@@ -9,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from nerfstudio.utils import writer
@@ -20,10 +17,10 @@ from sundae_ns.plugin.optimizer_configs import METRICS_EVENT, ProgressWriter
 from sundae_ns.train.progress import Interruption, TimeLeft, duration, loaded_run, long_on_cpu, resume_command
 
 
-def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+def test_a_line_says_what_is_done_and_left(monkeypatch, capsys):
     monkeypatch.setattr(writer, "GLOBAL_BUFFER", {})
     monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": 400})
-    events: list[dict[str, Any]] = [
+    events = [
         # A resumed run writes its configuration first.
         {"name": "config", "event": {}, "step": 0},
         {"name": "Train Iter (time)", "event": 0.25, "step": 159},
@@ -45,10 +42,10 @@ def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, caps
     assert percent_of(line) == 50, "sundae demo reads it"
 
 
-def test_the_time_left_does_not_jump() -> None:
+def test_the_time_left_does_not_jump():
     """Intervals of ten seconds in which a step takes 16 or 124 ms, which would be 8 and 62 minutes of 30,000 steps."""
     watch, total, done, now = TimeLeft(), 30000, 0, 0.0
-    found: list[tuple[float, float]] = []
+    found = []
     while done < total:
         steps = round(10 / (0.016 if len(found) % 2 else 0.124))
         done, now = min(done + steps, total), now + 10
@@ -59,7 +56,7 @@ def test_the_time_left_does_not_jump() -> None:
     assert 0.6 < found[half][0] / (now - found[half][1]) < 1.5, "and it is right"
 
 
-def test_a_lasting_change_is_followed() -> None:
+def test_a_lasting_change_is_followed():
     watch, now = TimeLeft(), 0.0
     for done in range(0, 3001, 10):
         now += 10 * (0.1 if done < 500 else 1.0)
@@ -67,10 +64,10 @@ def test_a_lasting_change_is_followed() -> None:
     assert watch.step_s == pytest.approx(1.0, rel=0.05)
 
 
-def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch, capsys):
     monkeypatch.setattr(nerfstudio_configs, "LINE_EVERY", 0.0)
     monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": 4})
-    events: list[dict[str, Any]] = [{"name": "Train Iter (time)", "event": 2.0, "step": 0}]
+    events = [{"name": "Train Iter (time)", "event": 2.0, "step": 0}]
     monkeypatch.setattr(nerfstudio_configs, "EVENT_STORAGE", events)
     made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10))
     made.write_stats_log(0)
@@ -89,22 +86,21 @@ def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     ("seconds", "text"), [(0.4, "0 s"), (59.6, "1 min 0 s"), (185, "3 min 5 s"), (7261, "2 h 1 min")]
 )
-def test_durations(seconds: float, text: str) -> None:
+def test_durations(seconds, text):
     assert duration(seconds) == text
 
 
-def test_a_training_of_hours_on_a_cpu_is_foretold() -> None:
+def test_a_training_of_hours_on_a_cpu_is_foretold():
     assert long_on_cpu(0.05, 30000) is None
     text = long_on_cpu(1.7, 30000)
-    assert text is not None
     for part in ("at least 14 h 10 min", "1700 ms", "sundae-tiny", "--downscale-factor"):
         assert part in text
 
 
-def test_the_first_signal_is_noted_and_the_handlers_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_signal_is_noted_and_the_handlers_come_back(monkeypatch):
     """Also if who read the output was killed."""
 
-    def broken(*_: Any) -> None:
+    def broken(*_):
         raise BrokenPipeError
 
     monkeypatch.setattr(os, "write", broken)
@@ -128,7 +124,7 @@ with Interruption(lambda: None):
 """
 
 
-def test_a_second_one_leaves_at_once() -> None:
+def test_a_second_one_leaves_at_once():
     result = subprocess.run([sys.executable, "-c", TWICE], capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout) == (130, "saving\n")
     assert "Left without saving" in result.stderr
@@ -143,7 +139,7 @@ def test_a_second_one_leaves_at_once() -> None:
         ("", "sundae --data data --load-dir 'a run'"),  # by another program
     ],
 )
-def test_the_command_that_resumes(started: str, expected: str) -> None:
+def test_the_command_that_resumes(started, expected):
     program = ["/usr/bin/ns-train", *started.split()] if started else ["pytest", "--load-dir", "x"]
     assert resume_command(program, Path("a run"), "sundae", "data") == f"ns-train {expected}"
 
@@ -162,7 +158,7 @@ def test_the_command_that_resumes(started: str, expected: str) -> None:
         ("", False),
     ],
 )
-def test_the_folder_of_the_run_that_a_command_opens(tmp_path: Path, command: str, opens: bool) -> None:
+def test_the_folder_of_the_run_that_a_command_opens(tmp_path, command, opens):
     words = command.format(tmp_path / "config.yml").split()
     assert loaded_run(words) is None, "there is no such file"
     (tmp_path / "config.yml").touch()

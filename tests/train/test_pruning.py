@@ -1,11 +1,7 @@
 """Pruning in training: options, steps around a prune, reports, warnings, and floaters."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import prunes
 import pytest
@@ -13,25 +9,21 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import Adam, Optimizer
+from torch.optim import Adam
 
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.pruning.decision import Pruner
 from sundae_ns.train.initialize import Start
 from sundae_ns.train.pruning import COUNT, UNPRUNED, PruningConfig, prune_when_due, summary
 from sundae_ns.train.schedules import Decay
 
-Gaussians = tuple[dict[str, Parameter], dict[str, Optimizer]]
-Report = dict[str, Any]
 
-
-def gaussians(n: int = 100, seed: int = 0) -> Gaussians:
+def gaussians(n=100, seed=0):
     params = {name: Parameter(value) for name, value in prunes.gaussians(n, seed=seed).items()}
     return params, {name: Adam([value], lr=0.01) for name, value in params.items()}
 
 
-def train_step(params: dict[str, Parameter], optimizers: dict[str, Optimizer]) -> float:
+def train_step(params, optimizers):
     for optimizer in optimizers.values():
         optimizer.zero_grad()
     loss = torch.stack([value.square().mean() for value in params.values()]).sum()
@@ -41,11 +33,11 @@ def train_step(params: dict[str, Parameter], optimizers: dict[str, Optimizer]) -
     return loss.item()
 
 
-def run(config: PruningConfig, made: Gaussians, steps: range, state: Report | None = None) -> tuple[list[Report], Any]:
+def run(config, made, steps, state=None):
     """The reports of the prunes in some steps of training, and the running state."""
     state, reports = dict(UNPRUNED) if state is None else state, []
 
-    def contribute(count: int | None) -> Tensor:
+    def contribute(count):
         return made[0]["opacities"].sigmoid().squeeze(1)
 
     for step in steps:
@@ -54,7 +46,7 @@ def run(config: PruningConfig, made: Gaussians, steps: range, state: Report | No
     return [report for report in reports if report is not None], state
 
 
-def test_one_shot_prunes_once_and_training_goes_on() -> None:
+def test_one_shot_prunes_once_and_training_goes_on():
     made, losses = gaussians(), []
     config, state = PruningConfig(prune_at=3, keep_ratio=0.25), dict(UNPRUNED)
     for step in range(8):
@@ -71,8 +63,8 @@ def test_one_shot_prunes_once_and_training_goes_on() -> None:
 
 
 @pytest.mark.parametrize(("cap", "kept"), [(None, [70, 49, 34]), (70, [70, 49, 34]), (60, [60, 42, 29])])
-def test_continuous_keeps_a_share_on_schedule(cap: int | None, kept: list[int]) -> None:
-    options: dict[str, Any] = {"start": 2, "every": 3, "stop": 9, "keep_ratio": 0.7, "num_neighbors": 4}
+def test_continuous_keeps_a_share_on_schedule(cap, kept):
+    options = {"start": 2, "every": 3, "stop": 9, "keep_ratio": 0.7, "num_neighbors": 4}
     reports, state = run(PruningConfig(mode="continuous", max_gaussians=cap, **options), gaussians(), range(13))
     assert [report["step"] for report in reports] == [2, 5, 8]
     assert [report["after"] for report in reports] == kept
@@ -81,8 +73,8 @@ def test_continuous_keeps_a_share_on_schedule(cap: int | None, kept: list[int]) 
     assert reports[0]["sigma"] != reports[1]["sigma"]
 
 
-def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
-    options: dict[str, Any] = {"start": 0, "every": 2, "stop": 100, "max_gaussians": 110, "keep_ratio": 1.0}
+def test_continuous_caps_a_growing_field_and_counts_the_peak():
+    options = {"start": 0, "every": 2, "stop": 100, "max_gaussians": 110, "keep_ratio": 1.0}
     config, state = PruningConfig(mode="continuous", num_neighbors=4, **options), dict(UNPRUNED)
     counts, peaks, (params, optimizers) = [], [], gaussians(100)
     for step in range(6):
@@ -97,8 +89,8 @@ def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
 
 
 @pytest.mark.parametrize("last", [60, 90])
-def test_continuous_ends_at_exactly_the_target(last: int) -> None:
-    options: dict[str, Any] = {"start": 0, "every": 2, "stop": 3, "target_gaussians": 80, "max_gaussians": 120}
+def test_continuous_ends_at_exactly_the_target(last):
+    options = {"start": 0, "every": 2, "stop": 3, "target_gaussians": 80, "max_gaussians": 120}
     config = PruningConfig(mode="continuous", num_neighbors=4, **options)
     reports, state = run(config, gaussians(), range(2))
     assert [report["after"] for report in reports] == [80]
@@ -112,7 +104,7 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
     assert state["peak"] == 100
 
 
-def test_continuous_draws_anew_each_time() -> None:
+def test_continuous_draws_anew_each_time():
     config, kept = PruningConfig(mode="continuous", start=0, every=1, keep_ratio=0.5, redistribution="none"), []
     for step in (3, 3, 4):
         made = gaussians()
@@ -122,25 +114,24 @@ def test_continuous_draws_anew_each_time() -> None:
     assert not torch.equal(kept[0], kept[2])
 
 
-def test_broken_gaussians_are_dropped_before_the_contribution_and_counted() -> None:
+def test_broken_gaussians_are_dropped_before_the_contribution_and_counted():
     params, optimizers = gaussians()
     params["means"].data[5], params["means"].data[9] = torch.nan, torch.inf
     params["opacities"].data[[5, 11]] = torch.inf  # an opacity of 1 has a meaning
-    asked: list[tuple[int | None, int]] = []
+    asked = []
 
-    def contribute(count: int | None) -> Tensor:
+    def contribute(count):
         asked.append((count, len(params["means"])))
         return torch.ones(len(params["means"]))
 
     config = PruningConfig(prune_at=0, keep_ratio=0.5)
     report = prune_when_due(config, Pruner(params, optimizers), dict(UNPRUNED), 0, contribute)
-    assert report is not None
     assert asked == [(49, 98)]
     assert (report["before"], report["dropped_nonfinite"], report["after"]) == (100, 2, 49)
     assert all(value.isfinite().all() for value in params.values())
 
 
-def test_off_never_prunes_but_counts() -> None:
+def test_off_never_prunes_but_counts():
     reports, state = run(PruningConfig(mode="off", prune_at=0, start=0, every=1), gaussians(), range(4))
     assert reports == []
     assert state == {"pruned_at": -1, "num_prunes": 0, "peak": 100}
@@ -155,9 +146,7 @@ def test_off_never_prunes_but_counts() -> None:
         (10, 10, torch.nan, False, "none of 10 Gaussians is finite: the training has diverged"),
     ],
 )
-def test_a_failed_prune_names_the_cause_and_changes_nothing(
-    n: int, seen: int, opacity: float, foreign: bool, words: str
-) -> None:
+def test_a_failed_prune_names_the_cause_and_changes_nothing(n, seen, opacity, foreign, words):
     (params, optimizers), state = gaussians(n), dict(UNPRUNED)
     params["opacities"].data[:] = opacity
     if foreign:
@@ -168,7 +157,7 @@ def test_a_failed_prune_names_the_cause_and_changes_nothing(
     assert state["pruned_at"] == -1
 
 
-def test_a_report_says_in_one_line_what_happened_and_leaves_out_what_did_not() -> None:
+def test_a_report_says_in_one_line_what_happened_and_leaves_out_what_did_not():
     (report,), _ = run(PruningConfig(prune_at=0), gaussians(), range(1))
     assert all(type(value) in (int, float) for value in report.values())
     assert summary(report).startswith("step 0: kept 10 of 100 Gaussians in ")
@@ -181,7 +170,7 @@ def test_a_report_says_in_one_line_what_happened_and_leaves_out_what_did_not() -
     assert summary(odd).split("; ")[2:] == ["1,200 were NaN or infinite", "sigma 0.0316, tau 0.009, 1,500 isolated"]
 
 
-def test_continuous_prunes_a_step_once_and_above_the_cap_also_afterwards() -> None:
+def test_continuous_prunes_a_step_once_and_above_the_cap_also_afterwards():
     config = PruningConfig(mode="continuous", start=0, stop=10, every=20, max_gaussians=100)
     assert [config.due(UNPRUNED, step, 101) for step in (9, 10, 30)] == [False, True, True]
     assert not config.due(UNPRUNED, 30, 100)
@@ -191,7 +180,7 @@ def test_continuous_prunes_a_step_once_and_above_the_cap_also_afterwards() -> No
 
 UNTRIED = "is set, and trials do not decide .*: set keep_ratio to None"
 CONTINUOUS = {"mode": "continuous"}
-IMPOSSIBLE: list[tuple[dict[str, Any], str]] = [
+IMPOSSIBLE = [
     *(({"keep_ratio": share}, "keep_ratio") for share in (0.0, 1.01, float("nan"))),
     *(({"gamma": share}, "gamma") for share in (-0.1, 1.1)),
     *(({name: "best"}, name) for name in ("mode", "selection", "score", "signal")),
@@ -209,7 +198,7 @@ IMPOSSIBLE: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("options", "words"), IMPOSSIBLE)
-def test_impossible_options_are_refused_in_one_line(options: dict[str, Any], words: str) -> None:
+def test_impossible_options_are_refused_in_one_line(options, words):
     with pytest.raises(ConfigError, match=words) as caught:
         PruningConfig(**options).validate()
     assert "\n" not in str(caught.value)
@@ -226,12 +215,12 @@ def test_impossible_options_are_refused_in_one_line(options: dict[str, Any], wor
         ({**CONTINUOUS, "max_gaussians": 30, "keep_ratio": 0.6}, 30, 6),
     ],
 )
-def test_the_options_decide_how_many_stay(options: dict[str, Any], of_60: int, of_10: int) -> None:
+def test_the_options_decide_how_many_stay(options, of_60, of_10):
     config = PruningConfig(**options)
     assert (config.target(60, {}), config.target(10, {})) == (of_60, of_10)
 
 
-def test_trials_decide_how_many_stay_and_the_prune_waits_for_them() -> None:
+def test_trials_decide_how_many_stay_and_the_prune_waits_for_them():
     config = PruningConfig(keep_ratio=None, prune_at=3, max_gaussians=40)
     assert not config.due(UNPRUNED, 3, 60)
     for chosen, kept in ((7, 7), (50, 40), (0, 6)):  # 0 for the usual share
@@ -255,26 +244,22 @@ SPAN = {"mode": "continuous", "start": 4, "stop": 21, "every": 5}
         ({**SPAN, "max_gaussians": 9}, 21, 21),
     ],
 )
-def test_steps_of_the_prunes(options: dict[str, Any], last: int, settled: int) -> None:
+def test_steps_of_the_prunes(options, last, settled):
     config = PruningConfig(**options)
     assert (config.last_due, config.settled_at) == (last, settled)
 
 
-Build = Callable[..., SundaeModel]
-TrainingOf = Callable[..., Any]
 N = 60  # Gaussians of a model that is built without a count
 
 
-def trainer_of(folder: Path | None = None) -> SimpleNamespace:
+def trainer_of(folder=None):
     """What a run of three steps asks of its trainer."""
     config = SimpleNamespace(schedule_length=None, load_dir=None, load_checkpoint=None)
     return SimpleNamespace(last_step=2, base_dir=folder, config=config)
 
 
 @pytest.mark.parametrize("score", ["detail-contribution", "response"])
-def test_prune_keeps_the_count_and_training_goes_on(
-    build: Build, training_of: TrainingOf, score: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_prune_keeps_the_count_and_training_goes_on(build, training_of, score, capsys):
     training = training_of(build(pruning={"score": score}, background_color="black"))
     losses = [training.step(step) for step in range(3)]
     assert training.model.num_points == N
@@ -292,9 +277,7 @@ def test_prune_keeps_the_count_and_training_goes_on(
     assert "base_loss" not in losses[0]
 
 
-def test_gaussians_that_are_not_finite_are_dropped_and_counted(
-    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_gaussians_that_are_not_finite_are_dropped_and_counted(build, training_of, capsys):
     training = training_of(build())
     training.step(0)
     with torch.no_grad():
@@ -309,7 +292,7 @@ def test_gaussians_that_are_not_finite_are_dropped_and_counted(
     assert training.step(4)["main_loss"].isfinite()
 
 
-def test_the_rate_of_a_head_that_starts_later_begins_with_it(build: Build, training_of: TrainingOf) -> None:
+def test_the_rate_of_a_head_that_starts_later_begins_with_it(build, training_of):
     training = training_of(build(head={"start_at": 6}))
     decays = {name: Decay(0.01, 20, 1.0, name == "compensation", 0) for name in ("means", "compensation")}
     for name, decay in decays.items():
@@ -321,7 +304,7 @@ def test_the_rate_of_a_head_that_starts_later_begins_with_it(build: Build, train
     assert {name: decay.pruned_at for name, decay in decays.items()} == {"means": 3, "compensation": 6}
 
 
-def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
+def said(capsys):
     return [line for line in capsys.readouterr().out.splitlines() if " needs more than " in line]
 
 
@@ -351,8 +334,8 @@ EARLY = {"mode": "continuous", "start": 1, "stop": 5}
     ],
 )
 def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_after(
-    build: Build, training_of: TrainingOf, capsys: Any, pruning: Any, head: Any, ending: str, tmp_path: Path
-) -> None:
+    build, training_of, capsys, pruning, head, ending, tmp_path
+):
     training = training_of(build(pruning=pruning, head=head), trainer_of(tmp_path))
     (before,) = said(capsys)
     which = "first prune" if "nothing" in ending else "head" if "it stays" in ending else "last prune"
@@ -377,9 +360,7 @@ def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_aft
         {"pruning": {"prune_at": 100}, "head": {"start_at": 101}, "warm_start": Path("anything")},
     ],
 )
-def test_a_run_that_prunes_or_is_not_to_says_nothing(
-    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str], options: dict[str, Any]
-) -> None:
+def test_a_run_that_prunes_or_is_not_to_says_nothing(build, training_of, capsys, options):
     model = build(**options)
     model._start = Start()  # of a file that need not be there
     training = training_of(model, trainer_of())
@@ -388,7 +369,7 @@ def test_a_run_that_prunes_or_is_not_to_says_nothing(
     assert said(capsys) == []
 
 
-def test_a_warm_start_counts_from_the_prune(build: Build, training_of: TrainingOf, capsys: Any) -> None:
+def test_a_warm_start_counts_from_the_prune(build, training_of, capsys):
     model = build(pruning={"prune_at": 100}, head={"start_at": 102}, warm_start=Path("anything"))
     model._start = Start()  # of a file that need not be there
     training_of(model, trainer_of())
@@ -399,20 +380,18 @@ def test_a_warm_start_counts_from_the_prune(build: Build, training_of: TrainingO
 FLOATERS = [4, 50]  # Rows of a field of 60 Gaussians; the cameras are 3 away from its middle
 
 
-def with_floaters(build: Build, **options: Any) -> SundaeModel:
+def with_floaters(build, **options):
     model = build(pruning={"keep_ratio": 1.0, "prune_at": 4}, stop_split_at=4, **options)
     with torch.no_grad():
         model.gauss_params["means"][FLOATERS] = torch.tensor([0.5, 0.1, 2.9])  # a tenth in front of the third camera
     return model
 
 
-def near(model: SundaeModel) -> int:
+def near(model):
     return int((model.means[:, 2] > 2).sum())
 
 
-def test_floaters_go_when_growth_ends_and_training_goes_on(
-    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_floaters_go_when_growth_ends_and_training_goes_on(build, training_of, capsys):
     training = training_of(with_floaters(build))
     for step in range(3):
         training.step(step)
@@ -426,7 +405,7 @@ def test_floaters_go_when_growth_ends_and_training_goes_on(
     assert training.model.num_points == 58
 
 
-def test_a_capture_without_points_keeps_its_field(build: Build, training_of: TrainingOf) -> None:
+def test_a_capture_without_points_keeps_its_field(build, training_of):
     training = training_of(with_floaters(build, seed_points=None, num_random=60))
     for step in range(5):
         training.step(step)
@@ -434,9 +413,7 @@ def test_a_capture_without_points_keeps_its_field(build: Build, training_of: Tra
 
 
 @pytest.mark.parametrize(("saved_after", "left"), [(2, 0), (3, 1)])
-def test_a_resumed_run_removes_them_only_if_that_was_still_due(
-    build: Build, training_of: TrainingOf, saved_after: int, left: int
-) -> None:
+def test_a_resumed_run_removes_them_only_if_that_was_still_due(build, training_of, saved_after, left):
     training = training_of(with_floaters(build))
     for step in range(saved_after + 1):
         training.step(step)

@@ -1,14 +1,9 @@
 """The training step: both halves and the whole, its inputs, and the terms of its loss."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from pytorch_msssim import SSIM
 from torch import Tensor
 
@@ -16,17 +11,14 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train.step import StepInputs, StepLosses, convolved_ssim_loss, image_losses, ssim_loss, training_step
 
-Build = Callable[..., SundaeModel]
-OPTIONS: tuple[dict[str, Any], ...] = ({}, {"head": {"mode": "off"}}, {"head": {"max_train_pixels": 20 * 24}})
+OPTIONS = ({}, {"head": {"mode": "off"}}, {"head": {"max_train_pixels": 20 * 24}})
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=["head", "no-head", "window"])
-def test_both_halves_are_the_whole_step(
-    build: Build, perturb: Callable[..., SundaeModel], camera: Any, batch: Any, options: dict[str, Any]
-) -> None:
+def test_both_halves_are_the_whole_step(build, perturb, camera, batch, options):
     """To the bit, with its gradients."""
     model = perturb(build(background_color="black", **options)).train()
-    found: list[tuple[dict[str, Tensor], list[Tensor]]] = []
+    found = []
     for whole in (False, True):
         if whole:
             inputs = model.step_inputs(camera(), batch())
@@ -35,7 +27,7 @@ def test_both_halves_are_the_whole_step(
             terms, images = result.losses, result.images
         else:
             outputs = model.get_outputs(camera())
-            terms = model.get_loss_dict(outputs, batch())  # type: ignore[arg-type]
+            terms = model.get_loss_dict(outputs, batch())
             images = {name: outputs[name] for name in ("rgb", "base_rgb")}
             loss = sum(terms.values(), torch.zeros(()))
         values = [value for value in model.gauss_params.values() if value.numel() and value.requires_grad]
@@ -50,8 +42,8 @@ def test_both_halves_are_the_whole_step(
 
 @pytest.mark.parametrize("mask", [None, torch.rand(4, 5, 1)], ids=["whole", "masked"])
 @pytest.mark.parametrize("rates", [None, torch.rand(7)], ids=["no-rates", "rates"])
-def test_inputs_of_a_recording_take_those_of_a_step(mask: Tensor | None, rates: Tensor | None) -> None:
-    def made(shift: float) -> StepInputs:
+def test_inputs_of_a_recording_take_those_of_a_step(mask, rates):
+    def made(shift):
         camera = Camera(torch.eye(4) + shift, torch.eye(3) + shift, 5, 4, 30.0)
         target = torch.rand(5, 4, 3).transpose(0, 1) + shift  # not contiguous
         moved = [None if one is None else one + shift for one in (mask, rates)]
@@ -69,15 +61,13 @@ def test_inputs_of_a_recording_take_those_of_a_step(mask: Tensor | None, rates: 
     assert not set(places) & {value.data_ptr() for value in first._tensors()}
 
 
-def test_the_view_of_a_training_camera_is_made_once(
-    build: Build, camera: Any, batch: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_view_of_a_training_camera_is_made_once(build, camera, batch, monkeypatch):
     """At each resolution; a camera that the datamanager does not know, or that is optimised, is read anew."""
     model = build(num_downscales=1, resolution_schedule=5).train()
-    made: list[int] = []
+    made = []
     camera_of = SundaeModel.camera_of
 
-    def counted(self: SundaeModel, seen: Any, downscale: int = 1) -> Camera:
+    def counted(self, seen, downscale=1):
         made.append(downscale)
         return camera_of(self, seen, downscale)
 
@@ -101,15 +91,8 @@ def test_the_view_of_a_training_camera_is_made_once(
     assert made == [2, 2, 1, 1, 1, 1, 1, 1]
 
 
-Perturb = Callable[[SundaeModel], SundaeModel]
-MakeCamera = Callable[..., Cameras]
-MakeBatch = Callable[..., dict[str, Tensor]]
-
-
 @pytest.mark.parametrize("mode", ["residual", "features"])
-def test_head_and_field_learn_together(
-    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, mode: str
-) -> None:
+def test_head_and_field_learn_together(build, perturb, camera, batch, mode):
     model = perturb(build(head={"mode": mode}))
     model.train()
     outputs = model.get_outputs(camera())
@@ -117,13 +100,13 @@ def test_head_and_field_learn_together(
     assert set(losses) == {"main_loss", "base_loss"}
     assert all(isinstance(value, Tensor) for value in losses.values())
     torch.stack(list(losses.values())).sum().backward()
-    for name, value in (*model.gauss_params.items(), *model.head.named_parameters()):  # type: ignore[union-attr]
+    for name, value in (*model.gauss_params.items(), *model.head.named_parameters()):
         assert value.grad is not None, name
         assert torch.isfinite(value.grad).all(), name
         assert value.grad.any(), name
 
 
-def test_masked_pixels_do_not_count(build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch) -> None:
+def test_masked_pixels_do_not_count(build, perturb, camera, batch):
     model = perturb(build(ssim_lambda=0.0))
     model.eval()
     outputs, target = model.get_outputs(camera()), batch()
@@ -139,9 +122,7 @@ def test_masked_pixels_do_not_count(build: Build, perturb: Perturb, camera: Make
 
 
 @pytest.mark.parametrize("term", ["rms", "l1"])
-def test_after_the_prune_the_root_of_the_mean_square_takes_the_place_of_l1(
-    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, term: str
-) -> None:
+def test_after_the_prune_the_root_of_the_mean_square_takes_the_place_of_l1(build, perturb, camera, batch, term):
     model = perturb(build(loss_after_prune=term))
     model.eval()
     outputs, target = model.get_outputs(camera()), batch()
@@ -158,9 +139,7 @@ def test_after_the_prune_the_root_of_the_mean_square_takes_the_place_of_l1(
     assert torch.equal(model.get_loss_dict(outputs, target)["main_loss"], before["main_loss"])
 
 
-def test_a_pruned_field_has_a_prior_that_counts_once(
-    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch
-) -> None:
+def test_a_pruned_field_has_a_prior_that_counts_once(build, perturb, camera, batch):
     """Twice as many training images halve its weight in the loss of one."""
     model = perturb(build(prior_after_prune=0.6))
     model.eval()
@@ -177,7 +156,7 @@ def test_a_pruned_field_has_a_prior_that_counts_once(
     assert set(model.get_loss_dict(outputs, target)) == {"main_loss", "base_loss"}
 
 
-def test_images_smaller_than_the_window_of_ssim(build: Build, camera: MakeCamera, batch: MakeBatch) -> None:
+def test_images_smaller_than_the_window_of_ssim(build, camera, batch):
     model = build().eval()
     outputs = model.get_outputs(camera(9, 8))
     loss = model.get_loss_dict(outputs, batch(9, 8))["main_loss"]
@@ -188,11 +167,11 @@ def test_images_smaller_than_the_window_of_ssim(build: Build, camera: MakeCamera
 SIZES = [(11, 11), (11, 40), (40, 12), (37, 53), (64, 96)]
 
 
-def ssim() -> SSIM:
+def ssim():
     return SSIM(data_range=1.0, channel=3)
 
 
-def images(height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+def images(height, width):
     """An image, its base colours and the target."""
     generator = torch.Generator().manual_seed(height * width)
     target = torch.rand(height, width, 3, generator=generator)
@@ -202,13 +181,11 @@ def images(height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 @pytest.mark.parametrize("weight", [0.2, 1.0])
-def test_losses_of_a_step_and_gradients_are_those_of_convolutions(height: int, width: int, weight: float) -> None:
+def test_losses_of_a_step_and_gradients_are_those_of_convolutions(height, width, weight):
     image, base, target = images(height, width)
     ours = image_losses(image, base, target, ssim(), weight)
     exact = image_losses(image.double(), base.double(), target.double(), ssim(), weight)
     for value, wanted in zip(ours, exact):
-        assert value is not None
-        assert wanted is not None
         torch.testing.assert_close(value.double(), wanted, rtol=1e-6, atol=1e-6)  # worst: 1.1e-7
     grads, wanted_grads = (torch.autograd.grad(1.5 * pair[0] + 0.3 * pair[1], (image, base)) for pair in (ours, exact))
     for grad, wanted in zip(grads, wanted_grads):
@@ -216,17 +193,17 @@ def test_losses_of_a_step_and_gradients_are_those_of_convolutions(height: int, w
         assert (grad != 0).all()
 
 
-def test_it_rounds_as_convolutions_in_single_precision() -> None:
+def test_it_rounds_as_convolutions_in_single_precision():
     image, _, target = images(48, 48)
     (wanted,) = torch.autograd.grad(convolved_ssim_loss(image.double(), target.double(), ssim()), image)
 
-    def error(value: Tensor) -> Tensor:
+    def error(value):
         return (torch.autograd.grad(value, image)[0] - wanted).norm() / wanted.norm()
 
     assert error(ssim_loss(image, target)) < 1.5 * error(convolved_ssim_loss(image, target, ssim())) + 1e-7
 
 
-def test_equal_images_have_no_loss_and_no_gradient() -> None:
+def test_equal_images_have_no_loss_and_no_gradient():
     target = images(32, 24)[2]
     image = target.clone().requires_grad_()
     rms, _ = image_losses(image, None, target, ssim(), 0.2, squares=True)
@@ -235,7 +212,7 @@ def test_equal_images_have_no_loss_and_no_gradient() -> None:
         assert torch.autograd.grad(loss, image)[0].abs().max() < 1e-6
 
 
-def test_nan_propagates() -> None:
+def test_nan_propagates():
     image, _, target = images(32, 24)
     with torch.no_grad():
         image[16, 12, 1] = torch.nan
@@ -246,7 +223,7 @@ def test_nan_propagates() -> None:
     assert gradient[0, 0].isfinite().all()
 
 
-def test_images_of_any_layout() -> None:
+def test_images_of_any_layout():
     image, _, target = images(40, 23)
     planes = image.detach().permute(2, 0, 1).contiguous().requires_grad_()
     loss, expected = ssim_loss(planes.permute(1, 2, 0), target.repeat(1, 2, 1)[:, :23]), ssim_loss(image, target)

@@ -1,12 +1,8 @@
 """Trials without a trainer: their fields and views, states of checkpoints, and estimated sizes."""
 
-from __future__ import annotations
-
 import copy
 import math
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -18,29 +14,27 @@ from sundae_ns.core.errors import CheckpointError
 from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
-from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train import trials as trials_module
 from sundae_ns.train.choice import HeldOutQuality, Tried
 from sundae_ns.train.pruning import PruningConfig
 from sundae_ns.train.schedules import Decay
 from sundae_ns.train.trials import Progress, Trial, Trials, packed_size
 
-Build = Callable[..., SundaeModel]
 VIEW = HeldOutQuality(10, 20.0, 0.5)
 
 
 class FakeRun:
     """A run whose steps add 1 to every centre."""
 
-    def __init__(self, state: Any) -> None:
+    def __init__(self, state):
         self.state = state
-        self.held_out: list[int] = []
+        self.held_out = []
         self.source = SimpleNamespace(total=20)
 
-    def hold_out(self, indices: Any) -> None:
+    def hold_out(self, indices):
         self.held_out = list(indices)
 
-    def train(self, trials: Trials, most: int = 100) -> int:
+    def train(self, trials, most=100):
         """Train to the end of the trial, or ``most`` steps; returns their number."""
         for number in range(1, most + 1):
             self.state.step += 1
@@ -50,14 +44,14 @@ class FakeRun:
         return most
 
 
-def trials_for(state: Any, begins_at: float = -math.inf) -> Trials:
+def trials_for(state, begins_at=-math.inf):
     head, pruning = SimpleNamespace(mode="auto"), PruningConfig(keep_ratio=None)
     options = SimpleNamespace(pruning=pruning, head=head, ssim_lambda=0.2)
-    return Trials(options, state, None, begins_at)  # type: ignore[arg-type]
+    return Trials(options, state, None, begins_at)
 
 
 @pytest.fixture
-def run(build: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> FakeRun:
+def run(build, monkeypatch):
     monkeypatch.setattr(trials_module, "AVERAGED_EVERY", 1)
     state = build(n=20).state
     state.gaussians["means"].data.zero_()
@@ -66,17 +60,17 @@ def run(build: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> FakeRun:
     return FakeRun(state)
 
 
-def height(run: FakeRun) -> float:
+def height(run):
     return float(run.state.gaussians["means"].detach()[0, 0])
 
 
-def test_trials_of_several_lengths_go_back_to_any_kept_field(run: FakeRun) -> None:
+def test_trials_of_several_lengths_go_back_to_any_kept_field(run):
     decay = Decay(0.1, 1000, 1.0, False, 0)
     decay.pruned_at = 0
     run.state.schedulers = {"means": LambdaLR(SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0), lr_lambda=decay)}
     trials, state = trials_for(run.state), run.state
 
-    def age() -> int:
+    def age():
         """Steps since the rate has restarted, as far as they count."""
         return state.step - (decay.pruned_at or 0)
 
@@ -100,12 +94,10 @@ def test_trials_of_several_lengths_go_back_to_any_kept_field(run: FakeRun) -> No
 
 
 @pytest.mark.parametrize(("averaged", "shown"), [(0.6, 4.0), (0, 5.0)])
-def test_the_mean_of_the_last_weights_is_measured(
-    run: FakeRun, monkeypatch: pytest.MonkeyPatch, averaged: float, shown: float
-) -> None:
-    seen: list[float] = []
+def test_the_mean_of_the_last_weights_is_measured(run, monkeypatch, averaged, shown):
+    seen = []
 
-    def measured(run: FakeRun, **_: bool) -> list[HeldOutQuality]:
+    def measured(run, **_):
         seen.append(height(run))
         return [VIEW]
 
@@ -118,7 +110,7 @@ def test_the_mean_of_the_last_weights_is_measured(
     assert (seen, height(run)) == ([shown], 5.0)
 
 
-def test_a_field_is_provisional_until_the_trials_end(run: FakeRun) -> None:
+def test_a_field_is_provisional_until_the_trials_end(run):
     state, trials = run.state, trials_for(run.state, begins_at=2)
     trials.start(run, "tenth", 5, [], width=5)
     run.train(trials)
@@ -129,7 +121,7 @@ def test_a_field_is_provisional_until_the_trials_end(run: FakeRun) -> None:
     assert state.schedule_step - state.head_starts_at - trials.taken_back == 3
 
 
-def test_another_width_begins_with_a_fresh_head_and_a_kept_one_comes_back(run: FakeRun) -> None:
+def test_another_width_begins_with_a_fresh_head_and_a_kept_one_comes_back(run):
     state, trials = run.state, trials_for(run.state)
     weights = {name: value.clone() for name, value in state.head.named_parameters()}
     trials.keep("start", state, head=True)
@@ -142,7 +134,7 @@ def test_another_width_begins_with_a_fresh_head_and_a_kept_one_comes_back(run: F
     assert all(torch.equal(value, weights[name]) for name, value in state.head.named_parameters())
 
 
-def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_in_the_middle_of_a_trial_is_resumed(run, monkeypatch):
     trials, other, state = trials_for(run.state), trials_for(run.state), run.state
     monkeypatch.setattr(trials_module, "MEAN_SHARE", 5 / 6)
     trials.keep("start", state, head=False)
@@ -162,10 +154,9 @@ def test_a_state_in_the_middle_of_a_trial_is_resumed(run: FakeRun, monkeypatch: 
     assert (height(run), other.taken_back) == (0.0, 6)
 
 
-def test_trials_are_there_for_an_undecided_head_which_is_disabled_or_an_undecided_count(build: Build) -> None:
+def test_trials_are_there_for_an_undecided_head_which_is_disabled_or_an_undecided_count(build):
     model = build(head={"mode": "auto"})
     model.step = 10**6
-    assert model.head is not None
     assert model.head.config.mode == "residual"
     assert not model.state.head_enabled
     for mode in ("residual", "features", "off"):
@@ -175,7 +166,7 @@ def test_trials_are_there_for_an_undecided_head_which_is_disabled_or_an_undecide
         assert names.index("trials") < names.index("pruning") < names.index("after-prune")
 
 
-def test_a_removed_head_leaves_no_values_and_no_moments(build: Build) -> None:
+def test_a_removed_head_leaves_no_values_and_no_moments(build):
     model = build(head={"mode": "residual"})
     training = Training(model)
     for step in range(3, 7):
@@ -195,13 +186,13 @@ def test_a_removed_head_leaves_no_values_and_no_moments(build: Build) -> None:
 
 
 @pytest.fixture
-def undecided(build: Build) -> tuple[SundaeModel, Trials]:
+def undecided(build):
     """A model whose head is to be decided about, and its trials."""
     model = build(head={"mode": "auto"})
     return model, next(one for one in model.train_callbacks if isinstance(one, Trials))
 
 
-def saved(state: Any, stage: str = "", kept: tuple[str, ...] = (), **progress: Any) -> dict[str, Any]:
+def saved(state, stage="", kept=(), **progress):
     """A state of trials."""
     trials = trials_for(state)
     trials.progress, trials.kept = Progress(stage, **progress), {name: {} for name in kept}
@@ -209,16 +200,14 @@ def saved(state: Any, stage: str = "", kept: tuple[str, ...] = (), **progress: A
     return trials.state_dict()
 
 
-def test_a_checkpoint_without_a_decision_names_the_option(undecided: tuple[SundaeModel, Trials]) -> None:
+def test_a_checkpoint_without_a_decision_names_the_option(undecided):
     model, trials = undecided
     with pytest.raises(CheckpointError, match=r"--pipeline.model.head.mode"):
         trials.prepare_loading(model.state, {})
 
 
 @pytest.mark.parametrize(("stage", "kept"), [("head", ("start",)), ("count", ()), ("length", ("plain",))])
-def test_a_state_without_a_field_to_go_back_to_is_refused(
-    undecided: tuple[SundaeModel, Trials], stage: str, kept: tuple[str, ...]
-) -> None:
+def test_a_state_without_a_field_to_go_back_to_is_refused(undecided, stage, kept):
     model, trials = undecided
     tried = [Tried("head", 9, "plain", 9)]
     with pytest.raises(CheckpointError, match="lacks a field") as raised:
@@ -226,25 +215,24 @@ def test_a_state_without_a_field_to_go_back_to_is_refused(
     assert "\n" not in str(raised.value)
 
 
-def test_only_trials_do_without_mirrored_images(undecided: tuple[SundaeModel, Trials]) -> None:
+def test_only_trials_do_without_mirrored_images(undecided):
     """They are too short to see what these bring; a run that resumes in a trial goes on with it."""
     model, trials = undecided
     for options, mirrored in (({"stage": "head", "kept": ("start",)}, False), ({"chosen": {"head": "head"}}, True)):
-        trials.load_state_dict(model.state, saved(model.state, **options))  # type: ignore[arg-type]
+        trials.load_state_dict(model.state, saved(model.state, **options))
         model.step = 10**6
         assert model.state.head_enabled
         assert model.resolution(model.step).mirror == mirrored
 
 
 @pytest.mark.parametrize("with_head", [False, True])
-def test_a_part_of_a_field_tells_the_size_of_all_of_it(with_head: bool) -> None:
+def test_a_part_of_a_field_tells_the_size_of_all_of_it(with_head):
     n, generator = 20_000, torch.Generator().manual_seed(0)
     shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}
     shapes |= {"features_rest": (3, 3), FEATURES: (5,)}
     gaussians = {name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()}
     head = CompensationHead(HeadConfig(mode="residual", size="tiny", num_features=5)) if with_head else None
     found = packed_size(gaussians, head)
-    assert found is not None
     packed = {name: value for name, value in gaussians.items() if with_head or name != FEATURES}
     data, sections = pack_bytes(*fit_scene(PackedScene(packed, {} if head is None else dict(head.state_dict()))))
     of_head = sum(size for name, size in sections.items() if name.startswith("head/"))
