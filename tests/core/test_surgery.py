@@ -23,6 +23,7 @@ from sundae_ns.core.surgery import (
 
 FIELD = normal_field(20, features=13)
 TRAINED = sorted(FIELD.keys() - {"quats"})
+SOME = torch.arange(20) % 3 == 0
 
 
 def gaussians(n=20):
@@ -44,10 +45,6 @@ def train(params, optimizers, steps=1):
             optimizer.step()
 
 
-def some(n=20):
-    return torch.arange(n) % 3 == 0
-
-
 def moments(optimizers, params, name):
     return optimizers[name].state[params[name]]["exp_avg"]
 
@@ -55,10 +52,10 @@ def moments(optimizers, params, name):
 def test_training_continues_as_if_only_the_kept_primitives_had_existed():
     (params, optimizers), (expected, expected_optimizers) = gaussians(), gaussians()
     still_alive = params["means"].exp().sum()
-    keep(expected, expected_optimizers, [], some())
+    keep(expected, expected_optimizers, [], SOME)
     for held, holders in ((params, optimizers), (expected, expected_optimizers)):
         train(held, holders, 3)
-    keep(params, optimizers, [], some())
+    keep(params, optimizers, [], SOME)
     for held, holders in ((params, optimizers), (expected, expected_optimizers)):
         train(held, holders, 3)
     for name, value in params.items():
@@ -73,9 +70,9 @@ def test_optimizers_hold_the_new_parameters_and_sliced_moments():
     train(params, optimizers)
     old = dict(params.items())
     before = {name: moments(optimizers, params, name).clone() for name in TRAINED}
-    keep(params, optimizers, [], some())
+    keep(params, optimizers, [], SOME)
     for name, value in params.items():
-        torch.testing.assert_close(value.data, old[name].data[some()])
+        torch.testing.assert_close(value.data, old[name].data[SOME])
         assert isinstance(value, Parameter)
         assert value.requires_grad == (name != "quats")
         if name == "quats":
@@ -85,7 +82,7 @@ def test_optimizers_hold_the_new_parameters_and_sliced_moments():
         assert optimizers[name].param_groups[0]["params"][0] is value
         assert optimizers[name].param_groups[0]["lr"] == 0.1
         assert int(state[value]["step"]) == 1
-        assert torch.equal(state[value]["exp_avg"], before[name][some()])
+        assert torch.equal(state[value]["exp_avg"], before[name][SOME])
         assert state[value]["exp_avg_sq"].shape == value.shape
 
 
@@ -94,7 +91,7 @@ def test_per_primitive_state_is_sliced_and_other_state_is_unchanged():
     rest = {"other": torch.rand(5), "step": 20, "no": None, "scalar": torch.tensor(20)}
     state, alone = {"grad2d": torch.arange(20), **rest}, {"pair": torch.rand(20, 2), **rest}
     network = [p.detach().clone() for p in optimizers["compensation"].param_groups[0]["params"]]
-    keep(params, optimizers, [state, alone], some())
+    keep(params, optimizers, [state, alone], SOME)
     assert state["grad2d"].tolist() == [0, 3, 6, 9, 12, 15, 18]
     assert alone["pair"].shape == (7, 2)
     assert all(each[name] is value for each in (state, alone) for name, value in rest.items())
@@ -139,7 +136,7 @@ def test_nothing_changes_on_error(fault):
     objects = dict(params)
     state = {"grad2d": torch.arange(20)}
     with pytest.raises(DataError, match="'features'"):
-        keep(params, optimizers, [state], some())
+        keep(params, optimizers, [state], SOME)
     with pytest.raises(DataError, match="'features'"):
         check_wiring(params, optimizers)
     assert all(params[name] is objects[name] for name in objects)
@@ -152,7 +149,7 @@ def test_a_mask_on_the_cpu_prunes_a_field_on_the_gpu():
     params = {name: Parameter(value.detach().cuda()) for name, value in gaussians()[0].items()}
     optimizers = {name: Adam([value]) for name, value in params.items()}
     train(params, optimizers)
-    keep(params, optimizers, [], some())
+    keep(params, optimizers, [], SOME)
     train(params, optimizers)
     assert params["means"].is_cuda
     assert len(params["means"]) == 7
