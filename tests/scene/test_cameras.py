@@ -484,7 +484,7 @@ def test_commands_state_them_without_coding_the_scene_again(tmp_path, capsys):
     one, other = (container.read_sections(path, container.read_header(path)) for path in (before, after))
     assert all(np.array_equal(one[name], other[name]) for name in (*one, *other))
     assert run("export", after, "-o", tmp_path / "a.html") == 0
-    (code,) = re.findall(r'id="scene"[^>]*>([^<]*)</script>', (tmp_path / "a.html").read_text())
+    (code,) = re.findall(r'class="scene"[^>]*>([^<]*)</script>', (tmp_path / "a.html").read_text())
     assert base64.b64decode(code) == after.read_bytes()
     sn.save(two_seen(), tmp_path / "a.ply")
     camera = written(tmp_path, {**LENS, "frames": [FRAME]})
