@@ -33,14 +33,22 @@ def names_of(data):
     return sorted(path.name for path in (data / "images").iterdir())
 
 
+def change_poses(data, edit, change):
+    """Replace the pose ``[4, 4]`` of each frame, by its index and pose."""
+    frames = meta_of(data)["frames"]
+    for index, frame in enumerate(frames):
+        frame["transform_matrix"] = change(index, np.array(frame["transform_matrix"])).tolist()
+    edit(data, frames=frames)
+
+
+def placed(pose, centre):
+    """The pose at another place."""
+    return np.column_stack([pose[:, :3], [*centre, 1.0]])
+
+
 def moved(data, offset, edit):
     """Shift cameras and cloud, with double numbers."""
-    frames = meta_of(data)["frames"]
-    for frame in frames:
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, 3] += offset
-        frame["transform_matrix"] = pose.tolist()
-    edit(data, frames=frames)
+    change_poses(data, edit, lambda _, pose: placed(pose, pose[:3, 3] + offset))
     vertex = PlyData.read(str(data / "sparse_pc.ply"))["vertex"].data
     wide = vertex.astype([(name, "f8" if name in "xyz" else kind) for name, kind in vertex.dtype.descr])
     for axis, shift in zip("xyz", offset, strict=True):
@@ -50,16 +58,13 @@ def moved(data, offset, edit):
 
 def stray(data, times, edit, *, index=4):
     """Put one training camera so many times as far from the middle; returns its image's name."""
-    meta = meta_of(data)
-    centres = np.array([np.array(frame["transform_matrix"])[:3, 3] for frame in meta["frames"]])
+    frames = meta_of(data)["frames"]
+    centres = np.array([np.array(frame["transform_matrix"])[:3, 3] for frame in frames])
     middle = np.median(centres, axis=0)
-    frame = meta["frames"][index]
-    pose = np.array(frame["transform_matrix"])
-    away = (pose[:3, 3] - middle) / np.linalg.norm(pose[:3, 3] - middle)
-    pose[:3, 3] = middle + times * np.median(np.linalg.norm(centres - middle, axis=1)) * away
-    frame["transform_matrix"] = pose.tolist()
-    edit(data, frames=meta["frames"])
-    return Path(frame["file_path"]).name
+    away = (centres[index] - middle) / np.linalg.norm(centres[index] - middle)
+    centre = middle + times * np.median(np.linalg.norm(centres - middle, axis=1)) * away
+    change_poses(data, edit, lambda i, pose: placed(pose, centre) if i == index else pose)
+    return Path(frames[index]["file_path"]).name
 
 
 def without(data, index, edit):
@@ -163,38 +168,26 @@ def test_a_packed_scene_is_measured_in_the_frame_of_its_training(capture, edit):
 
 @pytest.mark.parametrize("scale", [0.01, 7.5])
 def test_a_scale_in_the_rotations_is_none_of_the_cameras(capture, still_life, load, edit, scale):
-    frames = meta_of(capture)["frames"]
-    for frame in frames:
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, :3] *= scale
-        frame["transform_matrix"] = pose.tolist()
-    edit(capture, frames=frames)
+    change_poses(capture, edit, lambda _, pose: pose @ np.diag([scale, scale, scale, 1.0]))
     found, expected = (load(data).train_dataset.cameras.camera_to_worlds for data in (capture, still_life))
     torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
     torch.testing.assert_close(cameras_of(capture)[2].viewmat, cameras_of(still_life)[2].viewmat, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("change", [{(0, 0): 2.0}, {(0, 1): 0.5}], ids=["stretched", "sheared"])
-def test_axes_that_are_no_rotation_are_refused(capture, load, edit, change):
-    frames = meta_of(capture)["frames"]
+@pytest.mark.parametrize(("place", "value"), [((0, 0), 2.0), ((0, 1), 0.5)], ids=["stretched", "sheared"])
+def test_axes_that_are_no_rotation_are_refused(capture, load, edit, place, value):
     spoilt = np.eye(4)
-    for place, value in change.items():
-        spoilt[place] = value
-    frames[1]["transform_matrix"] = (np.array(frames[1]["transform_matrix"]) @ spoilt).tolist()
-    edit(capture, frames=frames)
+    spoilt[place] = value
+    change_poses(capture, edit, lambda index, pose: pose @ spoilt if index == 1 else pose)
     with pytest.raises(DataError, match="frame 1 .*its first three columns are not a rotation"):
         load(capture)
 
 
 def test_a_panorama_with_one_step_aside_keeps_its_scale(capture, load, edit, capsys):
     """All cameras but one stand within centimetres; the points are as far as that one, so it is no stray."""
-    meta = meta_of(capture)
-    rng = np.random.default_rng(0)
-    for index, frame in enumerate(meta["frames"]):
-        pose = np.array(frame["transform_matrix"])
-        pose[:3, 3] = 0.01 * rng.standard_normal(3) + (np.array([2.0, 0, 0]) if index == 4 else 0)
-        frame["transform_matrix"] = pose.tolist()
-    edit(capture, frames=meta["frames"])
+    centres = 0.01 * np.random.default_rng(0).standard_normal((12, 3))
+    centres[4] += [2.0, 0, 0]
+    change_poses(capture, edit, lambda index, pose: placed(pose, centres[index]))
     made = load(capture)
     assert float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].abs().max()) == pytest.approx(1.0, abs=1e-3)
     assert "times as far away" not in capsys.readouterr().out

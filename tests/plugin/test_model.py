@@ -31,8 +31,10 @@ def test_it_is_a_splatfacto_whose_groups_have_features_and_head(build):
     [
         ({"pruning": {"keep_ratio": 0.0}}, "keep_ratio"),
         ({"head": {"num_features": 0}}, "num-features"),
-        ({"base_loss_weight": -1.0}, "base-loss-weight"),
-        ({"use_bilateral_grid": True}, "bilateral"),
+        ({"base_loss_weight": -1.0}, "base-loss-weight is -1.0; give 0 or more"),
+        ({"average_share": 1.5}, "average-share is 1.5; give a share"),
+        ({"prior_after_prune": float("nan")}, "prior-after-prune is nan"),
+        ({"use_bilateral_grid": True}, "no bilateral grid"),
     ],
 )
 def test_options_that_cannot_work(build, options, cause):

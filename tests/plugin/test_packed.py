@@ -1,21 +1,24 @@
 """Runs as packed scenes: what is stored, what is not, and headers with false claims."""
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from documents import put
+from fields import random_field
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
+from packed_scenes import full_scene
 
 from sundae_ns.core.errors import CheckpointError, DataError, PackError
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io import checkpoint
-from sundae_ns.io.pack.packed_scene import PackedScene
 from sundae_ns.plugin.datamanager import SundaeDatamanagerConfig
 from sundae_ns.plugin.finished_runs import (
     datamanager_of,
@@ -25,16 +28,7 @@ from sundae_ns.plugin.finished_runs import (
     model_of,
     stated_capture,
 )
-from sundae_ns.scene.initialization import from_points
 from sundae_ns.scene.packing import contents_of, scene_of
-
-
-def gaussians(degree=1, features=5):
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(60, 3, generator=generator) - 0.5
-    made = from_points(points, points + 0.5, sh_degree=degree, num_features=features, generator=generator)
-    made["features_rest"] = 0.1 * torch.randn(60, (degree + 1) ** 2 - 1, 3, generator=generator)
-    return made
 
 
 def head():
@@ -43,20 +37,8 @@ def head():
     return {name: value + 0.05 * torch.randn_like(value) for name, value in state.items()}
 
 
-def cameras(n=3):
-    pose = torch.eye(4)[:3]
-    pose[2, 3] = 2.0
-    poses = pose.repeat(n, 1, 1)
-    poses[:, 0, 3] = torch.arange(n) / 10
-    return {
-        "poses": poses,
-        "intrinsics": torch.tensor([[40.5, 41.0, 20.0, 16.0]]).double().repeat(n, 1),
-        "sizes": torch.tensor([[40, 32]]).repeat(n, 1),
-    }
-
-
-def meta():
-    return {
+def scene():
+    meta = {
         "source": {"method": "sundae", "step": 30000},
         "model": {
             "sh_degree": 2,
@@ -68,10 +50,7 @@ def meta():
         "frame": {"transform": torch.eye(4)[:3].tolist(), "scale": 0.5},
         "capture": {"parser": "colmap", "options": {"colmap_path": "sparse/0"}, "scale": 1.0},
     }
-
-
-def scene():
-    return PackedScene(gaussians(), head(), cameras(), meta())
+    return replace(full_scene(60, degree=1, meta=meta), head=head())
 
 
 def test_a_packed_scene_becomes_a_model():
@@ -103,36 +82,29 @@ def test_a_folder_without_a_capture_is_refused(tmp_path, kind, parser):
 LIES = {
     "no model": {"model": None},
     "a model of text": {"model": "yes"},
-    "a huge degree": {"model": {"sh_degree": 10**6}},
-    "a true degree": {"model": {"sh_degree": True}},
-    "too low a degree": {"model": {"sh_degree": 0}},
-    "a strange rasteriser": {"model": {"rasterize_mode": "os.system"}},
-    "a list for a colour": {"model": {"background_color": ["white"]}},
-    "another head": {"model": {"head": {"size": "regular"}}},
-    "no head": {"model": {"head": None}},
-    "a head of text": {"model": {"head": "residual"}},
-    "a head that is off": {"model": {"head": {"mode": "off"}}},
-    "a huge head": {"model": {"head": {"pixel_unshuffle": 10**6}}},
-    "features of another number": {"model": {"head": {"num_features": 6}}},
-    "a head with more": {"model": {"head": {"_target": "os.system"}}},
-    "negative focal lengths": {"model": {"trained_focal": [-1.0, 2.0]}},
-    "one focal length": {"model": {"trained_focal": [1.0]}},
+    "a huge degree": {"model/sh_degree": 10**6},
+    "a true degree": {"model/sh_degree": True},
+    "too low a degree": {"model/sh_degree": 0},
+    "a strange rasteriser": {"model/rasterize_mode": "os.system"},
+    "a list for a colour": {"model/background_color": ["white"]},
+    "another head": {"model/head/size": "regular"},
+    "no head": {"model/head": None},
+    "a head of text": {"model/head": "residual"},
+    "a head that is off": {"model/head/mode": "off"},
+    "a huge head": {"model/head/pixel_unshuffle": 10**6},
+    "features of another number": {"model/head/num_features": 6},
+    "a head with more": {"model/head/_target": "os.system"},
+    "negative focal lengths": {"model/trained_focal": [-1.0, 2.0]},
+    "one focal length": {"model/trained_focal": [1.0]},
 }
-
-
-def merged(base, changes):
-    made = dict(base)
-    for name, value in changes.items():
-        both = isinstance(value, dict) and isinstance(base.get(name), dict)
-        made[name] = merged(base[name], value) if both else value
-    return made
 
 
 @pytest.mark.parametrize("lie", LIES)
 def test_headers_that_lie_are_refused(lie):
-    stated = merged(meta(), LIES[lie])
+    stated = scene()
+    put(stated.meta, LIES[lie])
     with pytest.raises(PackError):
-        scene_of(PackedScene(gaussians(), head(), cameras(), stated))
+        scene_of(stated)
 
 
 @pytest.mark.parametrize(
@@ -198,7 +170,7 @@ def run_folder(folder, method, step, **model):
     config = copy.deepcopy(all_methods[method])
     for name, value in model.items():
         setattr(config.pipeline.model, name, value)
-    truth = gaussians(degree=2, features=0 if method == "splatfacto" else 5)
+    truth = random_field(60, features=0 if method == "splatfacto" else 5)
     state = {f"gauss_params.{name}": value for name, value in truth.items()}
     state["device_indicator_param"] = torch.zeros(0)
     if method != "splatfacto":

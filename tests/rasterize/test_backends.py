@@ -45,10 +45,13 @@ def activated(values):
     return {**values, "scales": values["scales"].exp(), "opacities": values["opacities"].sigmoid()}
 
 
+def seen_by(camera, values):
+    """Arguments of a rasteriser: the scene after activation, the camera in its dtype and on its device."""
+    return activated(values) | {k: v.to(values["means"]) if isinstance(v, Tensor) else v for k, v in camera.items()}
+
+
 def splat(values, camera, backend, **options):
-    """Rasterise a scene in the dtype and on the device of its values."""
-    as_given = {k: v.to(values["means"]) if isinstance(v, Tensor) else v for k, v in camera.items()}
-    return rasterize(**activated(values), **as_given, **options, backend=backend)
+    return rasterize(**seen_by(camera, values), **options, backend=backend)
 
 
 def leaves_of(values, dtype, device="cpu"):
@@ -137,9 +140,7 @@ def test_matches_a_loop_over_pixels(backend, width, height, antialiased, opaque,
     expected = loop_over_pixels(activated(values), camera, antialiased)
     monkeypatch.setattr("sundae_ns.rasterize.reference._SEGMENT", 7)
     ours = splat(values, camera, backend, antialiased=antialiased, render_depth=True)
-    as_given = {k: v.double() if isinstance(v, Tensor) else v for k, v in camera.items()}
-    solid = {name: value for name, value in activated(values).items() if name != "colors"}
-    weights = blending_weights(**solid, **as_given, antialiased=antialiased, backend=backend)
+    weights = blending_weights(**seen_by(camera, values), antialiased=antialiased, backend=backend)
     for value, exact in zip((ours.colors, ours.alpha, ours.depth, weights), expected, strict=True):
         torch.testing.assert_close(value, exact, rtol=1e-13, atol=1e-12)  # measured: 5.2e-15 of weights
 
@@ -268,9 +269,7 @@ def test_order_and_unseen_gaussians_do_not_matter_and_weights_sum_up(backend):
     other = splat({name: value[shuffle] for name, value in values.items()}, camera, backend)
     torch.testing.assert_close(ours.colors, other.colors, rtol=0, atol=1e-13)
     assert torch.equal(ours.radii[shuffle], other.radii)
-    as_given = {k: v.double() if isinstance(v, Tensor) else v for k, v in camera.items()}
-    solid = {name: value for name, value in activated(values).items() if name != "colors"}
-    weights = blending_weights(**solid, **as_given, backend=backend)
+    weights = blending_weights(**seen_by(camera, values), backend=backend)
     assert (weights >= 0).all()
     torch.testing.assert_close(weights.sum(), ours.alpha.sum())
     torch.testing.assert_close((weights[:, None] * values["colors"]).sum(0), ours.colors.sum((0, 1)))
@@ -460,8 +459,7 @@ def test_radii_and_weights_of_gsplat():
     for backend, device, dtype in ((on_gpu("gsplat"), "cuda", F32), (REFERENCE, "cpu", F64)):
         placed = {name: value.to(device, dtype) for name, value in values.items()}
         radii.append(splat(placed, camera, backend).radii.cpu())
-        as_given = {k: v.to(device, dtype) if isinstance(v, Tensor) else v for k, v in camera.items()}
-        weights.append(blending_weights(**activated(placed), **as_given, backend=backend).cpu())
+        weights.append(blending_weights(**seen_by(camera, placed), backend=backend).cpu())
     assert deviation(*weights) < 1e-5  # measured: 3.8e-7
     ours, exact = radii
     assert ours.shape == exact.shape

@@ -105,11 +105,15 @@ class Training:
         """The extensions by name."""
         return {callback.name: callback for callback in self.model.train_callbacks}
 
+    @property
+    def run(self):
+        """The run that nerfstudio's callbacks belong to."""
+        return self.callbacks[-1].func.__self__
+
     def act(self, name, step):
         """Let one extension act after a step, and no other."""
         self.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step)
-        run = self.callbacks[0].func.__self__
-        run.act([self.train_callbacks[name]])
+        self.run.act([self.train_callbacks[name]])
 
     def run_callbacks(self, location, step):
         for callback in self.callbacks:

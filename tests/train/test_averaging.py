@@ -5,10 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sundae_ns.core.errors import ConfigError
 from sundae_ns.train import averaging
 from sundae_ns.train.averaging import Averaging
-from sundae_ns.train.build import check
 
 LAST = 99
 
@@ -18,47 +16,46 @@ def run_of(state, *, images=1, last=LAST, length=LAST + 1):
 
 
 @pytest.fixture
-def state(build):
+def state(build, monkeypatch):
+    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
     return build(n=20).state
 
 
-def train(state, mean, steps, *, seen=None, last=LAST):
-    """Steps that change the weights at random."""
+def train(state, mean, steps, *, last=LAST):
+    """Steps that change the weights at random; the centres at the steps from 90 on that are averaged."""
+    seen = []
     for step in steps:
         state.step = step
         torch.manual_seed(step)
         for value in state.gaussians.values():
             value.data += torch.randn_like(value)
-        if seen is not None and step >= 90 and step % averaging.AVERAGED_EVERY == 0:
+        if step >= 90 and step % averaging.AVERAGED_EVERY == 0:
             seen.append(state.gaussians["means"].detach().clone())
         mean.after_step(run_of(state, last=last))
+    return seen
 
 
-def test_the_last_weights_become_the_mean(state, monkeypatch):
-    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
-    seen = []
-    train(state, Averaging(0.09, settled_at=0), range(LAST + 1), seen=seen)
-    assert len(seen) == 4
+def assert_mean(state, seen, count):
+    assert len(seen) == count
     torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
 
 
-def test_a_mean_that_an_interruption_has_cut_short_is_dropped(state, monkeypatch):
+def test_the_last_weights_become_the_mean(state):
+    assert_mean(state, train(state, Averaging(0.09, settled_at=0), range(LAST + 1)), 4)
+
+
+def test_a_mean_that_an_interruption_has_cut_short_is_dropped(state):
     """A run that stops in its last part and is resumed for a longer one ends with weights of the end alone."""
-    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
     first, longer = Averaging(0.3, settled_at=0), Averaging(0.09, settled_at=0)
     train(state, first, range(90))
     assert first.state_dict()["count"] > 0
     longer.load_state_dict(state, first.state_dict())
-    seen = []
-    train(state, longer, range(80, LAST + 1), seen=seen)
-    torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
+    assert_mean(state, train(state, longer, range(80, LAST + 1)), 4)
 
 
-def test_no_mean_of_fields_that_differ(state, monkeypatch):
+def test_no_mean_of_fields_that_differ(state):
     """After a prune, or a return to an earlier field, only the weights since then count."""
-    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
     for change in ("prune", "return"):
-        seen = []
         mean = Averaging(0.3, settled_at=0)
         train(state, mean, range(91))
         if change == "prune":
@@ -66,9 +63,7 @@ def test_no_mean_of_fields_that_differ(state, monkeypatch):
                 value.data = value.data[:10].clone()
         else:
             state.restored += 1
-        train(state, mean, range(91, LAST + 1), seen=seen)
-        assert len(seen) == 3
-        torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
+        assert_mean(state, train(state, mean, range(91, LAST + 1)), 3)
 
 
 def test_unfinished_schedules_and_growing_fields_keep_their_weights(state):
@@ -95,14 +90,10 @@ def test_a_longer_training_goes_on_from_the_last_weights(state):
     assert not again.state_dict()["replaced"]
 
 
-def test_a_first_part_ends_with_the_mean_of_its_last_steps(state, monkeypatch):
+def test_a_first_part_ends_with_the_mean_of_its_last_steps(state):
     """As far as it reaches into the share: what is packed from there on begins at the mean."""
-    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 2)
-    seen = []
     mean = Averaging(0.09, settled_at=0)
-    train(state, mean, range(96), seen=seen, last=95)
-    assert len(seen) == 3
-    torch.testing.assert_close(state.gaussians["means"].detach(), torch.stack(seen).mean(dim=0))
+    assert_mean(state, train(state, mean, range(96), last=95), 2)
     assert mean.state_dict()["replaced"]
 
 
@@ -117,19 +108,3 @@ def test_ranks_do_not_save_the_mean_of_their_shard(state):
     mean.before_training(run_of(state, images=2))
     train(state, mean, range(20))
     assert not mean.state_dict()
-
-
-@pytest.mark.parametrize(
-    ("option", "value", "words"),
-    [
-        ("average_share", 1.5, "average-share is 1.5; give a share"),
-        ("base_loss_weight", -1.0, "base-loss-weight is -1.0; give 0 or more"),
-        ("prior_after_prune", float("nan"), "prior-after-prune is nan"),
-        ("use_bilateral_grid", True, "no bilateral grid"),
-    ],
-)
-def test_options_that_cannot_be(build, option, value, words):
-    config = build(n=5).config
-    setattr(config, option, value)
-    with pytest.raises(ConfigError, match=words):
-        check(config)

@@ -257,7 +257,7 @@ def test_a_cpu_sweeps_few_views_of_a_sparse_cloud(build, training_of, monkeypatc
 
 def test_photos_are_the_training_images_with_their_views_and_masks(build, training_of, batch, camera):
     """Transparent pixels are masked too."""
-    run = training_of(build()).callbacks[0].func.__self__
+    run = training_of(build()).run
     photos = list(run.photos())
     assert [float(photo.camera.center[0]) for photo in photos] == pytest.approx([-0.5, 0.0, 0.5])
     assert [photo.mask for photo in photos] == [None] * 3

@@ -17,17 +17,21 @@ from sundae_ns.plugin.optimizer_configs import METRICS_EVENT, ProgressWriter
 from sundae_ns.train.progress import Interruption, TimeLeft, duration, loaded_run, long_on_cpu, resume_command
 
 
-def test_a_line_says_what_is_done_and_left(monkeypatch, capsys):
+def progress_writer(monkeypatch, events, length, *banner):
     monkeypatch.setattr(writer, "GLOBAL_BUFFER", {})
-    monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": 400})
+    monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": length})
+    monkeypatch.setattr(nerfstudio_configs, "EVENT_STORAGE", events)
+    return ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10), *banner)
+
+
+def test_a_line_says_what_is_done_and_left(monkeypatch, capsys):
     events = [
         # A resumed run writes its configuration first.
         {"name": "config", "event": {}, "step": 0},
         {"name": "Train Iter (time)", "event": 0.25, "step": 159},
         {"name": METRICS_EVENT, "event": {"psnr": 21.456, "gaussian_count": 12345}},
     ]
-    monkeypatch.setattr(nerfstudio_configs, "EVENT_STORAGE", events)
-    made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10), ["Viewer at: somewhere"])
+    made = progress_writer(monkeypatch, events, 400, ["Viewer at: somewhere"])
     clock = [100.0]
     monkeypatch.setattr(nerfstudio_configs.time, "monotonic", lambda: clock[0])
     made.write_stats_log(0)
@@ -66,10 +70,8 @@ def test_a_lasting_change_is_followed():
 
 def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch, capsys):
     monkeypatch.setattr(nerfstudio_configs, "LINE_EVERY", 0.0)
-    monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": 4})
     events = [{"name": "Train Iter (time)", "event": 2.0, "step": 0}]
-    monkeypatch.setattr(nerfstudio_configs, "EVENT_STORAGE", events)
-    made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10))
+    made = progress_writer(monkeypatch, events, 4)
     made.write_stats_log(0)
     assert capsys.readouterr().out == "", "nothing is measured yet"
     events.append({"name": METRICS_EVENT, "event": {"psnr": 20.0, "gaussian_count": 7}})
