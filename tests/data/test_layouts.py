@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from colmap_models import write_model
+from limits import refused
 from photos import photos
 
 from sundae_ns.core.errors import DataError
@@ -70,20 +71,17 @@ def test_a_capture_of_blender(tmp_path):
     assert (layout.words, layout.options[-1]) == (["blender-data"], "white")
     for missing in ("train/0.png", "transforms_val.json"):
         (data / missing).unlink()
-        with pytest.raises(DataError, match=missing):
-            posed_layout(data)
+        refused(posed_layout, data, missing)
     for number, frames in enumerate(([], 3, [{}], ["r_0"])):
-        with pytest.raises(DataError, match=r"transforms_train\.json lists no frames with a file_path"):
-            posed_layout(blender(tmp_path / str(number), frames=frames))
+        other = blender(tmp_path / str(number), frames=frames)
+        refused(posed_layout, other, r"transforms_train\.json lists no frames with a file_path")
 
 
 def test_what_cannot_be_read_is_named(tmp_path):
     model(tmp_path / "sparse" / "0", 1)
-    with pytest.raises(DataError, match=r"no image 0\.png, which its model sparse/0 states, in images, input"):
-        posed_layout(tmp_path)
+    refused(posed_layout, tmp_path, r"no image 0\.png, which its model sparse/0 states, in images, input")
     (tmp_path / "sparse" / "0" / "images.bin").write_bytes(b"\0")
-    with pytest.raises(DataError, match=r"sparse/0/images\.bin is not a complete images\.bin"):
-        posed_layout(tmp_path)
+    refused(posed_layout, tmp_path, r"sparse/0/images\.bin is not a complete images\.bin")
 
 
 def _several(data):

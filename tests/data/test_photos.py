@@ -7,6 +7,7 @@ import struct
 import zlib
 
 import pytest
+from limits import refused
 from photos import photo
 from photos import photos as write_photos
 from PIL import Image
@@ -85,8 +86,7 @@ def test_what_is_no_photo_is_left_out_in_one_line(photos, kind):
     (line,) = said
     assert re.search(rf"^left out: .*x\.(png|cr2).*{cause}[^\n]*$", line)
     (photos / "0.png").unlink()
-    with pytest.raises(DataError, match=rf"{cause}.*; 1 of 3 photos cannot be used"):
-        find_photos(photos)
+    refused(find_photos, photos, rf"{cause}.*; 1 of 3 photos cannot be used")
 
 
 def test_half_of_the_photos_must_be_readable(photos, monkeypatch):
@@ -94,30 +94,26 @@ def test_half_of_the_photos_must_be_readable(photos, monkeypatch):
         (photos / f"{name}.png").touch()
     assert len(find_photos(photos)) == 3
     (photos / "d.png").touch()
-    with pytest.raises(DataError, match="; 4 of 7 photos cannot be used"):
-        find_photos(photos)
+    refused(find_photos, photos, "; 4 of 7 photos cannot be used")
 
     def refuse(path, *_, **__):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
     monkeypatch.setattr(Image, "open", refuse)  # the tests may run as root, who may read everything
-    with pytest.raises(DataError, match=r"\w\.png cannot be read \(Permission denied\)"):
-        find_photos(photos)
+    refused(find_photos, photos, r"\w\.png cannot be read \(Permission denied\)")
 
 
 @pytest.mark.parametrize(("count", "cause"), [(0, "holds no photos"), (1, "holds 1 photo, "), (2, "holds 2 photos, ")])
 def test_too_few_photos(photos, count, cause):
     for path in sorted(photos.iterdir())[count:]:
         path.unlink()
-    with pytest.raises(DataError, match=cause):
-        find_photos(photos)
+    refused(find_photos, photos, cause)
 
 
 def test_a_folder_that_is_none(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for name, cause in (("pipe", "Not a directory"), ("gone", "No such file")):
-        with pytest.raises(DataError, match=f"{name} cannot be read .{cause}"):
-            find_photos(tmp_path / name)
+        refused(find_photos, tmp_path / name, f"{name} cannot be read .{cause}")
 
 
 @pytest.mark.parametrize(
@@ -139,8 +135,7 @@ def test_photos_that_are_not_read_are_named(photos, monkeypatch, capsys, names, 
     assert capsys.readouterr().out.startswith(f"# warning: {remark}")
     for path in photos.glob("*.png"):
         path.unlink()
-    with pytest.raises(DataError, match=f"holds no photos that can be read: {remark}"):
-        find_photos(photos)
+    refused(find_photos, photos, f"holds no photos that can be read: {remark}")
 
 
 def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path):
@@ -148,8 +143,7 @@ def test_photos_in_several_folders_only_are_counted_and_not_opened(tmp_path):
         for index in range(count):
             (tmp_path / name).mkdir(parents=True, exist_ok=True)
             (tmp_path / name / f"{index}.png").touch()
-    with pytest.raises(DataError, match=r"holds 6 photos in 2 folders \(a: 4, b/c: 2\); give the folder of one scene"):
-        find_photos(tmp_path)
+    refused(find_photos, tmp_path, r"holds 6 photos in 2 folders \(a: 4, b/c: 2\); give the folder of one scene")
     paths = [photo(tmp_path / "DCIM" / "100" / f"{index}.png") for index in range(3)]
     assert paths_of(tmp_path / "DCIM") == paths
 
