@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from limits import refused
 from photos import ORIENTATION, photo
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -89,8 +90,7 @@ def test_frames_name_their_photos_in_order(tmp_path):
     assert placed_in(tmp_path) == Placed(("b", "images/c"), ("a",))
     for text in ('{"frames": 3}', '{"frames": [], "left_out": 2}', '{"frames": [{}, {}', "[]"):
         path.write_text(text)
-        with pytest.raises(DataError):
-            placed_in(tmp_path)
+        refused(placed_in, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -249,8 +249,7 @@ def test_a_copy_is_a_sound_capture_and_is_replaced(tmp_path):
     assert check_image(copy / "images" / "frame_00001.png") == (SIDE, SIDE)
     (tmp_path / "transforms.json").write_text("{}")
     for out, cause in ((tmp_path, "other files than the demo's capture"), (tmp_path / "transforms.json", "is a file")):
-        with pytest.raises(DataError, match=cause):
-            write_demo_capture(out)
+        refused(write_demo_capture, out, cause)
     assert (tmp_path / "transforms.json").read_text() == "{}"
 
 

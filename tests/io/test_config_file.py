@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import yaml
+from limits import refused
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.writer import EventName
@@ -46,8 +47,7 @@ def test_a_run_of_an_early_python_3_11_opens(tmp_path):
     assert load_config(path).data is EventName.ETA
     for attribute in ("__class__", "__members__", "3", "[ETA]"):
         path.write_text(f"!!python/object:nerfstudio.engine.trainer.TrainerConfig {{data: {call.format(attribute)}}}")
-        with pytest.raises(CheckpointError):
-            load_config(path)
+        refused(load_config, path, kind=CheckpointError)
 
 
 HOSTILE = {
@@ -87,9 +87,7 @@ def test_no_code_that_it_names_runs(tmp_path, kind):
     mark, path = tmp_path / "ran", tmp_path / "config.yml"
     path.write_text(HOSTILE[kind].format(mark) if "{}" in HOSTILE[kind] else HOSTILE[kind])
     for read in (load_config, load_run, load_model):
-        with pytest.raises(CheckpointError) as raised:
-            read(path)
-        assert "\n" not in str(raised.value)
+        refused(read, path, kind=CheckpointError)
         assert not mark.exists()
 
 
@@ -99,15 +97,11 @@ def test_a_file_that_is_no_run_is_refused(tmp_path, text):
     path.write_text(text)
     with pytest.raises(CheckpointError):
         contents_of(load_run(path))
-    with pytest.raises(CheckpointError):
-        load_model(path)
-    with pytest.raises(CheckpointError, match=r"cannot be read \(No such file"):
-        load_config(tmp_path / "gone.yml")
+    refused(load_model, path, kind=CheckpointError)
+    refused(load_config, tmp_path / "gone.yml", r"cannot be read \(No such file", CheckpointError)
     path.write_bytes(b"\xff\xfe\x80")
-    with pytest.raises(CheckpointError, match="codec"):
-        load_config(path)
-    with pytest.raises(CheckpointError, match="cannot be read"):
-        load_config(tmp_path)
+    refused(load_config, path, "codec", CheckpointError)
+    refused(load_config, tmp_path, "cannot be read", CheckpointError)
 
 
 def test_a_capture_that_has_moved_with_its_run_is_found(tmp_path):
@@ -133,5 +127,4 @@ def test_the_length_of_the_schedule(tmp_path):
     assert schedule_length(path) == 500
     for text in ("a: 1", "schedule_length: null", "[]"):
         path.write_text(text)
-        with pytest.raises(CheckpointError, match="states no length"):
-            schedule_length(path)
+        refused(schedule_length, path, "states no length", CheckpointError)
