@@ -18,29 +18,24 @@ LIMIT = 600
 """Seconds that a program may take on a busy machine."""
 
 
-def _run_ranks(file, folder):
-    # A missing result fails by name.
-    print(run(Path(__file__).with_name("rank.py"), file, RANKS, folder, LIMIT)[1])
-
-
-def _passed(folder, name):
-    for rank in range(RANKS):
-        path = folder / f"rank{rank}.json"
-        assert path.exists(), f"rank {rank} did not come to an end"
-        results = json.loads(path.read_text())
-        assert results.get(name, "not reached") == "", f"rank {rank}: {results.get(name)}"
-
-
 @pytest.fixture(scope="session")
 def run_ranks():
-    """Run the checks of a file on two ranks, which write their results into a folder."""
-    return _run_ranks
+    """Run the checks of a file on two ranks, which write their results into a folder; a missing one fails by name."""
+    return lambda file, folder: print(run(Path(__file__).with_name("rank.py"), file, RANKS, folder, LIMIT)[1])
 
 
 @pytest.fixture(scope="session")
 def passed():
     """Assert that every rank has passed a check."""
-    return _passed
+
+    def check(folder, name):
+        for rank in range(RANKS):
+            path = folder / f"rank{rank}.json"
+            assert path.exists(), f"rank {rank} did not come to an end"
+            results = json.loads(path.read_text())
+            assert results.get(name, "not reached") == "", f"rank {rank}: {results.get(name)}"
+
+    return check
 
 
 @pytest.fixture(scope="session")

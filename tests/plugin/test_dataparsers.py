@@ -79,9 +79,10 @@ def cameras_by_name(made):
     return dict(zip(names, made.train_dataset.cameras.camera_to_worlds, strict=True))
 
 
-def points_of(made):
-    points = made.train_dataparser_outputs.metadata["points3D_xyz"]
-    return points
+def cloud_of(made):
+    """Points and colours."""
+    metadata = made.train_dataparser_outputs.metadata
+    return metadata["points3D_xyz"], metadata["points3D_rgb"]
 
 
 @pytest.mark.parametrize("times", [20.0, 100.0, 3000.0, 1e9])
@@ -97,7 +98,7 @@ def test_a_stray_camera_does_not_shrink_the_scene(capture, tmp_path, load, edit,
     assert found.keys() - expected.keys() == {name}
     for other, pose in expected.items():
         torch.testing.assert_close(found[other], pose, atol=2e-6, rtol=0)
-    torch.testing.assert_close(points_of(made), points_of(alone), atol=2e-6, rtol=0)
+    torch.testing.assert_close(cloud_of(made)[0], cloud_of(alone)[0], atol=2e-6, rtol=0)
     # The transform that the run states is the one of its cameras.
     transform, scale = made.train_dataset.metadata[DATASET_FRAME]
     torch.testing.assert_close(transform, alone.train_dataset.metadata[DATASET_FRAME][0], atol=2e-6, rtol=0)
@@ -199,8 +200,8 @@ def test_survey_coordinates_train_as_those_near_the_origin(capture, still_life, 
     far = load(capture)
     own, theirs = near.train_dataset.cameras, far.train_dataset.cameras
     torch.testing.assert_close(theirs.camera_to_worlds, own.camera_to_worlds, atol=1e-6, rtol=0)
-    torch.testing.assert_close(points_of(far), points_of(near), atol=2e-6, rtol=0)
-    assert points_of(far).dtype == theirs.camera_to_worlds.dtype == torch.float32
+    torch.testing.assert_close(cloud_of(far)[0], cloud_of(near)[0], atol=2e-6, rtol=0)
+    assert cloud_of(far)[0].dtype == theirs.camera_to_worlds.dtype == torch.float32
 
 
 @pytest.mark.parametrize("applied", [None, [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]])
@@ -251,10 +252,10 @@ def test_a_colmap_model_in_survey_coordinates(capture, load, axes):
     far = load(capture, colmap="sparse/0", **options)
     expected = near.train_dataset.cameras.camera_to_worlds
     torch.testing.assert_close(far.train_dataset.cameras.camera_to_worlds, expected, atol=1e-6, rtol=0)
-    torch.testing.assert_close(points_of(far), points_of(near), atol=1e-6, rtol=0)
+    torch.testing.assert_close(cloud_of(far)[0], cloud_of(near)[0], atol=1e-6, rtol=0)
     transform, scale = far.train_dataset.metadata[DATASET_FRAME]
     point = scale * (transform[:, :3] @ torch.from_numpy(SURVEY + [0.1, 0.2, 0.3]) + transform[:, 3])
-    torch.testing.assert_close(point, points_of(near)[1].double(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(point, cloud_of(near)[0][1].double(), atol=1e-6, rtol=0)
 
 
 def test_a_stray_camera_of_a_colmap_model(capture, load):
@@ -264,12 +265,7 @@ def test_a_stray_camera_of_a_colmap_model(capture, load):
     write_model(capture / "sparse" / "0", names, (24, 24), stray=(5, 4000.0))
     made = load(capture, colmap="sparse/0")
     assert float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].norm(dim=1).median()) > 0.3
-    assert float(points_of(made).abs().max()) > 0.2 * float(points_of(usual).abs().max())
-
-
-def cloud_of(made):
-    metadata = made.train_dataparser_outputs.metadata
-    return metadata["points3D_xyz"], metadata["points3D_rgb"]
+    assert float(cloud_of(made)[0].abs().max()) > 0.2 * float(cloud_of(usual)[0].abs().max())
 
 
 @pytest.mark.parametrize("scale", [0.1, 25.0])

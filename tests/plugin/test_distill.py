@@ -1,7 +1,5 @@
 """Distillation of a scene into a smaller one."""
 
-import math
-
 import pytest
 import torch
 
@@ -30,19 +28,11 @@ def cameras():
 @pytest.mark.parametrize("size", [1.0, 1e-3])
 def test_it_is_better_than_the_prune_alone(size, ball, cameras):
     """Also for a scene that the near plane would hide; other cameras than those of the steps judge."""
-    gaussians = ball.gaussians.replaced(
-        {"means": ball.gaussians["means"] * size, "scales": ball.gaussians["scales"] + math.log(size)}
-    )
-    teacher = sn.Scene(gaussians)
+    teacher = sn.transform(ball, scale=size)
     made = sn.distill(teacher, keep=0.2, steps=150, head=False, size=40)
     pruned = sn.prune(teacher, keep=0.2, cameras=sn.virtual_cameras(teacher, 16, size=64))
     assert made.num_gaussians == pruned.num_gaussians == 300
-    grown = {"means": made.gaussians["means"] / size, "scales": made.gaussians["scales"] - math.log(size)}
-    judged = sn.Scene(made.gaussians.replaced(grown))
-    before = {"means": pruned.gaussians["means"] / size, "scales": pruned.gaussians["scales"] - math.log(size)}
-    quality, base = (
-        sn.measure(one, ball, cameras).psnr for one in (judged, sn.Scene(pruned.gaussians.replaced(before)))
-    )
+    quality, base = (sn.measure(sn.transform(one, scale=1 / size), ball, cameras).psnr for one in (made, pruned))
     assert quality > base + 2
 
 

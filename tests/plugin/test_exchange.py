@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from fields import normal_field
 from hypothesis import given
 from hypothesis import strategies as st
 from photographed import COUNT, batch_of, begin, image_of, update
@@ -32,21 +33,9 @@ COLORS = ColorSettings(REFERENCE)
 N, RANKS = 90, 2
 
 
-def gaussians(n=N):
-    generator = torch.Generator().manual_seed(3)
-
-    def normal(*shape):
-        return torch.randn(n, *shape, generator=generator, dtype=torch.float64)
-
-    return {
-        "means": normal(3) * 0.6,
-        "quats": normal(4),
-        "scales": normal(3) * 0.4 - 1.8,
-        "opacities": normal(1),
-        "features_dc": normal(3),
-        "features_rest": normal(8, 3) * 0.3,
-        "features": normal(5),
-    }
+def gaussians():
+    made = normal_field(N, degree=2, features=5, seed=3, dtype=torch.float64)
+    return {**made, "means": 0.6 * made["means"], "scales": 0.4 * made["scales"] - 1.8}
 
 
 def gaussians_of(values, start=0, end=N):

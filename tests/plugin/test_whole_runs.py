@@ -337,15 +337,12 @@ def test_signals_to_the_command_of_two_ranks(folder, tmp_path, number, whole_gro
     ],
 )
 def test_what_several_ranks_cannot_do_is_refused_before_anything_is_written(tmp_path, monkeypatch, options, words):
+    from trial_runs import set_options
+
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     config = configured(tmp_path, "refused")
     config.machine.device_type = "cuda"
-    for name, value in options.items():
-        *owners, last = name.split(".")
-        owner = config
-        for part in owners:
-            owner = getattr(owner, part)
-        setattr(owner, last, value)
+    set_options(config, options)
     with pytest.raises(ConfigError, match=words):
         config.save_config()
     assert not config.get_base_dir().exists()

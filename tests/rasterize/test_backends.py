@@ -338,7 +338,18 @@ def test_gradients_of_some_inputs_by_some_outputs(wanted, output):
         assert deviation(ours, exact) < 1e-10  # measured: 1.5e-14
 
 
-def check_default_strategy(backend, device, absgrad):
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize(
+    ("name", "device"),
+    [
+        ("reference", "cpu"),
+        ("cpu", "cpu"),
+        pytest.param("gsplat", "cuda", marks=pytest.mark.gpu),
+        pytest.param("reference", "cuda", marks=pytest.mark.gpu),
+    ],
+)
+def test_default_strategy_grows(name, device, absgrad):
+    backend = select_backend(name, device)
     gsplat = pytest.importorskip("gsplat")
     params = {name: torch.nn.Parameter(value.to(device)) for name, value in scene(50).items()}
     optimizers = {name: torch.optim.Adam([param], 1e-3) for name, param in params.items()}
@@ -357,12 +368,6 @@ def check_default_strategy(backend, device, absgrad):
             assert torch.equal(state["count"] > 0, ours.radii > 0)
             assert state["grad2d"].sum() > 0
     assert params["means"].shape[0] > 50
-
-
-@each_backend
-@pytest.mark.parametrize("absgrad", [False, True])
-def test_default_strategy_grows(backend, absgrad):
-    check_default_strategy(backend, "cpu", absgrad)
 
 
 # ------------------------------------------------------------------------------------------------------------ harmonics
@@ -505,13 +510,6 @@ def test_no_gaussians_are_an_empty_image_and_float64_is_refused():
         spherical_harmonics(
             0, torch.ones(1, 3).cuda().double(), torch.ones(1, 1, 3).cuda().double(), backend=on_gpu("auto")
         )
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("absgrad", [False, True])
-@pytest.mark.parametrize("name", ["gsplat", "reference"])
-def test_default_strategy_grows_on_a_gpu(name, absgrad):
-    check_default_strategy(on_gpu(name), "cuda", absgrad)
 
 
 # ------------------------------------------------------------------------------------------ promises of compiled loops
