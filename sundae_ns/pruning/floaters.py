@@ -22,9 +22,8 @@ def _distances(points: Tensor, others: Tensor, nth: int = 1) -> Tensor:
     """Distance of each point ``[N, 3]`` to the nth nearest of some others ``[M, 3]``, infinite without: ``[N]``."""
     if len(others) < nth or not len(points):
         return points.new_full((len(points),), torch.inf)
-    return torch.cat(
-        [torch.cdist(rows, others).topk(nth, largest=False).values[:, -1] for rows in points.split(1 << 14)]
-    )
+    nearest = (torch.cdist(rows, others).topk(nth, largest=False).values for rows in points.split(1 << 14))
+    return torch.cat([distances[:, -1] for distances in nearest])
 
 
 @torch.no_grad()

@@ -1,0 +1,105 @@
+"""Planted floaters of four kinds: how many ``remove_floaters`` finds, and what else it removes.
+
+    python benchmarks/cleaning.py FIELDS... -o benchmarks/results/cleaning.csv
+
+Cameras found in the clean field stand for those of photos: floaters are planted in their images, and they are held out
+(cleaning knows none). ``psnr_lost``: what a field that shows its photos at 30 dB loses with the real Gaussians that go.
+"""
+
+import argparse
+import csv
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import sundae_ns as sn
+from sundae_ns.scene.prune_scene import floater_mask
+from sundae_ns.scene.virtual_cameras import middle_and_reach, usable
+
+PLANTED, HELD_OUT = 100, 12  # floaters of each kind, and cameras
+KINDS = ("near", "shell", "haze", "spikes")
+
+
+def points_in_front(
+    scene: sn.Scene, cameras: Sequence[sn.Camera], generator: torch.Generator, low: float, high: float
+) -> Tensor:
+    """Random points between cameras and what they see ``[PLANTED, 3]``, at shares of the depth."""
+    points, depths = [], [sn.render(scene, camera).depth[..., 0] for camera in cameras]
+    for i in range(PLANTED):
+        camera, depth = cameras[i % len(cameras)], depths[i % len(cameras)]
+        row, column = (int(torch.randint(n, (1,), generator=generator)) for n in depth.shape)
+        z = float(depth[row, column]) * (low + (high - low) * float(torch.rand(1, generator=generator)))
+        K, viewmat = camera.K, camera.viewmat
+        ray = torch.stack([(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], torch.ones(())])
+        points.append(viewmat[:3, :3].T @ (z * ray - viewmat[:3, 3]))
+    return torch.stack(points).float()
+
+
+def planted(scene: sn.Scene, kind: str, cameras: Sequence[sn.Camera], seed: int) -> sn.Scene:
+    """The scene with ``PLANTED`` more Gaussians, the last ones."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(low: float, high: float, columns: int = 1) -> Tensor:
+        return low + (high - low) * torch.rand(PLANTED, columns, generator=generator)
+
+    gaussians = usable(scene)
+    middle, reach = middle_and_reach(gaussians)
+    distances = (gaussians["means"].double() - middle).norm(dim=1)
+    outer = float(distances.sort().values[int(0.99 * len(distances))])
+    chosen = torch.randint(len(distances), (PLANTED,), generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(PLANTED, 3, generator=generator), dim=1)
+    if kind == "near":
+        means, opacities = points_in_front(scene, cameras, generator, 0.1, 0.4), random(0.3, 0.99)
+        scales = reach * random(0.01, 0.05) * random(0.5, 1.5, 3)
+    elif kind == "shell":
+        means, opacities = middle.float() + directions * outer * random(1, 3), random(0.3, 0.99)
+        scales = outer * 0.02 * random(0.5, 1.5, 3)
+    elif kind == "haze":
+        means, opacities = points_in_front(scene, cameras, generator, 0.3, 0.7), random(0.03, 0.13)
+        scales = reach * random(0.1, 0.2) * random(0.5, 1.5, 3)
+    else:
+        means, opacities = gaussians["means"][chosen], random(0.5, 0.99)
+        scales = reach * torch.cat([random(0.2, 0.4), random(0.002, 0.006, 2)], dim=1)
+    values = {name: value[chosen].clone() for name, value in gaussians.items()}
+    values |= {"means": means, "scales": scales.log(), "opacities": torch.logit(opacities)}
+    values |= {"quats": torch.nn.functional.normalize(torch.randn(PLANTED, 4, generator=generator), dim=1)}
+    values |= {"features_dc": 3.5 * random(-0.5, 0.5, 3), "features_rest": torch.zeros_like(values["features_rest"])}
+    joined = {name: torch.cat([gaussians[name], values[name]]) for name in values}
+    return dataclasses.replace(scene, gaussians=gaussians.replaced(joined))
+
+
+def rows_of(path: Path) -> Iterator[tuple[object, ...]]:
+    """One row a kind, and one for all planted at once, whose mask gives what is lost."""
+    scene = sn.load(path)
+    cameras = sn.virtual_cameras(scene, HELD_OUT, seed=7, size=256)
+    dirty = scene
+    for seed, kind in enumerate(KINDS):
+        dirty = planted(dirty, kind, cameras, seed)
+    n = len(floats := floater_mask(dirty, ())) - PLANTED * len(KINDS)
+    psnr = sn.measure(scene[~floats[:n]], scene, cameras).psnr
+    lost = f"{10 * math.log10(1 + 10 ** (-psnr / 10) / 1e-3):.3f}"
+    for kind, part in zip(KINDS, floats[n:].split(PLANTED), strict=True):
+        yield path.stem, kind, PLANTED, int(part.sum()), "", ""
+    yield path.stem, "all", PLANTED * len(KINDS), int(floats[n:].sum()), int(floats[:n].sum()), lost
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("fields", nargs="+", type=Path)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    options = parser.parse_args()
+    with options.out.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(("field", "kind", "planted", "removed", "others_removed", "psnr_lost"))
+        for path in options.fields:
+            for row in rows_of(path):
+                writer.writerow(row)
+                print(*row, flush=True)
+
+
+if __name__ == "__main__":
+    main()
