@@ -60,6 +60,7 @@ def call_here(tmp_path_factory):
         (command,) = entry_points(group="console_scripts", name=words[0])
         with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out:
             patch.setattr(sys, "argv", words)
+            patch.setattr(urllib.request, "_opener", None)  # urlopen keeps the proxies of its first call
             for name, value in {"PATH": path, "https_proxy": nowhere, "http_proxy": nowhere}.items():
                 patch.setenv(name, value)
             try:
