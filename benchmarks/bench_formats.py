@@ -30,7 +30,8 @@ from typing import Any, NamedTuple, TextIO
 
 import sundae_ns as sn
 from sundae_ns.core.files import replacing
-from sundae_ns.io.accounting import bytes_of, bytes_of_module
+from sundae_ns.core.gaussians import bytes_of
+from sundae_ns.head.head import bytes_of_module
 from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.finished_runs import Opened, load_model, load_run
 from sundae_ns.scene.packing import packed_bytes

@@ -32,7 +32,7 @@ from harness.run import Options, Runner, check_out, compare, first_jobs, run_scr
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.tables import MEGABYTE, number, table
 from sundae_ns.io.pack.config import FINETUNE_STEPS
-from sundae_ns.report.measured import METRICS
+from sundae_ns.report.measure import METRICS
 
 DATASETS: Mapping[str, Mapping[str, int]] = {
     "Mip-NeRF 360": {"bicycle": 4, "bonsai": 2, "counter": 2, "garden": 4, "kitchen": 2, "room": 2, "stump": 4},

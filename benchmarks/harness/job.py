@@ -38,8 +38,7 @@ from sundae_ns.plugin.finished_runs import Opened, load_model, load_run, model_o
 from sundae_ns.plugin.model import SundaeModelConfig
 from sundae_ns.plugin.trainer import SundaeTrainerConfig
 from sundae_ns.plugin.tuned_packs import finetune
-from sundae_ns.report.measure import measure_scene
-from sundae_ns.report.measured import Measured
+from sundae_ns.report.measure import Measured, Subject, measure
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.packing import contents_of
 from sundae_ns.train.schedules import set_schedule
@@ -164,7 +163,8 @@ def _written(opened: Opened, path: Path, scene: PackedScene, codecs: Codecs) -> 
     """Write a pack of a run and measure the file on the test views."""
     report = write_fitted(path, scene, codecs)
     model = model_of(load(path)).to(opened.model.device).eval()
-    found = measure_scene(replace(opened, model=model, packed_bytes=report.bytes), label="", repeats=0, visible=False)
+    subject = Subject.of_run(replace(opened, model=model, packed_bytes=report.bytes))
+    found = measure(subject, repeats=0, visible=False)
     errors = {name: found.full.mean(name) for name in ("psnr", "ssim")}
     return {"bytes": report.bytes, **errors, **{f"{name}_base": found.base.mean(name) for name in ("psnr", "ssim")}}
 
@@ -196,7 +196,7 @@ def _measured(job: Job, config: TrainerConfig, command: str) -> tuple[Opened, Me
     _forget()
     opened = load_model(folder)
     lpips = Lpips() if lpips_weights()[1].is_file() else None
-    measured = measure_scene(opened, label=job.key, lpips=lpips, command=command)
+    measured = measure(Subject.of_run(opened), label=job.key, lpips=lpips, command=command)
     measured = replace(measured, scene=job.scene, variant=job.arm, seed=job.seed, train_s=seconds, peak_vram_mib=peak)
     return opened, measured if job.keep_ratio is None else replace(measured, keep_ratio=job.keep_ratio)
 

@@ -12,7 +12,7 @@ from harness.plan import Arm
 from sundae_ns.core.errors import DataError
 from sundae_ns.core.files import write_text
 from sundae_ns.core.tables import MEGABYTE, number, table
-from sundae_ns.report.measured import METRICS, csv_text
+from sundae_ns.report.measure import METRICS, csv_text
 
 Result = Mapping[str, Any]
 """Content of a file in ``done/``: the job's description as ``job``, its figures as ``measured``."""

@@ -1,5 +1,3 @@
 """The ``sundae`` command: tasks that nerfstudio's commands do not cover. Floor 9."""
 
-from sundae_ns.cli.main import main
-
-__all__ = ["main"]
+from sundae_ns.cli.main import main as main

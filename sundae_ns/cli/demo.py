@@ -16,7 +16,6 @@ from sundae_ns.cli.process import quoted, run_command, word
 from sundae_ns.core.errors import writing
 from sundae_ns.core.files import write_bytes, write_text
 from sundae_ns.core.metrics import Lpips
-from sundae_ns.core.tables import number, table
 from sundae_ns.data.capture_files import write_demo_capture
 from sundae_ns.io.run_folder import prunes_of
 
@@ -52,11 +51,12 @@ def demo(
     with console.status("Evaluating"), open(out / "measure.log", "w", encoding="utf-8") as log:
         with redirect_stdout(log), redirect_stderr(log):
             from sundae_ns.plugin.finished_runs import load_model, load_run
-            from sundae_ns.report.measure import measure_scene
+            from sundae_ns.report.measure import Subject, markdown, measure
             from sundae_ns.scene.packing import packed_bytes
             from sundae_ns.scene.page import write_page
 
-            measured = measure_scene(load_model(run), label="demo", lpips=Lpips(), visible=False, warmup=1, repeats=3)
+            subject = Subject.of_run(load_model(run))
+            measured = measure(subject, label="demo", lpips=Lpips(), visible=False, warmup=1, repeats=3)
             write_text(out / "eval.json", json.dumps(measured.as_json(), indent=2) + "\n")
             finished = load_run(run)
             packed = packed_bytes(finished)
@@ -64,26 +64,10 @@ def demo(
             write_page(out / "scene.html", ("sundae demo", finished, packed))
 
     (prune,) = prunes_of(run)[-1:] or [{"before": measured.primitives, "after": measured.primitives}]
-    metrics = {"psnr": 2, "ssim": 4, "lpips": 4}
-    stages = (
-        ("warm-up", prune["before"], prune.get("warm_up")),
-        ("after the prune", prune["after"], prune.get("pruned")),
-        ("final, base colours", prune["after"], {metric: measured.base.mean(metric) for metric in metrics}),
-        ("final, compensated", prune["after"], {metric: measured.full.mean(metric) for metric in metrics}),
-    )
-    rows = [
-        [name, number(primitives, 0), *(number(means.get(metric), digits) for metric, digits in metrics.items())]
-        for name, primitives, means in stages
-        if means
-    ]
-    title = f"{measured.resolution} px, {device}, {len(measured.full.views)} test views"
-    lines = [title, *table(["stage", "Gaussians", "PSNR, dB", "SSIM", "LPIPS"], rows, words=1)]
-    lines.append(
-        f"Kept: {prune['after'] / max(prune['before'], 1):.1%} of the Gaussians. "
-        f"Size: {measured.bytes_total / 1e6:.2f} MB, the head {measured.bytes_head / 1e6:.2f} MB of it; packed "
-        f"{len(packed) / 1e6:.2f} MB. A frame: "
-        f"{number(measured.full.ms, 2)} ms, without the head {number(measured.base.ms, 2)}."
-    )
-    console.print("\n".join(lines), highlight=False, soft_wrap=True)
+    for name, count, means in (("warm up", prune["before"], "warm_up"), ("pruned", prune["after"], "pruned")):
+        if means in prune:
+            print(f"{name}: {count:,} Gaussians, {prune[means]['psnr']:.2f} dB, SSIM {prune[means]['ssim']:.4f}")
+    print(markdown({f"The end, on {len(measured.full.views)} test views": [measured]}, []), end="")
+    print(f"Kept: {prune['after'] / max(prune['before'], 1):.1%} of the Gaussians. Packed: {len(packed) / 1e6:.2f} MB.")
     console.print(f"In a browser: {out / 'scene.html'}   View: ns-viewer --load-config {quoted(run / 'config.yml')}")
     return 0

@@ -76,12 +76,12 @@ def open_run(run: Path, **options: Any) -> Scene:
 
 def open_scene(path: Path, data: Path | None) -> Scene:
     """A scene; that of a run, whose capture may have moved, has cameras of it."""
-    return open_run(path, data=data) if _is_run(path) else load(path)
+    return open_run(path, data=data) if is_run(path) else load(path)
 
 
 def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     """As :func:`open_scene`, with the packed file that holds it; others are packed in memory."""
-    if not _is_run(path):
+    if not is_run(path):
         return packed_file(path)
     scene = open_scene(path, data)
     return scene, packed_of(scene)
@@ -90,10 +90,11 @@ def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
 def name_of(path: Path) -> str:
     """The name of a scene: that of its file; of a run, whose folder is CAPTURE/METHOD/TIME, that of its capture."""
     folder = path.resolve() if path.is_dir() else path.resolve().parent
-    return (folder.parents[1].name or folder.name) if _is_run(path) else path.resolve().stem
+    return (folder.parents[1].name or folder.name) if is_run(path) else path.resolve().stem
 
 
-def _is_run(path: Path) -> bool:
+def is_run(path: Path) -> bool:
+    """Whether a path is the folder of a run, or its ``config.yml``."""
     return (path.is_dir() or path.name == "config.yml") and find_config(path) is not None
 
 
@@ -103,7 +104,7 @@ def chosen_cameras(scene: Scene, cameras: Path | None, most: int | None) -> Sequ
         return scene.cameras
     if kind_of(cameras) == "packed":
         return load(cameras).cameras
-    if _is_run(cameras):
+    if is_run(cameras):
         return open_run(cameras, max_cameras=most or VIEWS["cpu"]).cameras
     return cameras_of(cameras, scene)
 

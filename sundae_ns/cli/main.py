@@ -34,7 +34,8 @@ COMMANDS = {
     "export": "write a scene as a web page, .ply, .spz, .sog or .glb",
     "view": "show a scene with its head in the browser",
     "render": "render a scene to an image, or to a film along a smooth path",
-    "report": "measure and compare finished runs: quality, speed, size",
+    "compare": "compare scenes, formats or runs: quality, bytes, speed; a page with sliders",
+    "info": "what a file holds: count, bounds, bytes, cameras, floaters, a crop box",
     "demo": "train and evaluate the embedded capture; takes minutes on a CPU",
     "doctor": "check this machine, and say how to repair it",
 }

@@ -34,8 +34,7 @@ class PoseOptions:
     matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
     """photos that are compared: all pairs, neighbours in time and similar ones (for a video), or similar ones; by
     default what suits their number."""
-    frames: int = 150
-    """number of frames of a video; the sharpest of each stretch."""
+    frames: int = 150  # number of frames of a video; the sharpest of each stretch
     masks: Path | None = None
     """folder with a mask for each photo, under its name; training leaves out what is black. By default one named masks
     beside the photos."""

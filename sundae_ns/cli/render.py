@@ -10,9 +10,8 @@ from rich.console import Console
 from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file, check_least, check_suffix, progress_bar
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.core.files import replacing, write_image
+from sundae_ns.core.files import replacing, write_image, write_video
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.report.video import write_video
 from sundae_ns.scene.cameras import CameraFile, camera_in_front, film_views, read_cameras, with_start
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.scene import image_of

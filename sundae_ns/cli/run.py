@@ -24,8 +24,8 @@ from sundae_ns.core.files import put_aside, write_text
 from sundae_ns.data.capture_files import placed_in
 from sundae_ns.data.layouts import is_model, is_posed, no_transforms, posed_layout
 from sundae_ns.io.config_file import schedule_length
-from sundae_ns.io.pack import container
 from sundae_ns.io.pack.config import FINETUNED_SIZE, tuned_steps
+from sundae_ns.io.pack.container import read_header, read_sections
 from sundae_ns.io.run_folder import LOCK, reserve, steps_left
 
 SETTINGS = "run.json"  # file with the settings of the first command; a repeated one must share them
@@ -46,14 +46,11 @@ class Step(NamedTuple):
 class Project:
     """The options of ``sundae run``, and the files and steps that follow from them."""
 
-    photos: Source
-    """folder of photos, a video, or a capture, which has poses already."""
-    out: Out
-    """folder for the capture, the run, scene.sundae, scene.html and the report; created if missing."""
+    photos: Source  # folder of photos, a video, or a capture, which has poses already
+    out: Out  # folder for the capture, the run, scene.sundae, scene.html and the report; created if missing
     quality: Literal["draft", "normal", "best"] = "normal"
     """draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03)."""
-    max_mb: float | None = None
-    """most megabytes of the packed scene; fewer Gaussians and coarser steps keep to it."""
+    max_mb: float | None = None  # most megabytes of the packed scene; fewer Gaussians and coarser steps keep to it
     train: Annotated[TrainOptions, tyro.conf.arg(name="")] = TrainOptions()
     poses: Annotated[PoseOptions, tyro.conf.arg(name="")] = PoseOptions()
 
@@ -107,12 +104,12 @@ class Project:
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
         packed, report, page = (self.out / name for name in ("scene.sundae", "report/report.html", "scene.html"))
-        measure = ["sundae", "report", word(self.run), word(packed), "--data", word(self.capture)]
+        measure = ["sundae", "compare", word(self.run), word(packed), "--data", word(self.capture)]
         measure += ["-o", word(report.parent), "--overwrite"]
         export = ["sundae", "export", word(packed), "-o", word(page)]
         steps = [
             Step("train", self._train, self._trained),
-            Step("pack", lambda: self._pack(packed), lambda: _check_pack(packed), packed),
+            Step("pack", lambda: self._pack(packed), lambda: read_sections(packed, read_header(packed)), packed),
             Step("report", lambda: run_command(measure), lambda: _check_report(report), report),
             Step("web page", lambda: run_command(export), lambda: _check_page(page), page),
         ]
@@ -237,10 +234,6 @@ def _passes(check: Callable[[], object]) -> bool:
         return check() is not False
     except (SundaeError, OSError, ValueError, TypeError, KeyError, AttributeError):
         return False
-
-
-def _check_pack(path: Path) -> None:
-    container.read_sections(path, container.read_header(path))  # checks the checksums
 
 
 def _check_report(page: Path) -> bool:

@@ -27,12 +27,10 @@ FINETUNE_WORDS = ("--finetune-steps", str(FINETUNE_STEPS))  # leaves the last st
 class TrainOptions:
     """Options of a training that everyone sets."""
 
-    method: str = "sundae"
-    """one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU."""
+    method: str = "sundae"  # one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU
     keep: Share | None = None
     """share of the Gaussians to keep, 0.25 or 25%; by default as many as the scene needs, or that of the method."""
-    steps: int | None = None
-    """number of training steps; by default that of the method."""
+    steps: int | None = None  # number of training steps; by default that of the method
 
     def check(self, capture: Path) -> None:
         """Raise ``DataError`` if the capture does not exist, and ``ConfigError`` for a wrong option."""

@@ -54,10 +54,8 @@ def camera_center(viewmat: Tensor) -> Tensor:
 class Camera(NamedTuple):
     """One camera in the rasteriser's form."""
 
-    viewmat: Tensor
-    """World-to-camera, OpenCV axes ``[4, 4]``."""
-    K: Tensor
-    """Intrinsics in pixels ``[3, 3]``."""
+    viewmat: Tensor  # World-to-camera, OpenCV axes ``[4, 4]``
+    K: Tensor  # Intrinsics in pixels ``[3, 3]``
     width: int
     height: int
     focal: float

@@ -223,3 +223,8 @@ def sanitise(params: Mapping[str, Any]) -> Sanitised:
     mask = finite_mask(sanitised)
     counts = (int((kind & mask).sum()) for kind in (limits, flat, unrotated))
     return Sanitised(sanitised if bool(mask.all()) else sanitised.rows(mask), mask, *counts)
+
+
+def bytes_of(params: Mapping[str, Tensor]) -> int:
+    """Bytes of the parameters of Gaussians in fp32, feature vectors included, for any dtype in memory."""
+    return sum(value.numel() for value in params.values()) * 4

@@ -25,14 +25,9 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     - opacity follows from ``t A = sum t_i A_i``, with optical depth ``t = -log(1 - alpha)`` and mean projected area A:
       a wall of many small Gaussians absorbs as much light from afar as before. Limited to ``MAX_OPACITY``.
 
-    Args:
-        params: finite parameters of N Gaussians.
-        label: index of the Gaussian that each one is merged into ``[N]``: its own if it stays, -1 if it is dropped.
-        weight: of each Gaussian in its group, not negative ``[N]``.
-
-    Returns:
-        The Gaussians that stay, in order, computed in float64. One that is alone, has no weight or overflows is
-        unchanged, bit for bit.
+    Of finite Gaussians, ``label`` ``[N]`` is the index of that which each one is merged into: its own if it stays, -1
+    if it is dropped. ``weight`` ``[N]`` in its group is not negative. Returns those that stay, in order, computed in
+    float64. One that is alone, has no weight or overflows is unchanged, bit for bit.
     """
     source = {name: value.detach() for name, value in params.items()}
     device = source["means"].device

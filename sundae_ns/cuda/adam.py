@@ -17,8 +17,7 @@ from sundae_ns.cuda.kernels import load_kernels
 
 _THREADS, _PER_THREAD = 256, 4
 
-OPTIONS = (f"-DPER_THREAD={_PER_THREAD}",)
-"""Compiler options of ``adam.cu``."""
+OPTIONS = (f"-DPER_THREAD={_PER_THREAD}",)  # Compiler options of ``adam.cu``
 
 
 class Update(NamedTuple):

@@ -17,8 +17,7 @@ from sundae_ns.core.errors import DataError, SundaeError
 from sundae_ns.core.metrics import SSIM_WINDOW
 from sundae_ns.cuda.kernels import Launch, load_kernels
 
-SIGMA = 1.5
-"""Standard deviation of the window, pixels."""
+SIGMA = 1.5  # Standard deviation of the window, pixels
 
 _TILE_WIDTH, _TILE_HEIGHT, _THREADS = 32, 16, 256
 

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from sundae_ns.cuda.kernels import Launch, load_kernels
 
-WINDOW = 7
-"""Side of the square patches, pixels."""
+WINDOW = 7  # Side of the square patches, pixels
 
 _TILE_WIDTH, _TILE_HEIGHT, _THREADS = 32, 16, 256
 

@@ -99,8 +99,7 @@ class Tape(NamedTuple):
 
     inputs: list[Tensor]  # Of all 3 x 3 convolutions; every second one holds the activations of the convolution before
     coarse: list[Tensor]  # Inputs of the upsamplings, from the coarsest level on
-    last: Tensor
-    """Input of the last kernel: the last 3 x 3 convolution before bias and activation ``[1, width, h, w]``."""
+    last: Tensor  # Input of the last kernel: the last 3 x 3 convolution before bias and activation ``[1, width, h, w]``
 
 
 def cast_weights(net: UNet, dtype: torch.dtype) -> list[Tensor]:

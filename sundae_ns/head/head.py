@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from sundae_ns.core.camera import Crop
 from sundae_ns.core.errors import BackendError, ConfigError
+from sundae_ns.core.gaussians import bytes_of
 from sundae_ns.head import fused
 from sundae_ns.head.unet import UNet
 
@@ -53,8 +54,7 @@ class HeadConfig:
     channels on each level."""
     pixel_unshuffle: int = 2
     """Fold blocks of this many pixels per side into channels before the U-Net: 1 is the paper's, 2 is faster."""
-    num_features: int = 13
-    """Length F of each Gaussian's feature vector. 1, 5, 13 and 29 splat without padding."""
+    num_features: int = 13  # Length F of each Gaussian's feature vector. 1, 5, 13 and 29 splat without padding.
     start_at: int | None = None
     """Training step after which the head is enabled; by default the last prune. If it is enabled for the last few
     thousand steps only, base colours stay those of a field without a head: less flicker and less overfitting to few
@@ -62,8 +62,7 @@ class HeadConfig:
     max_train_pixels: int = 2**22
     """Train on a random window of at most this many pixels if images are larger, once the head is enabled; 0 for whole
     images."""
-    precision: Literal["fp32", "bf16"] = "bf16"
-    """Arithmetic of the U-Net on CUDA; a CPU always uses fp32."""
+    precision: Literal["fp32", "bf16"] = "bf16"  # Arithmetic of the U-Net on CUDA; a CPU always uses fp32
 
     @property
     def resolved(self) -> HeadConfig:
@@ -224,3 +223,16 @@ def resize(image: Tensor, height: int, width: int) -> Tensor:
     planes = image.permute(2, 0, 1)[None]
     resized = F.interpolate(planes, size=(height, width), mode="bilinear", align_corners=False, antialias=True)
     return resized[0].permute(1, 2, 0)
+
+
+def bytes_of_module(module: nn.Module) -> int:
+    """Bytes of a module's parameters and buffers, each in its own dtype; a shared tensor counts once."""
+    return sum(tensor.numel() * tensor.element_size() for tensor in [*module.parameters(), *module.buffers()])
+
+
+def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
+    """Bytes of Gaussians and their head, whose weights are not allocated; the one count that decides in training."""
+    if head is None or head.mode == "off":
+        return bytes_of(params)
+    with torch.device("meta"):
+        return bytes_of(params) + bytes_of_module(CompensationHead(head))

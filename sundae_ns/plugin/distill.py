@@ -22,8 +22,7 @@ from sundae_ns.core.files import replacing
 from sundae_ns.core.gaussians import FEATURES, Gaussians, sanitise
 from sundae_ns.core.values import usual_defaults
 from sundae_ns.cuda.kernels import naming_full_memory
-from sundae_ns.head.head import CompensationHead, HeadConfig
-from sundae_ns.io.accounting import stored_bytes
+from sundae_ns.head.head import CompensationHead, HeadConfig, stored_bytes
 from sundae_ns.plugin.model import SundaeModelConfig
 from sundae_ns.plugin.optimizer_configs import RATES
 from sundae_ns.scene.initialization import initial_features

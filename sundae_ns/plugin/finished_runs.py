@@ -1,4 +1,4 @@
-"""Finished scenes as models with their test views: runs of sundae or splatfacto, and packed scenes.
+"""Finished scenes as models with test views: runs of sundae or splatfacto, and files in the views of a capture.
 
 A ``config.yml`` can run code in nerfstudio, so no part of it is packed. A packed scene states plain values of its
 capture; each one is checked, and a new configuration is made from them.
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.base_datamanager import DataManagerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
@@ -32,18 +33,20 @@ from torch import Tensor
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import CheckpointError, ConfigError, DataError, PackError
 from sundae_ns.core.values import usual_defaults
+from sundae_ns.data.layouts import posed_layout
 from sundae_ns.head.head import HeadConfig
 from sundae_ns.io import checkpoint
 from sundae_ns.io.config_file import check_run, config_of, load_config
-from sundae_ns.io.formats import kind_of, refuse, unread
+from sundae_ns.io.formats import kind_of, kind_of_gaussians, unread
 from sundae_ns.io.run_folder import prunes_of
-from sundae_ns.plugin.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.plugin.dataparsers import camera_of, check_capture
 from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rasterize.interface import fastest_device
+from sundae_ns.scene.compose import transform
 from sundae_ns.scene.load_save import load, scene_of_checkpoint
 from sundae_ns.scene.packing import refusal
-from sundae_ns.scene.scene import Scene, unit
+from sundae_ns.scene.scene import Scene, measure, unit
 from sundae_ns.train.pruning import PruningConfig
 
 _PARSERS: dict[str, type[DataParserConfig]] = {
@@ -59,11 +62,11 @@ passes paths of images to ffmpeg through one."""
 
 @dataclass(frozen=True)
 class Opened:
-    """A finished scene as a model, and the facts in its files; None for what a packed scene does not state."""
+    """A finished scene as a model, and the facts in its files; None for what a file does not state."""
 
     model: SundaeModel  # In evaluation mode, on the GPU if there is one
     datamanager: SundaeDatamanager  # The capture's views, training views too
-    source: Path  # The run's folder, or the packed scene
+    source: Path  # The run's folder, or the file
     capture: Path  # The photographs: a folder, or its transforms.json
     method: str
     variant: str
@@ -71,7 +74,7 @@ class Opened:
     kept: float | None = None  # Ratio of Gaussians after all prunes to those before
     seed: int | None = None
     prune_s: float | None = None  # Seconds of its prunes
-    packed_bytes: int | None = None  # Size of the packed file; None for a run
+    packed_bytes: int | None = None  # Size of the file; None for a run
     pipeline: Any = None  # nerfstudio's pipeline of a run
     cameras: list[Cameras] = field(default_factory=list)  # Test cameras, each of shape (1,), on the model's device
     truths: list[Tensor] = field(default_factory=list)  # True images [H, W, 3] over the model's background, likewise
@@ -83,21 +86,25 @@ class Opened:
 
 
 @usual_defaults()
-def load_model(path: Path, data: Path | None = None, *, split: Literal["test", "val"] = "test") -> Opened:
+def load_model(
+    path: Path, data: Path | None = None, *, split: Literal["test", "val"] = "test", like: Opened | None = None
+) -> Opened:
     """Open a finished scene as a model, with its test views. No code in its files runs, and they are only read.
 
-    ``path`` is the folder of a run of sundae or splatfacto, its ``config.yml``, or a packed scene; ``data`` the
-    capture, if it has moved, which a packed scene needs. A run of splatfacto becomes a model of ours without a head:
-    one code path renders and times all methods. ``split="val"`` opens a run to train on: without test views, and in the
-    state of its checkpoint. ``CheckpointError`` for no such run, one of another method, or without a whole checkpoint;
-    ``DataError`` for a missing or unusable capture, or no test views; ``PackError`` for a damaged pack, or impossible
-    values.
+    ``path`` is the folder of a run of sundae or splatfacto, its ``config.yml``, or a file of a scene; ``data`` the
+    capture, if it has moved, which a file needs. A run of splatfacto becomes a model of ours without a head: one code
+    path renders and times all methods. ``split="val"`` opens a run to train on: without test views, and in the state of
+    its checkpoint. A file that does not say how its capture is read gets the test views and the background of ``like``.
+    ``CheckpointError`` for no such run, one of another method, or without a whole checkpoint; ``DataError`` for a
+    missing or unusable capture, or no test views; ``PackError`` for a damaged pack, or impossible values.
     """
-    if kind_of(path) == "packed":
-        opened = _open_packed(path, data)
+    scene = load(path) if kind_of(path) == "packed" or kind_of_gaussians(path) is not None else None
+    if scene is not None and like is not None and "capture" not in scene.meta:
+        return _placed_in(like, path, scene)
+    if scene is not None:
+        opened = _open_file(path, scene, data or (None if like is None else like.capture))
     else:
-        wanted = "give the folder of a finished run, its config.yml, or a packed scene"
-        refuse(path, primitives=f"it comes without test views; {wanted}")
+        wanted = "give the folder of a finished run, its config.yml, or a file of a scene"
         config = config_of(path)
         if config.name != "config.yml" or not config.is_file():
             reason = "is no run" if path.exists() else "does not exist"
@@ -108,15 +115,31 @@ def load_model(path: Path, data: Path | None = None, *, split: Literal["test", "
         for camera, batch in opened.datamanager.fixed_indices_eval_dataloader:
             opened.cameras.append(camera.to(model.device))
             opened.truths.append(model.truth(batch, {"background": model._get_background_color()}))
-    return opened
+    return opened if scene is None or "capture" in scene.meta else _placed_in(opened, path, scene)
 
 
-def _open_packed(path: Path, data: Path | None) -> Opened:
+def _placed_in(like: Opened, path: Path, scene: Scene) -> Opened:
+    """A file in the test views of another scene; of the model's and the capture's coordinates, those that fit."""
+    device, some = like.model.device, slice(None, None, len(like.cameras) // 4 + 1)
+    scene = dataclasses.replace(scene, background_color=like.model.config.background_color)
+    if not scene.in_model_frame:  # which few formats state
+        matrix, scale = like.datamanager.train_dataset.metadata[DATASET_FRAME]
+        moved = transform(scene, matrix[:, :3], scale, scale * matrix[:, 3])
+        views = like.truths[some], [like.model.camera_of(camera) for camera in like.cameras[some]]
+        scene = max((scene, moved), key=lambda each: measure(each.to(device), *views).psnr)
+    facts: Any = {"source": path, "variant": path.name, "packed_bytes": path.stat().st_size, "method": "", "steps": 0}
+    facts |= dict.fromkeys(("kept", "seed", "prune_s", "pipeline"))
+    return dataclasses.replace(like, model=model_of(scene).to(device), **facts)
+
+
+def _open_file(path: Path, scene: Scene, data: Path | None) -> Opened:
     if data is None:
-        raise DataError(f"{path} is a packed scene, which does not name its capture; give the capture with --data")
-    scene = load(path)
+        raise DataError(f"{path} does not name its capture; give the capture with --data")
+    config = datamanager_of(scene, data)
+    if "capture" not in scene.meta and isinstance(config.dataparser, BlenderDataParserConfig):
+        scene = dataclasses.replace(scene, background_color="white")  # as `sundae train` reads this layout
     model = model_of(scene).to(fastest_device())
-    manager = datamanager_of(scene, data).setup(device=model.device, test_mode="test", world_size=1, local_rank=0)
+    manager = config.setup(device=model.device, test_mode="test", world_size=1, local_rank=0)
     source = scene.meta.get("source")
     source = source if isinstance(source, dict) else {}
     method, step = str(source.get("method") or "sundae"), source.get("step")
@@ -267,14 +290,19 @@ def _parser_options(kind: type[DataParserConfig]) -> dict[str, Any]:
 
 
 def datamanager_of(scene: Scene, data: Path) -> SundaeDatamanagerConfig:
-    """Configuration that parses, splits and scales a capture as in the training of a packed scene.
+    """Configuration that parses, splits and scales a capture as in the training of a scene, else by its layout.
 
-    ``DataError`` if the capture cannot be used, ``PackError`` if the scene does not say how, or the impossible.
+    ``DataError`` if the capture cannot be used, ``PackError`` if the scene states the impossible.
     """
-    stated: Any = scene.meta.get("capture")
-    parser, scale = stated_capture(stated)
+    shape: Any = {}
+    if "capture" in scene.meta:
+        stated = scene.meta["capture"]
+        parser, scale = stated_capture(stated)
+        shape = {"camera_res_scale_factor": scale, "robust_frame": stated.get("robust_frame") is True}
+    else:
+        kind, *words = ["nerfstudio-data"] if (layout := posed_layout(data)) is None else layout.words
+        parser = tyro.cli(_PARSERS[kind], args=words)
     check_capture(parser, data, ("train", "test"))
-    shape: Any = {"camera_res_scale_factor": scale, "robust_frame": stated.get("robust_frame") is True}
     return SundaeDatamanagerConfig(dataparser=parser, data=data.resolve(), cache_images_type="uint8", **shape)
 
 

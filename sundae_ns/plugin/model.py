@@ -24,11 +24,11 @@ from pytorch_msssim import SSIM
 from torch import Tensor
 
 from sundae_ns.core.camera import Camera, Crop, crop_image
+from sundae_ns.core.gaussians import bytes_of
 from sundae_ns.core.metrics import Lpips, psnr, quality_of
 from sundae_ns.cuda.kernels import naming_full_memory
-from sundae_ns.head.head import CompensationHead, HeadConfig
+from sundae_ns.head.head import CompensationHead, HeadConfig, bytes_of_module
 from sundae_ns.io import checkpoint
-from sundae_ns.io.accounting import bytes_of, bytes_of_module
 from sundae_ns.io.config_file import find_config
 from sundae_ns.io.run_folder import take_records
 from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanager, view_index
@@ -66,8 +66,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     _target: type = field(default_factory=lambda: SundaeModel)
     pruning: PruningConfig = field(default_factory=PruningConfig)
     """When to prune, how many Gaussians to keep, and which."""
-    head: HeadConfig = field(default_factory=HeadConfig)
-    """The compensation head."""
+    head: HeadConfig = field(default_factory=HeadConfig)  # The compensation head
     rasterizer: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
     """auto takes gsplat on CUDA and compiled loops on a CPU; reference is slow, in plain PyTorch."""
     base_loss_weight: float = 0.2
@@ -88,8 +87,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Coordinates of the warm start: nerfstudio's model, or the capture (COLMAP). auto decides by the kind of file."""
     stop_split_at: int = 12000
     """Step at which densification ends, that of the prune; longer growth gains nothing that the prune keeps."""
-    evaluate_prune: bool = True
-    """Evaluate all test views right before and right after the prune, and at the end."""
+    evaluate_prune: bool = True  # Evaluate all test views right before and right after the prune, and at the end
 
     @property
     def num_features(self) -> int:

@@ -30,8 +30,7 @@ LINE_EVERY = 10.0  # Seconds between two lines
 class FusedAdamConfig(AdamOptimizerConfig):
     """nerfstudio's Adam by :func:`sundae_ns.train.schedules.fused_adam`."""
 
-    betas: tuple[float, float] = (0.9, 0.999)
-    """Decay rates of the running means of gradients and of their squares."""
+    betas: tuple[float, float] = (0.9, 0.999)  # Decay rates of the running means of gradients and of their squares
     decoupled: bool = False
     """Whether weight decay acts beside Adam's step (Loshchilov & Hutter 2019), not through the gradient."""
 
@@ -48,10 +47,8 @@ class FusedAdamConfig(AdamOptimizerConfig):
 class NetworkAdamConfig(FusedAdamConfig):
     """Adam for a network without normalisation layers, see :func:`sundae_ns.train.schedules.network_groups`."""
 
-    betas: tuple[float, float] = NETWORK_BETAS
-    """Decay rates of the running means of gradients and of their squares."""
-    full_rate_inputs: int = FULL_RATE_INPUTS
-    """Weights with more inputs than this get a proportionally smaller rate."""
+    betas: tuple[float, float] = NETWORK_BETAS  # Decay rates of the running means of gradients and of their squares
+    full_rate_inputs: int = FULL_RATE_INPUTS  # Weights with more inputs than this get a proportionally smaller rate
     decoupled: bool = True
 
     def _groups(self, params: list[torch.Tensor]) -> list[dict[str, Any]]:
@@ -62,20 +59,15 @@ class NetworkAdamConfig(FusedAdamConfig):
 class PruneAwareDecayConfig(SchedulerConfig):
     """Decay that the prune can restart."""
 
-    _target: type = field(default_factory=lambda: PruneAwareDecay)
-    """target class to instantiate"""
-    lr_final: float = 1.6e-6
-    """Learning rate at max_steps."""
-    max_steps: int = 30000
-    """Step at which the decay ends."""
+    _target: type = field(default_factory=lambda: PruneAwareDecay)  # target class to instantiate
+    lr_final: float = 1.6e-6  # Learning rate at max_steps
+    max_steps: int = 30000  # Step at which the decay ends
     lr_restart: float | None = None
     """Learning rate right after the prune, where the decay restarts; None does not restart it."""
     hold_until_prune: bool = False
     """Whether the rate stays constant until pruning has ended and the head is enabled; the decay starts there."""
-    warmup_steps: int = 0
-    """Steps over which the rate rises after the prune."""
-    shape: DecayShape = "exponential"
-    """Decay by an exponential, or along half a cosine."""
+    warmup_steps: int = 0  # Steps over which the rate rises after the prune
+    shape: DecayShape = "exponential"  # Decay by an exponential, or along half a cosine
 
 
 class PruneAwareDecay(Scheduler):

@@ -35,12 +35,9 @@ class PruneRule:
     redistribution: Literal["none", "merge"] = "merge"
     """Whether each dropped Gaussian is merged into the kept one that is nearest along the graph, or of its group
     (merge), or discarded as in the paper (none). A merge needs a pass over the training views."""
-    gamma: float = 0.5
-    """Share of the kept Gaussians that the band selection takes from the high end, in [0, 1]."""
-    num_neighbors: int = 16
-    """Most neighbours of a Gaussian in the graph."""
-    seed: int = 0
-    """Seed of random draws, which are the same on every device."""
+    gamma: float = 0.5  # Share of the kept Gaussians that the band selection takes from the high end, in [0, 1]
+    num_neighbors: int = 16  # Most neighbours of a Gaussian in the graph
+    seed: int = 0  # Seed of random draws, which are the same on every device
 
     @property
     def uses_contribution(self) -> bool:

@@ -24,8 +24,7 @@ from sundae_ns.core.errors import SundaeError
 from sundae_ns.cuda.kernels import Argument, load_kernels
 from sundae_ns.rasterize.reference import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
-TILE = 16
-"""Side of gsplat's tiles, pixels."""
+TILE = 16  # Side of gsplat's tiles, pixels
 
 LANES = 32  # threads of a warp
 _PIXELS = TILE * TILE  # of a tile, and threads of a block that blends one
@@ -50,8 +49,7 @@ class Splats(NamedTuple):
 class Capacity:
     """Number of tile/Gaussian pairs to allocate, so that nothing waits for the GPU to count them."""
 
-    pairs: int | None = None
-    """Length of the lists; None for as many as needed."""
+    pairs: int | None = None  # Length of the lists; None for as many as needed
     needed: list[Tensor] = field(default_factory=list)
     """Number of pairs of each call so far, int64 ``[]`` each; lists that needed more than ``pairs`` are incomplete."""
 

@@ -21,40 +21,29 @@ from sundae_ns.core.errors import MemoryExhaustedError
 class Inputs:
     """N Gaussians after activation and a pinhole camera. All tensors have one dtype and device."""
 
-    means: Tensor
-    """Centres, world units ``[N, 3]``."""
-    quats: Tensor
-    """Rotations as wxyz quaternions of any length; all-zero ones are the identity ``[N, 4]``."""
-    scales: Tensor
-    """Standard deviations, world units ``[N, 3]``."""
-    opacities: Tensor
-    """Opacities in [0, 1] ``[N]``."""
-    colors: Tensor
-    """Vectors to blend, such as colours and features ``[N, C]`` with C >= 1."""
+    means: Tensor  # Centres, world units ``[N, 3]``
+    quats: Tensor  # Rotations as wxyz quaternions of any length; all-zero ones are the identity ``[N, 4]``
+    scales: Tensor  # Standard deviations, world units ``[N, 3]``
+    opacities: Tensor  # Opacities in [0, 1] ``[N]``
+    colors: Tensor  # Vectors to blend, such as colours and features ``[N, C]`` with C >= 1
     camera: Camera
-    near_plane: float = 0.01
-    """Gaussians with a smaller camera z are culled, world units."""
+    near_plane: float = 0.01  # Gaussians with a smaller camera z are culled, world units
     far_plane: float = 1e10
-    antialiased: bool = False
-    """Scale opacities by the ratio of screen areas without and with blur (Mip-Splatting)."""
+    antialiased: bool = False  # Scale opacities by the ratio of screen areas without and with blur (Mip-Splatting)
     absgrad: bool = False
     """Let the backward pass set ``info["means2d"].absgrad``: absolute gradients of each pixel, summed (AbsGS)."""
-    render_depth: bool = False
-    """Also blend camera z."""
+    render_depth: bool = False  # Also blend camera z
 
 
 @dataclass(frozen=True)
 class Rasterization:
     """One rendered view; all tensors have the dtype and device of the Gaussians, except ``radii``."""
 
-    colors: Tensor
-    """Blended colours ``[H, W, C]``, without background."""
+    colors: Tensor  # Blended colours ``[H, W, C]``, without background
     depth: Tensor | None
     """Expected camera z ``[H, W, 1]``, world units, 0 where nothing was blended; None unless requested."""
-    alpha: Tensor
-    """Accumulated opacity ``[H, W, 1]`` in [0, 1]."""
-    radii: Tensor
-    """Screen radius ``[N]`` in whole pixels, int32, 0 where the Gaussian was culled; not differentiable."""
+    alpha: Tensor  # Accumulated opacity ``[H, W, 1]`` in [0, 1]
+    radii: Tensor  # Screen radius ``[N]`` in whole pixels, int32, 0 where the Gaussian was culled; not differentiable
     info: dict[str, Any]
     """Statistics that the ``DefaultStrategy`` of the installed gsplat reads, in the shapes it expects.
 
@@ -111,8 +100,7 @@ def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device
 # Bounds of a view on a CPU, checked before memory and time are taken: a small file can describe a view of terabytes.
 MOST_PER_TILE = 8192
 """Most Gaussians in a tile, on average over the image; a scene of 504,143 has at most 400 in tiles of 8 x 8 pixels."""
-ALWAYS = 1 << 22
-"""Pairs of a tile and a Gaussian beside these that any view may have."""
+ALWAYS = 1 << 22  # Pairs of a tile and a Gaussian beside these that any view may have
 _NEGLIGIBLE = 1 << 28  # bytes that are taken without a look at the memory
 _CONTROL_GROUP, _PROCESS = Path("/sys/fs/cgroup"), Path("/proc")
 

@@ -1,72 +1,221 @@
-"""Measurements of a finished scene: quality, bytes and synchronised times."""
+"""Measurements of scenes, their quality, bytes and synchronised times; and the table of them, as Markdown and CSV."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import csv
+import html
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
-from statistics import median
-from typing import Any, NamedTuple
+from io import StringIO
+from pathlib import Path
+from statistics import fmean, median
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
-from sundae_ns.core.gaussians import FEATURES
+from sundae_ns.core.camera import Camera
+from sundae_ns.core.gaussians import FEATURES, bytes_of
 from sundae_ns.core.metrics import Lpips, ViewQuality, quality_of
+from sundae_ns.core.tables import MEGABYTE, number, table, without_nan
 from sundae_ns.core.timing import median_ms
-from sundae_ns.io.accounting import bytes_of, bytes_of_module
-from sundae_ns.plugin.finished_runs import Opened
-from sundae_ns.plugin.model import SundaeModel
-from sundae_ns.report.measured import HEAD_OFF, HEAD_ON, Configuration, Measured
-from sundae_ns.scene.render import compensate, draw, scale_plan
+from sundae_ns.cuda.kernels import naming_full_memory
+from sundae_ns.head.head import bytes_of_module
+from sundae_ns.scene.frames import FrameReplay
+from sundae_ns.scene.load_save import load
+from sundae_ns.scene.render import GaussianSource, RenderSettings, compensate, draw, scale_plan
+from sundae_ns.scene.scene import Scene, render
+from sundae_ns.scene.virtual_cameras import of_unit_size, resized, size_of
+
+if TYPE_CHECKING:
+    from sundae_ns.plugin.finished_runs import Opened
+
+HEAD_ON, HEAD_OFF = "head on", "head off"
+# In the order of a table's columns, with their number of decimals.
+METRICS = (("psnr", 2), ("ssim", 4), ("psnr_fitted", 2), ("flip", 4), ("lpips", 4))
+COLUMNS = (
+    *("scene", "method", "variant", "keep_ratio", "seed", "steps", "primitives"),
+    *("psnr", "ssim", "psnr_base", "ssim_base", "psnr_fitted", "lpips", "lpips_net"),
+    *("bytes_primitives", "bytes_head", "bytes_total", "ms_frame", "ms_splat", "ms_head"),
+    *("train_s", "prune_s", "peak_primitives", "peak_vram_mib", "gpu", "resolution", "command"),
+)
+"""Columns of the CSV. Metrics are means over the views, ``*_base`` without the head; ``bytes_*`` are bytes,
+``ms_*`` milliseconds per frame, ``*_s`` seconds, ``peak_vram_mib`` the MiB that torch allocated at most in training."""
 
 
-class FrameTimes(NamedTuple):
-    """Synchronised milliseconds of a frame, median over repeated renders."""
+@dataclass(frozen=True)
+class Configuration:
+    """One configuration of rendering a scene. ``ms`` and ``views`` come from the same calls with the same arguments."""
 
-    frame: float  # As nerfstudio's commands request it: camera, colours, splatting of colours and features, head
-    splat: float  # The same without head and features
-    head: float  # Alone; 0 if it does not run. Its second splatting pass at another scale counts in ``frame`` only
+    name: str  # HEAD_ON or HEAD_OFF; a scene without a head has only the latter
+    ms: float | None  # Synchronised milliseconds per frame, median over the views; None if not timed
+    bytes: int  # In fp32, without head and features where they are off; of a file, the whole file
+    views: tuple[ViewQuality, ...]  # Empty for the scene that others are compared with
+
+    def mean(self, metric: str) -> float | None:
+        """Mean of a metric over the views; None unless every view has it."""
+        values = [getattr(view, metric) for view in self.views]
+        known = [value for value in values if value is not None and not math.isnan(value)]
+        return fmean(known) if known and len(known) == len(values) else None
 
 
-@contextmanager
-def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
-    """Enable or disable the head's correction inside a block."""
-    before, model.compensated = model.compensated, on
-    try:
-        yield
-    finally:
-        model.compensated = before
+@dataclass(frozen=True)
+class Measured:
+    """A scene with its measurements."""
+
+    label: str  # In tables and plots, unique in a report
+    source: str  # File or folder that was opened
+    scene: str
+    primitives: int
+    bytes_primitives: int
+    bytes_head: int
+    resolution: str  # Width x height, pixels
+    configurations: tuple[Configuration, ...]  # With the head, if the scene has one, then without it
+    method: str = ""
+    variant: str = ""
+    keep_ratio: float | None = None
+    seed: int | None = None  # None if the file does not record it
+    steps: int | None = None
+    ms_head: float | None = None  # Milliseconds of the head alone; 0 without a head
+    precision: str = ""  # Arithmetic of the head; empty without one
+    lpips_net: str = ""
+    train_s: float | None = None
+    prune_s: float | None = None
+    peak_primitives: int | None = None
+    peak_vram_mib: float | None = None
+    gpu: str = ""  # Name of the GPU that rendered; empty for a CPU
+    command: str = ""
+
+    @property
+    def bytes_total(self) -> int:
+        """Bytes of Gaussians and head."""
+        return self.bytes_primitives + self.bytes_head
+
+    @property
+    def full(self) -> Configuration:
+        """The complete rendering: with the head, if the scene has one."""
+        return self.configurations[0]
+
+    @property
+    def base(self) -> Configuration:
+        """The rendering of base colours, without the head."""
+        return self.configurations[-1]
+
+    @property
+    def has_head(self) -> bool:
+        """Whether the scene has an enabled head."""
+        return len(self.configurations) > 1
+
+    def as_json(self) -> dict[str, Any]:
+        """All measurements, including those of each view, as plain values for JSON."""
+        plain = asdict(self)
+        plain["bytes_total"] = self.bytes_total
+        for configuration, entry in zip(self.configurations, plain["configurations"], strict=True):
+            entry["mean"] = {metric.name: configuration.mean(metric.name) for metric in fields(ViewQuality)}
+        return without_nan(plain)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A scene, and the views in which it is measured; cameras and true images are on its device."""
+
+    source: GaussianSource
+    settings: RenderSettings
+    background: Tensor
+    cameras: Sequence[Camera]
+    truths: Sequence[Tensor]  # True images [H, W, 3] in [0, 1]
+    names: Sequence[str]  # Of the views
+    facts: Mapping[str, Any]  # More fields of Measured
+    capture: str = ""  # Identifies the capture or the scene that gives the views
+    file_bytes: int | None = None  # None for a run: its Gaussians and head count in fp32
+    frames: FrameReplay = field(default_factory=FrameReplay)
+
+    @classmethod
+    def of_run(cls, opened: Opened) -> Subject:
+        """A run, or a file in the test views of a capture."""
+        model, names = opened.model, ("scene", "method", "variant", "seed", "steps", "prune_s")
+        facts: dict[str, Any] = {name: getattr(opened, name) for name in names}
+        facts |= {"source": str(opened.source), "keep_ratio": opened.kept}
+        facts["peak_primitives"] = model.state.pruning["peak"] or None
+        settings, cameras = model.render_settings(training=False), [model.camera_of(each) for each in opened.cameras]
+        photos = [path.name for path in opened.datamanager.eval_dataset.image_filenames]
+        views = (cameras, opened.truths, photos, facts, str(opened.capture.resolve()))
+        return cls(model.source, settings, model._get_background_color(), *views, opened.packed_bytes)
+
+    @classmethod
+    def of_file(cls, scene: Scene, path: Path, title: str, views: Sequence[tuple[Camera, Tensor]]) -> Subject:
+        """A scene in cameras, with the images of another one, which gives the ``title``."""
+        facts, size = {"source": str(path), "scene": title}, path.stat().st_size if path.is_file() else None
+        cameras, truths = [camera for camera, _ in views], [truth for _, truth in views]
+        given = (cameras, truths, [f"camera {i}" for i in range(len(views))], facts, title, size)
+        return cls(GaussianSource(scene.gaussians), scene.settings(), scene.background, *given)
+
+    @torch.no_grad()
+    def image(self, index: int, *, head: bool = True) -> Tensor:
+        """A view as viewers render it, in [0, 1] ``[H, W, 3]``."""
+        settings = self.settings if head else self.settings.without_head()
+        with naming_full_memory(lambda: self.source.total):
+            return self.frames.render(self.source, self.cameras[index], self.background, settings)["rgb"]
+
+    @torch.no_grad()
+    def head_ms(self, index: int, time: Callable[[Callable[[], object]], float]) -> float:
+        """Milliseconds of the head alone in a view; 0 if it does not run. Its second splatting pass does not count."""
+        zoom, weight = scale_plan(self.cameras[index], self.settings.trained_focal)
+        if self.settings.head is None or weight == 0:
+            return 0.0
+        camera = self.cameras[index].zoomed(zoom)
+        primitives = self.source.primitives(camera, self.settings, features=True)
+        images, splatted = draw(primitives, camera, self.background, self.settings, depth=False)
+        return time(partial(compensate, self.settings.head, images["base_rgb"], splatted, self.background))
+
+
+def against_photos(data: Path | None) -> Callable[[Path], Subject]:
+    """A function that opens runs and files in the test views of a capture; a run comes first unless ``data`` names it.
+
+    Files that do not say how their capture is read get the views of the first scene.
+    """
+    before: list[Opened] = []
+
+    def subject(path: Path) -> Subject:
+        from sundae_ns.plugin.finished_runs import load_model  # imports nerfstudio, which takes seconds
+
+        with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # nerfstudio's messages
+            before.append(load_model(path, data, like=before[0] if before else None))
+        return Subject.of_run(before[-1])
+
+    return subject
+
+
+def against_first(path: Path, whole: Scene, cameras: Sequence[Camera]) -> Callable[[Path], Subject]:
+    """A function that opens scenes in views of the scene at a path, ``whole``, whose images are the truth."""
+    size = size_of(whole)
+    full, scaled = of_unit_size(whole, cameras)
+    views = [(camera.to(full.device), render(full, camera).rgb) for camera in scaled]
+
+    def subject(other: Path) -> Subject:
+        if other == path:
+            return Subject.of_file(full, path, path.name, [])
+        scene = replace(load(other), background_color=whole.background_color).to(full.device)
+        return Subject.of_file(resized(scene, 1 / size), other, path.name, views)
+
+    return subject
+
+
+def labels_of(paths: Sequence[Path]) -> list[str]:
+    """Names of the files of some paths, or the paths where two names are the same."""
+    names = [(path.parent if path.name == "config.yml" else path).name for path in paths]
+    return [str(path) if names.count(name) > 1 else name for path, name in zip(paths, names, strict=True)]
 
 
 @torch.no_grad()
-def frame_times(model: SundaeModel, camera: Any, *, warmup: int = 3, repeats: int = 5) -> FrameTimes:
-    """Time ``repeats`` renders of a camera of shape ``(1,)`` by a model in evaluation mode, after ``warmup`` others."""
-    milliseconds = partial(median_ms, device=model.device, warmup=warmup, repeats=repeats)
-    with compensation(model, True):
-        frame = milliseconds(lambda: model.get_outputs_for_camera(camera)["rgb"])
-    with compensation(model, False):
-        splat = milliseconds(lambda: model.get_outputs_for_camera(camera)["rgb"])
-    settings, background = model.render_settings(training=False), model._get_background_color()
-    zoom, weight = scale_plan(model.camera_of(camera), settings.trained_focal)
-    if settings.head is None or weight == 0:
-        return FrameTimes(frame, splat, 0.0)
-    scaled = model.camera_of(camera).zoomed(zoom)
-    primitives = model.source.primitives(scaled, settings, features=True)
-    images, splatted = draw(primitives, scaled, background, settings, depth=False)
-    run_head = partial(compensate, settings.head, images["base_rgb"], splatted, background)
-    return FrameTimes(frame, splat, milliseconds(run_head))
-
-
-def sizes(model: SundaeModel) -> tuple[int, int]:
-    """Bytes of what a render needs: of Gaussians in fp32 with features, and of the head."""
-    return bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head)
-
-
-@torch.no_grad()
-def measure_scene(
-    opened: Opened,
+def measure(
+    subject: Subject,
     *,
-    label: str,
+    label: str = "",
     lpips: Lpips | None = None,
     visible: bool = True,
     warmup: int = 3,
@@ -74,66 +223,94 @@ def measure_scene(
     progress: Callable[[], object] | None = None,
     command: str = "",
 ) -> Measured:
-    """Evaluate and time a scene on its test views, with the head and without.
+    """Evaluate and time a scene in its views, with the head and without; ``label`` is its name in tables.
 
-    Args:
-        opened: the scene.
-        label: its name in tables.
-        lpips: LPIPS; None leaves it out.
-        visible: whether to compute FLIP, if its package is installed.
-        warmup: untimed renders of each view.
-        repeats: timed renders of each view; 0 leaves times out.
-        progress: called after each view.
-        command: command to record as the origin of the figures.
+    ``lpips`` and, if ``visible``, FLIP are left out where their weights or package are missing. ``warmup`` renders of
+    each view are untimed, ``repeats`` timed; none leaves times out. ``progress`` is called after each view, and the
+    ``command`` recorded.
     """
-    model = opened.model
-    has_head = model.state.head_enabled
-    ways = {HEAD_ON: True, HEAD_OFF: False} if has_head else {HEAD_OFF: False}
+    settings, gaussians = subject.settings, subject.source.gaussians
+    device, head = gaussians["means"].device, settings.head
+    ways = {HEAD_OFF: False} if head is None else {HEAD_ON: True, HEAD_OFF: False}
+    time = partial(median_ms, device=device, warmup=warmup, repeats=repeats)
     times: dict[str, list[float]] = {name: [] for name in (*ways, "head")}
     views: dict[str, list[ViewQuality]] = {name: [] for name in ways}
-    for camera, truth in zip(opened.cameras, opened.truths, strict=True):
+    for i, truth in enumerate(subject.truths):
         for name, on in ways.items():
-            with compensation(model, on):
-                image = model.get_outputs_for_camera(camera)["rgb"]
-            views[name].append(quality_of(image, truth, lpips, visible=visible))
+            views[name].append(quality_of(subject.image(i, head=on), truth, lpips, visible=visible))
+            if repeats:
+                times[name].append(time(partial(subject.image, i, head=on)))
         if repeats:
-            frame, splat, head = frame_times(model, camera, warmup=warmup, repeats=repeats)
-            for name, on in ways.items():
-                times[name].append(frame if on else splat)
-            times["head"].append(head)
+            times["head"].append(subject.head_ms(i, time))
         if progress is not None:
             progress()
-    bare = {name: value for name, value in model.gauss_params.items() if name != FEATURES}
-    # A disabled head is not needed, and neither are its features.
-    stored = sizes(model) if has_head else (bytes_of(bare), 0)
-    needed = {HEAD_ON: sum(stored), HEAD_OFF: bytes_of(bare)}
-    if opened.packed_bytes is not None:
-        # A packed file is read completely, with the head enabled or disabled.
-        stored, needed = (opened.packed_bytes, 0), dict.fromkeys(needed, opened.packed_bytes)
-    resolutions = [f"{int(camera.width)}x{int(camera.height)}" for camera in opened.cameras]
-    precision = "" if model.head is None or not has_head else model.head.config.precision
+    bare = bytes_of({name: value for name, value in gaussians.items() if name != FEATURES})
+    # A disabled head is not needed, and neither are its features. A file is read completely in any case.
+    stored = (bare, 0) if head is None else (bytes_of(gaussians), bytes_of_module(head))
+    stored = stored if subject.file_bytes is None else (subject.file_bytes, 0)
+    needed = {HEAD_ON: sum(stored), HEAD_OFF: subject.file_bytes or bare}
+    resolutions = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in subject.cameras))
+    timed = bool(times["head"])
     return Measured(
         label=label,
-        source=str(opened.source),
-        scene=opened.scene,
-        method=opened.method,
-        variant=opened.variant,
-        keep_ratio=opened.kept,
-        seed=opened.seed,
-        steps=opened.steps,
-        primitives=model.num_points,
+        **subject.facts,
+        primitives=subject.source.total,
         bytes_primitives=stored[0],
         bytes_head=stored[1],
-        resolution=resolutions[0] + (" and others" if len(set(resolutions)) > 1 else ""),
+        resolution=" and others".join([*resolutions[:1], *([""] if len(resolutions) > 1 else [])]),
         configurations=tuple(
-            Configuration(name, median(times[name]) if repeats else None, needed[name], tuple(views[name]))
+            Configuration(name, median(times[name]) if timed else None, needed[name], tuple(views[name]))
             for name in ways
         ),
-        ms_head=median(times["head"]) if repeats else None,
-        precision="fp32" if precision and model.device.type == "cpu" else precision,
+        ms_head=median(times["head"]) if timed else None,
+        precision="" if head is None else "fp32" if device.type == "cpu" else head.config.precision,
         lpips_net=lpips.net if lpips is not None else "",
-        prune_s=opened.prune_s,
-        peak_primitives=model.state.pruning["peak"] or None,
-        gpu=torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "",
+        gpu=torch.cuda.get_device_name(device) if device.type == "cuda" else "",
         command=command,
     )
+
+
+def cells_of(runs: Sequence[Measured]) -> tuple[list[str], list[list[str]]]:
+    """Heads, and the cells of each configuration of some scenes; columns in which nothing is measured are left out."""
+    nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})
+    heads = ["scene", "rendered with", "Gaussians", "MB", "ms per frame", "PSNR, dB", "worst, dB", "SSIM"]
+    heads += ["fitted, dB", "FLIP", f"LPIPS ({', '.join(nets)})"]
+    no_head = "no head" if any(run.has_head for run in runs) else "-"
+    rows = []
+    for run in runs:
+        for way in run.configurations:
+            psnr, *means = (number(way.mean(metric), digits) for metric, digits in METRICS)
+            figures = [number(run.primitives, 0), number(way.bytes / MEGABYTE, 2), number(way.ms, 2)]
+            worst = number(min((view.psnr for view in way.views), default=None), 2)
+            rows.append([run.label, way.name if run.has_head else no_head, *figures, psnr, worst, *means])
+    known = [i for i in range(len(heads)) if any(row[i] != "-" for row in rows)]
+    return [heads[i] for i in known], [[row[i] for i in known] for row in rows]
+
+
+def markdown(scenes: Mapping[str, Sequence[Measured]], notes: Sequence[str]) -> str:
+    """The table of each scene, and what was left out, as a Markdown page; names stay text."""
+    parts = []
+    for scene, runs in scenes.items():
+        heads, rows = cells_of(runs)
+        cells = [[_plain(cell) for cell in row] for row in rows]
+        parts.append(f"# {_plain(scene)}\n\n" + "\n".join(table(heads, cells, words=heads.index("Gaussians"))))
+    return "\n\n".join([*parts, *(f"- Left out: {_plain(note)}" for note in notes)]) + "\n"
+
+
+def _plain(text: str) -> str:
+    """Text of one line in which Markdown and HTML mark nothing."""
+    return re.sub(r"([\\`*\[\]|~])", r"\\\1", html.escape(" ".join(text.split()), quote=False))
+
+
+def csv_text(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Runs of :meth:`Measured.as_json` as CSV; an empty cell means not measured."""
+    buffer = StringIO()
+    writer = csv.DictWriter(buffer, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for run in runs:
+        full, base = run["configurations"][0], run["configurations"][-1]
+        cells = {"ms_frame": full["ms"], "ms_splat": base["ms"], **full["mean"]}
+        cells |= {"psnr_base": base["mean"]["psnr"], "ssim_base": base["mean"]["ssim"]}
+        cells["lpips_net"] = run["lpips_net"] if cells["lpips"] is not None else ""
+        writer.writerow({**run, **cells})
+    return buffer.getvalue()

@@ -5,7 +5,7 @@ for (const card of document.querySelectorAll(".view")) {
   const slider = card.querySelector("input[type=range]");
   const [left, right] = ["left", "right"].map((side) => card.querySelector(`.tag.${side}`));
   const under = card.querySelector(".under");
-  const photo = { src: under.src, alt: under.alt };
+  const truth = { src: under.src, alt: under.alt, name: left.textContent };
 
   const show = () => {
     stage.style.setProperty("--at", `${slider.value}%`);
@@ -47,9 +47,9 @@ for (const card of document.querySelectorAll(".view")) {
   card.querySelector(".layers").addEventListener("change", layer);
   card.querySelector(".beside")?.addEventListener("change", (event) => {
     const other = document.getElementById(event.target.value)?.querySelector('[data-layer="rendering"]');
-    under.src = other ? other.src : photo.src;
-    under.alt = other ? other.alt : photo.alt;
-    left.textContent = other ? event.target.selectedOptions[0].textContent : "photo";
+    under.src = other ? other.src : truth.src;
+    under.alt = other ? other.alt : truth.alt;
+    left.textContent = other ? event.target.selectedOptions[0].textContent : truth.name;
     show();
   });
   const larger = card.querySelector(".larger");

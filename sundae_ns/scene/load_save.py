@@ -34,8 +34,8 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     says how many.
 
     Args:
-        path: a ``.ply``, ``.spz``, ``.sog`` (of streamed SOG the finest level), ``.glb``, ``.splat`` or ``.ksplat`` of
-            any program, a checkpoint of gsplat (``.pt``), a packed ``.sundae``, or a run of ``ns-train`` with sundae or
+        path: a ``.ply``, also a compressed one, a ``.spz``, ``.sog``, ``.glb``, ``.splat`` or ``.ksplat`` of any
+            program, a checkpoint of gsplat (``.pt``), a packed ``.sundae``, or a run of ``ns-train`` with sundae or
             splatfacto: its folder, its ``config.yml`` or one of its checkpoints.
         device: of the scene.
 

@@ -29,20 +29,16 @@ class StepResolution(NamedTuple):
     """Form of the training images at one step: a function of the step and the options."""
 
     step: int
-    downscale: int
-    """Divisor of the sides of the images."""
-    window_pixels: int
-    """Most pixels of an image; larger images are trained on by a random window. 0 for no limit."""
-    mirror: bool = False
-    """Whether half of the steps mirror their image."""
+    downscale: int  # Divisor of the sides of the images
+    window_pixels: int  # Most pixels of an image; larger images are trained on by a random window. 0 for no limit.
+    mirror: bool = False  # Whether half of the steps mirror their image
 
 
 class TrainingCamera(NamedTuple):
     """A training view for passes that do not train."""
 
     camera: Camera
-    mask: Tensor | None
-    """Pixels that count, bool ``[H, W, 1]``; None for all."""
+    mask: Tensor | None  # Pixels that count, bool ``[H, W, 1]``; None for all
 
 
 @dataclass(frozen=True)
@@ -50,8 +46,7 @@ class ColorSettings:
     """How colours are evaluated for a camera."""
 
     backend: Backend
-    active_sh_degree: int | None = None
-    """Highest SH degree in use; None for that of the Gaussians."""
+    active_sh_degree: int | None = None  # Highest SH degree in use; None for that of the Gaussians
 
 
 def colors_from(params: Mapping[str, Tensor], gaussians: Gaussians, center: Tensor, settings: ColorSettings) -> Tensor:
@@ -104,10 +99,8 @@ class RenderSettings(ColorSettings):
     """Whether opacities compensate for the smallest footprint (``rasterize_mode`` of splatfacto)."""
     training: bool = False
     """Whether gradients are needed. Images are then not clamped, and the head runs at their scale."""
-    absgrad: bool = False
-    """Whether to sum absolute gradients of the projected centres."""
-    head: CompensationHead | None = None
-    """The head; None while it is disabled."""
+    absgrad: bool = False  # Whether to sum absolute gradients of the projected centres
+    head: CompensationHead | None = None  # The head; None while it is disabled
     trained_focal: tuple[float, float] | None = None
     """Shortest and longest focal length of the images that the head was trained on, pixels."""
 

@@ -57,14 +57,10 @@ class PruningConfig(PruneRule):
     keep_ratio: float | None = USUAL_SHARE
     """Share of the N Gaussians that one prune keeps, in (0, 1]: exactly round(keep_ratio * N). One-shot: None lets
     trials on held-out training views decide the number."""
-    prune_at: int = 12000
-    """Step after which the one-shot prune happens."""
-    start: int = 2000
-    """First step of continuous pruning."""
-    stop: int = 15000
-    """Last step of continuous pruning."""
-    every: int = 2000
-    """Steps from one continuous prune to the next."""
+    prune_at: int = 12000  # Step after which the one-shot prune happens
+    start: int = 2000  # First step of continuous pruning
+    stop: int = 15000  # Last step of continuous pruning
+    every: int = 2000  # Steps from one continuous prune to the next
     max_gaussians: int | None = None
     """Most Gaussians that a one-shot prune keeps, or that there are in continuous pruning, densification included."""
     target_gaussians: int | None = None
@@ -72,8 +68,7 @@ class PruningConfig(PruneRule):
     max_drop: float | None = None
     """One-shot, where trials decide: PSNR in dB that a smaller field may lose against the best one, and SSIM in
     proportion. None for 0.1 dB and 0.003."""
-    max_bytes: int | None = None
-    """One-shot, where trials decide: most bytes of the packed scene, by an estimate."""
+    max_bytes: int | None = None  # One-shot, where trials decide: most bytes of the packed scene, by an estimate
 
     @property
     def decides(self) -> bool:

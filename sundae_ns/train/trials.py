@@ -35,7 +35,7 @@ from sundae_ns.core.errors import CheckpointError, PackError
 from sundae_ns.core.gaussians import FEATURES
 from sundae_ns.core.metrics import MOST_PSNR, SSIM_WINDOW, fitted_psnr, psnr, ssim
 from sundae_ns.core.surgery import replace_parameter
-from sundae_ns.io.accounting import stored_bytes
+from sundae_ns.head.head import stored_bytes
 from sundae_ns.io.coordinates import scene_order
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.pruning.decision import Pruner
@@ -160,14 +160,9 @@ class Progress:
 class Trials(Callback):
     """Tries candidates for the number of Gaussians, the head, and the length of the training.
 
-    It acts before the schedule prunes. :class:`AfterPrune` calls it again afterwards, for the stages that follow.
-
-    Args:
-        options: of the model. Trials decide about the count if those of pruning leave it to them, about the head in
-            mode auto.
-        state: of the training. A head that is to be decided about stays disabled until its trial.
-        densification: its running state starts anew when the trials of counts begin.
-        begins_at: step of the schedule after which a head is tried: the number of Gaussians is settled.
+    It acts before the schedule prunes; :class:`AfterPrune` calls it again afterwards, for the stages that follow. It
+    decides about the count if the options leave it to trials, about the head in mode auto; a head stays disabled until
+    its trial, after the step ``begins_at`` of the schedule. The running state of ``densification`` then starts anew.
     """
 
     name = "trials"

@@ -98,8 +98,8 @@ def test_only_files_and_folders_are_replaced(here):
         ["export", "in", "-o", "x.spz"],
         ["export", "run", "-o", "x.spz"],
         ["pack", "in", "-o", "x.sundae"],
-        ["report", "in", "-o", "x"],
-        ["report", "run", "-o", "x"],
+        ["compare", "in", "-o", "x"],
+        ["compare", "run", "-o", "x"],
     ],
 )
 @pytest.mark.parametrize("kind", ["pipe", "device"])

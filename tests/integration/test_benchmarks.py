@@ -24,7 +24,7 @@ from harness.results import read_results
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.plugin.dataparsers import camera_of
 from sundae_ns.plugin.finished_runs import load_model
-from sundae_ns.report.measure import measure_scene
+from sundae_ns.report.measure import Subject, measure
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 WARM_UP = "sundae-tiny-warm-up"
@@ -104,7 +104,7 @@ def test_a_comparison_that_was_stopped_is_continued(tiny, tmp_path, monkeypatch,
     for arm in arms:
         packed, key = results[arm]["packed"], results[arm]["job"]["key"]
         scene = load_model(out / "jobs" / key / "scene.sundae", data=tiny.scene)
-        found = measure_scene(scene, label="", repeats=0, visible=False)
+        found = measure(Subject.of_run(scene), repeats=0, visible=False)
         assert packed["bytes"] == scene.packed_bytes == found.bytes_total
         for name, way in (("psnr", found.full), ("psnr_base", found.base)):
             assert packed[name] == pytest.approx(way.mean("psnr"))

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 from models import as_the_viewer
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils import colormaps
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerElement
@@ -46,7 +48,7 @@ def test_a_copied_run_is_evaluated_by_its_own_checkpoint(tiny, call_here, tmp_pa
     call_here("ns-eval", "--load-config", copy / "config.yml", "--output-path", tmp_path / "eval.json")
     result = json.loads((tmp_path / "eval.json").read_text())
     assert Path(result["checkpoint"]) == kept
-    call_here("sundae", "report", copy, "-o", tmp_path / "ours", "--repeats", 0)
+    call_here("sundae", "compare", copy, "-o", tmp_path / "ours", "--repeats", 0)
     (ours,) = json.loads((tmp_path / "ours" / "report.json").read_text())
     assert ours["configurations"][0]["mean"]["psnr"] == pytest.approx(result["results"]["psnr"], abs=1e-5)
 
@@ -117,14 +119,40 @@ def test_ns_export(tiny, exported):
 # ---------------------------------------------------------------------------------------- the viewer, without a browser
 
 
+@pytest.fixture(scope="module")
+def pipeline(tiny):
+    return eval_setup(tiny.config, test_mode="inference")[1]
+
+
+def camera(pipeline, height, aspect):
+    """A test camera at another size, as the viewer makes it."""
+    known = pipeline.datamanager.eval_dataset.cameras[0:1]
+    lens = {"fx": 1.2 * height, "fy": 1.2 * height, "cx": int(height * aspect) / 2, "cy": height / 2}
+    return Cameras(known.camera_to_worlds, **lens).to(pipeline.device)
+
+
+@pytest.mark.parametrize(("height", "aspect"), [(30, 1.0), (31, 1.7), (75, 0.6)])
 @torch.no_grad()
-def test_check_box_switches_the_head_off(tiny):
-    pipeline = eval_setup(tiny.config, test_mode="inference")[1]
+def test_every_output_becomes_an_image(pipeline, height, aspect):
     assert isinstance(pipeline.model, SplatfactoModel)
+    pipeline.model.set_background(torch.tensor([0.1, 0.2, 0.3], device=pipeline.device))
+    outputs = pipeline.model.get_outputs_for_camera(camera(pipeline, height, aspect), obb_box=None)
+    assert list(outputs)[0] == "rgb"
+    for name, value in outputs.items():
+        for normalize in (False, True):
+            shown = colormaps.apply_colormap(value, colormaps.ColormapOptions(normalize=normalize))
+            assert shown.shape == (height, int(height * aspect), 3), name
+            assert torch.isfinite(shown).all(), name
+    for name in ("rgb", "base_rgb", "features", "response", "depth"):
+        assert outputs[name].std() > 0, name
+
+
+@torch.no_grad()
+def test_check_box_switches_the_head_off(pipeline):
     # As nerfstudio's control panel finds them.
     controls = [control for _, control in parse_object(pipeline.model, ViewerElement, "Custom Elements")]
     (box,) = [control for control in controls if isinstance(control, ViewerCheckbox) and "compensation" in control.name]
-    cam = pipeline.datamanager.eval_dataset.cameras[0:1].to(pipeline.device)
+    cam = camera(pipeline, 40, 1.0)
     on = pipeline.model.get_outputs_for_camera(cam)
     box.value = False
     off = as_the_viewer(lambda: pipeline.model.get_outputs_for_camera(cam))

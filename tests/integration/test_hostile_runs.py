@@ -27,7 +27,8 @@ WORDS = {
     "export": ["RUN", "-o", "out.html"],
     "view": ["RUN", "--no-open-browser"],
     "render": ["RUN", "-o", "out.png"],
-    "report": ["RUN", "-o", "report"],
+    "compare": ["RUN", "-o", "report"],
+    "info": ["RUN"],
     "demo": ["DEMO", "--overwrite"],
     "doctor": [],
 }

@@ -89,7 +89,7 @@ def test_nothing_is_left_out_without_need():
 
 def test_the_readme_has_commands_to_run():
     found = {words[1] for words in commands_of(PAGES[0])}
-    assert {"doctor", "pack", "export", "prune", "report"} <= found
+    assert {"doctor", "pack", "export", "prune", "compare"} <= found
 
 
 @pytest.fixture

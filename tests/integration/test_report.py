@@ -1,8 +1,9 @@
-"""Finished runs opened and measured, and ``sundae report`` on the tiny run and on stock splatfacto of its Gaussians."""
+"""Finished runs opened and measured, and ``sundae compare`` of the tiny run and of stock splatfacto."""
 
 import base64
 import copy
 import csv
+import dataclasses
 import json
 import os
 import re
@@ -19,14 +20,14 @@ from csv_rows import read_rows
 from nerfstudio.configs.method_configs import method_configs
 from PIL import Image
 
-from sundae_ns.core.errors import DataError
+import sundae_ns as sn
+from sundae_ns.core.errors import CheckpointError, DataError
 from sundae_ns.core.metrics import flip_available, quality_of
 from sundae_ns.io import checkpoint
 from sundae_ns.io.pack.packed_scene import write_scene
 from sundae_ns.plugin import finished_runs
 from sundae_ns.plugin.finished_runs import load_model, load_run
-from sundae_ns.report.measure import compensation, frame_times, measure_scene, sizes
-from sundae_ns.report.measured import COLUMNS
+from sundae_ns.report.measure import COLUMNS, Subject, measure
 from sundae_ns.scene.packing import contents_of
 from sundae_ns.scene.render import render_view
 
@@ -52,7 +53,7 @@ def stock(tiny, tmp_path_factory):
 @pytest.fixture(scope="module")
 def report(tiny, stock, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
-    assert run("report", tiny.folder, stock / "config.yml", "-o", out, "--warmup", 0, "--repeats", 1) == 0
+    assert run("compare", tiny.folder, stock / "config.yml", "-o", out, "--warmup", 0, "--repeats", 1) == 0
     return out
 
 
@@ -96,6 +97,22 @@ def test_a_capture_that_has_moved_is_found_or_named(tiny, tmp_path):
     assert load_model(run).capture == capture
 
 
+def test_the_share_kept_is_the_product_over_all_prunes(tiny, opened, copied):
+    assert opened.kept == pytest.approx(tiny.keep_ratio, abs=0.01)  # a whole number of Gaussians
+    prunes = [{"before": 200, "after": 50, "seconds": 1.0}, {"before": 80, "after": 40, "seconds": 0.5}]
+    (copied / "prune.json").write_text(json.dumps(prunes))
+    found = load_model(copied)
+    assert (found.kept, found.prune_s) == (0.125, 1.5)
+    (copied / "prune.json").unlink()
+    found = load_model(copied)
+    assert (found.kept, found.prune_s) == (None, None)
+
+
+def test_a_run_that_is_not_there(tmp_path):
+    with pytest.raises(CheckpointError, match="does not exist"):
+        load_model(tmp_path / "config.yml")
+
+
 # -------------------------------------------------------------------------------------------------------------- measure
 
 
@@ -103,17 +120,16 @@ def test_figures_of_a_run(opened):
     model, cameras, truths = opened.model, opened.cameras, opened.truths
     assert [truth.shape[:2] for truth in truths] == [(int(c.height), int(c.width)) for c in cameras]
     assert all(0 <= truth.min() <= truth.max() <= 1 for truth in truths)
-    times = frame_times(model, cameras[0], warmup=0, repeats=1)
-    assert min(times.frame, times.splat, times.head) > 0
-    floats = sum(value.numel() for value in model.gauss_params.values())
-    head = sum(value.numel() * value.element_size() for value in model.head.parameters())
-    assert sizes(model)[:2] == (4 * floats, head)
-    assert measure_scene(opened, label="", warmup=0, repeats=1).bytes_head > 0
+    subject = Subject.of_run(opened)
+    figures = measure(subject, warmup=0, repeats=1)
+    assert min(figures.full.ms, figures.base.ms, figures.ms_head) > 0
+    assert figures.bytes_primitives == 4 * sum(value.numel() for value in model.gauss_params.values())
+    assert figures.bytes_head == sum(value.numel() * value.element_size() for value in model.head.parameters())
+    assert not torch.equal(subject.image(0), subject.image(0, head=False))
     # Before the head is enabled there is none to time, and it has no bytes.
     model.state.head_starts_at = 10**9
-    assert frame_times(model, cameras[0], warmup=0, repeats=1).head == 0
-    figures = measure_scene(opened, label="", warmup=0, repeats=1)
-    assert figures.bytes_head == 0
+    figures = measure(Subject.of_run(opened), warmup=0, repeats=1)
+    assert (figures.bytes_head, figures.ms_head) == (0, 0)
     assert figures.bytes_total == figures.full.bytes
 
 
@@ -132,22 +148,10 @@ def test_the_head_is_timed_at_the_size_at_which_it_runs(opened):
         camera = copy.deepcopy(opened.cameras[0])
         camera.rescale_output_resolution(factor)
         assert sizes_seen(partial(model.get_outputs_for_camera, camera)) == expected
-        assert sizes_seen(partial(frame_times, model, camera, warmup=0, repeats=1)) == expected
-    assert frame_times(model, camera, warmup=0, repeats=1).head == 0
-
-
-def test_the_head_is_disabled_inside_a_block(opened):
-    def corrected():
-        shown = opened.model.get_outputs_for_camera(opened.cameras[0])
-        return not torch.equal(shown["rgb"], shown["base_rgb"])
-
-    assert corrected()
-    with torch.no_grad(), compensation(opened.model, on=False):
-        assert not corrected()
-    assert corrected()
-    with pytest.raises(ZeroDivisionError), compensation(opened.model, on=False):
-        raise ZeroDivisionError
-    assert corrected()
+        subject = Subject.of_run(dataclasses.replace(opened, cameras=[camera], truths=opened.truths[:1]))
+        assert sizes_seen(partial(subject.image, 0)) == expected
+        milliseconds = subject.head_ms(0, lambda render: len(sizes_seen(render)))
+        assert milliseconds == len(expected)
 
 
 # ----------------------------------------------------------------------------------------------------------- the report
@@ -167,7 +171,7 @@ def test_rows_are_of_the_runs(report, tiny):
     assert ours.psnr != ours.psnr_base
     assert min(ours.ms_frame, ours.ms_splat, ours.ms_head, theirs.ms_frame) > 0
     assert ours.bytes_head > 0 == theirs.bytes_head
-    assert ours.command.startswith("sundae report ")
+    assert ours.command.startswith("sundae compare ")
 
 
 def test_the_page_shows_the_views_with_their_figures(report, tiny):
@@ -192,11 +196,10 @@ def test_the_page_shows_the_views_with_their_figures(report, tiny):
     assert len({*re.findall('<option value="(v[0-9-]+)">', text)}) == len(views)  # each stands beside the other run's
 
 
-def test_the_page_of_many_views_is_limited(tiny, tmp_path, monkeypatch, capsys):
+def test_the_page_of_many_views_is_limited(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr("sundae_ns.report.report_page.MOST_VIEWS", 2)
-    assert run("report", tiny.folder, "-o", tmp_path / "out", "--repeats", 0) == 0
-    assert "MB, 2 of 3 views" in " ".join(capsys.readouterr().out.split())
-    assert "2 of 3 test views" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert run("compare", tiny.folder, "-o", tmp_path / "out", "--repeats", 0) == 0
+    assert "2 of 3 views" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
 def test_times_come_with_the_error_of_the_same_rendering(report, opened):
@@ -245,13 +248,13 @@ def test_errors_are_one_line(tiny, tmp_path, capsys):
         ((tiny.folder, "-o", tmp_path / "file"), "choose another folder"),
         ((tiny.folder, "-o", out, "--repeats", -1), "repeats is -1; give at least 0"),
     ):
-        assert run("report", *words) == 2
+        assert run("compare", *words) == 2
         assert message in one_line(capsys)
 
 
 def test_a_run_that_cannot_be_opened_does_not_lose_the_others(tiny, tmp_path, capsys):
     paths = (tmp_path / "nowhere", tiny.folder, tiny.scene)
-    assert run("report", *paths, "-o", tmp_path / "out", "--repeats", 0) == 1
+    assert run("compare", *paths, "-o", tmp_path / "out", "--repeats", 0) == 1
     assert len(read_rows(tmp_path / "out" / "report.csv")) == 1
     said, page = " ".join(capsys.readouterr().out.split()), (tmp_path / "out" / "report.md").read_text()
     for text in ("does not exist", "is no run"):
@@ -262,9 +265,9 @@ def test_a_run_that_cannot_be_opened_does_not_lose_the_others(tiny, tmp_path, ca
 def test_a_packed_scene_counts_the_bytes_of_its_file(report, tiny, tmp_path, capsys):
     packed = tmp_path / "tiny.sundae"
     write_scene(packed, contents_of(load_run(tiny.folder)))
-    words = ("report", packed, "-o", tmp_path / "out", "--repeats", 0)
+    words = ("compare", packed, "-o", tmp_path / "out", "--repeats", 0)
     assert run(*words) == 2
-    assert "give the capture with --data" in one_line(capsys)
+    assert "give another, --formats, or --data with a capture" in one_line(capsys)
     assert run(*words, "--data", tiny.scene) == 0
     (row,), before = read_rows(tmp_path / "out" / "report.csv"), read_rows(report / "report.csv")[0]
     assert row.ms_frame is row.ms_splat is None, "nothing was timed"
@@ -273,3 +276,21 @@ def test_a_packed_scene_counts_the_bytes_of_its_file(report, tiny, tmp_path, cap
     assert (row.primitives, row.seed, row.keep_ratio) == (before.primitives, None, None)
     assert row.psnr == pytest.approx(before.psnr, abs=0.15)
     assert row.psnr_base == pytest.approx(before.psnr_base, abs=0.15)
+
+
+def test_files_of_any_program_are_compared_with_the_photos(tiny, report, tmp_path, capsys):
+    """A .ply says that its coordinates are the model's; a .spz does not, and those that fit the photos are taken."""
+    scene = sn.load(tiny.folder)
+    files = [tmp_path / "a.ply", tmp_path / "a.spz", tmp_path / "capture.ply"]
+    sn.save(scene, files[0])
+    sn.save(scene, files[1])
+    rows, scale = torch.tensor(scene.meta["frame"]["transform"])[:3], scene.meta["frame"]["scale"]
+    back = sn.transform(scene, rows[:, :3].T, 1 / scale, -(rows[:, :3].T @ rows[:, 3]))
+    sn.save(dataclasses.replace(back, in_model_frame=False, head=None), files[2])
+    base = read_rows(report / "report.csv")[0].psnr_base
+    for words in ((tiny.folder, *files), (*files, "--data", tiny.scene)):
+        assert run("compare", *words, "-o", tmp_path / "out", "--overwrite", "--repeats", 0) == 0
+        found = [row.psnr_base for row in read_rows(tmp_path / "out" / "report.csv")[-3:]]
+        # Without a run, what no Gaussian covers is black.
+        assert found == pytest.approx([base] * 3, abs=0.1 if tiny.folder in words else 0.6)
+        assert max(found) - min(found) < 0.1

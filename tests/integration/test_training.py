@@ -3,6 +3,7 @@
 import gc
 import json
 import re
+import shutil
 import signal
 import sys
 import tracemalloc
@@ -10,15 +11,19 @@ import tracemalloc
 import kill_and_resume
 import pytest
 import torch
+import yaml
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 from trial_runs import served_views
 
-from sundae_ns.core.errors import BackendError, MemoryExhaustedError
+from sundae_ns.core.errors import BackendError, CheckpointError, DataError, MemoryExhaustedError
 from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io import checkpoint
+from sundae_ns.io.ply import MODEL_FRAME, write_ply
+from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.plugin.datamanager import SundaeDatamanager
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.train import initialize
@@ -54,10 +59,20 @@ def test_prune_keeps_exactly_the_share(tiny, report):
     assert f"kept {report['after']:,} of {report['before']:,} Gaussians" in " ".join(tiny.output.split())
 
 
-def test_a_finished_training_says_what_it_made(tiny, report):
-    """Its schedule, quality, size and the next command."""
+def test_the_schedule_follows_the_number_of_steps(tiny):
+    """A tenth of the method's own steps; what the command sets stays."""
+    config = yaml.load(tiny.config.read_text(), Loader=yaml.Loader)
+    model, rates = config.pipeline.model, config.optimizers["compensation"]["scheduler"]
+    assert config.schedule_length == tiny.steps == sundae_tiny.config.max_num_iterations // 10
+    assert model.stop_split_at == sundae_tiny.config.pipeline.model.stop_split_at // 10
+    assert (rates.max_steps, rates.warmup_steps) == (tiny.steps, tiny.steps // 12)
+    assert (model.pruning.prune_at, model.refine_every) == (tiny.prune_at, 15)
     assert f"{tiny.steps} steps" in tiny.output
     assert re.search(rf"prune .* after {tiny.prune_at}", tiny.output)
+
+
+def test_a_finished_training_says_what_it_made(tiny, report):
+    """Quality, size and the next command."""
     found = re.search(r"trained: PSNR (\d+\.\d\d) dB, SSIM 0\.\d{4} on 3 test views\n(.*)\nnext: (.*)\n", tiny.output)
     assert 5 < float(found[1]) < 60
     assert re.fullmatch(rf"{report['after']:,} Gaussians, with a head: 0\.\d\d MB before packing", found[2])
@@ -101,6 +116,16 @@ def test_checkpoints_are_plain_and_hold_no_lpips(tiny, step, pruned_at):
         (moments,) = state["optimizers"][name]["state"].values()
         # Features have no gradient, and so no moments, before the head is enabled.
         assert (moments == {}) if (name, step) == ("features", 30) else moments["exp_avg"].shape == value.shape
+
+
+def test_ns_train_names_bad_input(tiny, call_here, tmp_path):
+    """In one line: test_registration.py raises such an error in a process of its own."""
+    data = shutil.copytree(tiny.scene, tmp_path / "scene")
+    meta = json.loads((data / "transforms.json").read_text())
+    meta["frames"][3]["transform_matrix"][0][3] = float("nan")
+    (data / "transforms.json").write_text(json.dumps(meta))
+    with pytest.raises(DataError, match=r"^transforms\.json, frame 3 \(.*transform_matrix is nan; it must be finite"):
+        call_here("ns-train", "sundae-tiny", "--data", data, "--output-dir", tmp_path / "out", "--vis", "tensorboard")
 
 
 # ------------------------------------------------------------------------------------------------------------- resumed
@@ -241,13 +266,35 @@ def test_full_memory_in_the_backward_pass(tiny, resumed, monkeypatch):
         trainer.train()
 
 
-# --------------------------------------------------------------------------------------------------------------- starts
+def saved(folder, tiny, change):
+    """A checkpoint of the tiny run from before the prune, changed by a function."""
+    state = load(tiny.checkpoint(30))
+    change(state["pipeline"])
+    torch.save(state, folder / "step-000000030.ckpt")
+    return folder
 
 
-@pytest.mark.parametrize("source", ["checkpoint", "exported"])
-def test_warm_start(tiny, trainer_of, source, request):
-    params = {name: value for name, value in gaussians(load(tiny.checkpoint(119))).items() if name in SPLAT_NAMES}
-    path = tiny.checkpoints if source == "checkpoint" else request.getfixturevalue("exported")
+def test_a_splatfacto_checkpoint_is_refused(tiny, trainer_of, tmp_path):
+    def strip(pipeline):
+        for name in [name for name in pipeline if not name.startswith("_model.gauss_params.") or "features" in name]:
+            del pipeline[name]
+
+    with pytest.raises(ValueError, match="warm-start"):
+        trainer_of(load_checkpoint=saved(tmp_path, tiny, strip) / "step-000000030.ckpt")
+
+
+@pytest.mark.parametrize("option", ["load_dir", "pipeline.model.warm_start"])
+def test_a_checkpoint_of_format_1_is_refused_in_one_line(tiny, trainer_of, tmp_path, option):
+    extra = {"method": "sundae", "format": 1, "step": 30, "num_features": 5}
+    folder = saved(tmp_path, tiny, lambda pipeline: pipeline.update({"_model._extra_state": extra}))
+    with pytest.raises(CheckpointError, match=r"^.*format 1, this version reads 2; use the version that wrote.*$"):
+        trainer_of(**{option: folder})
+
+
+# ---------------------------------------------------------------------------------------------------------- warm starts
+
+
+def check_warm(tiny, trainer_of, params, path):
     trainer = trainer_of(model={"warm_start": path}, max_num_iterations=3)
     model = trainer.pipeline.model
     for name in SPLAT_NAMES:
@@ -263,13 +310,45 @@ def test_warm_start(tiny, trainer_of, source, request):
     assert load(trainer.checkpoint_dir / "step-000000002.ckpt")["step"] == 2
 
 
-def test_few_views_start_from_more_points(tiny, trainer_of, capsys, monkeypatch):
+@pytest.mark.parametrize("source", ["checkpoint", "ply", "exported"])
+def test_warm_start(tiny, trainer_of, tmp_path, source, request):
+    params = {name: value for name, value in gaussians(load(tiny.checkpoint(119))).items() if name in SPLAT_NAMES}
+    path = {"checkpoint": tiny.checkpoints, "ply": tmp_path / "a.ply"}.get(source)
+    if source == "ply":
+        write_ply(path, params, comments=[MODEL_FRAME])
+    check_warm(tiny, trainer_of, params, path or request.getfixturevalue("exported"))
+
+
+def test_warm_start_from_a_stock_checkpoint(tiny, trainer_of, tmp_path):
+    params = {name: value for name, value in gaussians(load(tiny.checkpoint(30))).items() if name in SPLAT_NAMES}
+    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
+    config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
+    scheduler = config.setup().get_scheduler(optimizer, lr_init=1.6e-4)
+    optimizer.step()
+    scheduler.step()
+    path = tmp_path / "step-000029999.ckpt"
+    pipeline = {f"_model.gauss_params.{name}": value for name, value in params.items()}
+    torch.save({"step": 29999, "pipeline": pipeline, "schedulers": {"means": scheduler.state_dict()}}, path)
+    with pytest.raises(Exception, match="[Ww]eights.only"):
+        load(path)
+    check_warm(tiny, trainer_of, params, path)
+
+
+def test_few_views_start_from_more_points_and_resume_without_looking_for_them_again(
+    tiny, trainer_of, resumed, capsys, monkeypatch
+):
     monkeypatch.setitem(initialize.SIDES, "cpu", 48)
     monkeypatch.setitem(initialize.FILLED, "cpu", 800)
-    trainer = trainer_of(model={"dense_start_views": 12}, max_num_iterations=2)
-    trainer.train()
-    assert trainer.model.num_points == tiny.points + 500
+    options = {"model": {"dense_start_views": 12}, "steps_per_save": 5, "save_only_latest_checkpoint": False}
+    whole = trainer_of(max_num_iterations=10, **options)
+    whole.train()
+    assert whole.model.num_points == tiny.points + 500
     assert "500 points by a plane sweep beside 300 sparse ones" in " ".join(capsys.readouterr().out.split())
+    monkeypatch.setattr(initialize, "Sweep", None)
+    again = resumed(whole.checkpoint_dir, 5, 4, timestamp="resumed", **options)
+    again.train()
+    for name, value in whole.model.gauss_params.items():
+        assert torch.equal(again.model.gauss_params[name], value), name
 
 
 # ------------------------------------------------------------------------------------------------------- recorded steps

@@ -11,11 +11,12 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from trial_runs import LENGTH, PRUNE_AT, STEPS, records_of, same, served_views, tidy, tiny_run, tiny_scene, trials_of
 
+from sundae_ns.core.gaussians import bytes_of
+from sundae_ns.head.head import bytes_of_module
 from sundae_ns.plugin import optimizer_configs
 from sundae_ns.plugin.finished_runs import load_run
 from sundae_ns.plugin.model import NerfstudioRun
 from sundae_ns.pruning.rule import kept_count
-from sundae_ns.report.measure import sizes
 from sundae_ns.scene.packing import contents_of
 from sundae_ns.train import averaging, choice, trials
 from sundae_ns.train.choice import HeldOutQuality
@@ -274,7 +275,7 @@ def test_a_head_that_pays_stays_and_all_views_are_trained_on_again(make, judge_h
     held = set(record["held_out_views"])
     assert (record["decision"], record["step"]) == ("head", decided)
     assert record["arms"]["head"]["psnr"] == pytest.approx(20.5, abs=0.01)
-    assert record["arms"]["head"]["bytes"] == sum(sizes(model))
+    assert record["arms"]["head"]["bytes"] == bytes_of(model.gauss_params) + bytes_of_module(model.head)
     assert model.state.head_enabled
     assert len(held) == 2
     assert not held & set(served[31 : decided + 1])

@@ -17,8 +17,8 @@ from hypothesis import HealthCheck, given, settings
 
 import sundae_ns as sn
 from sundae_ns.core.errors import CheckpointError, DataError
-from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, sh_degree
-from sundae_ns.io.accounting import bytes_of, bytes_of_module
+from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, bytes_of, sh_degree
+from sundae_ns.head.head import bytes_of_module
 from sundae_ns.io.formats import (
     FORMATS,
     kind_of,

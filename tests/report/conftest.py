@@ -3,7 +3,7 @@
 import pytest
 
 from sundae_ns.core.metrics import ViewQuality
-from sundae_ns.report.measured import HEAD_OFF, HEAD_ON, Configuration, Measured
+from sundae_ns.report.measure import HEAD_OFF, HEAD_ON, Configuration, Measured
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from sundae_ns.core.errors import CheckpointError
 from sundae_ns.core.metrics import ViewQuality
 from sundae_ns.core.tables import number
-from sundae_ns.report.measured import COLUMNS, Configuration, csv_text, markdown
+from sundae_ns.report.measure import COLUMNS, Configuration, csv_text, markdown
 from sundae_ns.train.curve import CountCurve, CurvePoint, read_count_curve
 
 
@@ -20,13 +20,13 @@ def row_of(run):
 
 
 def test_a_row_pairs_each_time_with_the_quality_of_its_configuration(measured):
-    row = row_of(replace(measured(), command='sundae report "a, b"', seed=None))
+    row = row_of(replace(measured(), command='sundae compare "a, b"', seed=None))
     assert (row["ms_frame"], float(row["psnr"])) == ("3.5", pytest.approx(25.5))
     assert (row["ms_splat"], float(row["psnr_base"])) == ("2.0", pytest.approx(25.0))
     assert (float(row["ssim"]), float(row["ssim_base"])) == (pytest.approx(0.85), pytest.approx(0.8))
     assert (row["bytes_primitives"], row["bytes_head"], row["bytes_total"]) == ("2000000", "1000000", "3000000")
     assert (row["scene"], row["keep_ratio"], row["seed"]) == ("bicycle", "0.1", "")
-    assert row["command"] == 'sundae report "a, b"'
+    assert row["command"] == 'sundae compare "a, b"'
 
 
 def test_without_a_head_full_and_base_are_the_same(measured):
@@ -70,10 +70,11 @@ def test_each_configuration_has_a_row_of_the_table(measured):
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
     assert rows[0][-1] == "LPIPS (vgg)"
     assert rows[2:] == [
-        ["ours", "head on", "4,000", "3.00", "3.50", "25.50", "0.8500", "-", "0.2000", "-"],
-        ["ours", "head off", "4,000", "1.00", "2.00", "25.00", "0.8000", "-", "0.2000", "-"],
-        ["theirs", "no head", "4,000", "1.00", "2.00", "25.00", "0.8000", "-", "0.2000", "0.2500"],
+        ["ours", "head on", "4,000", "3.00", "3.50", "25.50", "24.50", "0.8500", "0.2000", "-"],
+        ["ours", "head off", "4,000", "1.00", "2.00", "25.00", "24.00", "0.8000", "0.2000", "-"],
+        ["theirs", "no head", "4,000", "1.00", "2.00", "25.00", "24.00", "0.8000", "0.2000", "0.2500"],
     ]
+    assert "rendered with" not in markdown({"bicycle": [run]}, [])
     assert text.startswith("# bicycle\n")
     assert text.endswith("- Left out: this and that\n")
     assert number(None, 2) == number(float("nan"), 2) == "-"

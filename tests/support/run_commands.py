@@ -18,7 +18,7 @@ from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.scene.initialization import from_points
 
 PHOTOS = 8
-STEPS = ["sundae poses", "ns-train", "sundae pack", "sundae report", "sundae export"]
+STEPS = ["sundae poses", "ns-train", "sundae pack", "sundae compare", "sundae export"]
 NASTY = """-a b'c"d$(touch PWNED)`touch PWNED`;touch PWNED&"""
 """A name that a shell or a reader of options would take for something else."""
 NAMES = ["camera poses", "train", "pack", "report", "web page"]

@@ -154,7 +154,7 @@ def test_the_command_that_resumes(started, expected):
         ("ns-viewer --load_config {}", True),
         ("ns-export gaussian-splat --load-config={}", True),
         ("ns-train sundae --load-config {}", False),
-        ("sundae report {}", False),
+        ("sundae compare {}", False),
         ("ns-eval --load-config", False),
         ("ns-eval --output-path {}", False),
         ("", False),

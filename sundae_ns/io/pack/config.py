@@ -11,24 +11,15 @@ from sundae_ns.core.errors import ConfigError
 class PackConfig:
     """Precision of each attribute."""
 
-    position_bits: int = 13
-    """Bits of each coordinate within a block, 4 to 16."""
-    block: int = 1024
-    """Gaussians per block of positions; smaller blocks are more exact and take more bytes."""
-    scale_step: float = 0.05
-    """Step of log-scales."""
-    rotation_step: float = 0.008
-    """Step of the components x, y and z of unit quaternions."""
-    color_step: float = 0.03
-    """Step of the view-independent colour, in units of the SH coefficients."""
-    opacity_step: float = 0.2
-    """Step of the logit of the opacity."""
-    harmonics_step: float = 0.02
-    """Step of the view-dependent colour, in units of the SH coefficients."""
-    feature_step: float = 0.09
-    """Step of features."""
-    head_step: float = 0.02
-    """Step of the head's weights, in units of the largest weight of their output channel."""
+    position_bits: int = 13  # Bits of each coordinate within a block, 4 to 16
+    block: int = 1024  # Gaussians per block of positions; smaller blocks are more exact and take more bytes
+    scale_step: float = 0.05  # Step of log-scales
+    rotation_step: float = 0.008  # Step of the components x, y and z of unit quaternions
+    color_step: float = 0.03  # Step of the view-independent colour, in units of the SH coefficients
+    opacity_step: float = 0.2  # Step of the logit of the opacity
+    harmonics_step: float = 0.02  # Step of the view-dependent colour, in units of the SH coefficients
+    feature_step: float = 0.09  # Step of features
+    head_step: float = 0.02  # Step of the head's weights, in units of the largest weight of their output channel
 
     def validate(self) -> None:
         """Raise ``ConfigError`` for the first invalid option, with its valid values."""

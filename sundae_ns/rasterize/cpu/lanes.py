@@ -21,8 +21,7 @@ from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 from numba.np import arrayobj
 
-WIDTH = 16
-"""Number of lanes: in float32 one register of AVX-512, or four of SSE or NEON, whose latencies overlap."""
+WIDTH = 16  # Number of lanes: in float32 one register of AVX-512, or four of SSE or NEON, whose latencies overlap
 
 _WORD = ir.IntType(32)
 

@@ -24,16 +24,13 @@ from sundae_ns.rasterize.cpu.parallel import as_array, compiled, parallel_for
 from sundae_ns.rasterize.reference import BIN, MIN_ALPHA, Projection
 from sundae_ns.rasterize.types import check_pairs
 
-TILE = 8
-"""Side of a tile in pixels."""
+TILE = 8  # Side of a tile in pixels
 
 U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT, HALF_WIDTH, HALF_HEIGHT = range(9)
 """Columns of the table: centre, conic, opacity, largest exponent that is blended, and its distance from the centre."""
 
-STEP = WIDTH // TILE
-"""Rows of pixels of a tile that are blended in one step."""
-ROUNDING = 1e-3
-"""Slack on exponents, so that rounding never drops a Gaussian that is blended."""
+STEP = WIDTH // TILE  # Rows of pixels of a tile that are blended in one step
+ROUNDING = 1e-3  # Slack on exponents, so that rounding never drops a Gaussian that is blended
 MOST_PAIRS = 1 << 23
 """Pairs of a tile and a Gaussian in memory at a time: 84 MB, and in a backward pass at least six times as much."""
 _MIN_PER_THREAD = 2_500  # Gaussians: below 0.1 ms of work, waking a thread costs more than it saves

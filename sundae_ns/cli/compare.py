@@ -1,0 +1,135 @@
+"""``sundae compare``: what scenes show, weigh and take, against each other or against photos."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.markup import escape
+
+from sundae_ns.cli.inputs import chosen_cameras, is_run
+from sundae_ns.cli.options import Flag, Overwrite, check_folder, check_least, progress_bar
+from sundae_ns.core.errors import ConfigError, SundaeError
+from sundae_ns.core.files import write_files
+from sundae_ns.core.metrics import Lpips, Net, flip_available, lpips_weights
+from sundae_ns.io.formats import FORMATS
+from sundae_ns.rasterize.interface import fastest_device
+from sundae_ns.scene.describe import HELD_OUT, held_out_cameras
+from sundae_ns.scene.load_save import load, save
+from sundae_ns.train.curve import read_count_curve
+
+if TYPE_CHECKING:
+    from sundae_ns.report.measure import Measured
+
+
+def compare(
+    scenes: Annotated[list[Path], tyro.conf.Positional],
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
+    data: Path | None = None,
+    cameras: Path | None = None,
+    num_cameras: int = HELD_OUT,
+    formats: Flag = False,
+    min_psnr: float | None = None,
+    lpips_net: Net = "alex",
+    warmup: int = 3,
+    repeats: int | None = None,
+    overwrite: Overwrite = False,
+) -> int:
+    """Compare scenes by PSNR, SSIM, worst view and bytes: a table, and a page with sliders.
+
+    Runs of training, and all files with --data, are compared with the test photos of their capture, and timed. Other
+    files are compared with the images of the first one: from its stored cameras, else from virtual ones.
+
+    Args:
+        scenes: files and runs of all kinds that sundae reads; no code in them runs.
+        out: folder for a web page with sliders (report.html), and for the table as report.md, .csv and .json.
+        data: capture whose test photos are the truth, or that of a run if it has moved.
+        cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene: the images of the
+            first scene from its cameras are the truth, of runs too.
+        num_cameras: most cameras, evenly spaced, or the number of virtual ones.
+        formats: compare a scene with itself in every format: what each costs.
+        min_psnr: exit with 1 if the mean PSNR of a scene is lower, dB.
+        lpips_net: net of LPIPS, which is measured against photos if its weights are on disk.
+        warmup: untimed renderings of each view before timing.
+        repeats: timed renderings of each view; 0 measures no times. By default 5 against photos, else 0.
+    """
+    if out is not None:
+        check_folder(out, reads=[*scenes, data, cameras], overwrite=overwrite)
+    check_least(warmup=(warmup, 0), repeats=(repeats, 0), num_cameras=(num_cameras, 1))
+    scenes = sorted(scenes, key=lambda path: not is_run(path))  # a run says how photos are read
+    photos = cameras is None and (data is not None or any(map(is_run, scenes)))
+    if not scenes:
+        raise ConfigError("there is nothing to compare; give two scenes, one with --formats, or runs")
+    first = None if photos else load(scenes[0]).to(fastest_device())
+    if first is not None and len(scenes) == 1 and not formats:
+        raise ConfigError(f"{scenes[0]} is one scene; give another, --formats, or --data with a capture")
+    from sundae_ns.report.measure import against_first, against_photos, csv_text, labels_of, markdown, measure
+    from sundae_ns.report.report_page import ShownRun, cameras_for_each, report_page, shown_views
+
+    repeats = (5 if photos else 0) if repeats is None else repeats
+    options: dict[str, object] = {"-o": out, "--data": data, "--cameras": cameras, "--num-cameras": num_cameras}
+    options |= {"--min-psnr": min_psnr, "--lpips-net": lpips_net, "--warmup": warmup, "--repeats": repeats}
+    words = [*scenes, *(word for pair in options.items() if pair[1] is not None for word in pair)]
+    command = shlex.join(map(str, ["sundae", "compare", *words, *(["--formats"] if formats else [])]))
+    lpips = Lpips(lpips_net) if photos and lpips_weights(lpips_net)[1].is_file() else None
+    missing = f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them."
+    notes = [missing] if photos and lpips is None else []
+    notes += ["FLIP: the package is not installed; run pip install flip-evaluator."] * (photos and not flip_available())
+    done, failures = list[ShownRun](), list[SundaeError]()
+    measured_by = partial(measure, lpips=lpips, visible=photos, warmup=warmup, repeats=repeats, command=command)
+    with progress_bar() as progress, TemporaryDirectory() as folder:
+        if formats:
+            task, whole, stem = progress.add_task("Writing all formats", total=None), load(scenes[0]), scenes[0].stem
+            others = [suffix for suffix in (*FORMATS, ".sundae") if suffix != scenes[0].suffix.lower()]
+            scenes = [scenes[0], *(Path(folder, f"{stem}{suffix}") for suffix in others)]
+            for path in scenes[1:]:
+                save(whole, path)
+            progress.remove_task(task)
+        opened = against_photos(data)
+        if first is not None:
+            chosen = held_out_cameras(first, chosen_cameras(first, cameras, num_cameras), num_cameras)
+            opened = against_first(scenes[0], first, chosen)
+        for path, label in zip(scenes, labels_of(scenes), strict=True):
+            task = progress.add_task(f"Opening {escape(label)}", total=None)
+            try:
+                subject = opened(path)
+                progress.update(task, description=f"Measuring {escape(label)}", total=len(subject.truths))
+                measured = measured_by(subject, label=label, progress=partial(progress.advance, task))
+                views = [] if out is None else shown_views(subject, measured, cameras_for_each(len(scenes)))
+                curve = read_count_curve(Path(measured.source)) if subject.file_bytes is None else None
+                done.append(ShownRun(measured, views, curve, subject.capture))
+            except SundaeError as error:  # keep the measurements of the others
+                failures.append(error)
+                notes.append(f"{path}: {error}")
+            progress.remove_task(task)
+    if not done:
+        raise failures[0]
+    groups: dict[str, list[Measured]] = {}
+    for run in done:
+        groups.setdefault(run.measured.scene, []).append(run.measured)
+    notes += [
+        f"Comparison within {name}: its scenes have different views, so their numbers do not compare."
+        for name, group in groups.items()
+        if len({(run.resolution, len(run.full.views)) for run in group if run.full.views}) > 1
+    ]
+    print(markdown(groups, notes), end="")
+    if out is not None:
+        page = report_page(done, notes, command, "photo" if photos else scenes[0].name)
+        rows = [run.measured.as_json() for run in done]
+        files = {"json": json.dumps(rows, indent=1), "csv": csv_text(rows), "md": markdown(groups, notes), "html": page}
+        write_files({out / f"report.{kind}": text.encode(errors="backslashreplace") for kind, text in files.items()})
+        print(f"wrote {out / 'report.html'}, for a browser ({len(page) / 1e6:.1f} MB), report.md, .csv and .json")
+    low = [
+        run.measured.label
+        for run in done
+        if run.measured.full.views and min_psnr is not None and not (run.measured.full.mean("psnr") or 0) >= min_psnr
+    ]
+    if low:
+        print(f"below {min_psnr:g} dB: {', '.join(low)}", file=sys.stderr)
+    return 1 if failures or low else 0

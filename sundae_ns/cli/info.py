@@ -1,0 +1,47 @@
+"""``sundae info``: what a file holds, and what cameras see of it."""
+
+from __future__ import annotations
+
+from json import dumps
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from sundae_ns.cli.inputs import chosen_cameras
+from sundae_ns.cli.options import Flag, Scene
+from sundae_ns.core.tables import without_nan
+from sundae_ns.rasterize.interface import fastest_device
+from sundae_ns.scene.describe import describe
+from sundae_ns.scene.load_save import load
+
+
+def info(scene: Scene, cameras: Path | None = None, json: Flag = False) -> int:
+    """Say what a scene holds: Gaussians, bounds, marks, bytes, what cameras do not see, likely floaters, a crop box.
+
+    Args:
+        cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, in place of the
+            scene's own or virtual cameras.
+        json: print one JSON object.
+    """
+    opened = load(scene).to(fastest_device())
+    facts = describe(opened, scene, chosen_cameras(opened, cameras, None), console=Console(stderr=True))
+    if json:
+        print(dumps(without_nan(facts)))
+        return 0
+    facts |= {"invisible": f"{facts['invisible']:.1%} of the Gaussians, to {facts.pop('seen_by')}"}
+    facts |= {"crop": f"--crop {_words(facts['crop'])} holds 99% of what they see"}
+    for name, value in facts.items():
+        parts = value if isinstance(value, dict) else {}
+        print(f"{name.replace('_', ' '):20}{'' if parts else _words(value)}".rstrip())
+        print("".join(f"  {part:18}{size:,}\n" for part, size in parts.items()), end="")
+    return 0
+
+
+def _words(value: Any) -> str:
+    """A fact as text."""
+    if isinstance(value, list):
+        return " ".join(f"{number:.6g}" for number in value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:,}" if isinstance(value, int) else str(value or "-")

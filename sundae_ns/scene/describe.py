@@ -1,0 +1,116 @@
+"""What a scene holds, and what cameras see of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from sundae_ns.core.camera import Camera
+from sundae_ns.core.gaussians import bytes_of, sanitise
+from sundae_ns.head.head import bytes_of_module
+from sundae_ns.io.formats import kind_of
+from sundae_ns.io.pack.container import read_header
+from sundae_ns.scene.prune_scene import at_most, floater_mask, weights_in
+from sundae_ns.scene.scene import Scene
+from sundae_ns.scene.virtual_cameras import virtual_cameras
+
+HELD_OUT, PIXELS = 16, 1 << 20  # cameras that tell what a change costs, and most pixels of their images
+LOOKING = 64  # virtual cameras that tell what is seen of a scene without cameras
+_PRODUCER = re.compile(
+    rb'"generator"\s*:\s*"([^"]{1,200})"|^comment ([^\r\n]* (?:by|from) [^\r\n]{1,200})', re.M | re.I
+)
+
+
+def held_out_cameras(scene: Scene, cameras: Sequence[Camera], count: int = HELD_OUT, *, seed: int = 0) -> list[Camera]:
+    """At most ``count`` cameras, evenly spaced among some; without any, virtual ones that no prune of the seed sees."""
+    if not cameras:
+        return virtual_cameras(scene, count, seed=seed + 1)
+    chosen = torch.linspace(0, len(cameras) - 1, min(count, len(cameras))).round().int().tolist()
+    return [at_most(cameras[i], PIXELS) for i in chosen]
+
+
+def bytes_at(path: Path, scene: Scene) -> int:
+    """Bytes of the file of a scene; of a run, those of its Gaussians and its head in fp32."""
+    if path.is_file():
+        return path.stat().st_size
+    return bytes_of(scene.gaussians) + (0 if scene.head is None else bytes_of_module(scene.head))
+
+
+@torch.no_grad()
+def describe(
+    scene: Scene, path: Path, cameras: Sequence[Camera] = (), *, console: Console | None = None
+) -> dict[str, Any]:
+    """Facts of a scene that was loaded from a path, as plain values for JSON; lengths are in units of the scene.
+
+    ``invisible`` is the share of the Gaussians that no camera sees, ``floaters`` how many a cleaning would remove, and
+    ``crop`` a box, lowest corner first, that holds 99% of what the cameras see. They are ``cameras``, by default those
+    stored with the scene, else virtual ones.
+    """
+    scene = dataclasses.replace(scene, gaussians=sanitise(scene.gaussians).gaussians)
+    gaussians, cameras = scene.gaussians, cameras or scene.cameras
+    views = cameras or virtual_cameras(scene, LOOKING)
+    weights, means = weights_in(scene, views, console=console), gaussians["means"].double()
+    stated = None
+    if path.is_file():  # a .sog holds its meta.json anywhere
+        stated = _PRODUCER.search(path.read_bytes()[: None if kind_of(path) == "sog" else 1 << 16])
+    return {
+        "bytes": bytes_at(path, scene),
+        "gaussians": scene.num_gaussians,
+        "sh_degree": gaussians.sh_degree,
+        "head": None if scene.head is None else scene.head.config.size,
+        "low": means.amin(dim=0).tolist(),
+        "high": means.amax(dim=0).tolist(),
+        "up": None if scene.up is None else list(scene.up),
+        "antialiased": scene.antialiased,
+        "nerfstudio_frame": scene.in_model_frame,
+        "producer": stated and (stated[1] or stated[2]).decode("utf-8", "replace").strip(),
+        "stored_cameras": len(scene.cameras),
+        "bytes_by_attribute": bytes_by_attribute(scene, path),
+        "seen_by": f"{len(views)} {'cameras' if cameras else 'virtual cameras'}",
+        "invisible": float((weights <= 0).float().mean()),
+        "floaters": int(floater_mask(scene, cameras).sum()),
+        "crop": box_of(means, weights),
+    }
+
+
+def bytes_by_attribute(scene: Scene, path: Path) -> dict[str, int]:
+    """Bytes of each part of a packed scene or a .sog in its file; of other files, of the Gaussians in fp32."""
+    parts = Counter[str]()
+    if kind_of(path) == "packed":
+        for name, section in read_header(path).sections.items():
+            parts[name.split("/")[0]] += section.size
+    elif kind_of(path) == "sog":
+        with zipfile.ZipFile(path) as bundle:
+            for entry in bundle.infolist():
+                parts[re.split(r"[_.]", Path(entry.filename).name)[0]] += entry.compress_size
+    else:
+        parts |= {f"{name}, fp32": 4 * value.numel() for name, value in scene.gaussians.items()}
+        parts["head"] = 0 if scene.head is None else bytes_of_module(scene.head)
+    return {name: size for name, size in parts.items() if size}
+
+
+def box_of(means: Tensor, weights: Tensor, share: float = 0.99) -> list[float]:
+    """A box, lowest and highest x, y and z, that holds at least a share of weights ``[N]`` at centres ``[N, 3]``.
+
+    Each face cuts off at most a sixth of the rest. Its numbers are rounded outwards, to a thousandth of the longest
+    side or less.
+    """
+    sides = []
+    for values in means.T:
+        order = values.argsort()
+        sums = weights[order].double().cumsum(0)
+        cut = sums[-1] * (1 - share) / 6
+        sides.append(values[order[torch.searchsorted(sums, torch.stack([cut, sums[-1] - cut]))]].tolist())
+    digits = 3 - math.floor(math.log10(max(high - low for low, high in sides) or 1.0))
+    low = [round(math.floor(low * 10.0**digits) / 10.0**digits, digits) for low, _ in sides]
+    return low + [round(math.ceil(high * 10.0**digits) / 10.0**digits, digits) for _, high in sides]

@@ -1,0 +1,84 @@
+"""``sundae compare`` and ``sundae info`` of files, without a capture."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from command_line import refusal, run
+
+import sundae_ns as sn
+from sundae_ns.core.gaussians import bytes_of
+from sundae_ns.scene.describe import box_of
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A scene with cameras, packed; the same as .ply, and with half of its Gaussians."""
+    folder, generator = tmp_path_factory.mktemp("scenes"), torch.Generator().manual_seed(0)
+    scene = sn.Scene.from_points(torch.rand(300, 3, generator=generator), torch.rand(300, 3, generator=generator))
+    cameras = tuple(sn.Camera.look_at((x, -3, 0.5), (0.5, 0.5, 0.5), width=48, height=32) for x in (0.0, 1.0, 2.0))
+    sn.save(dataclasses.replace(scene, cameras=cameras), folder / "whole.sundae")
+    sn.save(scene, folder / "whole.ply")
+    sn.save(sn.prune(scene, keep=0.5, cameras=cameras), folder / "half.ply")
+    return folder
+
+
+def rows_of(text):
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    return [dict(zip(lines[0], row, strict=True)) for row in lines[2:]]
+
+
+def test_files_are_compared_with_the_first_one(folder, tmp_path, capsys):
+    words = (folder / "whole.sundae", folder / "whole.ply", folder / "half.ply")
+    assert run("compare", *words, "-o", tmp_path / "out", "--min-psnr", 99) == 1
+    said = capsys.readouterr()
+    assert "below 99 dB: whole.ply, half.ply" in said.err
+    first, ply, half = rows_of(said.out)
+    assert (first["scene"], first["PSNR, dB"], first["Gaussians"]) == ("whole.sundae", "-", "300")
+    assert "rendered with" not in first, "a column without figures is left out"
+    assert float(half["worst, dB"]) <= float(half["PSNR, dB"]) < float(ply["PSNR, dB"]) < 99
+    scenes = [sn.load(path) for path in words]
+    cameras = scenes[0].cameras
+    assert half["PSNR, dB"] == f"{sn.measure(scenes[2], scenes[0], cameras).psnr:.2f}"
+    assert ply["MB"] == f"{(folder / 'whole.ply').stat().st_size / 1e6:.2f}"
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert page.count("<article") == 2 * len(cameras)
+    assert 'aria-hidden="true">whole.sundae</span>' in page
+    assert run("compare", *words, "--cameras", folder / "whole.sundae", "--num-cameras", 1, "--min-psnr", 5) == 0
+
+
+def test_formats_of_one_scene_are_one_table(folder, capsys):
+    assert run("compare", folder / "whole.ply", "--formats") == 0
+    rows = {row["scene"]: row for row in rows_of(capsys.readouterr().out)}
+    assert list(rows) == ["whole.ply", "whole.spz", "whole.sog", "whole.glb", "whole.sundae"]
+    assert float(rows["whole.glb"]["PSNR, dB"]) > 90 > float(rows["whole.spz"]["PSNR, dB"]) > 25
+
+
+def test_info_says_what_a_file_holds(folder, capsys):
+    assert run("info", folder / "whole.ply", "--json") == 0
+    facts, scene = json.loads(capsys.readouterr().out.splitlines()[-1]), sn.load(folder / "whole.ply")
+    assert (facts["gaussians"], facts["sh_degree"], facts["stored_cameras"]) == (300, 0, 0)
+    assert sum(facts["bytes_by_attribute"].values()) == bytes_of(scene.gaussians)
+    assert facts["low"] == pytest.approx(scene.gaussians["means"].amin(dim=0).tolist())
+    assert 0 <= facts["invisible"] < 0.5
+    assert run("info", folder / "whole.sundae") == 0
+    said = capsys.readouterr().out
+    assert "invisible           0.0% of the Gaussians, to 3 cameras" in said
+    box = said.partition("--crop ")[2].split()[:6]
+    assert run("export", folder / "whole.sundae", "-o", folder / "cut.spz", "--crop", *box) == 0
+    assert sn.load(folder / "cut.spz").num_gaussians > 290
+    capsys.readouterr()
+    assert "nothing.ply cannot be read" in refusal(capsys, "info", folder / "nothing.ply")
+
+
+def test_a_box_holds_the_share_that_is_asked_for():
+    generator = torch.Generator().manual_seed(0)
+    means, weights = 20 * torch.randn(5000, 3, generator=generator).double(), torch.rand(5000, generator=generator)
+    weights[means[:, 0] > 40] = 0  # what nobody sees does not count
+    numbers = box_of(means, weights, 0.9)
+    box = torch.tensor(numbers)
+    inside = ((means >= box[:3]) & (means <= box[3:])).all(dim=1)
+    assert 0.9 <= float(weights[inside].sum() / weights.sum()) < 0.95
+    assert box[3] < 40
+    assert numbers == [round(number, 2) for number in numbers], "they are short"
