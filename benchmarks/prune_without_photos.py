@@ -8,7 +8,7 @@ A run of sundae or splatfacto is a full field, and its capture has the test view
 with the full field's own images, ``psnr`` and ``ssim`` with the photographs, and ``psnr_virtual`` compares virtual
 views that no tool was given with the full field. Tools and rules: ``sundae_ns`` by virtual views (``pairs``, the
 default), and ``splat-transform`` by ``--decimate`` and ``--decimate-adaptive``, on its CPU path. Training is none, or
-that of ``sundae distill``: ``distill`` with a head where it pays, ``distill-no-head`` without. ``bytes`` are those of
+that of ``sundae prune --distill``: ``distill`` with a head where it pays, ``distill-no-head`` without. ``bytes`` are of
 the .sundae file, ``bytes_sog`` of the base colours as .sog. With ``-o`` rows that are there are not measured again;
 ``--again`` does.
 """

@@ -14,7 +14,7 @@ import tyro
 from rich.markup import escape
 
 from sundae_ns.cli.inputs import chosen_cameras, is_run
-from sundae_ns.cli.options import Flag, Overwrite, check_folder, check_least, progress_bar
+from sundae_ns.cli.options import Flag, Maybe, Overwrite, check_folder, check_least, progress_bar
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.files import write_files
 from sundae_ns.core.metrics import Lpips, Net, flip_available, lpips_weights
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 
 def compare(
     scenes: Annotated[list[Path], tyro.conf.Positional],
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
-    data: Path | None = None,
-    cameras: Path | None = None,
+    out: Annotated[Maybe[Path], tyro.conf.arg(aliases=["-o"])] = None,
+    data: Maybe[Path] = None,
+    cameras: Maybe[Path] = None,
     num_cameras: int = HELD_OUT,
     formats: Flag = False,
-    min_psnr: float | None = None,
+    min_psnr: Maybe[float] = None,
     lpips_net: Net = "alex",
     warmup: int = 3,
-    repeats: int | None = None,
+    repeats: Maybe[int] = None,
     overwrite: Overwrite = False,
 ) -> int:
     """Compare scenes by PSNR, SSIM, worst view and bytes: a table, and a page with sliders.

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 from rich.console import Console
 
-from sundae_ns.cli.inputs import Cleaning, copies_rows, name_of, open_packed, open_scene
+from sundae_ns.cli.inputs import copies_rows, name_of, opened, prepared_page, reduced
 from sundae_ns.cli.options import (
-    Direction,
+    Advanced,
     Flag,
+    Maybe,
     Out,
-    Overwrite,
+    Plain,
     Scene,
+    SceneDetails,
+    Wishes,
     check_file,
     check_folder,
     check_suffix,
@@ -23,32 +26,31 @@ from sundae_ns.cli.options import (
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.gaussians import sh_degree
 from sundae_ns.io.formats import FORMATS
-from sundae_ns.io.pack import container
-from sundae_ns.io.ply import keep_vertices
 from sundae_ns.io.run_folder import files_of
 from sundae_ns.io.sog import STREAMED
 from sundae_ns.io.spz import clamped
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import with_start
-from sundae_ns.scene.load_save import load, load_with_mask, save_for_viewers, save_levels
-from sundae_ns.scene.packing import packed_bytes, stated_start
+from sundae_ns.scene.load_save import save_for_viewers, save_levels
 from sundae_ns.scene.page import write_page
-from sundae_ns.scene.prune_scene import within
 from sundae_ns.scene.scene import Scene as Opened
+
+
+@dataclass(frozen=True)
+class ExportDetails(SceneDetails):
+    """Options that few need."""
+
+    upright: Flag = False
+    """rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers; not for a warm start."""
 
 
 def export(
     scene: Scene,
     out: Out,
-    beside: tyro.conf.Positional[Path | None] = None,
+    beside: tyro.conf.Positional[Maybe[Path]] = None,
+    wishes: Plain[Wishes] = Wishes(),  # noqa: B008
     views: tuple[str, ...] = (),
-    upright: bool = False,
-    start_view: str | None = None,
-    up: Direction | None = None,
-    data: Path | None = None,
     lod: Flag = False,
-    overwrite: Overwrite = False,
-    cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
+    advanced: Advanced[ExportDetails] = ExportDetails(),  # noqa: B008
 ) -> int:
     """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz, .sog or .glb.
 
@@ -60,63 +62,50 @@ def export(
             much smaller). A name without a suffix is a folder of page and scene, for a web server.
         beside: another scene, which the page shows as it is beside the first one, by the same camera.
         views: views that the page names: NAME=LINK, each with a link that its button Copy link gives.
-        upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers; not for a warm start.
-        start_view: what a page opens with: index of a stored camera, or a camera file as sundae render reads it; by
-            default that of a packed scene, else the first camera.
-        up: direction about which a page turns, for example 0 0 1; by default that of the scene, else of its cameras.
-        data: folder of the capture, if it moved; for a page or levels of a run.
         lod: write levels of detail as streamed SOG (lod-meta.json) into the folder, for PlayCanvas's viewers. Below
             the full scene are a half, a quarter and a tenth of its Gaussians, each pruned from it and trained on its
             images; minutes on a GPU.
     """
+    wishes.check_wishes()
     if lod and out.suffix:
         raise ConfigError(f"{out} is no folder, which levels of detail take; name one without a suffix")
-    page = out.suffix.lower() in (".html", "") and not lod
+    page, upright = out.suffix.lower() in (".html", "") and not lod, advanced.upright
     if out.suffix and not page:
         check_suffix(out, (*FORMATS, ".html"))
-    (check_file if out.suffix else check_folder)(out, reads=[*files_of(scene), beside, data], overwrite=overwrite)
-    started = start_view is not None or up is not None
+    reads = [*files_of(scene), beside, advanced.data, advanced.cameras]
+    (check_file if out.suffix else check_folder)(out, reads=reads, overwrite=advanced.overwrite)
     if page:
         if upright:
             raise ConfigError("a page turns the scene upright by itself; leave out --upright")
-        opened, packed = open_packed(scene, data)
-        if cleaning.chosen:
-            opened = cleaning.cleaned(opened)
-            packed = packed_bytes(opened)
-        if started:
-            opened = with_start(opened, start_view, up)
-            packed = container.restated(packed, stated_start(opened))
-        second = () if beside is None else ((name_of(beside), *open_packed(beside, None)),)
+        first = name_of(scene), *prepared_page(scene, wishes, advanced)
+        second = () if beside is None else ((name_of(beside), *prepared_page(beside, Wishes(), SceneDetails())),)
         named = {name: link for name, _, link in (word.partition("=") for word in views)}
-        size = write_page(out, (name_of(scene), opened, packed), *second, views=named)
+        size = write_page(out, first, *second, views=named)
         print(f"{out}: {size:,} bytes; {'open it in a browser' if out.suffix else 'serve it'}")
         return 0
     if beside is not None or views:
         raise ConfigError("only a page shows two scenes or named views; name it .html, or without a suffix")
     copies = copies_rows(scene, out)
-    if copies and (upright or not cleaning.chosen):
+    if copies and (upright or not (wishes.cleans or wishes.reduces)):
         raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
-    if started:
+    if advanced.start_view is not None or advanced.up is not None:
         raise ConfigError(f"{out.suffix or '.sog'} files hold neither a start view nor an up axis; leave them out")
-    if copies:
-        opened, usable = load_with_mask(scene)
-        rows = within(usable, cleaning.mask(opened, ()))
-        keep_vertices(scene, out, rows)
-        print(f"{out}: {int(rows.sum()):,} of {len(rows):,} Gaussians")
-        return 0
-    # A run's cameras, which tell floaters, are in its capture.
-    opened = cleaning.cleaned(open_scene(scene, data) if cleaning.remove_floaters or lod else load(scene))
-    if upright and not opened.in_model_frame:
+    left = reduced(opened(scene, wishes, advanced, capture=lod), scene, wishes, advanced, out=out)
+    if upright and not left.scene.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
     if lod:
-        return _write_levels(opened, out, upright)
-    with Console(stderr=True).status(f"Writing {opened.num_gaussians:,} Gaussians"):  # a .sog takes minutes
-        written = save_for_viewers(opened, out, upright=upright)
-    mode, degree = ", antialiased" if opened.antialiased else "", sh_degree(written["features_rest"])
+        return _write_levels(left.scene, out, upright)
+    if copies:
+        left.write(scene, out)
+        print(f"{out}: {left.scene.num_gaussians:,} of {left.total:,} Gaussians")
+        return 0
+    with Console(stderr=True).status(f"Writing {left.scene.num_gaussians:,} Gaussians"):  # a .sog takes minutes
+        written = save_for_viewers(left.stated, out, upright=upright)
+    mode, degree = ", antialiased" if left.scene.antialiased else "", sh_degree(written["features_rest"])
     print(f"{out}: {len(written['means']):,} Gaussians, degree {degree}{mode}, {out.stat().st_size:,} bytes")
     if out.suffix.lower() == ".spz" and (beyond := clamped(written)):
         print(f"clamped scales or colours of {beyond:,} Gaussians to the range of a .spz; a .sog has none")
-    if degree < opened.gaussians.sh_degree:
+    if degree < left.stated.gaussians.sh_degree:
         print(f"left out harmonics above SH degree {degree}, which {out.suffix} cannot store; .ply can")
     return 0
 

@@ -5,63 +5,154 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rich.console import Console
 from torch import Tensor
 
-from sundae_ns.cli.options import Flag
+from sundae_ns.cli.options import SceneDetails, Wishes
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import DataError
+from sundae_ns.core.tables import MEGABYTE
+from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.config_file import check_run, find_config
 from sundae_ns.io.formats import kind_of
-from sundae_ns.io.ply import has_own_columns
-from sundae_ns.scene.cameras import cameras_of
-from sundae_ns.scene.load_save import load, packed_file
+from sundae_ns.io.pack import container
+from sundae_ns.io.pack.config import PackConfig, scaled
+from sundae_ns.io.ply import has_own_columns, keep_vertices
+from sundae_ns.pruning.rule import PruneRule
+from sundae_ns.rasterize.interface import fastest_device
+from sundae_ns.scene.cameras import cameras_of, with_start
+from sundae_ns.scene.load_save import load, load_with_mask, write_scene
 from sundae_ns.scene.page import packed_of
-from sundae_ns.scene.prune_scene import crop_mask, floater_mask
+from sundae_ns.scene.prune_scene import PrunedScene, count_for_drop, crop_mask, floater_mask, prune_with_mask, within
 from sundae_ns.scene.scene import Scene
-from sundae_ns.scene.virtual_cameras import VIEWS
+from sundae_ns.scene.sizes import Form, forms_of, prune_to_bytes, stated
+from sundae_ns.scene.virtual_cameras import VIEWS, virtual_cameras
 
 
-@dataclass(frozen=True)
-class Cleaning:
-    """What to cut, before anything else."""
+class Left(NamedTuple):
+    """What options leave of a scene, and how a file states it."""
 
-    crop: tuple[float, float, float, float, float, float] | None = None
-    """keep the Gaussians whose centres are in this box: its lowest x y z, then its highest, in the coordinates of the
-    scene."""
-    remove_floaters: Flag = False
-    """remove small groups of Gaussians that touch no other, and what none of the cameras of the photographs sees."""
+    scene: Scene
+    rows: Tensor | None  # True for the rows of a file of Gaussians that are left, bool [N]
+    total: int  # Gaussians of the file
+    form: Form | None = None  # of a file of a given size
+    pruned: PrunedScene | None = None
+    cameras: Sequence[Camera] = ()  # by which it was pruned
 
     @property
-    def chosen(self) -> str:
-        """Name of the first option that is given, or empty."""
-        floaters = "--remove-floaters" if self.remove_floaters else ""
-        return floaters if self.crop is None else "--crop"
+    def stated(self) -> Scene:
+        """The scene, on the CPU, as its form states it."""
+        scene = self.scene.to("cpu")
+        return scene if self.form is None else stated(scene, self.form)
 
-    def mask(self, scene: Scene, cameras: Sequence[Camera]) -> Tensor:
-        """True for Gaussians that stay, bool ``[N]``; prints their numbers to stderr."""
-        mask = torch.ones(scene.num_gaussians, dtype=torch.bool, device=scene.device)
-        if self.crop is not None:
-            mask = crop_mask(scene, self.crop[:3], self.crop[3:])
-            print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
-        if self.remove_floaters:
-            floats = floater_mask(scene[mask], cameras, console=Console(stderr=True))
-            mask[mask.clone()] = ~floats
-            rule = "" if cameras else ", by their neighbours alone: no camera of the photographs is known"
-            print(f"removed {int(floats.sum()):,} floaters of {len(floats):,} Gaussians{rule}", file=sys.stderr)
-            if not bool(mask.any()):
-                raise DataError("all Gaussians float; leave out --remove-floaters")
-        return mask
+    @property
+    def precision(self) -> PackConfig | None:
+        """That of a packed file; None for the default."""
+        return None if self.form is None else scaled(PackConfig(), self.form.power)
 
-    def cleaned(self, scene: Scene) -> Scene:
-        """The scene without what :meth:`mask` cuts, by the cameras stored with it."""
-        return scene[self.mask(scene, scene.cameras)] if self.chosen else scene
+    def write(self, source: Path, out: Path) -> int:
+        """Write the scene; a .ply of a .ply keeps its properties and comments. Returns the bytes."""
+        if copies_rows(source, out):
+            assert self.rows is not None
+            moved = self.pruned is not None and self.pruned.moved
+            keep_vertices(source, out, self.rows.cpu(), self.stated.gaussians if moved else None)
+        else:
+            write_scene(self.stated, out, config=self.precision)
+        return out.stat().st_size
+
+
+def cleaned(scene: Scene, wishes: Wishes, cameras: Sequence[Camera]) -> Tensor:
+    """True for Gaussians in the box that do not float, bool ``[N]``; prints their numbers to stderr."""
+    mask = torch.ones(scene.num_gaussians, dtype=torch.bool, device=scene.device)
+    if wishes.crop is not None:
+        mask = crop_mask(scene, wishes.crop[:3], wishes.crop[3:])
+        print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
+    if wishes.remove_floaters:
+        floats = floater_mask(scene[mask], cameras, console=Console(stderr=True))
+        mask[mask.clone()] = ~floats
+        rule = "" if cameras else ", by their neighbours alone: no camera of the photographs is known"
+        print(f"removed {int(floats.sum()):,} floaters of {len(floats):,} Gaussians{rule}", file=sys.stderr)
+        if not bool(mask.any()):
+            raise DataError("all Gaussians float; leave out --remove-floaters")
+    return mask
+
+
+def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool = False) -> Left:
+    """A scene before its wishes, upright and started as its details say; ``capture`` asks for cameras of a run."""
+    rows = None
+    if is_run(source) and (capture or wishes.remove_floaters or details.data is not None):
+        scene = open_run(source, data=details.data)
+    else:
+        scene, rows = load_with_mask(source)
+    scene = with_start(scene, details.start_view, details.up)
+    return Left(scene, rows, scene.num_gaussians if rows is None else len(rows))
+
+
+def reduced(
+    left: Left,
+    source: Path,
+    wishes: Wishes,
+    details: SceneDetails,
+    *,
+    out: Path,
+    rule: PruneRule | None = None,
+    num_cameras: int | None = None,
+    target_drop: float | None = None,
+) -> Left:
+    """What the options leave of a scene; ``out`` is the file, of another one that is measured, to be written."""
+    scene, rows = left.scene, left.rows
+    cameras: Sequence[Camera] = ()
+    if details.no_head:
+        scene = replace(scene, head=None)
+    reduces = wishes.reduces or target_drop is not None
+    if not wishes.cleans and not reduces:
+        return left._replace(scene=scene)
+    with naming_full_memory(lambda: left.total):
+        scene, rule = scene.to(fastest_device()), rule or PruneRule()
+        rule = replace(rule, seed=details.seed or 0)
+        if reduces or wishes.remove_floaters:
+            cameras = chosen_cameras(scene, details.cameras, num_cameras)
+        if wishes.cleans:
+            mask = cleaned(scene, wishes, cameras)
+            scene, rows = scene[mask], None if rows is None else within(rows, mask.cpu())
+        left = left._replace(scene=scene, rows=rows)
+        if not reduces:
+            return left
+        warn_if_few(wishes.count, scene.num_gaussians)
+        if rule.uses_contribution or wishes.max_mb is not None or target_drop is not None:
+            cameras = cameras or virtual_cameras(scene, num_cameras, seed=rule.seed)
+        if target_drop is not None:
+            count, curve = count_for_drop(scene, target_drop, cameras, rule, progress=True)
+            for number, psnr in curve:
+                print(f"{number:12,} Gaussians: {psnr:.2f} dB against the full scene, on held-out cameras")
+            wishes = replace(wishes, count=count)
+
+        def after(pruned: PrunedScene, form: Form | None) -> Left:
+            kept = None if rows is None else within(rows, pruned.mask.cpu())
+            return Left(pruned.scene, kept, left.total, form, pruned, cameras)
+
+        if wishes.max_mb is None:
+            pruned = prune_with_mask(scene, wishes.keep, wishes.count, cameras, rule, progress=True)
+            return after(pruned, None)
+        most, suffix = int(wishes.max_mb * MEGABYTE), out.suffix.lower()
+        forms = forms_of(scene, suffix)[: 1 if copies_rows(source, out) else None]  # all columns of a .ply stay
+        return after(
+            *prune_to_bytes(
+                scene,
+                most,
+                lambda pruned, form, folder: after(pruned, form).write(source, folder / out.name),
+                forms,
+                cameras,
+                rule,
+                progress=True,
+            )
+        )
 
 
 def open_run(run: Path, **options: Any) -> Scene:
@@ -74,17 +165,17 @@ def open_run(run: Path, **options: Any) -> Scene:
         return load_run(run, **options)
 
 
-def open_scene(path: Path, data: Path | None) -> Scene:
-    """A scene; that of a run, whose capture may have moved, has cameras of it."""
-    return open_run(path, data=data) if is_run(path) else load(path)
+def prepared_page(source: Path, wishes: Wishes, details: SceneDetails) -> tuple[Scene, bytes]:
+    """What the options leave of a scene, and the packed file that a page of it shows; a packed one stays as it is."""
+    left = reduced(opened(source, wishes, details, capture=True), source, wishes, details, out=Path("page.html"))
+    if kind_of(source) != "packed" or wishes.cleans or wishes.reduces or details.no_head:
+        return left.stated, packed_of(left.stated, left.precision)
+    packed = source.read_bytes()
+    if details.start_view is not None or details.up is not None:
+        from sundae_ns.scene.packing import stated_start  # its encoder needs a compiler, which other files do not
 
-
-def open_packed(path: Path, data: Path | None) -> tuple[Scene, bytes]:
-    """As :func:`open_scene`, with the packed file that holds it; others are packed in memory."""
-    if not is_run(path):
-        return packed_file(path)
-    scene = open_scene(path, data)
-    return scene, packed_of(scene)
+        packed = container.restated(packed, stated_start(left.scene))
+    return left.scene, packed
 
 
 def name_of(path: Path) -> str:

@@ -28,8 +28,7 @@ COMMANDS = {
     "run": "photos or a video to a packed scene, its report and its web page; resumes",
     "poses": "camera poses of photos or of a video: a capture to train on; resumes",
     "train": "train by ns-train, with short options",
-    "prune": "make any splat scene smaller, without its photos",
-    "distill": "prune, then train on the full scene's own images, without photos",
+    "prune": "make any splat scene smaller, without its photos; by --distill trained on its images",
     "pack": "pack a scene into one file; says what that costs",
     "export": "write a scene as a web page, .ply, .spz, .sog or .glb",
     "view": "show a scene with its head in the browser",
@@ -63,7 +62,8 @@ def _dispatch(words: Sequence[str]) -> int:
 
     # Only the module of this command: some import torch, which takes a second.
     run = getattr(importlib.import_module(f"sundae_ns.cli.{name}"), name)
-    return tyro.cli(run, prog=f"sundae {name}", args=options)
+    short = importlib.import_module("sundae_ns.cli.options").SHORT
+    return tyro.cli(run, prog=f"sundae {name}", args=options, registry=short)
 
 
 def exit_with(command: Callable[[], int], name: str) -> NoReturn:

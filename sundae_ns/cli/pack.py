@@ -6,6 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
+from dataclasses import dataclass, field, fields, make_dataclass, replace
 from functools import cache
 from io import StringIO
 from json import dumps
@@ -15,11 +16,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 import torch
 import tyro
 
-from sundae_ns.cli.inputs import Cleaning, open_run
-from sundae_ns.cli.options import Direction, Out, Overwrite, check_exclusive, check_file, check_least, progress_bar
+from sundae_ns.cli.inputs import Left, open_run, reduced
+from sundae_ns.cli.options import (
+    Advanced,
+    Flag,
+    Maybe,
+    Out,
+    Plain,
+    SceneDetails,
+    Wishes,
+    check_drop,
+    check_exclusive,
+    check_file,
+    check_least,
+    progress_bar,
+)
 from sundae_ns.core.errors import ConfigError, SundaeError
+from sundae_ns.core.tables import MEGABYTE
 from sundae_ns.io.formats import PRIMITIVES, kind_of_gaussians
-from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED, PackConfig
+from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED, FINETUNED_SIZE, PackConfig
 from sundae_ns.io.pack.packed_scene import fit_scene, pack_bytes, write_fitted
 from sundae_ns.io.run_folder import files_of
 from sundae_ns.scene.cameras import with_start
@@ -30,24 +45,34 @@ if TYPE_CHECKING:
     from sundae_ns.io.pack.packed_scene import Codecs, PackedScene
     from sundae_ns.plugin.tuned_packs import Judge
 
-# Their types tell these numbers from equal ones that a user gives.
-DEFAULTS: Any = PackConfig(**{name: type("Default", (type(x),), {})(x) for name, x in vars(PackConfig()).items()})
+_maybe: Any = Maybe
+Precision: Any = make_dataclass(
+    "Precision", [(each.name, _maybe[each.type], None) for each in fields(PackConfig)], bases=(PackConfig,)
+)
+"""The options of :class:`PackConfig`, None for those that are not given."""
+
+
+@dataclass(frozen=True)
+class PackDetails(SceneDetails):
+    """Options that few need."""
+
+    target_drop: Maybe[float] = None
+    """find the coarsest steps that lose at most this PSNR on some test views, dB."""
+    finetune: int = 0
+    """training steps with quantisation in the loop before packing, for example 1000; the run is not changed. Bits and
+    steps that are not given are then coarser, for a smaller file."""
+    max_cameras: int = 100
+    """maximum number of training cameras to store for viewers; with 0, the capture is not needed."""
+    json: Flag = False
+    """print one JSON object in place of the table."""
+    precision: Plain[Precision] = field(default_factory=Precision)
 
 
 def pack(
     run: Annotated[Path, tyro.conf.Positional],
     out: Out,
-    target_bytes: int | None = None,
-    target_drop: float | None = None,
-    finetune: int = 0,
-    max_cameras: int = 100,
-    start_view: str | None = None,
-    up: Direction | None = None,
-    data: Path | None = None,
-    json: bool = False,
-    overwrite: Overwrite = False,
-    precision: Annotated[PackConfig, tyro.conf.arg(name="")] = DEFAULTS,
-    cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
+    wishes: Plain[Wishes] = Wishes(),  # noqa: B008
+    advanced: Advanced[PackDetails] = PackDetails(),  # noqa: B008
 ) -> int:
     """Pack a scene into one file that can be rendered; print the size of each part, and the quality before and after.
 
@@ -55,28 +80,19 @@ def pack(
         run: a run of sundae or splatfacto (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat,
             .ksplat or gsplat's .pt.
         out: file to write, for example scene.sundae.
-        target_bytes: find the finest steps whose file has at most this many bytes.
-        target_drop: find the coarsest steps that lose at most this PSNR on some test views, dB.
-        finetune: training steps with quantisation in the loop before packing, for example 1000; the run is not changed.
-            Bits and steps that are not given are then coarser, for a smaller file.
-        max_cameras: maximum number of training cameras to store for viewers; with 0, the capture is not needed.
-        start_view: what a page of the scene opens with: index of a stored camera, or a camera file as sundae render
-            reads it; by default the first camera.
-        up: direction that is upwards, for example 0 0 1; by default that of a run's capture.
-        data: folder of the capture, if it moved.
-        json: print one JSON object in place of the table.
     """
-    check_exclusive(target_bytes=target_bytes, target_drop=target_drop)
-    check_least(max_cameras=(max_cameras, 0), finetune=(finetune, 0), target_bytes=(target_bytes, 1))
-    if target_drop is not None and not 0 < target_drop < 100:
-        raise ConfigError(f"target-drop is {target_drop}; give a positive number of dB")
-    if cleaning.chosen and (finetune or target_drop is not None):
+    finetune, target_drop, data = advanced.finetune, advanced.target_drop, advanced.data
+    wishes.check_wishes()
+    check_exclusive(max_mb=wishes.max_mb, target_drop=target_drop)
+    check_least(max_cameras=(advanced.max_cameras, 0), finetune=(finetune, 0))
+    check_drop(target_drop)
+    if wishes.cleans and (finetune or target_drop is not None):
         whole = "--finetune and --target-drop look at photos of the whole scene"
-        raise ConfigError(f"{whole}; leave out {cleaning.chosen}, or cut the scene by `sundae prune` afterwards")
-    given = {name: value for name, value in vars(precision).items() if type(value) in (int, float)}
+        raise ConfigError(f"{whole}; leave out {wishes.cleans}, or cut the scene by `sundae prune` afterwards")
+    given = {name: value for name, value in vars(advanced.precision).items() if value is not None}
     precision, config = PackConfig(**given), PackConfig(**{**(FINETUNED if finetune else {}), **given})
     config.validate()
-    check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
+    check_file(out, reads=[*files_of(run), data, advanced.cameras], overwrite=advanced.overwrite)
     kind = kind_of_gaussians(run)
     for name, value in (("--finetune", finetune), ("--target-drop", target_drop), ("--data", data)):
         if kind is not None and value:
@@ -89,8 +105,13 @@ def pack(
 
         return Judge(run, data)
 
-    scene = open_run(run, max_cameras=max_cameras, data=data) if kind is None else load(run)
-    source = contents_of(with_start(cleaning.cleaned(scene), start_view, up))
+    scene = open_run(run, max_cameras=advanced.max_cameras, data=data) if kind is None else load(run)
+    left = Left(with_start(scene, advanced.start_view, advanced.up), None, scene.num_gaussians)
+    # A fine-tune shrinks the file; the search below gives its size.
+    roomy = None if wishes.max_mb is None else wishes.max_mb / (FINETUNED_SIZE if finetune else 1)
+    left = reduced(left, run, replace(wishes, max_mb=roomy), advanced, out=out.with_suffix(".sundae"))
+    most = None if wishes.max_mb is None else int(wishes.max_mb * MEGABYTE)
+    source = contents_of(left.stated)
     with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
         task = bar.add_task("Fine-tuning" if finetune else "Packing", total=2 + finetune)
         if finetune:
@@ -98,12 +119,12 @@ def pack(
 
             packs.append(tune(run, source, config, finetune, data=data, progress=lambda _: bar.advance(task)))
         bar.update(task, description="Packing")
-        if target_bytes is not None or target_drop is not None:
+        if most is not None or target_drop is not None:
             from sundae_ns.plugin.tuned_packs import Search, best_pack
 
             # Starts from the source, because positions of a fitted pack are rounded.
             searches = [Search(source, precision, judge), *(Search(*each, judge) for each in packs)]
-            best = best_pack(searches, most_bytes=target_bytes, most_drop=target_drop or 0.0)
+            best = best_pack(searches, most_bytes=most, most_drop=target_drop or 0.0)
             if packs and best.scene is not packs[0][0]:
                 print("the fine-tune loses too much for the target; packed without it, try more steps", file=sys.stderr)
                 finetune = 0
@@ -113,8 +134,8 @@ def pack(
         report = write_fitted(out, *packs[0])
         bar.update(task, advance=1, description="Measuring")
         # Photos show what a box leaves out.
-        figures = _measured(judge, packs, finetune) if kind is None and cleaning.crop is None else {}
-    if json:
+        figures = _measured(judge, packs, finetune) if kind is None and wishes.crop is None else {}
+    if advanced.json:
         print(dumps({"file": str(out), **report.summary(), **figures}))
         return 0
     print(f"{out}: {report.primitives:,} Gaussians in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
@@ -126,7 +147,7 @@ def pack(
         shown = "" if ssim is None else f", SSIM {ssim[0]:.4f} -> {ssim[1]:.4f}"
         views = f"{figures['views']} of {figures['test_views']} test views"
         print(f"PSNR {psnr[0]:.2f} -> {psnr[1]:.2f} dB{shown}, before and after, on {views}")
-        if not tuned and not cleaning.chosen and torch.cuda.is_available():
+        if not tuned and not wishes.cleans and torch.cuda.is_available():
             print(f"--finetune {FINETUNE_STEPS} makes it about 40% smaller")
     return 0
 

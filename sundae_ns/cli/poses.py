@@ -11,12 +11,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-import tyro
+from typing import TYPE_CHECKING, Literal
 
 from sundae_ns.cli.main import STEP
-from sundae_ns.cli.options import Out, Source, check_folder, check_least, progress_bar
+from sundae_ns.cli.options import Maybe, Out, Plain, Source, check_folder, check_least, progress_bar
 from sundae_ns.cli.process import quoted, word
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
 
@@ -35,7 +33,7 @@ class PoseOptions:
     """photos that are compared: all pairs, neighbours in time and similar ones (for a video), or similar ones; by
     default what suits their number."""
     frames: int = 150  # number of frames of a video; the sharpest of each stretch
-    masks: Path | None = None
+    masks: Maybe[Path] = None
     """folder with a mask for each photo, under its name; training leaves out what is black. By default one named masks
     beside the photos."""
 
@@ -49,7 +47,7 @@ class PoseOptions:
 def poses(
     photos: Source,
     out: Out,
-    options: Annotated[PoseOptions, tyro.conf.arg(name="")] = PoseOptions(),  # noqa: B008
+    options: Plain[PoseOptions] = PoseOptions(),  # noqa: B008
 ) -> int:
     """Find the camera poses of photos, and write a capture: images at several sizes, transforms.json, points, masks.
 

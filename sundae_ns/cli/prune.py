@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import dataclasses
+import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 import tyro
 
-from sundae_ns.cli.inputs import Cleaning, chosen_cameras, copies_rows, warn_if_few
-from sundae_ns.cli.options import Out, Overwrite, Scene, Share, check_exclusive, check_file, check_suffix
-from sundae_ns.cuda.kernels import naming_full_memory
-from sundae_ns.io.ply import keep_vertices
+from sundae_ns.cli.inputs import chosen_cameras, opened, reduced, warn_if_few
+from sundae_ns.cli.options import (
+    Advanced,
+    Flag,
+    Maybe,
+    Out,
+    Plain,
+    Scene,
+    SceneDetails,
+    Wishes,
+    check_drop,
+    check_exclusive,
+    check_file,
+    check_suffix,
+    progress_bar,
+)
+from sundae_ns.core.errors import ConfigError
+from sundae_ns.core.tables import MEGABYTE
 from sundae_ns.pruning.rule import PruneRule, ScoreName
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene import prune_scene as pruning
-from sundae_ns.scene.load_save import SUFFIXES, load_with_mask, save
-from sundae_ns.scene.prune_scene import within
+from sundae_ns.scene.load_save import SUFFIXES, save
+from sundae_ns.scene.scene import Scene as Opened
 from sundae_ns.scene.virtual_cameras import virtual_cameras
 
 
@@ -27,67 +42,109 @@ class RuleOptions(PruneRule):
     score: ScoreName = "detail-contribution"
     """Importance of a Gaussian: its blending weight over the cameras, with pixels weighted by the detail that the kept
     Gaussians cannot show (detail-contribution), or its high-pass response (response)."""
+    seed: tyro.conf.Suppress[int] = 0  # one for all draws of a command
+
+
+@dataclass(frozen=True)
+class PruneDetails(SceneDetails):
+    """Options that few need."""
+
+    num_cameras: Maybe[int] = None
+    """number of virtual cameras, for scenes that come without cameras; by default 128, on a GPU 256."""
+    steps: Maybe[int] = None
+    """number of training steps of --distill; by default 8,000 on a GPU, 3,000 on a CPU."""
+    rule: Plain[RuleOptions] = dataclasses.field(default_factory=RuleOptions)
 
 
 def prune(
     source: Scene,
     out: Out,
-    keep: Share | None = None,
-    count: int | None = None,
-    target_drop: float | None = None,
-    num_cameras: int | None = None,
-    cameras: Path | None = None,
-    overwrite: Overwrite = False,
-    rule: Annotated[RuleOptions, tyro.conf.arg(name="")] = RuleOptions(),  # noqa: B008
-    cleaning: Annotated[Cleaning, tyro.conf.arg(name="")] = Cleaning(),  # noqa: B008
+    wishes: Plain[Wishes] = Wishes(),  # noqa: B008
+    target_drop: Maybe[float] = None,
+    distill: Flag = False,
+    advanced: Advanced[PruneDetails] = PruneDetails(),  # noqa: B008
 ) -> int:
-    """Prune a scene of any program, without its photos.
+    """Prune a scene of any program, without its photos; by default to a tenth of its Gaussians.
 
     Kept are the Gaussians that virtual cameras see most of; the others are merged into them, and some steps fit pairs
     to the scene's own images. On a CPU a million Gaussians with three bands of harmonics take about 1.7 GB.
 
     Args:
-        out: file to write, in the format of its suffix: .ply, .spz, .sog, .glb or .sundae. A .ply of a .ply keeps all
-            properties and comments.
-        keep: share of the Gaussians to keep, of those that a box and the floaters leave, 0.25 or 25%; by default 0.1.
-        count: number of Gaussians to keep, in place of a share.
+        out: file to write, in the format of its suffix: .ply, .spz, .sog, .glb, .sundae, or .html, a web page. A .ply
+            of a .ply keeps all properties and comments.
         target_drop: keep as few as lose at most this PSNR, in dB, of a full scene that shows its photos at 30 dB; by
             the images of held-out cameras.
-        num_cameras: number of virtual cameras, for scenes that come without cameras; by default 128, on a GPU 256.
-        cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, in place of the
-            scene's own or virtual cameras.
+        distill: train what is kept on the full scene's images, each from a camera of its own near the scene's or
+            virtual ones, with a head if cameras that no step sees show that it pays. Ctrl-C saves; the same command
+            resumes.
     """
-    check_exclusive(keep=keep, count=count, target_drop=target_drop)
-    if target_drop is None:
-        keep = 0.1 if keep is None and count is None else keep
-        pruning.check_amount(keep, count)
-    check_suffix(out, SUFFIXES)
-    check_file(out, reads=[source, cameras], overwrite=overwrite)
-    rule.validate()
-    scene, usable = load_with_mask(source)
-    total = scene.num_gaussians if usable is None else len(usable)
-    with naming_full_memory(lambda: total):
-        scene, used, clean = scene.to(fastest_device()), None, None
-        looks_around = rule.uses_contribution or target_drop is not None
-        given = chosen_cameras(scene, cameras, num_cameras) if looks_around or cleaning.remove_floaters else ()
-        if cleaning.chosen:
-            clean = cleaning.mask(scene, given)
-            scene = scene[clean]
-        warn_if_few(count, scene.num_gaussians)
-        if looks_around:
-            used = given or virtual_cameras(scene, num_cameras, seed=rule.seed)
-        if target_drop is not None and used is not None:
-            count, curve = pruning.count_for_drop(scene, target_drop, used, rule, progress=True)
-            for number, psnr in curve:
-                print(f"{number:12,} Gaussians: {psnr:.2f} dB against the full scene, on held-out cameras")
-        pruned = pruning.prune_with_mask(scene, keep, count, used, rule, progress=True)
-    small = pruned.scene.to("cpu")
-    if copies_rows(source, out):
-        rows = within(usable, within(clean, pruned.mask).cpu())
-        keep_vertices(source, out, rows, small.gaussians if rule.redistribution == "merge" else None)
-    else:
-        save(small, out)
-    print(f"{out}: {small.num_gaussians:,} of {total:,} Gaussians")
-    if pruned.seen is not None and used:
-        print(f"{len(used)} cameras see {pruned.seen:.1%} of the Gaussians")
+    amounts = {"keep": wishes.keep, "count": wishes.count, "max_mb": wishes.max_mb, "target_drop": target_drop}
+    wishes.check_wishes()
+    check_exclusive(**amounts)
+    check_drop(target_drop)
+    check_exclusive(distill=distill or None, max_mb=wishes.max_mb, target_drop=target_drop)
+    with_head = check_suffix(out, SUFFIXES) in (".sundae", ".html")
+    if advanced.steps is not None and not distill:
+        raise ConfigError("--steps belongs to --distill; add it, or leave them out")
+    if distill and not with_head and not advanced.no_head:
+        raise ConfigError(f"{out} cannot hold a head; name it .sundae, or leave the head out with --no-head")
+    if advanced.start_view is not None and not with_head:
+        raise ConfigError(f"{out.suffix} files hold no start view; leave it out, or name a .sundae or .html")
+    if all(amount is None for amount in amounts.values()):
+        wishes = dataclasses.replace(wishes, keep=0.1)
+    check_file(out, reads=[source, advanced.cameras], overwrite=advanced.overwrite)
+    advanced.rule.validate()
+    left = opened(source, wishes, advanced)
+    if distill:
+        whole = dataclasses.replace(wishes, keep=None, count=None)
+        return _distilled(reduced(left, source, whole, advanced, out=out).scene, out, wishes, advanced)
+    more: dict[str, Any] = {"rule": advanced.rule, "num_cameras": advanced.num_cameras, "target_drop": target_drop}
+    left = reduced(left, source, wishes, advanced, out=out, **more)
+    size = left.write(source, out)
+    print(f"{out}: {left.scene.num_gaussians:,} of {left.total:,} Gaussians, {size / MEGABYTE:.2f} MB")
+    if left.pruned is not None and left.pruned.seen is not None:
+        print(f"{len(left.cameras)} cameras see {left.pruned.seen:.1%} of the Gaussians")
+    return 0
+
+
+def _distilled(scene: Opened, out: Path, wishes: Wishes, details: PruneDetails) -> int:
+    """Train a smaller scene on images of the full one, and save it; its exit code."""
+    from sundae_ns.plugin.distill import Distillation  # imports nerfstudio, which takes seconds
+    from sundae_ns.train.progress import Interruption
+
+    warn_if_few(wishes.count, scene.num_gaussians)
+    scene, near = scene.to(fastest_device()), None
+    if details.cameras is not None:
+        near = chosen_cameras(scene, details.cameras, None) or virtual_cameras(scene, seed=details.seed or 0)
+    options: dict[str, Any] = {"keep": wishes.keep, "count": wishes.count, "cameras": near, "steps": details.steps}
+    options |= {"seed": details.seed or 0, "head": not details.no_head, "progress": True}
+    training, partial = Distillation(scene, **options), out.with_name(f"{out.name}.partial")
+    if partial.exists():
+        training.load(partial)
+        print(f"resuming after step {training.step:,} of {training.steps:,}, with {partial}", file=sys.stderr)
+    stopped: list[bool] = []
+    with Interruption(lambda: stopped.append(True)), progress_bar() as bar:
+        task = bar.add_task("Training", total=None)
+
+        def after_step(done: int, total: int) -> bool:
+            bar.update(task, completed=done, total=total)
+            return not stopped
+
+        finished = training.train(after_step)
+    if not finished:
+        said = "nothing is saved yet: the trial of the head had not ended"
+        if training.step > 0:
+            training.save(partial)
+            said = f"saved step {training.step:,} of {training.steps:,} as {partial}; the same command resumes"
+        print(f"sundae: interrupted; {said}", file=sys.stderr)
+        return 130
+    result = training.result()
+    save(result, out)
+    partial.unlink(missing_ok=True)
+    counts = f"{result.num_gaussians:,} of {scene.num_gaussians:,} Gaussians"
+    print(f"{out}: {counts}, {'with' if result.head else 'without'} a head")
+    if training.gain is not None:
+        print(f"a head gained {training.gain:.2f} dB in its trial, on cameras that no step sees")
+    quality = f"{training.quality():.2f} dB against the full scene on {len(training.held_out)} cameras"
+    print(f"{quality} that no step sees; {out.stat().st_size:,} bytes")
     return 0

@@ -7,13 +7,25 @@ from pathlib import Path
 from PIL import Image
 from rich.console import Console
 
-from sundae_ns.cli.options import Direction, Out, Overwrite, Scene, check_file, check_least, check_suffix, progress_bar
+from sundae_ns.cli.inputs import opened, reduced
+from sundae_ns.cli.options import (
+    Advanced,
+    Maybe,
+    Out,
+    Plain,
+    Scene,
+    SceneDetails,
+    Wishes,
+    check_file,
+    check_least,
+    check_suffix,
+    progress_bar,
+)
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.files import replacing, write_image, write_video
 from sundae_ns.rasterize.interface import fastest_device
-from sundae_ns.scene.cameras import CameraFile, camera_in_front, film_views, read_cameras, with_start
-from sundae_ns.scene.load_save import load
+from sundae_ns.scene.cameras import CameraFile, camera_in_front, film_views, read_cameras
 from sundae_ns.scene.scene import image_of
 from sundae_ns.scene.scene import render as render_view
 
@@ -24,14 +36,13 @@ SECONDS = 12.0
 def render(
     scene: Scene,
     out: Out,
-    camera: Path | None = None,
-    view: int | None = None,
-    head: bool = True,
-    width: int | None = None,
-    seconds: float | None = None,
-    fps: float | None = None,
-    up: Direction | None = None,
-    overwrite: Overwrite = False,
+    camera: Maybe[Path] = None,
+    view: Maybe[int] = None,
+    width: Maybe[int] = None,
+    seconds: Maybe[float] = None,
+    fps: Maybe[float] = None,
+    wishes: Plain[Wishes] = Wishes(),  # noqa: B008
+    advanced: Advanced[SceneDetails] = SceneDetails(),  # noqa: B008
 ) -> int:
     """Render a scene to an image, or along a path to a video.
 
@@ -42,11 +53,9 @@ def render(
         out: image (.png, .jpg or .webp) or video (.mp4) to write.
         camera: a transforms.json or a camera path of the viewer; by default the cameras stored with the scene.
         view: index of the camera for an image; by default the start view of the scene, if it has one.
-        head: let the head correct the images.
         width: width of the images in pixels; by default that of the camera, in a film at most 1,280 a side.
         seconds: length of a film without --camera; by default 12.
         fps: frames a second of a video; by default those of the camera path, else 24.
-        up: direction that is upwards, for example 0 -1 0; by default that of the scene, else of its cameras, else z.
     """
     video = check_suffix(out, (*IMAGES, ".mp4")) == ".mp4"
     check_least(width=(width, 2))
@@ -54,24 +63,25 @@ def render(
         raise ConfigError("--seconds is the length of a film without --camera; leave it out")
     if fps is not None and not (video and 0 < fps <= 240):
         raise ConfigError("--fps is of a video, from above 0 to 240; leave it out, or name a video .mp4")
-    check_file(out, reads=[scene, camera], overwrite=overwrite)
-    opened = with_start(load(scene), None, up)
+    wishes.check_wishes()
+    check_file(out, reads=[scene, camera, advanced.cameras], overwrite=advanced.overwrite)
+    shown = reduced(opened(scene, wishes, advanced), scene, wishes, advanced, out=Path("scene.sundae")).stated
     if camera is not None:
-        cameras = read_cameras(camera, opened)
+        cameras = read_cameras(camera, shown)
     elif video:
         fps = fps or 24
         with Console(stderr=True).status("Finding a path"):
-            views = film_views(opened, seconds=SECONDS if seconds is None else seconds, frames_per_second=fps)
+            views = film_views(shown, seconds=SECONDS if seconds is None else seconds, frames_per_second=fps)
         cameras = CameraFile(views, fps)
-    elif view is None and opened.start is not None:
-        cameras = CameraFile([opened.start], None)
+    elif view is None and shown.start is not None:
+        cameras = CameraFile([shown.start], None)
     else:
-        cameras = CameraFile(list(opened.cameras) or [camera_in_front(opened)], None)
+        cameras = CameraFile(list(shown.cameras) or [camera_in_front(shown)], None)
     views = [_resized(each, width, even=video) for each in cameras.cameras]
-    opened = opened.to(fastest_device())
+    shown = shown.to(fastest_device())
 
     def rendered(camera: Camera) -> Image.Image:
-        return image_of(render_view(opened, camera, head=head).rgb)
+        return image_of(render_view(shown, camera).rgb)
 
     if video:
         speed = fps or cameras.frames_per_second or 24

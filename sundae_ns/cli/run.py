@@ -11,11 +11,9 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import tyro
-
-from sundae_ns.cli.options import Out, Source, check_folder
+from sundae_ns.cli.options import Out, Plain, Source, check_folder
 from sundae_ns.cli.poses import PoseOptions, check_poses
 from sundae_ns.cli.process import quoted, run_command, word
 from sundae_ns.cli.train import FINETUNE_WORDS, TrainOptions, has_gpu, pack_run
@@ -24,7 +22,7 @@ from sundae_ns.core.files import put_aside, write_text
 from sundae_ns.data.capture_files import placed_in
 from sundae_ns.data.layouts import is_model, is_posed, no_transforms, posed_layout
 from sundae_ns.io.config_file import schedule_length
-from sundae_ns.io.pack.config import FINETUNED_SIZE, tuned_steps
+from sundae_ns.io.pack.config import tuned_steps
 from sundae_ns.io.pack.container import read_header, read_sections
 from sundae_ns.io.run_folder import LOCK, reserve, steps_left
 
@@ -50,9 +48,8 @@ class Project:
     out: Out  # folder for the capture, the run, scene.sundae, scene.html and the report; created if missing
     quality: Literal["draft", "normal", "best"] = "normal"
     """draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03)."""
-    max_mb: float | None = None  # most megabytes of the packed scene; fewer Gaussians and coarser steps keep to it
-    train: Annotated[TrainOptions, tyro.conf.arg(name="")] = TrainOptions()
-    poses: Annotated[PoseOptions, tyro.conf.arg(name="")] = PoseOptions()
+    train: Plain[TrainOptions] = TrainOptions()
+    poses: Plain[PoseOptions] = PoseOptions()
 
     @cached_property
     def posed(self) -> bool:
@@ -73,7 +70,7 @@ class Project:
     @cached_property
     def tunes(self) -> bool:
         """Whether the pack is fine-tuned, which takes seconds on a GPU."""
-        return self.quality != "draft" and has_gpu()
+        return self.quality != "draft" and has_gpu() and not self.train.cleans
 
     def check(self) -> None:
         """Raise an error for photos that cannot be used, and for options that contradict each other."""
@@ -83,17 +80,13 @@ class Project:
             raise no_transforms(self.photos)  # says how to use a capture in another layout
         layout = posed_layout(self.photos) if self.posed else None
         self.train.check(self.photos)
-        mb, draft, method = self.max_mb, self.quality == "draft", self.train.method
-        fixed = self.train.keep is not None or method != "sundae"
-        decides = "needs a method that decides the number of Gaussians; leave out --keep and --method"
-        masks = "give frames their mask_path in transforms.json, or use `sundae train CAPTURE -- colmap --masks-path`"
+        draft, method = self.quality == "draft", self.train.method
+        fixed = (self.train.keep, self.train.count) != (None, None) or method != "sundae"
+        decides = "needs a method that decides the number of Gaussians; leave out --keep, --count and --method"
         steps = f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality"
         for wrong, message in (
-            (mb is not None and not 0.01 <= mb <= 1e6, f"max-mb is {mb or 0:g}; give at least 0.01"),
-            (self.poses.masks is not None and self.posed, f"{self.photos} has poses already; {masks}"),
             (draft and self.train.steps is not None, steps),
             (draft and method == "sundae-tiny", "sundae-tiny is shorter than a draft; leave out --quality"),
-            (fixed and mb is not None, f"--max-mb {decides}"),
             (fixed and self.quality == "best", f"--quality best {decides}"),
         ):
             if wrong:
@@ -141,10 +134,9 @@ class Project:
                 options = replace(options, steps=DRAFT_STEPS)
             if self.quality == "best":
                 more += ["--pipeline.model.pruning.max-drop", "0.03"]
-            if self.max_mb is not None:  # trials count the bytes of packs without a fine-tune
-                most = round(_bytes(self.max_mb) / (FINETUNED_SIZE if self.tunes else 1))
-                more += ["--pipeline.model.pruning.max-bytes", str(most)]
-        return run_command(options.words(self.capture, self.out / "runs", more), self.out / LOG)
+        masks = self.poses.masks if self.posed else None
+        words = options.words(self.capture, self.out / "runs", more, tunes=self.tunes, masks=masks)
+        return run_command(words, self.out / LOG)
 
     def _trained(self) -> bool:
         """Whether the last step is saved, of those before the pack's fine-tune."""
@@ -154,14 +146,15 @@ class Project:
         return self.tunes and left <= tuned_steps(schedule_length(self.run / "config.yml"))
 
     def _pack(self, packed: Path) -> int:
-        more = [] if self.max_mb is None else ["--target-bytes", str(_bytes(self.max_mb))]
-        return pack_run(self.run, packed, "--data", word(self.capture), *more, finetune=self.tunes)
+        words = "--data", word(self.capture), *self.train.pack_words
+        return pack_run(self.run, packed, *words, finetune=self.tunes)
 
     def claim(self) -> None:
         """Make the folder and lock it, or check that an earlier command with the same settings made it."""
         path, photos, masks = self.out / SETTINGS, self.photos.resolve(), self.poses.masks
-        settings = {"photos": str(photos), "quality": self.quality, "max_mb": self.max_mb}
+        settings: dict[str, Any] = {"photos": str(photos), "quality": self.quality}
         settings |= {**asdict(self.train), **asdict(self.poses), "masks": str(masks.resolve()) if masks else None}
+        settings = json.loads(json.dumps(settings | settings.pop("advanced")))  # with lists for tuples, as in the file
         # An earlier command may have been killed after it made the lock.
         begun = self.out.is_dir() and all(name.startswith((LOCK, SETTINGS)) for name in os.listdir(self.out))
         check_folder(self.out, reads=[photos], outside=self.photos, overwrite=begun or path.is_file() or None)
@@ -179,13 +172,13 @@ class Project:
         for name, *values in changed:
             first, now = ("left out" if value is None else value for value in values)
             again = "repeat the first command, or choose another folder"
-            if name == "max_mb" and self.max_mb is not None and self._trained():
-                size = f"--target-bytes {_bytes(self.max_mb)}"
+            if name == "max_mb" and self.train.max_mb is not None and self._trained():
+                size = f"--max-mb {self.train.max_mb:g}"
                 again = f"the finished run gets this size by `sundae pack {quoted(self.run)} -o FILE {size}`"
             raise ConfigError(f"{self.out} was made with {name.replace('_', '-')} {first}, not {now}; {again}")
 
 
-def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
+def run(project: Plain[Project]) -> int:
     """Turn photos or a video into a packed scene: find camera poses, train, pack, write a report and a page.
 
     Each step prints the command that it runs. The same command again skips the steps that are done, and resumes an
@@ -222,10 +215,6 @@ def run(project: Annotated[Project, tyro.conf.arg(name="")]) -> int:
     print(f"# to look at the scene: open {out / 'scene.html'} in a browser, or")
     print(shlex.join(["sundae", "view", word(out / "scene.sundae")]))
     return 0
-
-
-def _bytes(megabytes: float) -> int:
-    return round(megabytes * 1e6)
 
 
 def _passes(check: Callable[[], object]) -> bool:

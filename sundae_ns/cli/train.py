@@ -12,11 +12,24 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.options import Flag, Out, Share, Source, check_folder, check_least
+from sundae_ns.cli.options import (
+    Advanced,
+    Details,
+    Flag,
+    Maybe,
+    Out,
+    Plain,
+    Source,
+    Wishes,
+    check_folder,
+    check_least,
+    words_of,
+)
 from sundae_ns.cli.process import run_command, word
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError
+from sundae_ns.core.tables import MEGABYTE
 from sundae_ns.data.layouts import is_posed, no_transforms, posed_layout
-from sundae_ns.io.pack.config import FINETUNE_STEPS
+from sundae_ns.io.pack.config import FINETUNE_STEPS, FINETUNED_SIZE
 from sundae_ns.io.run_folder import new_name, unfinished_run
 
 PACKED = "scene.sundae"
@@ -24,13 +37,12 @@ FINETUNE_WORDS = ("--finetune-steps", str(FINETUNE_STEPS))  # leaves the last st
 
 
 @dataclass(frozen=True)
-class TrainOptions:
-    """Options of a training that everyone sets."""
+class TrainOptions(Wishes):
+    """Options of a training that everyone sets; without an amount it keeps as many Gaussians as the scene needs."""
 
     method: str = "sundae"  # one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU
-    keep: Share | None = None
-    """share of the Gaussians to keep, 0.25 or 25%; by default as many as the scene needs, or that of the method."""
-    steps: int | None = None  # number of training steps; by default that of the method
+    steps: Maybe[int] = None  # number of training steps; by default that of the method
+    advanced: Advanced[Details] = Details()
 
     def check(self, capture: Path) -> None:
         """Raise ``DataError`` if the capture does not exist, and ``ConfigError`` for a wrong option."""
@@ -38,20 +50,43 @@ class TrainOptions:
             raise DataError(f"{capture} does not exist; give the folder of a capture")
         if self.method not in methods():
             raise ConfigError(f"{self.method} is no method of sundae; use one of {', '.join(methods())}")
-        if self.keep is not None and not 0 < self.keep <= 1:
-            raise ConfigError(f"keep is {self.keep}; give a share in (0, 1], or per cent as 25%")
+        self.check_wishes()
         check_least(steps=(self.steps, 1))
+        if self.max_mb is not None and self.method != "sundae":
+            raise ConfigError("--max-mb needs a method that decides the number of Gaussians; leave out --method")
 
-    def words(self, capture: Path, out: Path, more: Sequence[str] = ()) -> list[str]:
-        """The command of ``ns-train``, with ``more`` options and perhaps a parser of captures among them."""
+    def words(
+        self, capture: Path, out: Path, more: Sequence[str] = (), *, tunes: bool = False, masks: Path | None = None
+    ) -> list[str]:
+        """The command of ``ns-train``, with ``more`` options and perhaps a parser of captures among them.
+
+        ``tunes`` says whether the pack is fine-tuned, ``masks`` is a folder of them for a capture in COLMAP's layout.
+        """
         words = ["ns-train", self.method, "--data", word(capture), "--output-dir", word(out)]
         if self.keep is not None:
             words += ["--pipeline.model.pruning.keep-ratio", f"{self.keep:g}"]
+        if self.count is not None:
+            words += ["--pipeline.model.pruning.target-gaussians", str(self.count)]
+        if self.max_mb is not None:  # trials count the bytes of packs without a fine-tune
+            most = round(self.max_mb * MEGABYTE / (FINETUNED_SIZE if tunes else 1))
+            words += ["--pipeline.model.pruning.max-bytes", str(most)]
+        if self.advanced.no_head:
+            words += ["--pipeline.model.head.mode", "off"]
+        if self.advanced.seed is not None:
+            words += ["--machine.seed", str(self.advanced.seed)]
         if self.steps is not None:
             words += ["--max-num-iterations", str(self.steps)]
         layout = None if any(map(_is_parser, more)) else posed_layout(capture)
+        of_masks = [] if masks is None else ["--masks-path", word(masks.resolve())]
+        if of_masks and (layout is None or layout.words[0] != "colmap"):
+            raise ConfigError(f"{capture} is not in COLMAP's layout; give frames their mask_path in transforms.json")
         # The parser and its options come last.
-        return [*words, *more] if layout is None else [*words, *layout.options, *more, *layout.words]
+        return [*words, *more] if layout is None else [*words, *layout.options, *more, *layout.words, *of_masks]
+
+    @property
+    def pack_words(self) -> list[str]:
+        """Words of ``sundae pack`` for the run."""
+        return [*words_of(self, "max_mb", "crop", "remove_floaters"), *words_of(self.advanced, "up", "start_view")]
 
 
 def methods() -> list[str]:
@@ -65,7 +100,8 @@ def train(
     further: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
     out: Out = Path("outputs"),
     resume: Flag = False,
-    options: Annotated[TrainOptions, tyro.conf.arg(name="")] = TrainOptions(),  # noqa: B008
+    masks: Maybe[Path] = None,
+    options: Plain[TrainOptions] = TrainOptions(),  # noqa: B008
 ) -> int:
     """Print a command of ns-train and run it; then pack the scene into scene.sundae in the run's folder.
 
@@ -77,6 +113,8 @@ def train(
         further: behind --, any options of ns-train, as in sundae train CAPTURE -- --pipeline.model.sh-degree 2
         out: folder of runs.
         resume: train the remaining steps of the newest unfinished run of this method on this capture.
+        masks: folder with a mask for each photo, under its name, of a capture in COLMAP's layout; training leaves out
+            what is black.
     """
     if further and not (further[0].startswith("-") or _is_parser(further[0])):
         raise ConfigError(f"{further[0]} is no option; options of ns-train follow a --")
@@ -99,7 +137,9 @@ def train(
     lengths = ("--max-num-iterations", "--schedule-length", "--finetune-steps")
     if tunes and not any(_value_of(option, further) for option in lengths):
         more[:0] = FINETUNE_WORDS
-    words = options.words(capture, out, more)  # refuses a damaged capture before runs are mentioned
+    words = options.words(
+        capture, out, more, tunes=tunes, masks=masks
+    )  # refuses a damaged capture before runs are mentioned
     if not resume and old is not None and not (old / PACKED).exists():
         resuming = ["sundae", "train", word(capture), "--resume"]
         resuming += ["-o", word(out)] if out != Path("outputs") else []
@@ -112,7 +152,7 @@ def train(
     if code or run is None:
         return code
     stale = ["--overwrite"] if (run / PACKED).exists() else []  # of the steps before a resume
-    return pack_run(run, run / PACKED, *stale, finetune=tunes)
+    return pack_run(run, run / PACKED, *options.pack_words, *stale, finetune=tunes and not options.cleans)
 
 
 def pack_run(run: Path, out: Path, *more: str, finetune: bool) -> int:

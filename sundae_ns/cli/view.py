@@ -6,11 +6,10 @@ import sys
 import webbrowser
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
 
-from sundae_ns.cli.inputs import name_of, open_packed
-from sundae_ns.cli.options import Scene
+from sundae_ns.cli.inputs import name_of, prepared_page
+from sundae_ns.cli.options import Advanced, Flag, Plain, Scene, SceneDetails, Wishes
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.scene.page import page_of
 
@@ -63,7 +62,13 @@ def _hosts(port: int) -> set[str]:
     return {f"{name}:{port}" for name in names} | (names if port == 80 else set())
 
 
-def view(scene: Scene, port: int = 0, open_browser: bool = True, data: Path | None = None) -> int:
+def view(
+    scene: Scene,
+    port: int = 0,
+    no_open_browser: Flag = False,
+    wishes: Plain[Wishes] = Wishes(),  # noqa: B008
+    advanced: Advanced[SceneDetails] = SceneDetails(),  # noqa: B008
+) -> int:
     """Show a scene with its head in the browser, until Ctrl-C.
 
     Serves the page of sundae export on 127.0.0.1 and opens it. From another machine, forward the port to the same
@@ -71,14 +76,14 @@ def view(scene: Scene, port: int = 0, open_browser: bool = True, data: Path | No
 
     Args:
         port: port on 127.0.0.1; 0 takes a free one.
-        open_browser: open the default browser; otherwise only print the address.
-        data: folder of the capture of a run, if it moved.
+        no_open_browser: only print the address, and open no browser.
     """
-    page = page_of((name_of(scene), *open_packed(scene, data)))
+    wishes.check_wishes()
+    page = page_of((name_of(scene), *prepared_page(scene, wishes, advanced)))
     with serve(page, port) as server, suppress(KeyboardInterrupt):
         address = f"http://127.0.0.1:{server.server_port}/"
         print(f"{scene} is shown at {address} until Ctrl-C", flush=True)
-        if open_browser:
+        if not no_open_browser:
             webbrowser.open(address)
         server.serve_forever()
     return 0

@@ -26,7 +26,7 @@ from sundae_ns.core.metrics import Quality, evaluate
 from sundae_ns.core.values import usual_defaults
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.pack.codecs import Codecs, estimated_bits
-from sundae_ns.io.pack.config import STEPS, PackConfig
+from sundae_ns.io.pack.config import COARSEST, FINEST, PackConfig, scaled
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.plugin.finished_runs import load_model, place
 from sundae_ns.plugin.model import SundaeModel
@@ -43,7 +43,6 @@ RATES |= {"quats": 2e-4, "features": 5e-4, "head": 2e-4}
 """Peak rates of Adam, about a fifth of the initial rates of a run. Positions are rounded once and fixed: at the end of
 training they hardly move."""
 RATE = 0.025  # Loss for each bit per stored number: about what a bit less costs in quality at the steps of FINETUNED
-FINEST, COARSEST = -3.0, 4.0  # Ends of the search: powers of two of the factor
 
 
 @usual_defaults()
@@ -211,14 +210,6 @@ def is_worth(psnr: float, size: int, other_psnr: float, other_size: int) -> bool
     return psnr >= other_psnr + GAIN_PER_DOUBLING * math.log2(size / other_size)
 
 
-def scaled(config: PackConfig, power: float, *, with_positions: bool = True) -> PackConfig:
-    """Options with all steps larger by 2^power, and as many fewer bits of positions, but at least 10."""
-    steps = {name: min(max(getattr(config, name) * 2**power, 1e-4), 1.0) for name in STEPS}
-    if with_positions:
-        steps["position_bits"] = min(max(round(config.position_bits - power), 10), 16)
-    return replace(config, **steps)  # type: ignore[arg-type]
-
-
 class Candidate(NamedTuple):
     """One pack of the search."""
 
@@ -265,9 +256,7 @@ class Search:
             drop = ""
             with suppress(SundaeError):  # sizes need no capture
                 drop = f" and loses {self.drop(coarsest):.2f} dB"
-            raise PackError(
-                f"the smallest pack has {coarsest.bytes:,} bytes{drop}; give a larger --target-bytes, or prune the run"
-            )
+            raise PackError(f"the smallest pack has {coarsest.bytes:,} bytes{drop}; give a larger --max-mb")
         finest = self._bisected(lambda candidate: candidate.bytes <= limit, coarsest, COARSEST, FINEST)
         with suppress(SundaeError):
             if self.default.bytes <= limit and self.drop(self.default) < self.drop(finest):

@@ -17,6 +17,7 @@ from sundae_ns.head.head import SIZES, CompensationHead, HeadConfig
 from sundae_ns.io import checkpoint, formats
 from sundae_ns.io.config_file import find_config, model_options, orientation_of
 from sundae_ns.io.formats import FORMATS, kind_of
+from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.ply import Marks
 from sundae_ns.scene.cameras import is_frame
 from sundae_ns.scene.page import packed_of, write_page
@@ -94,7 +95,11 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
     >>> sn.load(path).num_gaussians
     50
     """
-    path = Path(path)
+    write_scene(scene, Path(path), upright=upright)
+
+
+def write_scene(scene: Scene, path: Path, *, upright: bool = False, config: PackConfig | None = None) -> None:
+    """As :func:`save`, with the precision of a pack, that of a page included."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
@@ -104,9 +109,9 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
         if suffix in FORMATS:
             save_for_viewers(scene, path, upright=upright)
         elif suffix == ".html":
-            write_page(path, (path.resolve().stem, scene, packed_of(scene)))
+            write_page(path, (path.resolve().stem, scene, packed_of(scene, config)))
         else:
-            write_bytes(path, packed_of(scene))
+            write_bytes(path, packed_of(scene, config))
 
 
 def packed_file(path: Path) -> tuple[Scene, bytes]:

@@ -23,6 +23,7 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, writing
 from sundae_ns.core.files import write_bytes, write_text
 from sundae_ns.core.values import whole
+from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.scene.cameras import camera_in_front
 from sundae_ns.scene.scene import Scene, image_of, render
 from sundae_ns.scene.virtual_cameras import middle_and_reach, usable
@@ -60,11 +61,11 @@ def page(scenes: Scene | Mapping[str, Scene], path: Path | str, *, views: Mappin
 Shown = tuple[str, Scene, bytes]  # a scene on a page: its name, itself, and its packed file
 
 
-def packed_of(scene: Scene) -> bytes:
-    """The packed file of a scene, with default settings."""
+def packed_of(scene: Scene, config: PackConfig | None = None) -> bytes:
+    """The packed file of a scene, by default with default settings."""
     from sundae_ns.scene.packing import packed_bytes  # its encoder needs a compiler, which other files do not
 
-    return packed_bytes(scene)
+    return packed_bytes(scene, config)
 
 
 def page_of(*shown: Shown, views: Mapping[str, View] | None = None) -> str:

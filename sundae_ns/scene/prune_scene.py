@@ -18,6 +18,7 @@ from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError, DataError
 from sundae_ns.core.gaussians import Gaussians, sanitise
 from sundae_ns.core.values import AnyArray, numbers, whole
+from sundae_ns.graph.graph import NeighborGraph
 from sundae_ns.graph.neighbors import knn
 from sundae_ns.pruning.decision import prune_gaussians
 from sundae_ns.pruning.rule import PruneRule, kept_count
@@ -37,6 +38,7 @@ class PrunedScene(NamedTuple):
     scene: Scene
     mask: Tensor  # True for kept Gaussians of the scene before the prune, bool [N]
     seen: float | None = None  # share of the finite Gaussians that the cameras see; None if none was asked
+    moved: bool = False  # whether kept Gaussians have other values than before
 
 
 def prune(
@@ -97,8 +99,13 @@ def prune_with_mask(
     *,
     progress: bool = False,
     fit: bool = True,
+    weights: Tensor | None = None,
+    graph: NeighborGraph | None = None,
 ) -> PrunedScene:
-    """As :func:`prune`, with the mask of the kept Gaussians; without ``fit``, a training that follows fits them."""
+    """As :func:`prune`, with the mask of the kept Gaussians; without ``fit``, a training that follows fits them.
+
+    ``weights`` ``[M]`` of the finite Gaussians, by :func:`weights_in`, and their ``graph`` are not computed again.
+    """
     check_amount(keep, count)
     rule, sanitised = rule or PruneRule(), sanitise(scene.gaussians)
     n = sanitised.gaussians.num_gaussians
@@ -107,11 +114,13 @@ def prune_with_mask(
     assert count is not None
     usable = dataclasses.replace(scene, gaussians=sanitised.gaussians)
     console = Console(stderr=True) if progress else None
-    weights = None
-    if rule.uses_contribution and count < n:
+    if not rule.uses_contribution or count >= n:
+        weights = None
+    else:
         given = cameras if cameras is not None else scene.cameras or virtual_cameras(usable)
-        weights = weights_in(usable, given, count if rule.uses_detail else None, console)
-    pruned = prune_gaussians(sanitised.gaussians, rule, count, weights)
+        if weights is None:
+            weights = weights_in(usable, given, count if rule.uses_detail else None, console)
+    pruned = prune_gaussians(sanitised.gaussians, rule, count, weights, graph)
     small = dataclasses.replace(scene, gaussians=pruned.gaussians)
     if weights is not None and rule.refits and fit:
         size, (full, scaled) = size_of(usable), of_unit_size(usable, given)
@@ -121,7 +130,8 @@ def prune_with_mask(
         fitted = resized(dataclasses.replace(scene, gaussians=fitted), size).gaussians
         small = dataclasses.replace(scene, gaussians=fitted)
     mask = within(sanitised.mask, pruned.decision.mask)
-    return PrunedScene(small, mask, None if weights is None else float((weights > 0).float().mean()))
+    seen = None if weights is None else float((weights > 0).float().mean())
+    return PrunedScene(small, mask, seen, rule.redistribution == "merge" and count < n)
 
 
 def at_most(camera: Camera, pixels: int) -> Camera:
@@ -258,7 +268,7 @@ def crop(scene: Scene, low: AnyArray, high: AnyArray) -> Scene:
 
     Args:
         scene: to cut; it does not change.
-        low, high: lowest and highest x, y and z of the box, world units.
+        low, high: lowest and highest x, y and z of the box, in the coordinates of the scene's file.
 
     Raises:
         ConfigError: the box is empty or not finite.
@@ -303,17 +313,21 @@ def within(mask: Tensor | None, inner: Tensor) -> Tensor:
 
 def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
     """True for the Gaussians in a box, bool ``[N]``; arguments and errors as for :func:`crop`."""
-    means = scene.gaussians["means"].detach()
+    # In float64, which is exact, and holds survey coordinates.
+    means = scene.gaussians["means"].detach().double()
+    means = means + means.new_tensor(scene.offset or (0.0, 0.0, 0.0))
     lowest, highest = (numbers(corner, "a corner of the box", (3,)).to(means.device) for corner in (low, high))
     if not bool((lowest < highest).all()):
         raise ConfigError("the box is empty; give its lowest x y z first, then its highest")
-    inside = ((means.double() >= lowest) & (means.double() <= highest)).all(dim=1)  # exact in float64
+    inside = ((means >= lowest) & (means <= highest)).all(dim=1)
     if not bool(inside.any()):
-        finite = means[means.isfinite().all(dim=1)].double().cpu().numpy()
+        finite = means[means.isfinite().all(dim=1)].cpu().numpy()
         if not len(finite):
             raise DataError("no Gaussian is in the box, because none is finite; export the scene again")
         quantiles = np.quantile(finite, (0.05, 0.95), axis=0)
-        corners = (" ".join(f"{value:.3g}" for value in corner) for corner in quantiles)
+        corners = (
+            " ".join(f"{value:.{3 if scene.offset is None else 10}g}" for value in corner) for corner in quantiles
+        )
         raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
     return inside
 

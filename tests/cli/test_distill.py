@@ -1,4 +1,4 @@
-"""``sundae distill``."""
+"""``sundae prune --distill``."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ from sundae_ns.plugin.distill import Distillation
 
 
 def run(*words):
-    return command_line.run("distill", *words)
+    return command_line.run("prune", *words, "--distill")
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -144,7 +145,7 @@ def test_every_command_reads_files_of_other_programs(tmp_path, monkeypatch, capl
     found = read_scene(Path("packed/a.sundae")).gaussians["means"]
     assert torch.cdist(truth["means"].double(), found.double()).amin(dim=1).max() < 0.002
     assert run("render", name, "-o", "images/a.png", "--width", "64") == 0
-    assert run("distill", name, "-o", "small/a.sundae", "--steps", "1", "--no-head", "--keep", "0.5") == 0
+    assert run("prune", name, "-o", "small/a.sundae", "--distill", "--steps", "1", "--no-head", "--keep", "0.5") == 0
     for file in ("exported/a.spz", "pages/a.html", "images/a.png", "small/a.sundae"):
         assert Path(file).stat().st_size > 0
     if name != "plain.ply":
@@ -222,6 +223,20 @@ def test_prune_by_the_cameras_of_files(tmp_path, capsys):
         assert "50 of 200 Gaussians" in text
     words = ("-o", tmp_path / "transforms.json", "--cameras", tmp_path, "--overwrite")
     assert run("prune", tmp_path / "a.ply", *words) == 2
+
+
+@pytest.mark.parametrize(("name", "asked"), [("a.ply", 0.1), ("a.spz", 0.02), ("a.sundae", 0.012), ("a.html", 0.235)])
+def test_a_size_that_was_asked_for_binds(name, asked, tmp_path, capsys):
+    """With a box, a direction and a page in the same command; if all Gaussians fit, none goes."""
+    points = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0))
+    sn.save(sn.Scene.from_points(points, points), tmp_path / "in.ply")
+    words = ["prune", tmp_path / "in.ply", "-o", tmp_path / name, "--num-cameras", "2", "--up", "0", "1", "0"]
+    assert run(*words, "--max-mb", asked, "--crop", "0", "0", "0", "1", "1", "0.9") == 0
+    size, (kept,) = (tmp_path / name).stat().st_size, re.findall("([0-9,]+) of 3,000", capsys.readouterr().out)
+    assert 0.97 * asked <= size / 1e6 <= asked
+    assert 100 < int(kept.replace(",", "")) < 2700
+    assert run(*words, "--max-mb", "9", "--overwrite") == 0
+    assert "3,000 of 3,000" in capsys.readouterr().out
 
 
 @pytest.mark.gpu

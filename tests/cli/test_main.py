@@ -18,7 +18,7 @@ SUNDAE = Path(sys.executable).parent / "sundae"
 
 
 def test_the_twelve_commands():
-    names = "run poses train prune distill pack export view render compare info demo doctor"
+    names = "run poses train prune pack export view render compare info demo doctor"
     assert list(COMMANDS) == names.split()
 
 

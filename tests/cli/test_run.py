@@ -110,17 +110,17 @@ def test_a_size_and_a_quality(commands):
     pruning = tyro.cli(type(usual), default=usual, args=commands.ran[1][2:]).pipeline.model.pruning
     assert (pruning.max_bytes, pruning.max_drop) == (2_000_000, 0.03)
     pruning.validate()
-    assert commands.option("--target-bytes", 2) == "2000000"
+    assert commands.option("--max-mb", 2) == "2"
     started(commands, "photos", "-o", "draft", "--quality", "draft")
     assert commands.option("--max-num-iterations", 1) == "3000"
-    assert "--target-bytes" not in commands.ran[2]
+    assert "--max-mb" not in commands.ran[2]
 
 
 def test_a_gpu_packs_with_a_fine_tune(commands, capsys):
     commands.gpu = True
     started(commands, *OUT, "--max-mb", "2")
     assert commands.option("--finetune", 2) == commands.option("--finetune-steps", 1) == "1500"
-    assert commands.option("--target-bytes", 2) == "2000000"
+    assert commands.option("--max-mb", 2) == "2"
     # Trials count the bytes of a pack without one.
     assert commands.option("--pipeline.model.pruning.max-bytes", 1) == "3333333"
     assert shlex.join(commands.ran[2]) in capsys.readouterr().out
@@ -263,7 +263,7 @@ def test_other_or_damaged_settings_are_refused(commands, capsys):
         (["--steps", "200"], "steps left out, not 200"),
         (["--keep", "0.5"], "keep left out, not 0.5"),
         (["--method", "sundae-tiny"], "method sundae, not sundae-tiny"),
-        (["--max-mb", "2"], f"size by `sundae pack {RUN} -o FILE --target-bytes 2000000`"),
+        (["--max-mb", "2"], f"size by `sundae pack {RUN} -o FILE --max-mb 2`"),
     ):
         assert cause in refusal(capsys, *OUT, *more)
     for text in ("[]", "{"):

@@ -22,7 +22,6 @@ WORDS = {
     "poses": ["RUN", "-o", "capture"],
     "train": ["CAPTURE", "-o", "runs"],
     "prune": ["RUN", "-o", "out.ply", "--num-cameras", "2"],
-    "distill": ["RUN", "-o", "out.sundae", "--steps", "2"],
     "pack": ["RUN", "-o", "out.sundae"],
     "export": ["RUN", "-o", "out.html"],
     "view": ["RUN", "--no-open-browser"],

@@ -31,7 +31,7 @@ NAMES |= dict.fromkeys(("RUN_OR_PACK_OR_PLY", "FILE", "scene.ply", "before.ply")
 NAMES["Detail=#camera=..."] = "Detail=#camera=2"
 SHORTER = {"--finetune": "2", "--view": "2", "--width": "32", "--height": "24", "--train-views": "6"}
 """Values that suit a small run and a small scene."""
-MORE = {"prune": ["--num-cameras", "4"], "distill": ["--steps", "4"], "render": ["--width", "32"]}
+MORE = {"prune": ["--num-cameras", "4"], "render": ["--width", "32"]}
 """Options that shorten commands of ``sundae`` further."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sundae_ns.core.errors import ConfigError
 
@@ -31,6 +31,16 @@ class PackConfig:
 
 
 STEPS = ("scale_step", "rotation_step", "color_step", "opacity_step", "harmonics_step", "feature_step", "head_step")
+FINEST, COARSEST = -3.0, 4.0  # powers of two of the factor by which a search for a size changes all steps
+
+
+def scaled(config: PackConfig, power: float, *, with_positions: bool = True) -> PackConfig:
+    """Options with all steps larger by 2^power, and as many fewer bits of positions, but at least 10."""
+    steps = {name: min(max(getattr(config, name) * 2**power, 1e-4), 1.0) for name in STEPS}
+    if with_positions:
+        steps["position_bits"] = min(max(round(config.position_bits - power), 10), 16)
+    return replace(config, **steps)  # type: ignore[arg-type]
+
 
 FINETUNED: dict[str, int | float] = {
     "position_bits": 12,
