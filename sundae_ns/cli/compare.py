@@ -85,7 +85,8 @@ def compare(
     measured_by = partial(measure, lpips=lpips, visible=photos, warmup=warmup, repeats=repeats, command=command)
     with progress_bar() as progress, TemporaryDirectory() as folder:
         if formats:
-            task, whole, stem = progress.add_task("Writing all formats", total=None), load(scenes[0]), scenes[0].stem
+            task, stem = progress.add_task("Writing all formats", total=None), scenes[0].stem
+            whole = load(scenes[0]) if first is None else first.to("cpu")
             others = [suffix for suffix in (*FORMATS, ".sundae") if suffix != scenes[0].suffix.lower()]
             scenes = [scenes[0], *(Path(folder, f"{stem}{suffix}") for suffix in others)]
             for path in scenes[1:]:

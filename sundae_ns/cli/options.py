@@ -79,9 +79,9 @@ class Wishes:
     remove_floaters: Flag = False
     """remove small groups of Gaussians that touch no other, and what none of the cameras of the photographs sees."""
 
-    def check_wishes(self) -> None:
-        """Raise ``ConfigError`` for more than one amount, or one that is out of range."""
-        check_exclusive(keep=self.keep, count=self.count, max_mb=self.max_mb)
+    def check_wishes(self, **others: object) -> None:
+        """Raise ``ConfigError`` for more than one amount, ``others`` included, or one that is out of range."""
+        check_exclusive(keep=self.keep, count=self.count, max_mb=self.max_mb, **others)
         if self.keep is not None and not 0 < self.keep <= 1:
             raise ConfigError(f"keep is {self.keep}; give a share in (0, 1], or per cent as 25%")
         check_least(count=(self.count, 1), max_mb=(self.max_mb, 0.001))

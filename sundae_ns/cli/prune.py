@@ -78,9 +78,7 @@ def prune(
             virtual ones, with a head if cameras that no step sees show that it pays. Ctrl-C saves; the same command
             resumes.
     """
-    amounts = {"keep": wishes.keep, "count": wishes.count, "max_mb": wishes.max_mb, "target_drop": target_drop}
-    wishes.check_wishes()
-    check_exclusive(**amounts)
+    wishes.check_wishes(target_drop=target_drop)
     check_drop(target_drop)
     check_exclusive(distill=distill or None, max_mb=wishes.max_mb, target_drop=target_drop)
     with_head = check_suffix(out, SUFFIXES) in (".sundae", ".html")
@@ -90,7 +88,7 @@ def prune(
         raise ConfigError(f"{out} cannot hold a head; name it .sundae, or leave the head out with --no-head")
     if advanced.start_view is not None and not with_head:
         raise ConfigError(f"{out.suffix} files hold no start view; leave it out, or name a .sundae or .html")
-    if all(amount is None for amount in amounts.values()):
+    if not wishes.reduces and target_drop is None:
         wishes = dataclasses.replace(wishes, keep=0.1)
     check_file(out, reads=[source, advanced.cameras], overwrite=advanced.overwrite)
     advanced.rule.validate()

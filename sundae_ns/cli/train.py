@@ -137,9 +137,8 @@ def train(
     lengths = ("--max-num-iterations", "--schedule-length", "--finetune-steps")
     if tunes and not any(_value_of(option, further) for option in lengths):
         more[:0] = FINETUNE_WORDS
-    words = options.words(
-        capture, out, more, tunes=tunes, masks=masks
-    )  # refuses a damaged capture before runs are mentioned
+    # Refuses a damaged capture before runs are mentioned.
+    words = options.words(capture, out, more, tunes=tunes, masks=masks)
     if not resume and old is not None and not (old / PACKED).exists():
         resuming = ["sundae", "train", word(capture), "--resume"]
         resuming += ["-o", word(out)] if out != Path("outputs") else []

@@ -205,8 +205,7 @@ def plan(focal: float, trained: tuple[float, float] | None, pixels: int) -> Scal
     """Plan the compensation of an image of ``pixels`` and a focal length, by the shortest and longest of training."""
     if trained is None:
         return ScalePlan(1.0, 1.0)
-    nearest = min(max(focal, trained[0]), trained[1])
-    zoom = nearest / focal
+    zoom = min(max(focal, trained[0]), trained[1]) / focal  # to the nearest one
     if 1 / TOLERANCE <= zoom <= TOLERANCE:
         return ScalePlan(1.0, 1.0)
     limit = max(MAX_PIXELS, MARGIN**2 * pixels)
@@ -220,13 +219,14 @@ def _fading(value: float, off: float, full: float) -> float:
 
 def resize(image: Tensor, height: int, width: int) -> Tensor:
     """Resize ``[h, w, C]`` to ``[height, width, C]``, antialiased where it shrinks."""
-    planes = image.permute(2, 0, 1)[None]
-    resized = F.interpolate(planes, size=(height, width), mode="bilinear", align_corners=False, antialias=True)
+    resized = F.interpolate(image.permute(2, 0, 1)[None], (height, width), mode="bilinear", antialias=True)
     return resized[0].permute(1, 2, 0)
 
 
-def bytes_of_module(module: nn.Module) -> int:
-    """Bytes of a module's parameters and buffers, each in its own dtype; a shared tensor counts once."""
+def bytes_of_module(module: nn.Module | None) -> int:
+    """Bytes of a module's parameters and buffers, each in its own dtype; a shared tensor counts once; 0 for None."""
+    if module is None:
+        return 0
     return sum(tensor.numel() * tensor.element_size() for tensor in [*module.parameters(), *module.buffers()])
 
 

@@ -43,6 +43,7 @@ from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanager, Sunda
 from sundae_ns.plugin.dataparsers import camera_of, check_capture
 from sundae_ns.plugin.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rasterize.interface import fastest_device
+from sundae_ns.scene.cameras import spread
 from sundae_ns.scene.compose import transform
 from sundae_ns.scene.load_save import load, scene_of_checkpoint
 from sundae_ns.scene.packing import refusal
@@ -260,8 +261,7 @@ def load_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> 
     cameras, up = tuple[Camera, ...](), scene.up
     if max_cameras > 0:
         views: Cameras = manager.setup(device="cpu", test_mode="test").train_dataset.cameras
-        chosen = torch.linspace(0, len(views) - 1, min(max_cameras, len(views))).round().long().tolist()
-        cameras = tuple(camera_of(views[i : i + 1], "cpu") for i in chosen)
+        cameras = tuple(camera_of(views[i : i + 1], "cpu") for i in spread(len(views), max_cameras))
     if up is None and cameras:
         with suppress(ConfigError):  # cameras that look all around have none
             up = unit(torch.stack([camera.pose[:, 1] for camera in cameras]).double().mean(dim=0).tolist())

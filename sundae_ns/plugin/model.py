@@ -487,7 +487,7 @@ class NerfstudioRun:
                     callback.finish(self)
             if self.folder is not None:
                 head = self.state.head if self.state.head_enabled else None
-                size = bytes_of(self.state.gaussians) + (0 if head is None else bytes_of_module(head))
+                size = bytes_of(self.state.gaussians) + bytes_of_module(head)
                 with_head = f"{'without' if head is None else 'with'} a head"
                 lines = [f"{self.source.total:,} Gaussians, {with_head}: {size / 1e6:.2f} MB before packing"]
                 lines += [f"next: {shlex.join(['sundae', 'pack', str(self.folder), '-o', 'scene.sundae'])}"]

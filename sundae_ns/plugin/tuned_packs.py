@@ -31,6 +31,7 @@ from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.plugin.finished_runs import load_model, place
 from sundae_ns.plugin.model import SundaeModel
 from sundae_ns.rasterize.gsplat_kernels import Capacity
+from sundae_ns.scene.cameras import spread
 from sundae_ns.scene.optimise import optimise, rate_factor
 from sundae_ns.scene.render import RenderSettings
 from sundae_ns.train.choice import GAIN_PER_DOUBLING
@@ -187,10 +188,9 @@ class Judge:
 
     def __init__(self, run: Path, data: Path | None) -> None:
         opened = load_model(run, data)
-        self._model, self.all_cameras = opened.model, len(opened.cameras)
-        chosen = torch.linspace(0, self.all_cameras - 1, min(8, self.all_cameras)).round().long().unique().tolist()
-        self.cameras = len(chosen)  # Number of test views that are measured, of all_cameras
-        self._cameras, self._truths = ([each[i] for i in chosen] for each in (opened.cameras, opened.truths))
+        chosen = spread(len(opened.cameras), 8)
+        self._model, self.cameras, self.all_cameras = opened.model, len(chosen), len(opened.cameras)  # Measured, of all
+        self._cameras, self._truths = [opened.cameras[i] for i in chosen], [opened.truths[i] for i in chosen]
         self.before = self._quality()  # Of the run itself
 
     def quality(self, scene: PackedScene, codecs: Codecs) -> Quality:

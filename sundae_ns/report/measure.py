@@ -246,7 +246,7 @@ def measure(
             progress()
     bare = bytes_of({name: value for name, value in gaussians.items() if name != FEATURES})
     # A disabled head is not needed, and neither are its features. A file is read completely in any case.
-    stored = (bare, 0) if head is None else (bytes_of(gaussians), bytes_of_module(head))
+    stored = (bare if head is None else bytes_of(gaussians), bytes_of_module(head))
     stored = stored if subject.file_bytes is None else (subject.file_bytes, 0)
     needed = {HEAD_ON: sum(stored), HEAD_OFF: subject.file_bytes or bare}
     resolutions = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in subject.cameras))

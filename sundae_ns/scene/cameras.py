@@ -169,6 +169,11 @@ def is_frame(stated: Any) -> bool:
     return True
 
 
+def spread(total: int, most: int) -> list[int]:
+    """At most ``most`` indices below ``total``, evenly spaced from the first to the last."""
+    return torch.linspace(0, total - 1, min(most, total)).round().int().tolist()
+
+
 def with_start(scene: Scene, start_view: str | None, up: Sequence[float] | None) -> Scene:
     """The scene with another start view or up axis, as a user names them; None keeps that of the scene.
 

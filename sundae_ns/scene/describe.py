@@ -20,6 +20,7 @@ from sundae_ns.core.gaussians import bytes_of, sanitise
 from sundae_ns.head.head import bytes_of_module
 from sundae_ns.io.formats import kind_of
 from sundae_ns.io.pack.container import read_header
+from sundae_ns.scene.cameras import spread
 from sundae_ns.scene.prune_scene import at_most, floater_mask, weights_in
 from sundae_ns.scene.scene import Scene
 from sundae_ns.scene.virtual_cameras import virtual_cameras
@@ -35,15 +36,14 @@ def held_out_cameras(scene: Scene, cameras: Sequence[Camera], count: int = HELD_
     """At most ``count`` cameras, evenly spaced among some; without any, virtual ones that no prune of the seed sees."""
     if not cameras:
         return virtual_cameras(scene, count, seed=seed + 1)
-    chosen = torch.linspace(0, len(cameras) - 1, min(count, len(cameras))).round().int().tolist()
-    return [at_most(cameras[i], PIXELS) for i in chosen]
+    return [at_most(cameras[i], PIXELS) for i in spread(len(cameras), count)]
 
 
 def bytes_at(path: Path, scene: Scene) -> int:
     """Bytes of the file of a scene; of a run, those of its Gaussians and its head in fp32."""
     if path.is_file():
         return path.stat().st_size
-    return bytes_of(scene.gaussians) + (0 if scene.head is None else bytes_of_module(scene.head))
+    return bytes_of(scene.gaussians) + bytes_of_module(scene.head)
 
 
 @torch.no_grad()
@@ -95,7 +95,7 @@ def bytes_by_attribute(scene: Scene, path: Path) -> dict[str, int]:
                 parts[re.split(r"[_.]", Path(entry.filename).name)[0]] += entry.compress_size
     else:
         parts |= {f"{name}, fp32": 4 * value.numel() for name, value in scene.gaussians.items()}
-        parts["head"] = 0 if scene.head is None else bytes_of_module(scene.head)
+        parts["head"] = bytes_of_module(scene.head)
     return {name: size for name, size in parts.items() if size}
 
 

@@ -114,12 +114,6 @@ def write_scene(scene: Scene, path: Path, *, upright: bool = False, config: Pack
             write_bytes(path, packed_of(scene, config))
 
 
-def packed_file(path: Path) -> tuple[Scene, bytes]:
-    """A scene and the bytes of its packed file; a file that is not packed is packed with default settings."""
-    scene = load(path)
-    return scene, path.read_bytes() if kind_of(path) == "packed" else packed_of(scene)
-
-
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> dict[str, Tensor]:
     """Write base colours in a format of other viewers; returns the written Gaussians. See :func:`save`."""
     return formats.write_for_viewers(path, scene.gaussians, _marks_of(scene), upright=upright)

@@ -18,7 +18,7 @@ from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.container import FORMAT, fault
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.rasterize.reference import harmonic_basis
-from sundae_ns.scene.cameras import is_frame
+from sundae_ns.scene.cameras import is_frame, spread
 from sundae_ns.scene.render import GaussianSource, render_view
 from sundae_ns.scene.scene import Direction, Scene, unit
 
@@ -186,7 +186,7 @@ def _of_head(scene: Scene, cameras: Sequence[Camera]) -> tuple[Tensor, dict[str,
     form = torch.zeros(features.shape[1], features.shape[1], dtype=torch.float64)
     squares = {name: torch.zeros(value.shape[:2], dtype=torch.float64) for name, value in weights.items()}
     signs = torch.Generator().manual_seed(0)
-    for i in torch.linspace(0, len(cameras) - 1, min(8, len(cameras))).round().int().tolist():
+    for i in spread(len(cameras), 8):
         camera = cameras[i]
         if camera.width * camera.height > 1 << 17:
             camera = camera.zoomed((2**17 / (camera.width * camera.height)) ** 0.5)

@@ -325,9 +325,8 @@ def crop_mask(scene: Scene, low: AnyArray, high: AnyArray) -> Tensor:
         if not len(finite):
             raise DataError("no Gaussian is in the box, because none is finite; export the scene again")
         quantiles = np.quantile(finite, (0.05, 0.95), axis=0)
-        corners = (
-            " ".join(f"{value:.{3 if scene.offset is None else 10}g}" for value in corner) for corner in quantiles
-        )
+        digits = 3 if scene.offset is None else 10
+        corners = (" ".join(f"{value:.{digits}g}" for value in corner) for corner in quantiles)
         raise DataError(f"no Gaussian is in the box; most of them lie between {' and '.join(corners)}")
     return inside
 

@@ -8,6 +8,7 @@ are computed once. What is taken is then fitted, and counted or rounded to the s
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -96,8 +97,7 @@ def prune_to_bytes(
         lines = [sampled(form) for form in forms]
         # Sparser Gaussians take more bytes each, so the whole scene takes at most about this.
         if lines[0][0] + n * lines[0][1] <= most and (size := bytes_of(whole := rows(n), forms[0])) <= most:
-            form = _rounded(whole, forms[0], size, most, bytes_of) if packs else forms[0]
-            return whole, form
+            return whole, _rounded(whole, forms[0], size, most, bytes_of) if packs else forms[0]
         counts = [min(n, int((AIM * most - fixed) / each)) for fixed, each in lines]
         if max(counts) < 1:
             raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; give more than {most:,}")
@@ -122,8 +122,7 @@ def prune_to_bytes(
             pruned = cut(counts[i], fit=False)
             size = bytes_of(pruned, form)
             shown = _as_packed(pruned.scene, form) if packs else stated(pruned.scene, form)
-            spare = torch.tensor(most / size).log2()
-            worth = measure(shown, images, judges).psnr + DB_PER_DOUBLING * min(float(spare), 1.0)
+            worth = measure(shown, images, judges).psnr + DB_PER_DOUBLING * min(math.log2(most / size), 1.0)
             tried.append((worth, i, size))
         _, best, size = max(tried)
         (fixed, _), form, count = lines[best], forms[best], counts[best]
@@ -135,8 +134,7 @@ def prune_to_bytes(
             pruned = cut(count, fit=True)
             size = bytes_of(pruned, form)
             if packs:
-                form = _rounded(pruned, form, size, most, bytes_of)
-                return pruned, form
+                return pruned, _rounded(pruned, form, size, most, bytes_of)
             if size <= most:
                 chosen, low = pruned, count
                 if size >= LEAST * most or count == n:
@@ -174,7 +172,7 @@ def _rounded(
         if LEAST * most <= size <= most:
             break
         # A bit less of each value, of about three.
-        guess = power + 3 * float(torch.tensor(size / (AIM * most)).log2())
+        guess = power + 3 * math.log2(size / (AIM * most))
         power = guess if low < guess < high else (low + high) / 2
         size = bytes_of(pruned, form._replace(power=power))
         if size <= most:

@@ -19,14 +19,13 @@ import numpy as np
 import pytest
 import torch
 from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packages, touch
-from packed_scenes import KINDS, write_bomb, write_kind
+from packed_scenes import KINDS, packed_file, write_bomb, write_kind
 from PIL import Image
 
 from sundae_ns.cli.view import serve
 from sundae_ns.io.pack import container
 from sundae_ns.io.pack.packed_scene import read_scene, write_scene
 from sundae_ns.plugin.finished_runs import load_run
-from sundae_ns.scene.load_save import packed_file
 from sundae_ns.scene.packing import contents_of, stated_start
 from sundae_ns.scene.page import page as page_of_scene
 from sundae_ns.scene.page import page_of, write_page

@@ -17,7 +17,7 @@ import pytest
 import torch
 from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_node
 from command_line import refusal, run
-from packed_scenes import KINDS, header_and_body, sealed, write_bomb, write_kind
+from packed_scenes import KINDS, header_and_body, packed_file, sealed, write_bomb, write_kind
 from PIL import Image
 
 import sundae_ns as sn
@@ -26,7 +26,7 @@ from sundae_ns.io.pack.packed_scene import read_scene
 from sundae_ns.rasterize.reference import project
 from sundae_ns.rasterize.types import Inputs
 from sundae_ns.scene import page as page_module
-from sundae_ns.scene.load_save import load, packed_file
+from sundae_ns.scene.load_save import load
 from sundae_ns.scene.packing import packed_bytes
 from sundae_ns.scene.page import page_of, render_first, write_page
 

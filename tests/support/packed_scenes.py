@@ -21,6 +21,8 @@ from sundae_ns.io.pack.codecs import Sensitivity
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, write_scene
 from sundae_ns.scene.initialization import from_points
+from sundae_ns.scene.load_save import load
+from sundae_ns.scene.scene import Scene
 
 WIDTH, HEIGHT = 50, 37
 FOCAL = 45.0
@@ -153,6 +155,11 @@ def _cameras() -> dict[str, Tensor]:
     poses[1, :, 3] = torch.tensor([0.1, 0.0, 0.55])
     lens = torch.tensor([FOCAL, FOCAL + 1, 24.0, 19.5]).double()
     return {"poses": poses, "intrinsics": lens.repeat(2, 1), "sizes": torch.tensor([[WIDTH, HEIGHT]]).repeat(2, 1)}
+
+
+def packed_file(path: Path) -> tuple[Scene, bytes]:
+    """A packed scene, and the bytes of its file."""
+    return load(path), path.read_bytes()
 
 
 def header_and_body(content: bytes) -> tuple[dict[str, Any], bytes]:
