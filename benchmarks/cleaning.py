@@ -64,12 +64,10 @@ def planted(scene: sn.Scene, kind: str, cameras: Sequence[sn.Camera], seed: int)
     else:
         means, opacities = gaussians["means"][chosen], random(0.5, 0.99)
         scales = reach * torch.cat([random(0.2, 0.4), random(0.002, 0.006, 2)], dim=1)
-    values = {name: value[chosen].clone() for name, value in gaussians.items()}
-    values |= {"means": means, "scales": scales.log(), "opacities": torch.logit(opacities)}
-    values |= {"quats": torch.nn.functional.normalize(torch.randn(PLANTED, 4, generator=generator), dim=1)}
-    values |= {"features_dc": 3.5 * random(-0.5, 0.5, 3), "features_rest": torch.zeros_like(values["features_rest"])}
-    joined = {name: torch.cat([gaussians[name], values[name]]) for name in values}
-    return dataclasses.replace(scene, gaussians=gaussians.replaced(joined))
+    quats = torch.nn.functional.normalize(torch.randn(PLANTED, 4, generator=generator), dim=1)
+    colors = 3.5 * random(-0.5, 0.5, 3)[:, None]
+    floaters = sn.Scene.from_arrays(means, scales, quats, opacities[:, 0], colors).gaussians
+    return sn.merge([dataclasses.replace(scene, gaussians=each) for each in (gaussians, floaters)])
 
 
 def rows_of(path: Path) -> Iterator[tuple[object, ...]]:

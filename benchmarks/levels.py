@@ -15,8 +15,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -27,12 +25,13 @@ from typing import Any
 
 import torch
 from bench_formats import read_rows, replace_rows
+from prune_without_photos import OTHER, decimated, device_of
 
 import sundae_ns as sn
 from sundae_ns.plugin.distill import LEVELS, levels_of
 
 COLUMNS = ("field", "share", "tool", "gaussians", "psnr_to_field", "psnr_worst", "seconds", "device")
-OURS, OTHER = "sundae", "splat-transform"
+OURS = "sundae"
 
 
 def held_out(scene: sn.Scene, path: Path) -> list[sn.Camera]:
@@ -46,20 +45,15 @@ def held_out(scene: sn.Scene, path: Path) -> list[sn.Camera]:
     return sn.cameras_of(path)
 
 
-def decimated(scene: sn.Scene, name: str, options: argparse.Namespace) -> Iterator[tuple[sn.Scene, float]]:
+def others(scene: sn.Scene, name: str, options: argparse.Namespace) -> Iterator[tuple[sn.Scene, float]]:
     """The levels of the other program, and the seconds that each took; 0 for one that was there."""
     for share in LEVELS:
         path, seconds = options.decimated / f"{name}_{round(100 * share)}.sog", 0.0
         if not path.exists():
+            count = str(round(share * scene.num_gaussians))
             with TemporaryDirectory() as folder:
-                full, small = Path(folder, "full.ply"), Path(folder, "small.ply")
-                sn.save(scene, full)
-                began = time.monotonic()
-                words = [*shlex.split(options.splat_transform), "--gpu", "cpu", "--quiet", str(full)]
-                count = round(share * scene.num_gaussians)
-                subprocess.run([*words, "--decimate", str(count), str(small)], check=True, stdout=sys.stderr)
-                seconds = time.monotonic() - began
-                sn.save(sn.load(small), path)
+                small, seconds = decimated(scene, options.splat_transform, "decimate", count, Path(folder))
+            sn.save(small, path)
         yield sn.load(path, device=scene.device), seconds
 
 
@@ -77,18 +71,17 @@ def trained(scene: sn.Scene, folder: Path) -> Iterator[tuple[sn.Scene, float]]:
 
 def rows_of(path: Path, tool: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The rows of a field."""
-    on_gpu = torch.cuda.is_available()
-    scene = sn.load(path, device="cuda" if on_gpu else "cpu")
+    scene = sn.load(path, device="cuda" if torch.cuda.is_available() else "cpu")
     cameras = held_out(scene, options.decimated / f"{path.stem}.cameras.json")
     images = [sn.render(scene, camera).rgb for camera in cameras]
     with TemporaryDirectory() as folder:
-        levels = trained(scene, Path(folder)) if tool == OURS else decimated(scene, path.stem, options)
+        levels = trained(scene, Path(folder)) if tool == OURS else others(scene, path.stem, options)
         for share, (level, seconds) in zip(LEVELS, levels, strict=True):
             values = [sn.measure(level, [image], [camera]).psnr for image, camera in zip(images, cameras, strict=True)]
             yield {
                 **{"field": path.stem, "share": share, "tool": tool, "gaussians": level.num_gaussians},
                 **{"psnr_to_field": f"{mean(values):.3f}", "psnr_worst": f"{min(values):.3f}"},
-                **{"seconds": f"{seconds:.1f}", "device": torch.cuda.get_device_name() if on_gpu else "cpu"},
+                **{"seconds": f"{seconds:.1f}", "device": device_of(scene)},
             }
 
 

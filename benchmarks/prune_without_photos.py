@@ -75,6 +75,18 @@ def device_of(scene: sn.Scene) -> str:
     return torch.cuda.get_device_name(scene.device) if scene.device.type == "cuda" else "cpu"
 
 
+def decimated(scene: sn.Scene, program: str, option: str, amount: str, folder: Path) -> tuple[sn.Scene, float]:
+    """The scene of splat-transform's ``--option amount``, on its CPU path, and the seconds that it took."""
+    source, out = folder / "full.ply", folder / "small.ply"
+    if not source.exists():
+        sn.save(scene, source)
+    began = time.monotonic()
+    words = [*shlex.split(program), "--gpu", "cpu", "--quiet", "-w", str(source), f"--{option}", amount, str(out)]
+    subprocess.run(words, check=True, stdout=sys.stderr)
+    seconds = time.monotonic() - began
+    return sn.load(out, device=scene.device), seconds
+
+
 def jobs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The rows to make, without their figures."""
     for share in options.shares:
@@ -89,16 +101,8 @@ def made(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: P
     """The small scene of a job, and the seconds that it took, without loading and saving."""
     began, scene, share = time.monotonic(), full.scene, job["share"]
     if job["tool"] == OTHER:
-        source, out = folder / "full.ply", folder / "small.ply"
-        if not source.exists():
-            sn.save(scene, source)
-        began = time.monotonic()
-        words = [*shlex.split(options.splat_transform), "--gpu", "cpu", "-w"]
-        words += [str(source), f"--{job['rule']}", f"{100 * share:g}%", str(out)]
-        subprocess.run(words, check=True, stdout=sys.stderr)
-        seconds = time.monotonic() - began
-        found = sn.load(out, device=scene.device)
-        return dataclasses.replace(scene, gaussians=found.gaussians), seconds
+        small, seconds = decimated(scene, options.splat_transform, job["rule"], f"{100 * share:g}%", folder)
+        return dataclasses.replace(scene, gaussians=small.gaussians), seconds
     if job["training"] == "none":
         rule = dataclasses.replace(RULE, seed=options.seed)
         small = sn.prune(scene, keep=share, cameras=sn.virtual_cameras(scene, seed=options.seed), rule=rule)

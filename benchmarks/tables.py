@@ -14,6 +14,7 @@ import csv
 import inspect
 import json
 import re
+import textwrap
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -317,33 +318,47 @@ def prune() -> list[str]:
     return table(["capture, 50% and 10% kept", *PRUNES.values()], made, words=1)
 
 
+GLUE = "\0"
+"""Stands for a space at which no line ends."""
+
+
 def library() -> list[str]:
-    """The public names: a line with the signature and the first sentences of the docstring, then those of members."""
-    lines = []
+    """The public names: a line with the signature and the first sentence of the docstring, then those of members."""
+    lines: list[str] = []
+
+    def add(indent: str, text: str) -> None:
+        wrapper = textwrap.TextWrapper(120, f"{indent}- ", "  ", break_on_hyphens=False)  # four spaces would be code
+        lines.extend(line.replace(GLUE, " ") for line in wrapper.wrap(text))
+
     for name in sn.__all__:
         value = getattr(sn, name)
-        lines.append(f"- `sn.{_signature(name, value)}`: {_first(value)}")
+        add("", f"`sn.{_signature(name, value)}`: {_first(value)}")
         members = vars(value).items() if value in (sn.Camera, sn.Scene) else ()
         for member, held in members:
             held = getattr(held, "__func__", held)  # of a class method
             if isinstance(held, property):
-                lines.append(f"  - `{name}.{member}`: {_first(held)}")
+                add("  ", f"`{name}.{member}`: {_first(held)}")
             elif inspect.isfunction(held) and held.__doc__ and (member[0] != "_" or member == "__getitem__"):
-                lines.append(f"  - `{name}.{_signature(member, held)}`: {_first(held)}")
+                add("  ", f"`{name}.{_signature(member, held)}`: {_first(held)}")
     return lines
 
 
 def _signature(name: str, value: Any) -> str:
     if isinstance(value, type) and value is not sn.PruneRule:  # which callers do not make by hand
         return name
-    parameters = re.sub(r"(: |-> )'([^']+)'", r"\1\2", str(inspect.signature(value)))
-    return name + re.sub(r"\((self|cls)(, )?", "(", parameters, count=1)
+    signature = inspect.signature(value)
+    bare = [each.replace(annotation=each.empty) for each in signature.parameters.values()]  # docstrings say the types
+    returned = "" if isinstance(value, type) else f" -> {str(signature.return_annotation).strip(chr(39))}"
+    parameters = str(signature.replace(parameters=bare, return_annotation=signature.empty))
+    return name + re.sub(r"\((self|cls)(, )?", "(", parameters, count=1) + returned
 
 
 def _first(value: Any) -> str:
-    """The first paragraph of a docstring in one line, code in single backticks."""
-    paragraph = (inspect.getdoc(value) or "").partition("\n\n")[0]
-    return re.sub(r":\w+:`[.~]?([^`]+)`", r"`\1`", " ".join(paragraph.split())).replace("``", "`")
+    """The first sentence of a docstring in one line, code in single backticks."""
+    paragraph = " ".join((inspect.getdoc(value) or "").partition("\n\n")[0].split())
+    sentence = re.split(r"(?<=\.) (?=[A-Z`])", paragraph, maxsplit=1)[0]
+    sentence = re.sub(r":\w+:`[.~]?([^`]+)`", r"`\1`", sentence).replace("``", "`")
+    return re.sub("`[^`]*`", lambda code: code[0].replace(" ", GLUE), sentence)  # a line must not begin with * or +
 
 
 MAKERS = (
