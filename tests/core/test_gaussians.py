@@ -1,9 +1,11 @@
 """A field: its shapes, its initial values from points, and values beyond the finite numbers."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
+from fields import normal_field
 from torch.nn.functional import normalize
 
 from sundae_ns.core.covariance import rotation_matrices
@@ -26,18 +28,12 @@ from sundae_ns.scene.initialization import (
 )
 
 N = 40
-
-
-def gaussians():
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(N, 3, generator=generator)
-    return from_points(points, points, sh_degree=1, num_features=3, generator=generator)
+gaussians = partial(normal_field, N, features=3)
 
 
 @pytest.mark.parametrize("degree", range(MAX_SH_DEGREE + 1))
 def test_fields_have_no_odd_shapes(degree):
-    points = torch.rand(7, 3)
-    assert odd_shapes(from_points(points, points, sh_degree=degree, num_features=3)) == []
+    assert odd_shapes(normal_field(7, degree=degree, features=3)) == []
     assert sh_degree_of((degree + 1) ** 2 - 1) == degree
 
 

@@ -68,18 +68,6 @@ def test_smallest_image_with_an_ssim():
         assert psnr(*_pair(*size)).isfinite()
 
 
-@pytest.mark.parametrize("metric", [psnr, ssim])
-def test_gradient_and_dtype(metric):
-    pred, target = _pair()
-    value = metric(pred.requires_grad_(), target)
-    assert value.shape == ()
-    assert value.dtype == torch.float64
-    value.backward()
-    assert pred.grad.abs().sum() > 0
-    better = (pred + 1e-3 * pred.grad / pred.grad.norm()).detach()
-    assert metric(better, target) > value
-
-
 @pytest.mark.parametrize("metric", [psnr, ssim, flip])
 @pytest.mark.parametrize("shape", [(4, 5), (3, 4, 5), (1, 4, 5, 3)])
 def test_wrong_shapes(metric, shape):
@@ -118,7 +106,7 @@ def hub(tmp_path, monkeypatch):
     return limits
 
 
-def test_without_weights_there_is_one_warning_and_no_error(hub, caplog):
+def test_without_weights_or_with_damaged_ones_there_is_one_warning_and_no_error(hub, caplog):
     metric, image = Lpips(), torch.rand(40, 40, 3)
     small = image[:31]  # images without an LPIPS need no weights
     assert (metric(small, small), hub, caplog.records) == (None, [], [])
@@ -128,14 +116,10 @@ def test_without_weights_there_is_one_warning_and_no_error(hub, caplog):
     for words in ("no network", url, str(path.parent)):
         assert words in message
     assert "\n" not in message
-
-
-def test_damaged_weights_are_one_warning(hub, caplog):
-    _, path = lpips_weights()
     path.parent.mkdir(parents=True)
     path.write_bytes(b"not a checkpoint")
-    assert Lpips()(torch.rand(40, 40, 3), torch.rand(40, 40, 3)) is None
-    assert (len(caplog.records), hub) == (1, [])
+    assert Lpips()(image, image) is None
+    assert (len(caplog.records), len(hub)) == (2, 1)
 
 
 def test_weights_on_disk_are_used_without_the_network(hub):
