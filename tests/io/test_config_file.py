@@ -51,9 +51,7 @@ def test_a_run_of_an_early_python_3_11_opens(tmp_path):
 
 
 HOSTILE = {
-    "an attribute": (
-        "!!python/object/apply:builtins.getattr [!!python/name:nerfstudio.engine.trainer.Trainer '', setup]"
-    ),
+    "an attribute": "!!python/object/apply:builtins.getattr [!!python/name:sundae_ns.head.head.HeadConfig '', setup]",
     "an attribute of nothing": "!!python/object/apply:builtins.getattr []",
     "a call": "!!python/object/apply:os.mkdir ['{}']",
     "a new object": "!!python/object/new:os.mkdir\nargs: ['{}']",

@@ -26,7 +26,7 @@ from sundae_ns.core.gaussians import SPLAT_NAMES
 from sundae_ns.io.formats import read_gaussian_file, unread
 from sundae_ns.io.splat import read_ksplat
 
-FIELD, PLAIN = small_field(), small_field(degree=0)
+FIELD, PLAIN, NAN = small_field(), small_field(degree=0), torch.full((300, 3), torch.nan)
 # Half a level of a byte in 1 / 0.2821 and in 1, and of a quaternion before it is normalised.
 SPLAT = {"scales": 1e-6, "quats": 0.011, "features_dc": 0.0072, "opacities": 0.002}
 # Half a level: of 11 and 10 bits in 2 units, of 10 bits in sqrt(2), of 8 bits in 1 / 0.2821, in 1, and in 8.
@@ -116,11 +116,7 @@ def _renamed(old, new):
 DAMAGED = {
     "an empty .splat": ("a.splat", lambda path: path.touch(), "0 Gaussians"),
     "half a Gaussian": ("a.splat", _changed("a.splat", lambda data: data[:48]), "a multiple of element size"),
-    "a short compressed .ply": (
-        "a.ply",
-        _changed("a.compressed.ply", lambda data: data[:2000]),
-        "its header states at least",
-    ),
+    "a short compressed .ply": ("a.ply", _changed("a.compressed.ply", lambda data: data[:2000]), "header states at"),
     "no chunks": ("a.ply", _renamed(b"element chunk", b"element chump"), "compressed .ply"),
     "too few chunks": ("a.ply", _renamed(b"vertex 300", b"vertex 999"), "its header states"),
     "no bound": ("a.ply", _renamed(b"min_scale_x", b"min_scale_u"), "compressed .ply"),
@@ -132,18 +128,10 @@ DAMAGED = {
     "no splats": ("a.pt", lambda path: torch.save({"step": 1}, path), "it holds no splats"),
     "no harmonics": ("a.pt", _saved(means=torch.zeros(3, 3)), "its splats lack scales, quats, sh0, shN, opacities"),
     "colours of a network": ("a.pt", _saved(colors=torch.zeros(3, 3)), "its colours need a network"),
-    "an odd shape": (
-        "a.pt",
-        lambda path: write_gsplat(path, {**FIELD, "scales": torch.zeros(300, 2)}),
-        "scales has shape",
-    ),
+    "an odd shape": ("a.pt", lambda path: write_gsplat(path, FIELD | {"scales": FIELD["quats"]}), "scales has shape"),
     "sparse": ("a.pt", _saved(means=torch.zeros(3, 3).to_sparse()), "sparse"),
     "a missing file": ("a.splat", lambda _: None, "cannot be read"),
-    "only NaN": (
-        "a.splat",
-        lambda path: write_splat(path, {**FIELD, "means": torch.full((300, 3), math.nan)}),
-        "300 Gaussians, and none is finite",
-    ),
+    "NaN": ("a.splat", lambda path: write_splat(path, FIELD | {"means": NAN}), "300 Gaussians, and none is finite"),
 }
 
 

@@ -2,7 +2,6 @@
 
 import gzip
 import json
-import re
 import shutil
 import subprocess
 from contextlib import suppress
@@ -64,9 +63,7 @@ def test_equal_fields_give_equal_bytes(tmp_path, kind):
     assert (tmp_path / f"a{kind}").read_bytes() == (tmp_path / f"b{kind}").read_bytes()
 
 
-@pytest.mark.skipif(
-    PROGRAM is None, reason="splat-transform is not in PATH: npm install -g @playcanvas/splat-transform"
-)
+@pytest.mark.skipif(PROGRAM is None, reason="no splat-transform: npm install -g @playcanvas/splat-transform")
 @pytest.mark.parametrize("kind", [".ply", ".spz", ".sog", "/lod-meta.json"])
 @pytest.mark.parametrize(("degree", "antialiased"), [(3, True), (0, False)])
 def test_another_program_reads_the_same_scene(tmp_path, kind, degree, antialiased):
@@ -126,9 +123,7 @@ def test_survey_coordinates_are_moved_stated_and_kept(tmp_path, kind, caplog):
         assert back.meta["frame"] == scene.meta["frame"]
     error = torch.cdist(scene.gaussians["means"].double(), back.gaussians["means"].double()).amin(dim=1).max()
     assert error < {".ply": 1e-9, ".glb": 1e-5, ".spz": 1e-5}.get(kind, 0.01)
-    if kind in (".ply", ".sundae"):
-        assert back.meta["frame"] == scene.meta["frame"]
-        assert not back.in_model_frame
+    assert not back.in_model_frame
     # Cameras of the survey see the moved scene, and rows of the file keep their doubles.
     camera = {"fl_x": 50, "fl_y": 50, "cx": 32, "cy": 24, "w": 64, "h": 48}
     pose = [[1, 0, 0, 4e6 + 1], [0, 1, 0, 4e6], [0, 0, 1, 4e6], [0, 0, 0, 1]]
@@ -187,23 +182,21 @@ def test_upright_rotates_z_to_minus_y(tmp_path):
 
 BAD = {"opacities": torch.zeros(300)}, {"features_rest": torch.zeros(300, 4, 3)}
 REFUSED = [
-    *((f"a{kind}", change, DataError, "has shape") for kind in FORMATS for change in BAD),
-    *((f"a{kind}", {"means": torch.full((300, 3), torch.nan)}, DataError, "no Gaussians") for kind in FORMATS[1:]),
-    ("a.spz", {"means": torch.full((300, 3), 1e5)}, DataError, "1e+05 from the origin"),
+    *((kind, change, "has shape") for kind in FORMATS for change in BAD),
+    *((kind, {"means": torch.full((300, 3), torch.nan)}, "no Gaussians") for kind in FORMATS[1:]),
+    (".spz", {"means": torch.full((300, 3), 1e5)}, r"1e\+05 from the origin"),
 ]
 
 
-@pytest.mark.parametrize(("name", "change", "failure", "words"), REFUSED)
-def test_refusals_leave_the_older_file(tmp_path, name, change, failure, words):
-    (tmp_path / name).write_bytes(b"older")
-    with pytest.raises(failure, match=re.escape(words)):
-        write_for_viewers(tmp_path / name, {**small_field(), **change})
+@pytest.mark.parametrize(("kind", "change", "words"), REFUSED)
+def test_refusals_leave_the_older_file(tmp_path, kind, change, words):
+    (tmp_path / f"a{kind}").write_bytes(b"older")
+    with pytest.raises(DataError, match=words):
+        write_for_viewers(tmp_path / f"a{kind}", {**small_field(), **change})
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"older"]
 
 
-@pytest.mark.parametrize(
-    ("farthest", "bits"), [(0.0, 24), (0.25, 24), (1.0, 22), (2.0, 21), (-2000.0, 12), (2048.0, 11)]
-)
+@pytest.mark.parametrize(("farthest", "bits"), [(0, 24), (0.25, 24), (1, 22), (2, 21), (-2000, 12), (2048, 11)])
 def test_positions_of_a_spz_get_as_many_bits_as_fit(tmp_path, farthest, bits):
     assert fractional_bits(torch.tensor([[0.0, farthest, 0.0]])) == bits
     gaussians = small_field(50)

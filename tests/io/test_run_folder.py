@@ -2,17 +2,13 @@
 
 import json
 import os
-import subprocess
-import sys
 
 import pytest
 
 from sundae_ns.core.errors import StorageError
+from sundae_ns.core.files import locked
 from sundae_ns.io.config_file import find_config
-from sundae_ns.io.run_folder import files_of, new_name, prunes_before, prunes_of, reserve, take_records
-
-HOLDER = "import sys, time; from pathlib import Path; from sundae_ns.io.run_folder import reserve; "
-HOLDER += "reserve(Path(sys.argv[1])); print(flush=True); time.sleep(600)"
+from sundae_ns.io.run_folder import LOCK, files_of, new_name, prunes_before, prunes_of, reserve, take_records
 
 
 def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path):
@@ -30,26 +26,22 @@ def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path):
 
 def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):
     run = tmp_path / "runs" / "a"
-    other = subprocess.Popen([sys.executable, "-c", HOLDER, run], stdout=subprocess.PIPE)
-    try:
-        other.stdout.readline()
+    left = ("config.yml.17.partial", "models/partial--1.17.tmp", "config.yml", "models/step-000000001.ckpt")
+    (run / "models").mkdir(parents=True)
+    with (run / LOCK).open("w") as other:
+        assert locked(other)
+        print("process 7 on a node", file=other, flush=True)
         for path in (run, tmp_path / "runs" / ".." / "runs" / "a"):
-            with pytest.raises(StorageError, match=f"^process {other.pid} on .* trains in .*; .*--timestamp$"):
+            with pytest.raises(StorageError, match="^process 7 on a node trains in .*/runs/a; .*--timestamp$"):
                 reserve(path)
-        (run / "models").mkdir()
-        for name in ("config.yml.17.partial", "models/partial--1.17.tmp", "config.yml", "models/step-000000001.ckpt"):
+        for name in left:
             (run / name).touch()
-    finally:
-        other.kill()
-        other.wait()
     reserve(run)
     reserve(run)  # its own folder
-    assert (run / "training.lock").read_text().startswith(f"process {os.getpid()} on ")
-    assert sorted(path.name for path in run.rglob("*") if path.is_file()) == [
-        "config.yml",
-        "step-000000001.ckpt",
-        "training.lock",
-    ]
+    with (run / LOCK).open() as ours:
+        assert ours.read().startswith(f"process {os.getpid()} on ")
+        assert locked(ours) is False
+    assert {path for path in run.rglob("*") if path.is_file()} == {run / name for name in (LOCK, *left[2:])}
 
 
 def test_runs_of_the_same_second_have_different_names():
