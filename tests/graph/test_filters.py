@@ -1,4 +1,4 @@
-"""Filters against exact spectra and dense algebra, and their invariances."""
+"""Filters against dense algebra, and their invariances."""
 
 import numpy as np
 import pytest
@@ -18,18 +18,16 @@ def random_walk(graph):
     return W / W.sum(1, keepdim=True)
 
 
-@pytest.mark.parametrize("num_neighbors", [5, 59])
-def test_filters_match_the_exact_spectrum(num_neighbors):
-    points = cloud()
-    graph = build_graph(points, num_neighbors=num_neighbors, tau=100.0, sigma=0.5)
-    eigenvalues, V = torch.linalg.eig(random_walk(graph))
-    assert eigenvalues.abs().max().item() == pytest.approx(1.0)
-    x = points.to(V.dtype)
-    high = V @ ((1 - eigenvalues)[:, None] * torch.linalg.solve(V, x))
-    low = V @ ((1 + eigenvalues)[:, None] * torch.linalg.solve(V, x))
-    assert high.imag.abs().max() < 1e-8
-    torch.testing.assert_close(high_pass(graph, points), high.real, rtol=1e-8, atol=1e-8)
-    torch.testing.assert_close(low_pass(graph, points), low.real, rtol=1e-8, atol=1e-8)
+@pytest.mark.parametrize("num_neighbors", [5, 60])
+def test_filters_match_dense_algebra_and_isolated_nodes_are_nan(num_neighbors):
+    points = torch.cat([cloud(), torch.full((1, 3), 1e3, dtype=torch.float64)])
+    graph = build_graph(points, num_neighbors=num_neighbors)
+    alone, A = graph.isolated, random_walk(graph)
+    assert alone[-1]
+    assert torch.linalg.eigvals(A).abs().max().item() == pytest.approx(1.0)
+    assert torch.equal(response_magnitude(high_pass(graph, points)).isnan(), alone)
+    torch.testing.assert_close(high_pass(graph, points)[~alone], (points - A @ points)[~alone])
+    torch.testing.assert_close(low_pass(graph, points)[~alone], (points + A @ points)[~alone])
 
 
 def test_shapes_dtypes_and_chunks_agree_and_constants_vanish(monkeypatch):
@@ -41,16 +39,6 @@ def test_shapes_dtypes_and_chunks_agree_and_constants_vanish(monkeypatch):
     torch.testing.assert_close(high_pass(graph, x[:, 0]), whole[:, 0])
     monkeypatch.setattr(filters, "CHUNK_ELEMENTS", 7 * 18)
     assert torch.equal(high_pass(graph, x), whole)
-
-
-def test_isolated_nodes_are_nan():
-    points = torch.cat([cloud(), torch.full((1, 3), 1e3, dtype=torch.float64)])
-    graph = build_graph(points, num_neighbors=6)
-    alone, A = graph.isolated, random_walk(graph)
-    assert alone[-1]
-    assert torch.equal(response_magnitude(high_pass(graph, points)).isnan(), alone)
-    torch.testing.assert_close(high_pass(graph, points)[~alone], (points - A @ points)[~alone])
-    torch.testing.assert_close(low_pass(graph, points)[~alone], (points + A @ points)[~alone])
 
 
 def test_one_node_and_no_node():

@@ -72,13 +72,10 @@ def test_the_width_is_the_lower_median_of_positive_distances(sampled, monkeypatc
     assert graph._typical_distance(torch.zeros(3, 2)) == graph._typical_distance(torch.zeros(0, 2)) == 1.0
 
 
-def test_given_values_replace_the_median():
-    points = normal(20)
-    cases = (({"sigma": 2.0}, 36.0, 2.0), ({"sigma": 1e200}, math.inf, 1e200), ({"tau": 0.5}, 0.5, None))
-    for options, tau, sigma in cases:
-        found = build_graph(points, num_neighbors=4, **options)
-        assert found.tau == tau
-        assert sigma is None or found.sigma == sigma
+def test_a_given_width_sets_the_reach_and_may_overflow():
+    for sigma, tau in ((2.0, 36.0), (1e200, math.inf)):
+        found = build_graph(normal(20), num_neighbors=4, sigma=sigma)
+        assert (found.tau, found.sigma) == (tau, sigma)
 
 
 def test_symmetries_are_followed():
@@ -96,15 +93,10 @@ def test_symmetries_are_followed():
     assert torch.equal(magnitude(points[order]).nan_to_num(-1), expected[order].nan_to_num(-1))
 
 
-def test_smallest_graphs():
+def test_the_smallest_graph():
     two = build_graph(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]), num_neighbors=1)
     assert two.sigma == 1.0
     torch.testing.assert_close(two.weights, torch.full((2, 1), math.exp(-0.5)))
-    for distance in (0.0, 1e-30, 1.0, 1e18):
-        points = torch.tensor([[0.0, 0, 0], [distance, 0, 0]])
-        found = build_graph(points, num_neighbors=1)
-        check(found, points)
-        assert (found.weights > 0).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -114,7 +106,7 @@ def test_every_hard_cloud(cloud, dtype):
 
 
 @given(
-    st.lists(st.tuples(st.integers(-2, 2), st.integers(-2, 2), st.integers(0, 1)), min_size=3, max_size=60),
+    st.lists(st.tuples(st.integers(-2, 2), st.integers(-2, 2), st.integers(0, 1)), min_size=2, max_size=60),
     st.integers(-30, 15),
     st.sampled_from([0.0, 1.0, 1e5]),
     st.sampled_from([None, 0.0, 1e-30, 1.0, float("inf")]),
@@ -124,26 +116,9 @@ def test_any_cells_at_any_scale(cells, exponent, shift, tau, double):
     points = torch.tensor(cells, dtype=torch.float64 if double else torch.float32) * 2.0**exponent + shift
     graph = build_graph(points, num_neighbors=min(4, len(cells) - 1), tau=tau)
     check(graph, points)
+    assert tau in (None, graph.tau)
     assert tau != 0 or not graph.weights.any()
     assert tau != float("inf") or not graph.isolated.any()
-
-
-def test_two_clusters_1e6_apart_are_independent():
-    cluster = (torch.randn(300, 3, dtype=torch.float64) * 2**20).round() / 2**20
-    found = magnitude(torch.cat([cluster, cluster + 1e6])).nan_to_num(-1)
-    assert torch.equal(found, magnitude(cluster).nan_to_num(-1).repeat(2))
-
-
-def test_a_shift_by_1e5_changes_no_bit_of_the_response_in_float32():
-    points = (torch.randn(2000, 3) * 64).round() / 64  # exact at this offset
-    assert torch.equal(magnitude(points + 1e5).nan_to_num(-1), magnitude(points).nan_to_num(-1))
-
-
-def test_thousands_of_points_at_one_spot_do_not_respond():
-    points = torch.cat([torch.full((5000, 3), 0.1), torch.randn(500, 3)])
-    found = magnitude(points, 16)
-    assert (found[:5000] == 0).all()
-    assert (found[5000:].nan_to_num(1) > 0).all()
 
 
 def test_an_overflowing_distance_and_an_infinite_width_give_no_nan():

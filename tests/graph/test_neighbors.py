@@ -66,7 +66,7 @@ def test_memory_and_time_grow_with_points_also_of_clones(place):
         finally:
             tracemalloc.stop()
 
-    assert peak(80_000) < 6 * peak(20_000)
+    assert peak(40_000) < 6 * peak(10_000)
 
 
 @pytest.mark.parametrize(
@@ -185,16 +185,6 @@ def test_same_tree_as_on_the_cpu(cloud):
     assert on_gpu.depth == on_cpu.depth
     for name in ("points", "order", "boxes", "lowest"):
         assert torch.equal(getattr(on_gpu, name).cpu(), getattr(on_cpu, name))
-
-
-@pytest.mark.gpu
-@pytest.mark.usefixtures("on_gpu")
-def test_a_million_clones_of_one_point():
-    found = knn(torch.ones(1_000_000, 3, device="cuda"), 16)
-    assert (found.distances == 0).all()
-    assert torch.equal(found.indices[20:], torch.arange(16, device="cuda").expand(999_980, -1))
-    for row in range(17):
-        assert found.indices[row].tolist() == [other for other in range(17) if other != row]
 
 
 @pytest.mark.gpu

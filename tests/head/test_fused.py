@@ -49,24 +49,6 @@ def by_kernels(head, images):
     return fused.compensated(head.net, head.config.mode == "residual", *images, torch.float32)
 
 
-KINDS = [{"mode": mode, "pixel_unshuffle": fold} for mode in ("residual", "features") for fold in (1, 2, 3, 4)]
-
-
-@pytest.mark.parametrize("options", [*KINDS, {"size": "compact"}, {"size": "wide"}], ids=str)
-@torch.no_grad()
-def test_same_image(options):
-    head, images = make(**options), splatted(37, 50, 5)
-    torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
-
-
-@given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
-@torch.no_grad()
-def test_same_image_at_any_size(height, width, num_features, seed):
-    head = make(num_features=num_features)
-    images = splatted(height, width, num_features, seed=seed)
-    torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
-
-
 @torch.no_grad()
 def test_overflowing_pixels_are_not_corrected():
     head = make()
@@ -97,21 +79,26 @@ def kernel_gradients(head, images, grad_out):
     return [out.detach(), *(leaf.grad for leaf in leaves), *(p.grad.clone() for p in head.parameters())]
 
 
+KINDS = [{"mode": mode, "pixel_unshuffle": fold} for mode in ("residual", "features") for fold in (1, 2, 3, 4)]
+
+
 @pytest.mark.parametrize("workers", [37, fused.MOST_WORKERS])
-@pytest.mark.parametrize("options", KINDS, ids=str)
-def test_same_gradients(options, workers, monkeypatch):
+@pytest.mark.parametrize("options", [*KINDS, {"size": "compact"}, {"size": "wide"}], ids=str)
+def test_same_image_and_gradients(options, workers, monkeypatch):
     """Also where few threads sum over the pixels."""
     monkeypatch.setattr(fused, "MOST_WORKERS", workers)
     head, images, grad_out = make(**options), splatted(37, 50, 5), torch.randn(37, 50, 3)
     both = kernel_gradients(head, images, grad_out), layer_gradients(head, images, grad_out)
+    torch.testing.assert_close(by_kernels(head, images), both[1][0], rtol=1e-4, atol=1e-5)
     for found, expected in zip(*both, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5 * max(1.0, float(expected.abs().max())))
 
 
 @given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
-def test_same_gradients_at_any_size(height, width, num_features, seed):
+def test_same_image_and_gradients_at_any_size(height, width, num_features, seed):
     head = make(num_features=num_features)
     images, grad_out = splatted(height, width, num_features, seed=seed), torch.randn(height, width, 3)
+    torch.testing.assert_close(by_kernels(head, images), head(*images).detach(), rtol=1e-4, atol=1e-5)
     both = kernel_gradients(head, images, grad_out), layer_gradients(head, images, grad_out)
     for found, expected in zip(*both, strict=True):
         # Compare norms: some image has an activation so near zero that rounding decides its slope.

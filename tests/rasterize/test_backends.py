@@ -1,14 +1,15 @@
-"""The backends against a loop over pixels, finite differences, each other, and invariants; and hard scenes.
+"""The backends against a loop over pixels, finite differences, and each other; and hard scenes.
 
 Scenes are given before activation and in float32 numbers, so that both precisions render the same scene. Errors are the
 norm of the difference over the norm of the exact value, which is the reference's in float64.
 """
 
 import math
-import subprocess
+import multiprocessing
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 import torch
 from hard_scenes import CASES, NEAR, scene
@@ -18,6 +19,7 @@ from splat_inputs import blending_weights, geometry, rasterize, rasterize_camera
 from torch import Tensor
 
 from sundae_ns.core.errors import BackendError
+from sundae_ns.rasterize.cpu import parallel
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.rasterize.interface import select_backend, spherical_harmonics
@@ -164,7 +166,8 @@ def test_gradcheck(backend, n, size, antialiased, fast):
     leaves = leaves_of(values, F64).values()
     check = {"eps": 1e-7, "atol": 1e-5, "rtol": 1e-4, "fast_mode": fast}
     assert torch.autograd.gradcheck(outputs, (viewmat, *leaves), **check)
-    assert torch.autograd.gradcheck(outputs, (viewmat.detach(), *leaves), **check)
+    if backend is CPU:  # its own derivatives of the projection
+        assert torch.autograd.gradcheck(outputs, (viewmat.detach(), *leaves), **check)
 
 
 @each_backend
@@ -206,6 +209,7 @@ def test_any_scene(seed, n, size, channels, log_scale, logit, options):
     values["opacities"] += logit
     values["means"][: n // 3, 2] -= 2.5  # near the camera, and behind it
     values["means"][::5, 2] = 3.0  # ties are broken by index
+    values["quats"] = values["quats"].T.contiguous().T
     ours, exact = (render(values, camera, F64, backend, **options) for backend in (CPU, REFERENCE))
     assert torch.equal(ours["radii"], exact["radii"])
     compare(ours, exact, 1e-9, 1e-7)  # measured of ordinary scenes: 3.0e-15 and 1.6e-13
@@ -257,40 +261,6 @@ def test_footprints_that_overflow_integers(dtype, scale):
         assert torch.equal(ours["alpha"], render(others, camera, dtype, CPU)["alpha"])
 
 
-# ----------------------------------------------------------------------------------------------------------- invariants
-
-
-@each_backend
-def test_order_and_unseen_gaussians_do_not_matter_and_weights_sum_up(backend):
-    values, camera = leaves_of(scene(300), F64), make_view(32, 24)
-    values = {name: value.detach() for name, value in values.items()}
-    ours = splat(values, camera, backend)
-    shuffle = torch.randperm(300)
-    other = splat({name: value[shuffle] for name, value in values.items()}, camera, backend)
-    torch.testing.assert_close(ours.colors, other.colors, rtol=0, atol=1e-13)
-    assert torch.equal(ours.radii[shuffle], other.radii)
-    weights = blending_weights(**seen_by(camera, values), backend=backend)
-    assert (weights >= 0).all()
-    torch.testing.assert_close(weights.sum(), ours.alpha.sum())
-    torch.testing.assert_close((weights[:, None] * values["colors"]).sum(0), ours.colors.sum((0, 1)))
-    assert (weights == 0).any()
-    seen = splat({name: value[weights > 0] for name, value in values.items()}, camera, backend)
-    torch.testing.assert_close(seen.colors, ours.colors, rtol=0, atol=1e-13)
-
-
-@each_backend
-def test_rigid_motion_of_scene_and_camera(backend):
-    values, camera = {name: value.double() for name, value in scene(200).items()}, make_view(32, 24, turned=False)
-    c, s, shift = math.cos(0.35), math.sin(0.35), torch.tensor([0.3, -1.0, 2.0], dtype=F64)
-    rotation = torch.tensor([[c * c - s * s, 0, 2 * s * c], [0, 1, 0], [-2 * s * c, 0, c * c - s * s]], dtype=F64)
-    w, x, y, z = values["quats"].unbind(-1)
-    quats = torch.stack([c * w - s * y, c * x + s * z, c * y + s * w, c * z - s * x], dim=-1)
-    moved, viewmat = {**values, "means": values["means"] @ rotation.T + shift, "quats": quats}, torch.eye(4).double()
-    viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ shift
-    images = splat(values, camera, backend).colors, splat(moved, {**camera, "viewmat": viewmat}, backend).colors
-    torch.testing.assert_close(*images, rtol=0, atol=1e-11)
-
-
 @each_backend
 def test_footprints_end_with_the_bins_of_gsplat(backend):
     """A 16-pixel bin that the three-sigma square does not reach stays empty, though alphas there would be visible."""
@@ -307,21 +277,6 @@ def test_footprints_end_with_the_bins_of_gsplat(backend):
         ends[centre] = int(ours.alpha[10, :, 0].nonzero().max())
     # 6.9 + 9 is inside the first bin; 7.1 + 9 is not; -1.1 + 9 is, and all of that bin is blended.
     assert ends == {6.9: 15, 7.1: 16, -1.1: 8}
-
-
-@each_backend
-def test_zero_quaternions_are_the_identity_and_zero_directions_have_no_gradient(backend):
-    values, camera = scene(30), make_view(16, 16)
-    identity = torch.tensor([[1.0, 0, 0, 0]]).expand(30, 4)
-    images = [splat({**values, "quats": quats}, camera, backend).colors for quats in (torch.zeros(30, 4), identity)]
-    assert torch.equal(*images)
-    directions, coeffs = torch.zeros(2, 3, requires_grad=True), torch.randn(2, 16, 3, requires_grad=True)
-    value = spherical_harmonics(3, directions, coeffs, backend=backend)
-    value.sum().backward()
-    ahead = torch.tensor([[0.0, 0.0, 5.0]]).expand(2, 3)
-    torch.testing.assert_close(value, spherical_harmonics(3, ahead, coeffs, backend=backend))
-    assert directions.grad is None or not directions.grad.any()
-    assert coeffs.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("wanted", [("colors",), ("opacities",), ("means", "scales"), ("colors", "quats")])
@@ -388,7 +343,7 @@ def harmonics(degree, directions, coeffs, backend):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_compiled_harmonics_match_the_reference(degree, dtype):
     directions, coeffs = 3 * torch.randn(200, 3, dtype=dtype), torch.randn(200, 25, 3, dtype=dtype)
-    directions[0] = 0
+    directions[1:3], coeffs[1] = torch.tensor([[0.0, 0, 0], [0, 0, 5]]), coeffs[2]  # zero is taken as +z
     bound = 1e-13 if dtype == F64 else 1e-6
     exact = harmonics(degree, directions.double(), coeffs.double(), REFERENCE)
     odd = directions.T.contiguous().T, coeffs.transpose(0, 1).contiguous().transpose(0, 1)  # not contiguous
@@ -397,15 +352,8 @@ def test_compiled_harmonics_match_the_reference(degree, dtype):
         assert value.dtype == dtype
         assert (value - expected).norm() <= bound * expected.norm()
         assert torch.equal(value, same)
-
-
-def test_only_what_needs_a_gradient_gets_one():
-    directions, coeffs = torch.randn(8, 3), torch.randn(8, 9, 3, requires_grad=True)
-    spherical_harmonics(2, directions, coeffs, backend=CPU).sum().backward()
-    assert directions.grad is None
-    assert coeffs.grad is not None
-    with torch.no_grad():
-        assert not spherical_harmonics(2, directions, coeffs, backend=CPU).requires_grad
+    torch.testing.assert_close(ours[0][1], ours[0][2])
+    assert not ours[1][1].any()
 
 
 # ------------------------------------------------------------------------------------------------------------ on a GPU
@@ -477,16 +425,21 @@ def test_radii_and_weights_of_gsplat():
         assert (ours != exact).float().mean() < 1e-2
 
 
-@pytest.mark.gpu
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("channels", [1, 35])
-@pytest.mark.parametrize("name", ["gsplat", "recordable"])
-def test_several_cameras_of_a_gpu_are_those_of_single_passes(name, channels, antialiased):
-    shared, cameras = ({k: v.cuda() for k, v in values.items()} for values in several_views(3000, channels))
-    options = {"width": 40, "height": 30, "antialiased": antialiased}
-    images = rasterize_cameras(**shared, **cameras, **options, backend=select_backend("gsplat", "cuda"))
+@pytest.mark.parametrize(
+    "name", ["reference", "cpu", *(pytest.param(name, marks=pytest.mark.gpu) for name in ("gsplat", "recordable"))]
+)
+def test_several_cameras_are_those_of_single_passes(name, channels, antialiased):
+    device = "cpu" if name in ("reference", "cpu") else "cuda"
+    backend = select_backend(name, "cpu") if device == "cpu" else on_gpu(name)
+    shared, cameras = ({k: v.to(device) for k, v in values.items()} for values in several_views(300, channels))
+    options = {"width": 40, "height": 30, "antialiased": antialiased, "backend": backend}
+    images = rasterize_cameras(**shared, **cameras, **options)
+    assert images.shape == (3, 30, 40, channels)
     for image, colors, viewmat, K in zip(images, *cameras.values(), strict=True):
-        single = rasterize(**shared, colors=colors, viewmat=viewmat, K=K, **options, backend=on_gpu(name)).colors
+        assert float(image.max()) > 0.1
+        single = rasterize(**shared, colors=colors, viewmat=viewmat, K=K, **options).colors
         assert deviation(image, single) < 1e-6
 
 
@@ -515,6 +468,9 @@ def test_no_gaussians_are_an_empty_image_and_float64_is_refused():
 # ------------------------------------------------------------------------------------------ promises of compiled loops
 
 
+SMALL = scene(800), make_view(60, 50)
+
+
 @pytest.fixture
 def threads():
     before = torch.get_num_threads()
@@ -539,20 +495,10 @@ def test_results_do_not_depend_on_the_number_of_threads(threads, monkeypatch):
 def test_threads_that_rasterise_at_once(threads):
     """A viewer renders beside a training run."""
     torch.set_num_threads(2)
-    values, camera = scene(800), make_view(60, 50)
-    alone = render(values, camera, F32, CPU)
+    alone = render(*SMALL, F32, CPU)
     with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda _: render(values, camera, F32, CPU), range(12)))
+        together = list(pool.map(lambda _: render(*SMALL, F32, CPU), range(12)))
     assert all(torch.equal(value, other[name]) for other in together for name, value in alone.items())
-
-
-def test_layouts_that_are_not_contiguous():
-    values, camera = activated(scene(100)), make_view(24, 20)
-    odd = {name: torch.stack([value, value], dim=-1)[..., 0] for name, value in values.items()}
-    odd["scales"] = values["scales"].T.contiguous().T
-    assert not odd["means"].is_contiguous()
-    images = [rasterize(**each, **camera, backend=CPU).colors for each in (values, odd)]
-    assert torch.equal(*images)
 
 
 def test_unsupported_dtypes_are_refused():
@@ -563,30 +509,18 @@ def test_unsupported_dtypes_are_refused():
         spherical_harmonics(1, torch.ones(2, 3).half(), torch.ones(2, 4, 3).half(), backend=CPU)
 
 
-def test_a_forked_process_rasterises(threads):
+def test_a_forked_process_runs_compiled_loops(threads):
     """Data loaders fork; numba's own thread pools would end such a process."""
-    code = """
-import os, sys, torch
-from sundae_ns.core.camera import Camera
-from sundae_ns.rasterize.interface import blending_weights, select_backend
-from sundae_ns.rasterize.types import Inputs
-torch.set_num_threads(2)
-scene = torch.rand(2000, 3) + torch.tensor([-0.5, -0.5, 2]), torch.ones(2000, 4), 0.02 * torch.ones(2000, 3)
-camera = Camera(torch.eye(4), torch.tensor([[90.0, 0, 40], [0, 90, 40], [0, 0, 1]]), 80, 80, 90.0)
-inputs = Inputs(*scene, torch.full((2000,), 0.5), torch.ones(2000, 1), camera)
-def work():
-    return blending_weights(inputs, backend=select_backend("auto", "cpu")).sum()
-before = work()
-child = os.fork()
-if child == 0:
     torch.set_num_threads(2)
-    from sundae_ns.rasterize.cpu import parallel
-    parallel.torch.get_num_threads = lambda: 2  # torch's own pool does not survive a fork
-    from sundae_ns.rasterize.cpu.tiles import _sort_by_tile
-    import numpy as np
-    done = np.zeros(1 << 16)
-    parallel.parallel_for(lambda begin, end: done[begin:end].fill(1), 1 << 16)
-    os._exit(0 if done.all() else 3)
-sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-"""
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120).returncode == 0
+    render(*SMALL, F32, CPU)
+
+    def work():
+        parallel.torch.get_num_threads = lambda: 2  # torch's own pool does not survive a fork
+        done = np.zeros(1 << 16)
+        parallel.parallel_for(lambda begin, end: done[begin:end].fill(1), len(done))
+        sys.exit(0 if done.all() else 3)
+
+    child = multiprocessing.get_context("fork").Process(target=work, daemon=True)
+    child.start()
+    child.join(30)
+    assert child.exitcode == 0

@@ -104,7 +104,6 @@ _operator(operator.sub, lambda builder, a, b: builder.fsub(a, b))
 _operator(operator.mul, lambda builder, a, b: builder.fmul(a, b))
 _operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
 _operator(operator.lt, partial(_compared, "<"), MASK)
-_operator(operator.le, partial(_compared, "<="), MASK)
 _operator(operator.gt, partial(_compared, ">"), MASK)
 _operator(operator.ge, partial(_compared, ">="), MASK)
 
