@@ -13,6 +13,7 @@ import torch
 from colmap_models import write_model
 from command_line import run
 from foreign_files import FOREIGN, KSPLAT, small_field
+from numpy.lib.recfunctions import append_fields
 from packed_scenes import KINDS, write_kind
 from plyfile import PlyData, PlyElement
 from short_prunes import SHORT
@@ -84,9 +85,8 @@ def test_export_says_how_many_primitives_are_clamped(tmp_path, kind, clamped, ca
     given["features_rest"][5, 0, 0] = 1.2
     write_ply(tmp_path / "in.ply", given)
     assert run("export", tmp_path / "in.ply", "-o", tmp_path / f"a{kind}") == 0
-    text = capsys.readouterr().out
-    assert (f"clamped scales or colours of {clamped} Gaussians" in text) == (clamped > 0)
-    assert ("clamped" in text) == (clamped > 0)
+    said = re.findall(r"clamped scales or colours of (\d+) Gaussians", capsys.readouterr().out)
+    assert said == ([str(clamped)] if clamped else [])
 
 
 def test_export_of_a_ply_of_nerfstudio_upright(tmp_path):
@@ -96,27 +96,19 @@ def test_export_of_a_ply_of_nerfstudio_upright(tmp_path):
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
 
 
-@pytest.mark.parametrize(
-    "options",
-    [["--num-cameras", "4"], ["--score", "response", "--selection", "band"]],
-)
+@pytest.mark.parametrize("options", [["--num-cameras", "4"], ["--score", "response", "--selection", "band"]])
 def test_prune_does_not_change_kept_rows(tmp_path, options, capsys, caplog):
     source, out = tmp_path / "in.ply", tmp_path / "out.ply"
     write_ply(source, gaussians(), comments=["SplatRenderMode: mip", "by another program"])
     # Add a property that is not part of 3DGS, and an element beside the vertices.
     data = PlyData.read(source)
-    rows = data["vertex"].data
-    more = np.empty(len(rows), [*rows.dtype.descr, ("label", "<i4")])
-    for name in rows.dtype.names:
-        more[name] = rows[name]
-    more["label"] = np.arange(len(rows))
+    more = append_fields(data["vertex"].data, "label", np.arange(200, dtype="<i4"), usemask=False)
     more["opacity"][3] = np.nan
     other = PlyElement.describe(np.array([(7,)], [("number", "<i4")]), "extra")
     PlyData([PlyElement.describe(more, "vertex"), other], comments=data.comments).write(str(source))
 
     assert run("prune", source, "-o", out, "--keep", "0.25", "--redistribution", "none", *options) == 0
-    text = capsys.readouterr().out
-    assert "50 of 200 Gaussians" in text
+    assert "50 of 200 Gaussians" in capsys.readouterr().out
     assert "dropped 1 that were not finite" in caplog.text
     found = PlyData.read(out)
     assert found.comments == ["SplatRenderMode: mip", "by another program"]
@@ -139,70 +131,63 @@ def test_every_command_reads_files_of_other_programs(tmp_path, monkeypatch, capl
     assert len(read_ply(Path("pruned/a/b.ply"))["means"]) == len(truth["means"]) // 2
     assert run("prune", name, "-o", "same/a.ply", "--keep", "1", "--num-cameras", "4") == 0
     torch.testing.assert_close(read_gaussian_file(Path("same/a.ply"))[0].gaussians["features_dc"], colors)
-    assert run("export", name, "-o", "exported/a.spz") == 0
-    assert run("export", name, "-o", "pages/a.html") == 0
     assert run("pack", name, "-o", "packed/a.sundae") == 0
     found = read_scene(Path("packed/a.sundae")).gaussians["means"]
     assert torch.cdist(truth["means"].double(), found.double()).amin(dim=1).max() < 0.002
-    assert run("render", name, "-o", "images/a.png", "--width", "64") == 0
-    assert run("prune", name, "-o", "small/a.sundae", "--distill", "--steps", "1", "--no-head", "--keep", "0.5") == 0
-    for file in ("exported/a.spz", "pages/a.html", "images/a.png", "small/a.sundae"):
-        assert Path(file).stat().st_size > 0
+    if name == "a.splat":  # these open it as the others do
+        for words in ("export {} -o a/a.spz", "export {} -o b/a.html", "render {} -o c/a.png --width 64"):
+            assert run(*words.format(name).split()) == 0
+        assert run("prune", name, "-o", "d/a.sundae", "--distill", "--steps", "1", "--no-head", "--keep", "0.5") == 0
+        assert all(Path(file).stat().st_size > 0 for file in ("a/a.spz", "b/a.html", "c/a.png", "d/a.sundae"))
     if name != "plain.ply":
         assert run("export", name, "-o", "plain/a.ply") == 0
         assert torch.equal(read_ply(Path("plain/a.ply"))["features_dc"], colors)
     assert all("states no upward direction" in message for message in caplog.messages)
 
 
-WITHOUT = """
+WITHOUT = f"""
 import json, sys
-package, commands = json.loads(sys.argv[1])
-sys.modules[package] = None
-%s
+sys.modules["nerfstudio"] = sys.modules["numba"] = None
+{SHORT}
 from sundae_ns.cli import main
+from sundae_ns.rasterize.interface import numba_problem
 codes = []
-for words in commands:
+for words in json.loads(sys.argv[1]):
     try:
         main(words.split())
     except SystemExit as end:
         codes.append(end.code)
+    if sys.modules.get("numba", 1) is None:  # for the first command alone
+        del sys.modules["numba"]
+        numba_problem.cache_clear()
 print(json.dumps(codes))
 """
 
 
-def without(package, commands, folder):
-    """Run commands of ``sundae`` in one process where importing a package fails; exit codes, and lines of stderr."""
-    started = [sys.executable, "-c", WITHOUT % SHORT, json.dumps([package, commands])]
-    done = subprocess.run(started, cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1]), done.stderr.splitlines()
-
-
-def test_files_are_exported_pruned_and_refused_without_nerfstudio(tmp_path):
+def test_commands_on_files_need_no_nerfstudio_and_a_prune_no_compiler(tmp_path):
     write_scene(tmp_path / "a.sundae", PackedScene(gaussians(), meta={"model": MODEL}))
+    write_ply(tmp_path / "few.ply", gaussians(50))
     write_kind(tmp_path / "head.sundae", KINDS["residual"])
     commands = [
+        "prune few.ply -o fewer.ply --num-cameras 2",
         "export a.sundae -o a.ply",
         "export a.ply -o a.spz",
         "prune a.ply -o pruned.ply --num-cameras 4",
         "prune a.spz -o pruned.sundae --count 20 --num-cameras 4",
         "export head.sundae -o head.html",
         "pack a.ply -o packed.sundae",
+        "pack gone -o x",
+        "export gone -o x.html",
     ]
-    refused = {"pack gone -o x": "give the folder of a", "export gone -o x.html": "gone does not exist; give a run"}
-    codes, errors = without("nerfstudio", [*commands, *refused], tmp_path)
-    assert codes == [0] * len(commands) + [2] * len(refused), errors
-    for command in commands:
+    words = [sys.executable, "-c", WITHOUT, json.dumps(commands)]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == [0] * 7 + [2] * 2, done.stderr
+    for command in commands[:7]:
         assert (tmp_path / command.split()[3]).stat().st_size > 0
-    told = [line for line in errors if line.startswith("sundae: ")]
-    for error, reason in zip(told, refused.values(), strict=True):
-        assert reason in error
-
-
-def test_fields_are_pruned_without_a_compiler(tmp_path):
-    write_ply(tmp_path / "a.ply", gaussians(50))
-    codes, errors = without("numba", ["prune a.ply -o pruned.ply --num-cameras 2"], tmp_path)
-    assert codes == [0], errors
+    pack, export = (line for line in done.stderr.splitlines() if line.startswith("sundae: "))
+    assert "give the folder of a" in pack
+    assert "gone does not exist; give a run" in export
 
 
 def test_prune_by_the_cameras_of_files(tmp_path, capsys):
@@ -235,8 +220,9 @@ def test_a_size_that_was_asked_for_binds(name, asked, tmp_path, capsys):
     size, (kept,) = (tmp_path / name).stat().st_size, re.findall("([0-9,]+) of 3,000", capsys.readouterr().out)
     assert 0.97 * asked <= size / 1e6 <= asked
     assert 100 < int(kept.replace(",", "")) < 2700
-    assert run(*words, "--max-mb", "9", "--overwrite") == 0
-    assert "3,000 of 3,000" in capsys.readouterr().out
+    if name != "a.html":  # whose code takes most of the time, and which is searched for as a .sundae is
+        assert run(*words, "--max-mb", "9", "--overwrite") == 0
+        assert "3,000 of 3,000" in capsys.readouterr().out
 
 
 @pytest.mark.gpu

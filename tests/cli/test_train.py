@@ -8,28 +8,16 @@ from pathlib import Path
 
 import command_line
 import pytest
-import tyro
 from colmap_models import write_model
 from PIL import Image
-from run_commands import write_run
+from run_commands import config_of, write_run
 
-from sundae_ns import method_configs
 from sundae_ns.cli.train import methods
 from sundae_ns.io.run_folder import LOCK, unfinished_run
 
 
 def train(*words):
     return command_line.run("train", *words)
-
-
-def refusal(capsys, *words):
-    return command_line.refusal(capsys, "train", *words)
-
-
-def config_of(words, method="sundae"):
-    """The options that ns-train reads from the words of a method and its options."""
-    usual = getattr(method_configs, method.replace("-", "_")).config
-    return tyro.cli(type(usual), default=usual, args=words[2:])
 
 
 @pytest.mark.parametrize("method", methods())
@@ -100,7 +88,7 @@ def test_an_unfinished_run_is_named_and_resumed(commands, capsys):
     assert not capsys.readouterr().out.startswith("#")
     # Another method or folder has no such run.
     for more in (["--method", "sundae-tiny"], ["-o", "elsewhere"]):
-        assert "no unfinished run" in refusal(capsys, "my scene", "--resume", *more)
+        assert "no unfinished run" in command_line.refusal(capsys, "train", "my scene", "--resume", *more)
 
 
 def test_a_run_that_another_one_has_resumed_or_that_is_trained_is_not_named(tmp_path):

@@ -14,12 +14,10 @@ VIEWS = tuple(sn.Camera.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=9
 
 
 def scene_of(points, scale):
-    made = sn.Scene.from_points(points, points.sigmoid())
-    values = {
-        "scales": torch.full_like(made.gaussians["scales"], math.log(scale)),
-        "opacities": made.gaussians["opacities"] + 9,
-    }
-    return dataclasses.replace(made, gaussians=made.gaussians.replaced(values), cameras=VIEWS)
+    made = dataclasses.replace(sn.Scene.from_points(points, points.sigmoid()), cameras=VIEWS)
+    made.gaussians["scales"][:] = math.log(scale)
+    made.gaussians["opacities"][:] += 9
+    return made
 
 
 def wall(n=4000):

@@ -19,14 +19,13 @@ def ball(n=4000):
     points = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1)
     points = points * torch.rand(n, 1, generator=generator) ** (1 / 3)
     scene = sn.Scene.from_points(points, torch.rand(n, 3, generator=generator))
-    return dataclasses.replace(
-        scene, gaussians=scene.gaussians.replaced({"opacities": scene.gaussians["opacities"] + 4})
-    )
+    scene.gaussians["opacities"][:] += 4
+    return scene
 
 
-def looking(eyes, targets, roll=0.0):
-    up = (math.sin(roll), 0.0, math.cos(roll))
-    pairs = zip(eyes, targets, strict=True)
+def looking(eyes, targets=None, up=(0.0, 0.0, 1.0)):
+    """Cameras at eyes that look at targets, by default at the middle of the ball."""
+    pairs = zip(eyes, targets or len(eyes) * [(0.0, 0.0, 0.0)], strict=True)
     return tuple(sn.Camera.look_at(eye, target, up, fov=50, width=40, height=30) for eye, target in pairs)
 
 
@@ -36,8 +35,8 @@ def on_a_ring(n, radius=4.0):
     return [(radius * math.cos(turn), radius * math.sin(turn), 0.5 * math.cos(3 * turn)) for turn in turns]
 
 
-def film(scene):
-    return film_views(scene, seconds=COUNT / 24, frames_per_second=24)
+def film(scene, **values):
+    return film_views(dataclasses.replace(scene, **values), seconds=COUNT / 24, frames_per_second=24)
 
 
 def steps(cameras, distance):
@@ -46,7 +45,8 @@ def steps(cameras, distance):
     return (parts.roll(-1, dims=0) - parts).norm(dim=1)
 
 
-def check_upright(cameras, up):
+def check_upright(cameras, up=(0.0, 0.0, 1.0)):
+    up = torch.tensor(up)
     for camera in cameras:
         assert abs(float(camera.pose[:, 0] @ up)) < 1e-5
         assert float(camera.pose[:, 1] @ up) > 0.3
@@ -61,15 +61,15 @@ def turned(cameras, x, y):
 
 def test_the_path_leads_through_views_and_closes():
     eyes = on_a_ring(23)
-    scene = dataclasses.replace(ball(), cameras=looking(eyes, len(eyes) * [(0.0, 0.0, 0.0)]))
-    cameras = film(scene)
+    stored = looking(eyes)
+    cameras = film(ball(), cameras=stored)
     assert len(cameras) == COUNT
     assert (cameras[0].width, cameras[0].height) == (40, 30)
-    assert torch.equal(cameras[0].K, scene.cameras[0].K)
-    assert torch.allclose(cameras[0].viewmat, scene.cameras[0].viewmat, atol=1e-5)
+    assert torch.equal(cameras[0].K, stored[0].K)
+    assert torch.allclose(cameras[0].viewmat, stored[0].viewmat, atol=1e-5)
     found = steps(cameras, 3.0)  # the ball's near side is 3 away
     assert float(found.max() / found.min()) < 1.2
-    check_upright(cameras, torch.tensor([0.0, 0.0, 1.0]))
+    check_upright(cameras)
     assert turned(cameras, 0, 1) == pytest.approx(2 * math.pi, rel=1e-5), "once around, not to and fro"
     centers = torch.stack([camera.center for camera in cameras])
     apart = torch.cdist(torch.tensor(eyes), centers).amin(dim=1)
@@ -78,55 +78,45 @@ def test_the_path_leads_through_views_and_closes():
 
 
 def test_it_begins_with_the_start_view_and_keeps_the_up_axis():
-    eyes = on_a_ring(9)
-    rolled = looking(eyes, len(eyes) * [(0.0, 0.0, 0.0)], roll=0.3)
-    start = sn.Camera.look_at((0, -5, 1), (0, 0, 0), fov=30, width=3000, height=2000)
     up = (math.sin(0.3), 0.0, math.cos(0.3))
-    cameras = film(dataclasses.replace(ball(), cameras=rolled, start=start, up=up))
+    start = sn.Camera.look_at((0, -5, 1), (0, 0, 0), fov=30, width=3000, height=2000)
+    cameras = film(ball(), cameras=looking(on_a_ring(9), up=up), start=start, up=up)
     assert torch.allclose(cameras[0].center, start.center, atol=1e-4)
     assert (cameras[0].width, cameras[0].height) == (1280, 853)
     assert cameras[0].focal == pytest.approx(start.focal * 1280 / 3000, rel=1e-3)
-    check_upright(cameras, torch.tensor(up))
+    check_upright(cameras, up)
 
 
 def test_views_that_look_in_opposite_directions_are_turned_between():
     eyes = [(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.2, 0.0, 0.0)]
-    scene = dataclasses.replace(ball(), cameras=looking(eyes, [(0.0, 9.0, 0.0), (0.1, -9.0, 0.0), (0.2, 9.0, 0.0)]))
-    cameras = film(scene)
+    cameras = film(ball(), cameras=looking(eyes, [(0.0, 9.0, 0.0), (0.1, -9.0, 0.0), (0.2, 9.0, 0.0)]))
     found = steps(cameras, 1.0)
     assert float(found.max()) < 3 * float(found.mean())
-    check_upright(cameras, torch.tensor([0.0, 0.0, 1.0]))
+    check_upright(cameras)
 
 
 def test_views_that_see_nothing_make_a_path_too():
     eyes = on_a_ring(9, radius=400.0)
     outward = [(2 * x, 2 * y, z) for x, y, z in eyes]
-    cameras = film(dataclasses.replace(ball(), cameras=looking(eyes, outward)))
+    cameras = film(ball(), cameras=looking(eyes, outward))
     found = steps(cameras, 400.0)
     assert float(found.max() / found.min()) < 1.5
     assert min(float(camera.center.norm()) for camera in cameras) > 300
 
 
 def test_a_view_straight_down_is_passed_over():
-    eyes = on_a_ring(5)
-    cameras = looking([(0.0, 0.0, 6.0), *eyes], 6 * [(0.0, 0.0, 0.0)])
-    found = film(dataclasses.replace(ball(), cameras=cameras, up=(0.0, 0.0, 1.0)))
-    check_upright(found, torch.tensor([0.0, 0.0, 1.0]))
+    found = film(ball(), cameras=looking([(0.0, 0.0, 6.0), *on_a_ring(5)]), up=(0.0, 0.0, 1.0))
+    check_upright(found)
     assert max(float(camera.center[2]) for camera in found) < 2
 
 
 @pytest.mark.parametrize(("stored", "factor"), [(0, 1.0), (1, 1000.0), (4, 1.0)])
 def test_a_scene_without_a_path_is_seen_from_all_around(stored, factor):
-    scene = ball(1500)
-    grown = {"means": factor * scene.gaussians["means"], "scales": scene.gaussians["scales"] + math.log(factor)}
-    camera = looking([(0.0, -5.0 * factor, 0.0)], [(0.0, 0.0, 0.0)])
-    scene = dataclasses.replace(
-        scene, gaussians=scene.gaussians.replaced(grown), cameras=stored * camera, up=(0.0, -1.0, 0.0)
-    )
-    cameras = film(scene)
+    scene, up = sn.transform(ball(1500), scale=factor), (0.0, -1.0, 0.0)
+    cameras = film(scene, cameras=stored * looking([(0.0, -5.0 * factor, 0.0)]), up=up)
     found = steps(cameras, float(cameras[0].center.norm()))
     assert float(found.max() / found.min()) < 1.2
-    check_upright(cameras, torch.tensor([0.0, -1.0, 0.0]))
+    check_upright(cameras, up)
     assert turned(cameras, 2, 0) == pytest.approx(2 * math.pi, rel=1e-4)
     seen = [float(sn.render(scene, camera.zoomed(0.05)).accumulation.mean()) for camera in cameras[::20]]
     assert min(seen) > 0.1

@@ -1,14 +1,16 @@
 """What errors of a pack do to images: predicted changes are those of renderings."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
 from fields import random_field
 
+import sundae_ns as sn
 from sundae_ns.head.head import CompensationHead, HeadConfig
 from sundae_ns.io.pack.packed_scene import PackedScene
-from sundae_ns.scene.packing import cameras_of_arrays, scene_of, sensitivity_of
+from sundae_ns.scene.packing import scene_of, sensitivity_of
 from sundae_ns.scene.render import GaussianSource, render_view
 
 
@@ -19,20 +21,11 @@ def head():
     return state
 
 
-def cameras(n, *, turn, away=0.0):
-    """Cameras on a circle around the origin, or on a part of it, which look at its centre."""
-    angles = torch.arange(n) * (turn / n)
-    zero, one = torch.zeros(n), torch.ones(n)
-    axes = [
-        torch.stack([angles.cos(), zero, -angles.sin()], dim=1),
-        torch.stack([zero, one, zero], dim=1),
-        torch.stack([angles.sin(), zero, angles.cos()], dim=1),
-    ]
-    poses = torch.stack([*axes, 6 * axes[2]], dim=2)
-    poses[:, :, 3] += away * poses[:, :, 2].roll(1, dims=1)
-    sizes = torch.tensor([[48, 32]]).expand(n, 2)
-    intrinsics = torch.tensor([[40.0, 40, 24, 16]]).double().expand(n, 4)
-    return cameras_of_arrays({"poses": poses, "intrinsics": intrinsics, "sizes": sizes})
+def cameras(n, *, turn, ahead=0.0):
+    """Cameras on a circle around the origin, or on a part of it, which look at its centre, or away from there."""
+    eyes = [(6 * math.sin(i * turn / n), 0.0, 6 * math.cos(i * turn / n)) for i in range(n)]
+    fov = 2 * math.degrees(math.atan(16 / 40))
+    return [sn.Camera.look_at(eye, (0, ahead, 0), (0, 1, 0), fov=fov, width=48, height=32) for eye in eyes]
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +86,6 @@ def test_cameras_of_one_side_tell_fewer_harmonics_apart(scene):
 
 
 def test_primitives_that_no_camera_sees(scene):
-    form = sensitivity_of(scene, cameras(2, turn=0.1, away=1000.0)).rows["features_rest"]
+    form = sensitivity_of(scene, cameras(2, turn=0.1, ahead=1000.0)).rows["features_rest"]
     assert torch.isfinite(form).all()
     assert float(torch.linalg.eigvalsh(form)[0]) > 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import zipfile
+from functools import cache
 from pathlib import Path
 
 import command_line
@@ -12,8 +13,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import tyro
+from nerfstudio.engine.trainer import TrainerConfig
 from PIL import Image
 
+from sundae_ns import method_configs
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.scene.initialization import from_points
 
@@ -107,6 +111,7 @@ def write_run(
     return folder
 
 
+@cache
 def packed() -> bytes:
     points = torch.linspace(0, 1, 30).reshape(10, 3)
     model = {"sh_degree": 0, "rasterize_mode": "classic", "background_color": "black"}
@@ -134,3 +139,9 @@ def write_video(path: Path, frames: int, size: tuple[int, int] = (64, 48)) -> No
         frame[10:30, index % 40 : index % 40 + 20] = (40, 200, 250)
         writer.write(frame if index % 3 == 1 else cv2.GaussianBlur(frame, (9, 9), 4))
     writer.release()
+
+
+def config_of(words: list[str], method: str = "sundae") -> TrainerConfig:
+    """The options that ns-train reads from the words of a method and its options."""
+    usual = getattr(method_configs, method.replace("-", "_")).config
+    return tyro.cli(type(usual), default=usual, args=words[2:])
