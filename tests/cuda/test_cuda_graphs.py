@@ -1,7 +1,8 @@
 """The cache of CUDA graphs, and the recording of one; users of recorded graphs have tests of their own."""
 
 import gc
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
+from unittest import mock
 
 import pytest
 import torch
@@ -64,81 +65,55 @@ def test_no_garbage_collection_during_a_recording(enabled, fails):
     try:
         if not enabled:
             gc.disable()
-        try:
-            with cuda_graphs._no_garbage_collection():
-                assert not gc.isenabled()
-                if fails:
-                    raise ValueError
-        except ValueError:
-            assert fails
+        with suppress(ValueError), cuda_graphs._no_garbage_collection():
+            assert not gc.isenabled()
+            if fails:
+                raise ValueError
         assert gc.isenabled() == enabled
     finally:
         gc.enable()
 
 
 def test_a_failed_recording_restores_stream_and_generator(monkeypatch):
-    current = "main"
+    streams, generator, ended, failed = ["main"], mock.Mock(), mock.Mock(), []
 
     @contextmanager
     def stream(side):
-        nonlocal current
-        before, current = current, side
+        before = streams[:]
+        streams.append(side)
         try:
             yield
         finally:
-            current = before
+            streams[:] = before
 
-    class Capture:
+    @contextmanager
+    def capture(graph, *, stream, **_):
         """Like torch's: a failure at its end leaves its stream current."""
-
-        def __init__(self, graph, *, stream, **_):
-            self.stream = stream
-
-        def __enter__(self):
-            nonlocal current
-            current = self.stream
-
-        def __exit__(self, *_):
+        streams.append(stream)
+        try:
+            yield
+        finally:
             assert not gc.isenabled()
             raise RuntimeError("operation failed due to a previous error during capture\nand more lines")
 
-    class Generator:
-        """Like torch's: a failed recording leaves it refusing to draw, but copies from before still draw."""
-
-        def __init__(self):
-            self.drawn_from = "now"
-
-        def clone_state(self):
-            return "before"
-
-        def graphsafe_set_state(self, state):
-            self.drawn_from = state
-
-    generator = Generator()
-    stand_ins = {"stream": stream, "graph": Capture, "CUDAGraph": object, "device": nullcontext}
+    stand_ins = {"stream": stream, "graph": capture, "CUDAGraph": object, "device": nullcontext}
     stand_ins |= {"default_generators": (generator,), "current_device": lambda: 0, "graph_pool_handle": lambda: "pool"}
     for name, stand_in in stand_ins.items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
     monkeypatch.setattr(cuda_graphs, "_side_stream", lambda device: "side")
-    monkeypatch.setattr(cuda_graphs, "_abandoned", failed := [])
-    ended = []
-    monkeypatch.setattr(torch._C, "_cuda_endAllocateToPool", lambda *of: ended.append(of), raising=False)
-    with pytest.raises(
-        BackendError, match=r"as a CUDA graph: operation failed due to a previous error during capture$"
-    ):
-        record(lambda: current, torch.device("cuda"))
-    assert current == "main"
-    assert generator.drawn_from == "before"
-    assert ended == [(0, "pool")]
+    monkeypatch.setattr(cuda_graphs, "_abandoned", failed)
+    monkeypatch.setattr(torch._C, "_cuda_endAllocateToPool", ended, raising=False)
+    with pytest.raises(BackendError, match="as a CUDA graph: operation failed .* during capture$"):
+        record(lambda: streams, torch.device("cuda"))
+    assert streams == ["main"]
+    generator.graphsafe_set_state.assert_called_once_with(generator.clone_state())
+    ended.assert_called_once_with(0, "pool")
     assert len(failed) == 1
     assert gc.isenabled()
-
-    def too_much():
-        raise torch.cuda.OutOfMemoryError("no room")
-
+    too_much = mock.Mock(side_effect=torch.cuda.OutOfMemoryError("no room"))
     with pytest.raises(torch.cuda.OutOfMemoryError, match="no room"):  # not the error that follows from it
         record(too_much, torch.device("cuda"))
-    assert len(ended) == len(failed) == 2
+    assert ended.call_count == len(failed) == 2
 
 
 @pytest.mark.gpu

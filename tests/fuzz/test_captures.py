@@ -39,13 +39,8 @@ def as_text(data):
     write_text_model(data / "sparse" / "0", sorted(path.name for path in (data / "images").iterdir()))
 
 
-FILES = (
-    "transforms.json",
-    *(f"sparse/0/{name}.{kind}" for name in ("cameras", "images", "points3D") for kind in ("bin", "txt")),
-)
-FILES += ("0.png", "0.jpg")
-
-
+FILES = [f"sparse/0/{name}.{kind}" for name in ("cameras", "images", "points3D") for kind in ("bin", "txt")]
+FILES += ["transforms.json", "0.png", "0.jpg"]
 many = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
 
@@ -95,7 +90,7 @@ def test_damaged_values_of_transforms(capture, data, value):
 
 
 NAN = float("nan")
-POSE = "frames/1/transform_matrix"
+POSE, FIRST = "frames/1/transform_matrix", "images/frame_00001.png"
 ROUND = {"camera_model": "FISHEYE624", "distortion_params": [0.0] * 12}
 
 
@@ -122,16 +117,13 @@ REFUSED = {
     "an unknown camera": ({"camera_model": "BRAIN"}, "camera_model is 'BRAIN'; use one of SIMPLE_PINHOLE"),
     "a round lens without a radius": (ROUND, "fisheye_crop_radius is None; .*a positive number"),
     "a round lens of a whole number": ({**ROUND, "fisheye_crop_radius": 7}, "with a decimal point"),
-    "a round lens and masks": (
-        {**ROUND, "fisheye_crop_radius": 7.0, "frames": masked("images/frame_00001.png")},
-        "remove mask_path",
-    ),
+    "a round lens and masks": ({**ROUND, "fisheye_crop_radius": 7.0, "frames": masked(FIRST)}, "remove mask_path"),
     "distortion NaN": ({"k1": NAN}, "k1 is nan"),
     "distortion of 3 numbers": ({"distortion_params": [0, 0, 0]}, "4, 6 or 12"),
     "a split of other images": ({"frames/1/file_path": "images/none.png"}, "which no frame has as its file_path"),
     "a missing split": ({"train_filenames": ["a.png"], "val_filenames": None}, "train_filenames|val_filenames"),
     "no list of test images": ({"val_filenames": GONE, "test_filenames": GONE}, "none for val"),
-    "a mask for one": ({"frames/1/mask_path": "images/frame_00001.png"}, "1 of .* frames have a mask_path"),
+    "a mask for one": ({"frames/1/mask_path": FIRST}, "1 of .* frames have a mask_path"),
     "a scale of zero": ({"applied_scale": 0}, "applied_scale"),
     "a frame of NaN": ({"applied_transform": [[NAN] * 4] * 3}, "applied_transform"),
     "an unknown orientation": ({"orientation_override": "sideways"}, "orientation_override"),
@@ -244,10 +236,7 @@ TEXTS = ("", "[1, 2]", "[" * 200_000, '{"frames": ' + "9" * 5000 + "}", '{"frame
 FOLDERS = {
     **{f"text {number}": (_written(text), "transforms.json") for number, text in enumerate(TEXTS)},
     "no folder": (shutil.rmtree, "does not exist; give the folder of the capture"),
-    "no transforms": (
-        lambda data: (data / "transforms.json").unlink(),
-        "has no transforms.json; it is in COLMAP layout",
-    ),
+    "no transforms": (lambda data: (data / "transforms.json").unlink(), "has no transforms.json; it is in COLMAP"),
 }
 
 
@@ -310,17 +299,21 @@ def _renamed(data):
     (data / "transforms.json").write_text(text, encoding="utf-8")
 
 
+def _one_pixel(data):
+    _each_image(lambda image: image.resize((1, 1)))(data)
+    rewrite(data, {"w": 1, "h": 1, "cx": 0.5, "cy": 0.5})
+
+
+def _masked(data):
+    photo(data / "masks" / "half.png", image=Image.fromarray(HALF))
+    rewrite(data, {"frames": masked("masks/half.png")})
+
+
 FINE = {
     "unchanged": lambda data: None,
     **{mode: _each_image(lambda image, mode=mode: image.convert(mode)) for mode in ("1", "L", "LA", "P", "RGBA")},
-    "one pixel": lambda data: (
-        _each_image(lambda image: image.resize((1, 1)))(data),
-        rewrite(data, {"w": 1, "h": 1, "cx": 0.5, "cy": 0.5}),
-    ),
-    "masks": lambda data: (
-        photo(data / "masks" / "half.png", image=Image.fromarray(HALF)),
-        rewrite(data, {"frames": masked("masks/half.png")}),
-    ),
+    "one pixel": _one_pixel,
+    "masks": _masked,
     "unicode and spaces in names": _renamed,
     "no points": lambda data: rewrite(data, {"ply_file_path": GONE}),
 }

@@ -49,13 +49,9 @@ def trainer():
     made.optimizers = Optimizers({n: {"optimizer": FusedAdamConfig(), "scheduler": None} for n in groups}, groups)
     made.grad_scaler = GradScaler(enabled=False)
     made.config = SimpleNamespace(
-        load_dir=None,
-        load_step=None,
-        load_checkpoint=None,
-        load_scheduler=True,
-        save_only_latest_checkpoint=True,
-        machine=SimpleNamespace(seed=0),
+        load_scheduler=True, save_only_latest_checkpoint=True, machine=SimpleNamespace(seed=0)
     )
+    vars(made.config).update(dict.fromkeys(("load_dir", "load_step", "load_checkpoint")))
     return made
 
 
@@ -149,14 +145,11 @@ def test_odd_contents_are_refused(good, tmp_path, kind):
     verdict(lambda: read_gaussians(path), path.stat().st_size)
 
 
-class MakesFolder:
-    """Make a folder when unpickled."""
-
-    def __init__(self, path):
-        self.path = path
+class MakesFolder(str):
+    """A path that becomes a folder when it is unpickled."""
 
     def __reduce__(self):
-        return os.mkdir, (str(self.path),)
+        return os.mkdir, (str(self),)
 
 
 @pytest.mark.parametrize("place", ["pipeline", "optimizers", "random", "schedulers", "scalers"])

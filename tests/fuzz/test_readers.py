@@ -12,7 +12,6 @@ import struct
 import sys
 import zipfile
 import zlib
-from contextlib import contextmanager
 from pathlib import Path
 
 import hypothesis.strategies as st
@@ -38,7 +37,7 @@ from sundae_ns.scene.initialization import from_points
 
 HEADER = b"ply\nformat %s 1.0\nelement vertex %s\n%send_header\n"
 XYZ = b"property float x\nproperty float y\nproperty float z\n"
-SCENE = full_scene(50, 2, 3, {"model": {"sh_degree": 2}})
+FIELD, SCENE = small_field(60), full_scene(50, 2, 3, {"model": {"sh_degree": 2}})
 
 
 def unpack(path):
@@ -59,22 +58,16 @@ def read_cloud(path):
 
 
 def write_lod(path):
-    write_levels(path.parent / "lod", [small_field(60), small_field(20)], Marks())
+    write_levels(path.parent / "lod", [FIELD, small_field(20)], Marks())
     Path(shutil.make_archive(str(path), "zip", path.parent / "lod")).rename(path)
 
 
+WRITERS = FOREIGN | dict.fromkeys(("a.spz", "a.sog", "a.glb"), write_for_viewers)
 READERS = {
-    **{
-        name: (lambda path, write=write: write(path, small_field(60)), read_gaussian_file)
-        for name, write in FOREIGN.items()
-    },
-    **{
-        f"a{suffix}": (lambda path: write_for_viewers(path, small_field(60)), read_gaussian_file)
-        for suffix in (".spz", ".sog", ".glb")
-    },
+    **{name: (lambda path, write=write: write(path, FIELD), read_gaussian_file) for name, write in WRITERS.items()},
     "lod.sog": (write_lod, read_gaussian_file),
-    "four.spz": (lambda path: path.write_bytes(spz(small_field(60), 4, axes=8)), read_gaussian_file),
-    "one.spz": (lambda path: path.write_bytes(spz(small_field(60), 1)), read_gaussian_file),
+    "four.spz": (lambda path: path.write_bytes(spz(FIELD, 4, axes=8)), read_gaussian_file),
+    "one.spz": (lambda path: path.write_bytes(spz(FIELD, 1)), read_gaussian_file),
     "field.ply": (lambda path: FOREIGN["plain.ply"](path, small_field(20)), read_gaussians),
     "cloud.ply": (lambda path: write_cloud(path, text=False), read_cloud),
     "text.ply": (lambda path: write_cloud(path, text=True), read_cloud),
@@ -165,8 +158,8 @@ def test_odd_packs_are_refused(kind, tmp_path):
 
 @pytest.mark.parametrize(("stated", "words"), [(1 << 27, "would unpack to"), (1 << 20, "cannot be decompressed")])
 def test_bombs_are_refused_before_they_unpack(stated, words, good, tmp_path):
-    deflate = zlib.compressobj(9, wbits=-15)
-    stream = deflate.compress(bytes(1 << 27)) + deflate.flush()
+    deflate = zlib.compressobj(1, wbits=-15)
+    stream = deflate.compress(bytes(1 << 22)) + deflate.flush()
     meta, body = header_and_body(good("a.sundae"))
     meta["sections"].append({"name": "a", "dtype": "|u1", "shape": [stated], "parts": [len(stream)]})
     content = resealed(meta, body + stream)
@@ -176,7 +169,7 @@ def test_bombs_are_refused_before_they_unpack(stated, words, good, tmp_path):
 
 def test_a_few_constant_planes_cannot_fill_the_memory(tmp_path):
     """Every section is within its limit, but the field that they describe is not."""
-    n, path = 200_000, tmp_path / "a.sundae"
+    n, path = 80_000, tmp_path / "a.sundae"
     write_scene(path, PackedScene({k: v[:1].expand(n, *v.shape[1:]) for k, v in SCENE.gaussians.items()}))
     meta, body = header_and_body(path.read_bytes())
     padding = meta["sections"].pop()
@@ -186,23 +179,14 @@ def test_a_few_constant_planes_cannot_fill_the_memory(tmp_path):
     refused(read_scene, path, "would unpack to", PackError)
 
 
-PLACES = (
-    "../../outside",
-    "/tmp/outside-of-sundae",
-    "..\\..\\outside",
-    "a/../../../outside",
-    "~/outside",
-    "$HOME/outside",
-)
+PLACES = ["../../outside", "/tmp/outside-of-sundae", "a/../../../outside", "..\\..\\outside", "~/outside", "$HOME/a"]
 ACTS = ("os.mkdir", "os.rename", "os.remove", "os.link", "os.symlink", "os.chmod", "os.system", "os.exec", "os.fork")
 ACTS += ("os.posix_spawn", "subprocess.Popen", "socket.connect", "socket.bind", "shutil.unpack_archive")
-recorded = None
-"""Acts recorded in :func:`watched`; None outside of it, because an audit hook cannot be removed."""
+recorded = []
+"""Acts since the last :func:`watched` began: an audit hook cannot be removed."""
 
 
 def record(event, arguments):
-    if recorded is None:
-        return
     if event == "open":
         path, mode, flags = arguments
         writes = isinstance(mode, str) and any(letter in mode for letter in "wax+")
@@ -215,23 +199,16 @@ def record(event, arguments):
 sys.addaudithook(record)
 
 
-@contextmanager
-def watched():
-    """Yield a list to which the acts of the block are added."""
-    global recorded  # noqa: PLW0603
-    recorded = []
-    try:
-        yield recorded
-    finally:
-        recorded = None
+def watched(call):
+    """What a call returns, and its acts."""
+    recorded.clear()
+    return call(), [*recorded]
 
 
 def test_the_hook_records_writes_and_no_reads(tmp_path):
-    with watched() as found:
-        (tmp_path / "a").mkdir()
-        (tmp_path / "a" / "b").write_text("x")
-        (tmp_path / "a" / "b").read_text()
-    assert [line.split()[0] for line in found] == ["os.mkdir", "open"]
+    (tmp_path / "b").touch()
+    calls = (tmp_path / "a").mkdir, (tmp_path / "b").read_text, lambda: (tmp_path / "b").write_text("x")
+    assert [[act.split()[0] for act in watched(call)[1]] for call in calls] == [["os.mkdir"], [], ["open"]]
 
 
 def a_checkpoint(path, place):
@@ -271,19 +248,8 @@ def test_nothing_leaves_the_file(tmp_path, name, place):
     path = tmp_path / "deep" / "er" / name
     path.parent.mkdir(parents=True)
     make(path, place)
-    with watched() as found:
-        verdict(lambda: read(path), path.stat().st_size)
-    assert found == []
+    assert watched(lambda: verdict(lambda: read(path), path.stat().st_size))[1] == []
     assert [entry.name for entry in path.parent.iterdir()] == [name]
-
-
-def test_members_of_an_exported_archive_are_plain_names(tmp_path):
-    """A .sog is a zip that other programs unpack."""
-    write_for_viewers(tmp_path / "a.sog", small_field(20))
-    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
-        names = archive.namelist()
-    assert "meta.json" in names
-    assert all(Path(name).name == name for name in names)
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -292,7 +258,6 @@ def test_reading_a_capture_writes_nothing(capture, place):
     meta["frames"][0]["file_path"] = meta["ply_file_path"] = place
     (capture / "transforms.json").write_text(json.dumps(meta))
     parser = NerfstudioDataParserConfig(_target=LightNerfstudioParser, data=capture)
-    with watched() as found:
-        error = verdict(lambda: check_capture(parser, capture, ("train",)), 10**4)
+    error, acts = watched(lambda: verdict(lambda: check_capture(parser, capture, ("train",)), 10**4))
     assert error is not None
-    assert found == []
+    assert acts == []

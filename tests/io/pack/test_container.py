@@ -1,5 +1,6 @@
 """The container of packed scenes: the description of the format, the checks by it, and sections beyond their limits."""
 
+import json
 from copy import deepcopy
 from typing import get_args, get_type_hints
 
@@ -14,19 +15,14 @@ from sundae_ns.core.errors import PackError
 from sundae_ns.core.gaussians import MAX_SH_DEGREE
 from sundae_ns.head.head import HeadConfig
 from sundae_ns.io.pack import container
-from sundae_ns.io.pack.container import FORMAT, LIMITS, fault, fits, in_range, parsed
+from sundae_ns.io.pack.container import FORMAT, LIMITS, fault, parsed
 from sundae_ns.io.pack.packed_scene import read_scene, write_scene
 from sundae_ns.scene.scene import Background
 
 SCHEMAS = ("container", "header", "model")
 HEAD = {"mode": "residual", "size": "tiny", "pixel_unshuffle": 1, "num_features": 3, "precision": "bf16"}
-MODEL = {
-    "sh_degree": 2,
-    "rasterize_mode": "classic",
-    "background_color": "black",
-    "head": HEAD,
-    "trained_focal": [5, 6],
-}
+MODEL = {"sh_degree": 2, "rasterize_mode": "classic", "background_color": "black"}
+MODEL |= {"head": HEAD, "trained_focal": [5, 6]}
 ATTRIBUTES = {
     "means": {"codec": "blocks", "bits": 13, "block": 1024},
     "quats": {"codec": "xyz", "step": 0.008},
@@ -36,13 +32,8 @@ ATTRIBUTES = {
 }
 POSE = [[1.0, 0, 0, 3], [0, 0.6, -0.8, 1e9], [0, 0.8, 0.6, 0]]
 START = {"pose": POSE, "intrinsics": [9, 9.5, -3, 0], "size": [640, 480.0]}
-HEADER = {
-    "primitives": 40,
-    "attributes": ATTRIBUTES,
-    "source": {"method": "sundae"},
-    "up": [0, 0.6, -0.82],
-    "start": START,
-}
+HEADER = {"primitives": 40, "attributes": ATTRIBUTES, "source": {"method": "sundae"}}
+HEADER |= {"up": [0, 0.6, -0.82], "start": START}
 SECTION = {"name": "means/low", "dtype": "<f4", "shape": [1, 3], "parts": [3, 3, 3, 3], "sha256": 64 * "0"}
 CONTAINER = {"sections": [SECTION, {**SECTION, "name": "means/high"}]}
 VALID = {"container": CONTAINER, "header": HEADER, "model": MODEL}
@@ -53,53 +44,43 @@ def test_valid_values_pass(schema):
     assert fault(VALID[schema], FORMAT[schema]) is None
 
 
-WRONG = [
-    ("header", "primitives", 0),
-    ("header", "primitives", 2.5),
-    ("header", "source", []),
-    ("header", "attributes/means", None),
-    ("header", "attributes/means/bits", 3),
-    ("header", "attributes/means/bits", 17),
-    ("header", "attributes/means/block", 1048577),
-    ("header", "attributes/opacities/step", 1e39),
-    ("header", "attributes/scales/codec", None),
-    ("header", "attributes/quats/step", 1.5),
-    ("header", "attributes/scales/codec", ["transform"]),
-    ("header", "attributes/features_rest/width", 10),
-    ("header", "attributes/head/tensors", []),
-    ("header", "attributes/head/tensors/0/0", "a\n"),
-    ("header", "attributes/head/tensors/1/1", [2, 0]),
-    ("header", "attributes/head/tensors/1", ["b", [2], 3]),
-    ("header", "up", None),
-    ("header", "up", [0, 0, 0]),
-    ("header", "up", [0, 0, 1, 0]),
-    ("header", "up", [0, 1e-200, 0]),
-    ("header", "up/1", 1e30),
-    ("header", "start", None),
-    ("header", "start/pose", POSE[:2]),
-    ("header", "start/pose", [POSE[1], POSE[0], POSE[2]]),
-    ("header", "start/pose", [[1.06, 0, 0, 0], *POSE[1:]]),
-    ("header", "start/pose/0/3", 1e30),
-    ("header", "start/intrinsics/1", 0),
-    ("header", "start/intrinsics/2", -1e10),
-    ("header", "start/size/0", 0),
-    ("header", "start/size/1", 480.5),
-    ("container", "sections/1/dtype", "|O"),
-    ("container", "sections/1/sha256", 64 * "g"),
-    ("container", "sections/1/shape", []),
-    ("model", "sh_degree", 5),
-    ("model", "head/precision", "fp64"),
-    ("model", "trained_focal/0", 1e30),
-    ("model", "trained_focal", [5]),
-]
+WRONG = {
+    "header": {
+        "primitives": [0, 2.5],
+        "source": [[]],
+        "attributes/means": [None],
+        "attributes/means/bits": [3, 17],
+        "attributes/means/block": [1048577],
+        "attributes/opacities/step": [1e39],
+        "attributes/scales/codec": [None, ["transform"]],
+        "attributes/quats/step": [1.5],
+        "attributes/features_rest/width": [10],
+        "attributes/head/tensors": [[]],
+        "attributes/head/tensors/0/0": ["a\n"],
+        "attributes/head/tensors/1/1": [[2, 0]],
+        "attributes/head/tensors/1": [["b", [2], 3]],
+        "up": [None, [0, 0, 0], [0, 0, 1, 0], [0, 1e-200, 0]],
+        "up/1": [1e30],
+        "start": [None],
+        "start/pose": [POSE[:2], [POSE[1], POSE[0], POSE[2]], [[1.06, 0, 0, 0], *POSE[1:]]],
+        "start/pose/0/3": [1e30],
+        "start/intrinsics/1": [0],
+        "start/intrinsics/2": [-1e10],
+        "start/size/0": [0],
+        "start/size/1": [480.5],
+    },
+    "container": {"sections/1/dtype": ["|O"], "sections/1/sha256": [64 * "g"], "sections/1/shape": [[]]},
+    "model": {"sh_degree": [5], "head/precision": ["fp64"], "trained_focal/0": [1e30], "trained_focal": [[5]]},
+}
+CASES = [(schema, *case) for schema, places in WRONG.items() for case in places.items()]
 
 
-@pytest.mark.parametrize(("schema", "place", "value"), WRONG)
-def test_the_first_wrong_place_is_named(schema, place, value):
-    changed = deepcopy(VALID[schema])
-    put(changed, {place: value})
-    found = fault(changed, FORMAT[schema], "x")
-    assert found.startswith("x." + place.replace("/", "."))
+@pytest.mark.parametrize(("schema", "place", "values"), CASES)
+def test_the_first_wrong_place_is_named(schema, place, values):
+    for value in values:
+        changed = deepcopy(VALID[schema])
+        put(changed, {place: value})
+        assert fault(changed, FORMAT[schema], "x").startswith("x." + place.replace("/", ".")), value
 
 
 def test_names_are_unique_and_heads_have_no_other_option():
@@ -107,7 +88,7 @@ def test_names_are_unique_and_heads_have_no_other_option():
     header = {**HEADER, "attributes": {**ATTRIBUTES, "head": {**ATTRIBUTES["head"], "tensors": twice}}}
     assert fault(header, FORMAT["header"]) == "attributes.head.tensors"
     assert fault({"sections": [SECTION, SECTION]}, FORMAT["container"]) == "sections"
-    many = {**SECTION, "parts": [1] * 10**6}  # no loop of Python over them
+    many = {**SECTION, "parts": [1] * 10**5}  # no loop of Python over them
     assert fault({"sections": [many]}, FORMAT["container"]) is None
     assert fault({"sections": [{**many, "parts": [*many["parts"], -1]}]}, FORMAT["container"]) == "sections.0.parts"
     assert fault({**MODEL, "head": {**HEAD, "other": 4}}, FORMAT["model"]) == "head"
@@ -149,22 +130,6 @@ def test_headers_are_json_of_utf8_with_numbers_of_float64():
     ):
         with pytest.raises((ValueError, RecursionError), match=r"\w"):
             parsed(text)
-
-
-def test_sections_have_shape_and_range():
-    section = {"dtype": "<f4", "shape": ["rows", 2], "minimum": [0, -1], "maximum": 10}
-    array = np.array([[0, -1], [10, 10]], np.float32)
-    assert fits(array, section, {"rows": 2})
-    assert not fits(array, section, {"rows": 3})
-    assert not fits(array[None], section, {"rows": 1})
-    assert not fits(array.astype(np.float64), section, {"rows": 2})
-    assert fits(array, {"dtype": "<f4", "shape": [None, 2]}, {})
-    assert in_range(array, section)
-    for row, column, value in ((0, 0, -0.5), (0, 1, -2), (1, 0, 11), (1, 1, np.nan), (0, 0, np.inf)):
-        changed = array.copy()
-        changed[row, column] = value
-        assert not in_range(changed, section)
-    assert not in_range(np.array([np.inf], np.float32), {})
 
 
 SECTIONS = {
@@ -231,11 +196,7 @@ def test_shapes_of_the_head(path, shape):
 
 def test_whole_numbers_may_be_written_as_real_ones(path):
     def real(value):
-        if isinstance(value, dict):
-            return {key: real(each) for key, each in value.items()}
-        return (
-            [real(each) for each in value] if isinstance(value, list) else float(value) if type(value) is int else value
-        )
+        return json.loads(json.dumps(value), parse_int=float)
 
     truth = read_scene(path)
     restate(path, {name: real for name in ("primitives", "attributes", "sections")})

@@ -30,13 +30,6 @@ def cells_of(n, bits, block, seed):
     return codes
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    """Compile first, because hypothesis watches the time."""
-    entropy.encode_levels(np.zeros((1, 1), np.int32), entropy.neighbours_of(np.zeros((1, 3)), 1))
-    entropy.encode_gaps(np.zeros(1, np.uint64), 1, 4)
-
-
 @given(st.integers(0, 300), st.integers(1, 6), st.integers(0, 2**16))
 def test_numbers_come_back(n, width, seed):
     levels = levels_of(n, width, seed)

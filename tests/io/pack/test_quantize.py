@@ -109,7 +109,7 @@ def test_rotations(n, seed, step):
 
 def test_the_bound_of_rotations_is_nearly_reached():
     rng = np.random.default_rng(0)
-    q = rng.normal(size=(300_000, 4)).astype(np.float32)
+    q = rng.normal(size=(100_000, 4)).astype(np.float32)
     turned, _ = quantize.aligned(q, np.zeros((len(q), 3), np.float32))
     worst = angles(turned.astype(np.float64), through_rotations(q, 0.01).astype(np.float64)).max()
     assert 0.85 * quantize.rotation_bound(0.01) < worst <= quantize.rotation_bound(0.01)
