@@ -35,7 +35,6 @@ def gaussians(n=20):
 
 
 def train(params, optimizers, steps=1):
-    """Steps towards ones."""
     for _ in range(steps):
         loss = torch.stack([(value - 1).square().sum() for value in params.values() if value.requires_grad]).sum()
         for optimizer in optimizers.values():

@@ -89,7 +89,6 @@ def images(height, width, seed=0):
 
 
 def exact_loss(image, target, weight):
-    """Loss and gradient by convolutions in float64."""
     image, ssim = image.double().requires_grad_(), SSIM(data_range=1.0, channel=3)
     ssim.win = ssim.win.to(image)  # moving the module leaves its window where it was
     value = image_losses(image, None, target.double(), ssim, weight)[0]

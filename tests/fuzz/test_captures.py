@@ -18,14 +18,13 @@ from documents import GONE, put
 from hypothesis import HealthCheck, given, settings
 from icc_profiles import judged, profile
 from limits import refused, verdict
+from models import _build
 from photos import photo
 from PIL import Image
-from small_captures import HEIGHT, SIZE, VIEWS, WIDTH, bytes_of, load, manager, meta_of, write_text_model
+from small_captures import HEIGHT, SIZE, WIDTH, bytes_of, load, manager, meta_of, write_text_model
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.data.colmap import check_colmap
-from sundae_ns.head.head import HeadConfig
-from sundae_ns.plugin.model import SundaeModelConfig
 
 
 def rewrite(data, changes):
@@ -100,13 +99,11 @@ def masked(path):
 
 REFUSED = {
     "NaN in a pose": ({f"{POSE}/0/3": NAN}, r"frame 1 .*transform_matrix is nan; it must be finite"),
-    "infinity in a pose": ({f"{POSE}/2/1": float("inf")}, "frame 1 .*finite"),
     "a pose of zeros": ({POSE: [[0.0] * 4] * 4}, "frame 1 .*singular"),
     "a pose of 3 rows": ({POSE: [[1.0, 0, 0, 0]] * 3}, "4 rows of 4"),
     "no pose": ({POSE: GONE}, "4 rows of 4"),
     "zero focal length": ({"fl_x": 0.0}, "fl_x is 0.0; it must be positive"),
     "negative focal length": ({"fl_y": -3}, "fl_y is -3; it must be positive"),
-    "focal length NaN": ({"fl_x": NAN}, "fl_x is nan"),
     "no focal length": ({"fl_x": GONE}, "fl_x missing"),
     "zero width": ({"w": 0}, "w is 0; .*whole number of pixels"),
     "a huge width": ({"w": 10**9}, "w is 1000000000"),
@@ -248,7 +245,6 @@ def test_captures_are_refused_by_name(capture, kind):
 
 
 def bomb(width, height):
-    """Write a PNG whose header claims more pixels than follow."""
     content = b"\x89PNG\r\n\x1a\n"
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(b"\0" * 99)), (b"IEND", b"")):
@@ -320,16 +316,12 @@ FINE = {
 
 
 def train_a_step(data):
-    """Train one step with the head, and evaluate the test views."""
     datamanager = load(data)
-    config = SundaeModelConfig(head=HeadConfig(mode="residual", size="tiny"), num_random=50, num_downscales=0)
-    dataset = datamanager.train_dataset
-    points = [dataset.metadata[f"points3D_{name}"] for name in ("xyz", "rgb") if "points3D_xyz" in dataset.metadata]
-    model = config.setup(
-        scene_box=dataset.scene_box, num_train_data=VIEWS, metadata=dataset.metadata, seed_points=points or None
-    )
+    metadata = datamanager.train_dataset.metadata
+    points = [metadata[f"points3D_{name}"] for name in ("xyz", "rgb") if "points3D_xyz" in metadata]
+    model = _build(seed_points=points or None, metadata=metadata, num_random=50)
     model.train()
-    model.step = config.pruning.prune_at + 1
+    model.step = 4
     camera, batch = datamanager.next_train(0)
     outputs = model(camera)
     losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))

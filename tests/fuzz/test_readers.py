@@ -229,7 +229,6 @@ def a_pack(path, place):
 
 
 def a_ply(path, place):
-    """Write a .ply that names ``place`` in its comments."""
     write_ply(path, small_field(20), comments=[place, f"TextureFile {place}"])
 
 

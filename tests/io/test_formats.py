@@ -49,18 +49,14 @@ def test_what_is_written_is_read(tmp_path, kind, n, degree, marks):
     truth, path = small_field(n, degree), tmp_path / f"a{kind}"
     antialiased, in_model_frame = marks
     written = write_for_viewers(path, truth, Marks(antialiased, in_model_frame))
+    content = path.read_bytes()
+    write_for_viewers(path, truth, Marks(antialiased, in_model_frame))
+    assert path.read_bytes() == content
     assert len(written["means"]) == n
     sanitised, read = read_gaussian_file(path)
     assert_close(sanitised.gaussians, truth, TOLERANCES[kind])
     assert read.antialiased == antialiased
     assert read.in_model_frame == (in_model_frame and kind in (".ply", ".glb"))
-
-
-@pytest.mark.parametrize("kind", FORMATS)
-def test_equal_fields_give_equal_bytes(tmp_path, kind):
-    for name in ("a", "b"):
-        write_for_viewers(tmp_path / f"{name}{kind}", small_field())
-    assert (tmp_path / f"a{kind}").read_bytes() == (tmp_path / f"b{kind}").read_bytes()
 
 
 @pytest.mark.skipif(PROGRAM is None, reason="no splat-transform: npm install -g @playcanvas/splat-transform")

@@ -27,13 +27,12 @@ SPLAT, SPZ_2 = f"{PRIMITIVE}/extensions/{EXTENSION}", f"{EXTENSION}_compression_
 
 
 def parts(path):
-    """The document of a .glb, and its buffer."""
     data = path.read_bytes()
     (length,) = struct.unpack("<I", data[12:16])
     return json.loads(data[20 : 20 + length]), data[28 + length :]
 
 
-def write(path, document, binary):
+def write(path, document, binary=b""):
     text = document if isinstance(document, bytes) else json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
@@ -41,7 +40,6 @@ def write(path, document, binary):
 
 
 def written(path, gaussians, **marks):
-    """The document of a field, and its buffer."""
     write_glb(path, gaussians, Marks(**marks))
     return parts(path)
 
@@ -160,7 +158,6 @@ def added(document, binary, values, component, **accessor):
 
 
 def test_instances_are_nodes_of_their_own(tmp_path):
-    """Each shows what a node with its translation, rotation and scale shows."""
     document, binary = written(tmp_path / "a.glb", small_field(20, 2))
     half = math.sqrt(0.5)
     turns = [[0, half, 0, half], [0, 0, 0, 1], [half, half, 0, 0]]
@@ -201,7 +198,6 @@ def test_a_spz_inside(tmp_path):
 
 
 def copies(count, nodes):
-    """A primitive so many times, in so many nodes."""
     return {
         "meshes/0/primitives": lambda primitives: primitives * count,
         "nodes": [{"mesh": 0}] * nodes,
@@ -216,11 +212,8 @@ HOSTILE = {
     "compressed": ({f"{SPLAT}/extensions": {"KHR_gaussian_splatting_compression_spz": {}}}, "compression_spz"),
     "no SPZ": ({f"{SPLAT}/extensions": {SPZ_2: {"bufferView": 0}}}, "missing|header"),
     "an unknown requirement": ({"extensionsRequired": ["KHR_new"]}, "it requires KHR_new"),
-    "a requirement of words": ({"extensionsRequired": 3}, "not that of a glTF scene"),
-    "a node 9,999 times": ({"scenes/0/nodes": [0] * 9999}, "two parents"),
     "a node twice a child": ({"nodes": [{"children": [1, 1]}, {}]}, "two parents"),
     "children without end": ({"nodes/0/children": [0] * 30_000}, "two parents"),
-    "half a million nodes": (copies(1, 20_000), "over 10,000 nodes"),
     "a chain of nodes": ({"nodes": [{"children": [i + 1]} for i in range(20_000)]}, "over 10,000 nodes"),
     "a primitive 4,000 times": (copies(4000, 1), "would unpack to"),
     "a primitive 1,000 times in 9,000 nodes": (copies(1000, 9000), "would unpack to"),
@@ -265,7 +258,7 @@ def test_hostile_files_are_refused_in_one_line(tmp_path, kind):
 
 @pytest.mark.parametrize("text", TEXTS, ids=TEXTS.values())
 def test_odd_documents_are_refused_in_one_line(tmp_path, text):
-    write(tmp_path / "a.glb", text, b"")
+    write(tmp_path / "a.glb", text)
     refused(sn.load, tmp_path / "a.glb", TEXTS[text])
 
 

@@ -299,21 +299,15 @@ def test_a_folder_has_all_its_files(tmp_path, bundled, file, words):
     refused(read_gaussian_file, folder / "meta.json", words)
 
 
-def write_folder(folder, monkeypatch):
-    """Write three levels of detail in several chunks and leaves; returns them."""
-    monkeypatch.setattr("sundae_ns.io.sog._LEAF", 20)
-    monkeypatch.setattr("sundae_ns.io.sog._CHUNK", 50)
-    levels = [gaussians(n, degree=1) for n in (150, 70, 4)]
-    write_streamed(folder, levels, Marks(True, up=(0.0, 0.6, 0.8), offset=(4e6 + 1 / 3, 0.0, -7.0)))
-    return levels
-
-
 def leaves_of(node):
     return [leaf for child in node["children"] for leaf in leaves_of(child)] if "children" in node else [node]
 
 
 def test_levels_of_detail(tmp_path, monkeypatch):
-    levels = write_folder(tmp_path, monkeypatch)
+    monkeypatch.setattr("sundae_ns.io.sog._LEAF", 20)
+    monkeypatch.setattr("sundae_ns.io.sog._CHUNK", 50)
+    levels = [gaussians(n, degree=1) for n in (150, 70, 4)]
+    write_streamed(tmp_path, levels, Marks(True, up=(0.0, 0.6, 0.8), offset=(4e6 + 1 / 3, 0.0, -7.0)))
     meta = json.loads((tmp_path / "lod-meta.json").read_text())
     assert (meta["version"], meta["count"], meta["counts"], meta["lodLevels"]) == (1, 224, [150, 70, 4], 3)
     chunks = [read_gaussian_file(tmp_path / name)[0].gaussians for name in meta["filenames"]]
@@ -336,21 +330,12 @@ def test_levels_of_detail(tmp_path, monkeypatch):
         apart = torch.cdist(levels[0]["means"], found.gaussians["means"])
         assert apart.amin(dim=1).max() < 1e-3
         assert found.gaussians.num_gaussians == 150
-
-
-def test_other_levels_replace_those_of_a_folder(tmp_path, monkeypatch):
-    write_folder(tmp_path, monkeypatch)
+    (tmp_path / "lod-meta.json").write_text(json.dumps(meta).replace('"0_0', '"../a/0_0'))
+    refused(read_gaussian_file, tmp_path, "lies elsewhere")
     (tmp_path / "0_0-notes").mkdir()
-    write_streamed(tmp_path, [gaussians(9, degree=0)])
+    write_streamed(tmp_path, [gaussians(9, degree=0)])  # replaces the others
     chunk = json.loads((tmp_path / "lod-meta.json").read_text())["filenames"][0].split("/")[0]
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([chunk, "0_0-notes", "lod-meta.json"])
-
-
-def test_a_chunk_elsewhere_is_refused(tmp_path, monkeypatch):
-    write_folder(tmp_path / "a", monkeypatch)
-    text = (tmp_path / "a" / "lod-meta.json").read_text()
-    (tmp_path / "a" / "lod-meta.json").write_text(text.replace('"0_0', '"../a/0_0'))
-    refused(read_gaussian_file, tmp_path / "a", "lies elsewhere")
+    assert {path.name for path in tmp_path.iterdir()} == {chunk, "0_0-notes", "lod-meta.json"}
 
 
 def test_a_zip_with_an_environment(tmp_path, bundled):

@@ -157,7 +157,6 @@ SECTIONS = {
 
 @pytest.fixture
 def path(tmp_path):
-    """A small file with everything."""
     write_scene(tmp_path / "a.sundae", full_scene(40, 1, 3))
     return tmp_path / "a.sundae"
 

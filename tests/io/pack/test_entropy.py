@@ -15,7 +15,6 @@ LARGEST = entropy.LARGEST
 
 
 def levels_of(n, width, seed):
-    """Numbers of every size, some of them the largest."""
     rng = np.random.default_rng(seed)
     found = np.rint(rng.laplace(size=(n, width)) * 10 ** rng.uniform(-1, 6, width)).astype(np.int32)
     found[rng.random((n, width)) < 0.02] = rng.choice([-LARGEST, LARGEST])
@@ -23,7 +22,6 @@ def levels_of(n, width, seed):
 
 
 def cells_of(n, bits, block, seed):
-    """Morton codes, sorted in each block."""
     codes = interleave(np.random.default_rng(seed).integers(0, 2**bits, (n, 3)).astype(np.uint64))
     for start in range(0, n, block):
         codes[start : start + block].sort()
@@ -57,7 +55,6 @@ def test_sizes_are_near_the_entropy(scale):
 
 
 def test_contexts_use_neighbours():
-    """Numbers like those of the neighbours cost less than without neighbours."""
     rng = np.random.default_rng(0)
     cells = rng.integers(0, 64, (4000, 3)).astype(np.uint64)
     cells = cells[np.argsort(interleave(cells))]

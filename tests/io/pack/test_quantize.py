@@ -64,7 +64,6 @@ def test_a_far_primitive_does_not_increase_the_error_of_others():
 
 
 def angles(a, b):
-    """Angles between rotations, radians, exact for small ones too."""
     a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (a, b))
     near = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
     return 4 * np.arcsin(np.minimum(near / 2, 1))
