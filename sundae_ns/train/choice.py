@@ -31,7 +31,7 @@ GAIN_PER_DOUBLING = 0.4
 twice this at the end of a run, and a trial shows a part of a gain."""
 LEAST_LOSS = 0.005  # Growth of the loss over the best measurement, as a share, from which on more training harms
 
-HELD_OUT_EVERY, FEW_HELD_OUT_EVERY, MOST_HELD_OUT = 8, 4, 16  # Every 8th training view, every 4th of few; at most 16
+HELD_OUT_EVERY, MOST_HELD_OUT = 8, 16  # Every 8th training view; at most 16
 FEW_VIEWS = 12  # With fewer training views, two are held out in turn, for trials of half the length
 HEAD_STEPS = 1200  # Length of a trial of a head within the shares below: shorter ones show too little
 LEAST_TRIAL, MOST_TRIAL = 0.04, 0.05
@@ -169,20 +169,17 @@ class Tolerance(NamedTuple):
 
     psnr: float = 0.1  # dB
     ssim: float = 0.003
-    summed: bool = False
-    """Whether the count with the least sum of both losses is taken: few views are too few for each on its own."""
 
     @classmethod
-    def of_drop(cls, psnr: float | None, *, few: bool = False) -> Tolerance:
+    def of_drop(cls, psnr: float | None) -> Tolerance:
         """The tolerance for a drop of PSNR in dB, SSIM in proportion; the usual one for None."""
-        return cls(summed=few) if psnr is None else cls(psnr, psnr * cls().ssim / cls().psnr)
+        return cls() if psnr is None else cls(psnr, psnr * cls().ssim / cls().psnr)
 
 
-def curve_of(tried: Sequence[Tried], *, few: bool = False) -> list[CurvePoint]:
+def curve_of(tried: Sequence[Tried]) -> list[CurvePoint]:
     """The curve of trials of counts, largest count first, measured with a fitted PSNR.
 
-    Losses of a trial whose images are not finite are infinite. There are no points if masks leave no pixel. Of few
-    views the figures are those that were measured: what smaller counts gain later was found where views are many.
+    Losses of a trial whose images are not finite are infinite. There are no points if masks leave no pixel.
     """
     if not tried or not tried[0].views:
         return []
@@ -191,8 +188,8 @@ def curve_of(tried: Sequence[Tried], *, few: bool = False) -> list[CurvePoint]:
     halvings = -np.log2(np.asarray(counts, dtype=np.float64))[:, None]
     columns = []
     for index, weights in ((3, PSNR_WEIGHTS), (2, SSIM_WEIGHTS)):
-        end, (weight, later) = values[:, :, index], (1.0, 0.0) if few else weights
-        expected = weight * end + later * halvings  # [T, V], up to a constant of the capture
+        end = values[:, :, index]
+        expected = weights[0] * end + weights[1] * halvings  # [T, V], up to a constant of the capture
         means = np.where(np.isfinite(expected).all(1), expected @ pixels, -np.inf)
         best = int(means.argmax())
         losses, errors = zip(*(_paired(expected[best] - row, pixels) for row in expected), strict=True)
@@ -244,10 +241,7 @@ def choose(curve: Sequence[CurvePoint], tolerance: Tolerance) -> int:
 
     Between the smallest tried count that is and the next smaller one, the loss is interpolated over the logarithm of
     the count. If PSNR and SSIM ask for different counts, the one that loses least, in tolerances, is taken.
-    Where losses are summed, it is the tried count with the least sum, in tolerances.
     """
-    if tolerance.summed:
-        return min(curve, key=lambda point: point.psnr_loss / tolerance.psnr + point.ssim_loss / tolerance.ssim).count
     over = [excess(point, tolerance) for point in curve]
     good = [index for index, value in enumerate(over) if value <= 1]
     if not good:
@@ -265,7 +259,7 @@ def choose_within(
 ) -> tuple[int, str]:
     """The count by :func:`choose` within a number of Gaussians and of bytes of the packed scene, and why."""
     count = choose(curve, tolerance)
-    reason = "the least loss in both figures" if tolerance.summed else "the fewest that are as good as the best"
+    reason = "the fewest that are as good as the best"
     fitting = None if most_bytes is None else affordable(curve, most_bytes)
     for name, limit in (("max-gaussians", most), ("max-bytes", fitting)):
         if limit is not None and limit < count:

@@ -5,8 +5,8 @@ pay:
 
 ``count``
     How many Gaussians the prune keeps (``pruning.keep_ratio`` left out), smaller ones in turn. Views are held out from
-    the first step: many Gaussians remember for long what they have seen once. Of few views every 4th is, fewer counts
-    are tried, and the one that loses least in PSNR and SSIM together is taken.
+    the first step: many Gaussians remember for long what they have seen once. Few views decide by their number alone:
+    what they would tell is less than what the training loses without them.
 ``tenth``
     If more than the usual share is chosen, that share is trained without and with a head: there it gains the sooner.
 ``head``
@@ -54,10 +54,9 @@ from sundae_ns.train.state import Callback, TrainingRun, TrainingState
 log = logging.getLogger(__name__)
 
 SHARES: tuple[float, ...] = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)  # Of the Gaussians that are tried
-FEW_SHARES: tuple[float, ...] = SHARES[1:5]  # With few views, which all Gaussians overfit
 COUNT_SHARE = 0.02  # Length of a trial of a count, and of a window of a length, as a share of the schedule
-MANY_VIEWS = 32  # With as many, the length is not tried: captures of 43 training views and more gain to the end
-FEWEST_TO_COUNT = 8  # Fewer training views cannot compare counts
+MANY_VIEWS = 32  # With as many, counts are tried, and no length is: captures of 43 training views gain to the end
+FEW_SHARE, USUAL_VIEWS = 0.05, 24  # Least share of the Gaussians that few views keep, and as many keep the usual share
 FEWEST_VIEWS = 6  # Fewer cannot judge a head
 MOST_CONTRIBUTING = 32  # Training views that the prune of a trial looks at
 MOST_TRIALS = 0.45  # Largest share of the steps after the prune that trials of counts, and of a head in them, may take
@@ -180,7 +179,7 @@ class Trials(Callback):
         self._mean = RunningMean()
         self._window = 1  # Steps of a trial of a count, and between two measurements of a length
         self._judges: list[int] = []  # Views that are held out for the trials of counts
-        self._few, self._shares = False, SHARES  # Whether training views are few, and what is tried
+        self._few_share: float | None = None  # Of the Gaussians that few training views keep; None with many
         self._folds: list[list[int]] = []  # Views that are held out for the trials of each head, one after another
         self._length = 1  # Steps of a trial of a head
         self._densification = densification
@@ -251,22 +250,22 @@ class Trials(Callback):
         progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
         self._window, indices = max(round(COUNT_SHARE * progress.steps), 1), run.view_indices()
         self._folds, self._length = choice.plan_heads(indices, progress.steps)
-        self._few = num_views < MANY_VIEWS
-        self._shares = FEW_SHARES if self._few else SHARES
-        every = choice.FEW_HELD_OUT_EVERY if self._few else choice.HELD_OUT_EVERY
-        self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // every), 0)
+        self._judges = choice.spread_cameras(indices, min(choice.MOST_HELD_OUT, num_views // choice.HELD_OUT_EVERY), 0)
+        if num_views < MANY_VIEWS:
+            self._few_share = max(FEW_SHARE, USUAL_SHARE * num_views / USUAL_VIEWS)
         if self.config.decides and "count" not in progress.chosen:
-            steps, left = len(self._shares) * self._window, _steps_of(run) - self.config.prune_at
+            steps, left = len(SHARES) * self._window, _steps_of(run) - self.config.prune_at
             steps += 2 * self._length if self.decides_head else 0
             obstacles = {
                 "trials of counts need a single GPU": several,
                 "a warm start has seen all training views before": state.offset > 0,
-                f"{num_views} training views are too few to compare counts": num_views < FEWEST_TO_COUNT,
                 "the steps after the prune are too few to compare counts": steps > MOST_TRIALS * left,
             }
             reason = next((reason for reason, holds in obstacles.items() if holds), None)
             if state.pruning["num_prunes"] and not progress.stage:  # by a share that was given
                 progress.chosen["count"] = 0
+            elif self._few_share is not None:  # of as many as there are at the prune
+                _warn_of_share(self._few_share, f"{num_views} training views are too few to compare counts")
             elif reason is not None:
                 self._keep_usual(run, reason)
             else:
@@ -291,7 +290,10 @@ class Trials(Callback):
         if progress.stage in ("count", "tenth"):
             self._go_on(run)
         elif self.config.decides and "count" not in progress.chosen and run.state.schedule_step >= self.config.prune_at:
-            self._begin_counts(run)
+            if self._few_share is None:
+                self._begin_counts(run)
+            else:
+                self._set_count(run, kept_count(self._few_share, run.source.total))
 
     def after_prune(self, run: TrainingRun) -> None:
         """Try heads and lengths, once the schedule has pruned."""
@@ -425,19 +427,19 @@ class Trials(Callback):
 
     def curve(self) -> list[CurvePoint]:
         """Expected quality over the counts that were tried, largest first, with a head if trials say that it pays."""
-        curve, tenth = choice.curve_of(self.progress.of("count"), few=self._few), self.progress.of("tenth")
+        curve, tenth = choice.curve_of(self.progress.of("count")), self.progress.of("tenth")
         return choice.with_head(curve, HeadGain.of(*tenth)) if self.progress.chosen.get("tenth") else curve
 
     @property
     def _tolerance(self) -> Tolerance:
-        return Tolerance.of_drop(self.config.max_drop, few=self._few)
+        return Tolerance.of_drop(self.config.max_drop)
 
     def _begin_counts(self, run: TrainingRun) -> None:
         state = run.state
         Pruner(state.gaussians, state.optimizers, [state.densification]).drop_nonfinite()
         self._densification.initialize(state)  # its statistics would not match the Gaussians that come back
         self.progress.full = run.source.total
-        self._announce(run, "how many Gaussians does the scene need?", len(self._shares), self._window, self._judges)
+        self._announce(run, "how many Gaussians does the scene need?", len(SHARES), self._window, self._judges)
         self.enable_head(state, False)
         self.keep("start", state, head=self.decides_head)
         self._try_count(run)
@@ -451,8 +453,8 @@ class Trials(Callback):
             curve = self.curve()
         usual = kept_count(USUAL_SHARE, progress.full)
         promising = number == 0 or (curve and not choice.is_lost(curve[-1], self._tolerance))
-        if progress.stage != "tenth" and number < len(self._shares) and promising:
-            count, length = kept_count(self._shares[number], progress.full), self._window
+        if progress.stage != "tenth" and number < len(SHARES) and promising:
+            count, length = kept_count(SHARES[number], progress.full), self._window
             self._prune(run, count)
             notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + length)
             self.start(run, "count", length, self._judges, width=0)
@@ -491,7 +493,7 @@ class Trials(Callback):
         self._set_count(run, count)
         log.info("\n".join(["expected at the end, on held-out training views:", *curve_table(curve)]))
         log.info(f"keeping {count:,} of {progress.full:,} Gaussians: {reason}")
-        if not self._few and choice.still_climbs(curve, self._tolerance):
+        if choice.still_climbs(curve, self._tolerance):
             more = "a lower --pipeline.model.densify-grad-thresh makes more Gaussians, which the scene may need"
             log.info(f"quality still grows at the full count: {more}")
         run.log_scalars("Curve", {"chosen": count, "full": progress.full})
@@ -507,9 +509,7 @@ class Trials(Callback):
         self._record(run, count=record)
 
     def _keep_usual(self, run: TrainingRun, reason: str) -> None:
-        log.warning(
-            f"pruning keeps {USUAL_SHARE:.0%} of the Gaussians: {reason}; --pipeline.model.pruning.keep-ratio sets it"
-        )
+        _warn_of_share(USUAL_SHARE, reason)
         self._set_count(run, 0)
 
     def _set_count(self, run: TrainingRun, count: int) -> None:
@@ -640,6 +640,10 @@ class AfterPrune(Callback):
     def after_step(self, run: TrainingRun) -> None:
         """Try heads and lengths."""
         self._trials.after_prune(run)
+
+
+def _warn_of_share(share: float, reason: str) -> None:
+    log.warning(f"pruning keeps {share:.0%} of the Gaussians: {reason}; --pipeline.model.pruning.keep-ratio sets it")
 
 
 def _steps_of(run: TrainingRun) -> int:

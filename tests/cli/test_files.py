@@ -234,7 +234,7 @@ def test_prune_uses_the_gpu(tmp_path, monkeypatch):
         devices.append(scene.device.type)
         return whole(scene, *arguments, **options)
 
-    monkeypatch.setattr(pruning, "prune_with_mask", noted)
+    monkeypatch.setattr("sundae_ns.cli.inputs.prune_with_mask", noted)
     sn.save(sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3)), tmp_path / "a.ply")
     for name in ("out.ply", "out.sundae"):
         assert run("prune", tmp_path / "a.ply", "-o", tmp_path / name, "--count", "50", "--num-cameras", "8") == 0

@@ -40,16 +40,6 @@ def test_where_no_count_is_best_in_both_figures_the_one_that_loses_least_is_take
     assert choose([point(n, *loss) for n, loss in zip((1000, 400, 200, 100), losses, strict=True)], Tolerance()) == 400
 
 
-def test_few_views_take_the_least_sum_of_what_was_measured():
-    """In tolerances of 0.1 dB and 0.003; what smaller counts gain later is not added."""
-    measured = {400: (20.0, 0.700), 200: (20.2, 0.697), 100: (20.4, 0.695), 50: (20.41, 0.680)}
-    rows = [Tried("count", n, "plain", 9, [[9, 0, similarity, psnr]]) for n, (psnr, similarity) in measured.items()]
-    curve = curve_of(rows, few=True)
-    assert [(one.psnr, one.ssim) for one in curve] == [pytest.approx(figures) for figures in measured.values()]
-    assert choose(curve, Tolerance.of_drop(None, few=True)) == 100
-    assert choose(curve, Tolerance.of_drop(0.4, few=True)) < 400  # a drop that was asked for is kept in both figures
-
-
 def test_a_budget_in_bytes_is_in_proportion_to_the_one_size_that_is_known():
     assert affordable([point(1000, size=16000)], 8000) == pytest.approx(500, abs=1)
 
