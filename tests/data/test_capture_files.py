@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import sys
 import zipfile
 from contextlib import nullcontext
@@ -21,18 +20,9 @@ from scipy.spatial.transform import Rotation
 from sundae_ns.core.errors import DataError
 from sundae_ns.data import capture_files
 from sundae_ns.data.capture import check_transforms
-from sundae_ns.data.capture_files import (
-    APPLIED,
-    ARCHIVE,
-    Placed,
-    names_of,
-    placed_in,
-    write_demo_capture,
-    write_images,
-    write_smaller,
-)
+from sundae_ns.data.capture_files import APPLIED, Placed, names_of, placed_in, write_demo_capture, write_images
 from sundae_ns.data.images import check_image, reads_heif
-from sundae_ns.data.photos import find_photos
+from sundae_ns.data.photos import find_photos, photo_of
 from sundae_ns.scene.cameras import cameras_of
 
 PARAMETERS = [50.0, 60.0, 20.0, 15.0, 0.01, -0.02, 0.003, 0.004]
@@ -43,19 +33,16 @@ def model(cameras=1):
     images = []
     for i, number in enumerate((5, 4, 3, 2, 9)):
         pose = np.column_stack([Rotation.random(random_state=i).as_matrix(), np.random.default_rng(i).normal(size=3)])
-        camera, stated = 1 + i % cameras, SimpleNamespace(matrix=lambda pose=pose: pose)
-        name = f"c{camera}/frame_{number:05d}.jpg"
-        images.append(
-            SimpleNamespace(name=name, camera_id=camera, has_pose=number != 9, cam_from_world=lambda s=stated: s)
-        )
+        pose_of, camera = lambda pose=pose: SimpleNamespace(matrix=lambda: pose), 1 + i % cameras
+        known = {"name": f"c{camera}/frame_{number:05d}.jpg", "camera_id": camera, "has_pose": number != 9}
+        images.append(SimpleNamespace(**known, cam_from_world=pose_of))
     stated = [SimpleNamespace(width=40 + i, height=30, params=np.array(PARAMETERS)) for i in range(cameras)]
     return SimpleNamespace(images=dict(enumerate(images)), cameras=dict(enumerate(stated, start=1)))
 
 
 def transforms(made):
-    return capture_files.transforms_of(
-        made, {image.name: f"IMG {image.name[-9:-4]}.HEIC" for image in made.images.values()}
-    )
+    sources = {image.name: f"IMG {image.name[-9:-4]}.HEIC" for image in made.images.values()}
+    return capture_files.transforms_of(made, sources)
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
@@ -116,9 +103,9 @@ def gradient(width=40, height=24):
     return Image.fromarray(np.stack([x, y, np.zeros_like(x)], axis=2).astype(np.uint8))
 
 
-def written(folder, out):
-    photos = find_photos(folder)
-    done = []
+def written(out, *paths):
+    """Paths of the images that are written of photos."""
+    photos, done = [photo_of(path) for path in paths], []
     assert [*write_images(photos, out, str, done.append)] == names_of(photos)
     assert sum(done) == len(photos)
     return [out / name for name in names_of(photos)]
@@ -135,16 +122,15 @@ def test_photos_of_one_camera_share_a_folder(tmp_path):
     assert names_of(find_photos(tmp_path)) == [*(f"{name}.jpg" for name in names[:4]), f"{names[4]}.png"]
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_photos_become_upright(tmp_path, orientation):
-    turns = [None, "FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM"]
-    turns += ["TRANSPOSE", "ROTATE_90", "TRANSVERSE", "ROTATE_270"]
-    turn = turns[orientation - 1]
+TURNS = [None, "FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE", "ROTATE_90", "TRANSVERSE", "ROTATE_270"]
+
+
+@pytest.mark.parametrize(("orientation", "turn"), enumerate(TURNS, start=1))
+def test_photos_become_upright(tmp_path, orientation, turn):
     stored = gradient() if turn is None else gradient().transpose(Image.Transpose[turn])
-    for name in ("a", "b", "c"):
-        photo(tmp_path / f"{name}.jpg", image=stored, orientation=orientation)
-    assert find_photos(tmp_path)[0].as_it_is == (orientation == 1)
-    with Image.open(written(tmp_path, tmp_path / "out")[0]) as image:
+    path = photo(tmp_path / "a.jpg", image=stored, orientation=orientation)
+    assert photo_of(path).as_it_is == (orientation == 1)
+    with Image.open(*written(tmp_path / "out", path)) as image:
         assert image.getexif().get(ORIENTATION, 1) == 1
         assert image.size == (40, 24)
         assert np.abs(np.asarray(image, float) - np.asarray(gradient(), float)).mean() < 6
@@ -158,25 +144,25 @@ def test_files_that_can_stay_are_copied_and_others_saved(tmp_path):
     gradient().save(tmp_path / "c.tif")
     clear.save(tmp_path / "d.webp", lossless=True)
     gradient().convert("L").save(tmp_path / "e.bmp")
-    paths = written(tmp_path, tmp_path / "out")
+    sources = sorted(tmp_path.iterdir())
+    paths = written(tmp_path / "out", *sources)
     kinds = [("JPEG", "RGB"), ("PNG", "RGB"), ("JPEG", "RGB"), ("PNG", "RGBA"), ("JPEG", "L")]
     for path, (kind, mode) in zip(paths, kinds, strict=True):
         with Image.open(path) as image:
             assert (path.suffix, image.format, image.mode) == ({"JPEG": ".jpg"}.get(kind, ".png"), kind, mode)
-    for name, path in zip(("a.jpg", "b.png"), paths):
-        assert path.read_bytes() == (tmp_path / name).read_bytes()
+    for source, path in zip(sources[:2], paths):
+        assert path.read_bytes() == source.read_bytes()
     before = paths[0].stat().st_mtime_ns
     paths[1].unlink()
-    write_images(find_photos(tmp_path), tmp_path / "out", str, str)
+    written(tmp_path / "out", *sources)
     assert (paths[0].stat().st_mtime_ns, paths[1].exists()) == (before, True), "what is there stays"
 
 
 def test_heic_is_turned_as_its_box_says(tmp_path):
     if not reads_heif():
         pytest.skip("pillow-heif is not installed")
-    for name in ("a", "b", "c"):
-        photo(tmp_path / f"{name}.HEIC", image=gradient(), orientation=6)
-    with Image.open(written(tmp_path, tmp_path / "out")[0]) as image:
+    path = photo(tmp_path / "a.HEIC", image=gradient(), orientation=6)
+    with Image.open(*written(tmp_path / "out", path)) as image:
         assert (image.size, image.getexif().get(ORIENTATION, 1)) == ((24, 40), 1)
         assert image.getpixel((2, 20))[1] > image.getpixel((21, 20))[1] + 100  # the bottom is at the left
 
@@ -200,7 +186,7 @@ def test_pixels_that_cannot_be_decoded(tmp_path, kind):
 def test_smaller_images(tmp_path, width, factors):
     (tmp_path / "images").mkdir()
     gradient(width, 19).save(tmp_path / "images" / "a.jpg")
-    write_smaller(tmp_path / "images", lambda _: None)
+    capture_files.write_smaller(tmp_path / "images", lambda _: None)
     assert {path.name for path in tmp_path.iterdir()} == {"images", *(f"images_{factor}" for factor in factors)}
     for factor in factors:
         with Image.open(tmp_path / f"images_{factor}" / "a.jpg") as image:
@@ -213,8 +199,8 @@ class Raw(nullcontext[Any]):
 
     def __init__(self, path):
         super().__init__(self)
-        self.size = (16, 12) if Path(path).stem != "odd" else (12, 16)
-        self.sizes = SimpleNamespace(iwidth=16, iheight=12, flip=0 if self.size == (16, 12) else 5)
+        self.size, flip = ((12, 16), 5) if Path(path).stem == "odd" else ((16, 12), 0)
+        self.sizes = SimpleNamespace(iwidth=16, iheight=12, flip=flip)
 
     def postprocess(self):
         return np.asarray(gradient(*self.size))
@@ -222,14 +208,14 @@ class Raw(nullcontext[Any]):
 
 def test_raw_photos(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rawpy", SimpleNamespace(imread=Raw))
-    for name in ("a", "b", "c"):
-        (tmp_path / f"{name}.CR2").write_bytes(b"II*\0\x10\0\0\0CR\2\0" + bytes(100))
-    with Image.open(written(tmp_path, tmp_path / "out")[2]) as image:
-        assert (image.format, image.size) == ("JPEG", (16, 12))
-    (tmp_path / "c.CR2").rename(tmp_path / "odd.CR2")
-    shutil.rmtree(tmp_path / "out")
+    paths = [tmp_path / f"{name}.CR2" for name in ("a", "b", "odd")]
+    for path in paths:
+        path.write_bytes(b"II*\0\x10\0\0\0CR\2\0" + bytes(100))
     assert [photo.size for photo in find_photos(tmp_path)] == [(16, 12), (16, 12), (12, 16)]
-    assert [path.parent.name for path in written(tmp_path, tmp_path / "out")] == ["c1", "c1", "c2"]
+    images = written(tmp_path / "out", *paths)
+    assert [path.parent.name for path in images] == ["c1", "c1", "c2"]
+    with Image.open(images[0]) as image:
+        assert (image.format, image.size) == ("JPEG", (16, 12))
 
 
 TRAIN, TEST, SIDE = 48, 8, 128  # of the demo's capture
@@ -241,7 +227,7 @@ def test_a_copy_is_a_sound_capture_and_is_replaced(tmp_path):
     meta = json.loads((copy / "transforms.json").read_text())
     assert (len(meta["train_filenames"]), len(meta["test_filenames"])) == (TRAIN, TEST)
     assert {check_image(copy / frame["file_path"]) for frame in meta["frames"]} == {(SIDE, SIDE)}
-    assert ARCHIVE.stat().st_size < 1_400_000
+    assert capture_files.ARCHIVE.stat().st_size < 1_400_000
     for name in ("notes.txt", "images/frame_00001.png"):
         (copy / name).write_text("mine")
     write_demo_capture(copy)

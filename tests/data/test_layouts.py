@@ -8,6 +8,7 @@ import pytest
 from colmap_models import write_model
 from limits import refused
 from photos import photos
+from small_captures import write_text_model
 
 from sundae_ns.core.errors import DataError
 from sundae_ns.data import layouts
@@ -80,7 +81,9 @@ def test_a_capture_of_blender(tmp_path):
 def test_what_cannot_be_read_is_named(tmp_path):
     model(tmp_path / "sparse" / "0", 1)
     refused(posed_layout, tmp_path, r"no image 0\.png, which its model sparse/0 states, in images, input")
-    (tmp_path / "sparse" / "0" / "images.bin").write_bytes(b"\0")
+    images = tmp_path / "sparse" / "0" / "images.bin"
+    assert str(no_transforms(images)) == f"{images} is a file, not a capture; sundae poses makes a capture of a video"
+    images.write_bytes(b"\0")
     refused(posed_layout, tmp_path, r"sparse/0/images\.bin is not a complete images\.bin")
 
 
@@ -90,10 +93,7 @@ def _several(data):
 
 
 def _text(data):
-    folder = data / "colmap" / "sparse" / "0"
-    folder.mkdir(parents=True)
-    (folder / "cameras.txt").write_text("1 PINHOLE 20 16 18 18 10 8\n")
-    (folder / "images.txt").write_text("1 1 0 0 0 0 0 3 1 a.png\n\n")
+    write_text_model(data / "colmap" / "sparse" / "0", ["a.png"])
 
 
 def _inner(data):
@@ -113,9 +113,8 @@ ADVICE = {
 }
 
 
-@pytest.mark.parametrize("kind", ADVICE)
-def test_advice_fits_what_a_folder_holds(tmp_path, kind):
-    make, advice = ADVICE[kind]
+@pytest.mark.parametrize(("make", "advice"), ADVICE.values(), ids=ADVICE)
+def test_advice_fits_what_a_folder_holds(tmp_path, make, advice):
     make(tmp_path)
     assert advice in str(no_transforms(tmp_path))
     assert "\n" not in str(no_transforms(tmp_path))

@@ -4,32 +4,22 @@ The file's ``checks(FOLDER)`` run in their order; the error of each, or "", is w
 forked off a process that has imported the file, so that they do not import nerfstudio themselves.
 """
 
-import importlib.util
 import json
 import multiprocessing
+import runpy
 import sys
 import time
 import traceback
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))  # as pytest does
-
 import torch
 import torch.distributed as dist
 
 
-def imported(file):
-    spec = importlib.util.spec_from_file_location(Path(file).stem, file)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[module.__name__] = module  # dataclasses look their module up by name
-    spec.loader.exec_module(module)
-    return module
-
-
-def go_through(module, rank, ranks, folder):
+def go_through(checks, rank, ranks, folder):
     dist.init_process_group("gloo", init_method=f"file://{folder / 'meeting'}", rank=rank, world_size=ranks)
     results = {}
-    for name, check in module.checks(folder).items():
+    for name, check in checks(folder).items():
         try:
             check(rank)
             results[name] = ""
@@ -44,8 +34,8 @@ def go_through(module, rank, ranks, folder):
 
 def main(file, ranks, folder, seconds):
     torch.set_num_threads(1)
-    module, fork = imported(file), multiprocessing.get_context("fork")
-    programs = [fork.Process(target=go_through, args=(module, rank, ranks, folder)) for rank in range(ranks)]
+    checks, fork = runpy.run_path(file)["checks"], multiprocessing.get_context("fork")
+    programs = [fork.Process(target=go_through, args=(checks, rank, ranks, folder)) for rank in range(ranks)]
     end = time.monotonic() + seconds
     for program in programs:
         program.start()

@@ -10,13 +10,12 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from PIL import Image
 from small_captures import meta_of
 
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.plugin.datamanager import DATASET_FRAME, SundaeDatamanagerConfig, check_cameras
+from sundae_ns.plugin.datamanager import SundaeDatamanagerConfig, check_cameras
 
 VIEWS, SIDE = 10, 24
 
@@ -29,7 +28,6 @@ def test_the_order_is_a_function_of_seed_and_step(still_life, load):
     assert len(set(passes)) > 1
     # Asked in any order, as a resumed run or a viewer may.
     assert [again.view_of_step(step) for step in reversed(range(40))] == order[::-1]
-    assert [first.view_of_step(step) for step in (39, 3, 20)] == [order[39], order[3], order[20]]
     assert [other.view_of_step(step) for step in range(40)] != order
 
 
@@ -125,12 +123,6 @@ def test_images_that_do_not_fit_on_the_gpu_stay_in_main_memory(still_life, load,
     assert "the train images need more than half of the free GPU memory" in " ".join(capsys.readouterr().out.split())
 
 
-def test_image_of_another_size_is_named(capture, load):
-    Image.new("RGB", (18, SIDE)).save(sorted((capture / "images").iterdir())[1])
-    with pytest.raises(DataError, match=r"frame_00002\.png is 18 x 24 px but its camera says 24 x 24"):
-        load(capture).next_train(0)
-
-
 def test_undistorted_test_views_are_not_checked_against_their_cropped_cameras(capture, load, edit):
     edit(capture, k1=0.3, k2=0.1)
     made = load(capture)
@@ -149,54 +141,11 @@ def test_images_may_differ_where_each_has_its_own_camera(capture, load, edit):
     assert len({batch["image"].shape for batch in load(capture).cached_train}) == VIEWS
 
 
-@pytest.mark.usefixtures("open3d")
-def test_point_cloud_as_nerfstudio_reads_it(still_life, load):
-    config = NerfstudioDataParserConfig(data=still_life, load_3D_points=True)
-    theirs = Nerfstudio(config).get_dataparser_outputs("train").metadata
-    ours = load(still_life).train_dataparser_outputs.metadata
-    torch.testing.assert_close(ours["points3D_xyz"], theirs["points3D_xyz"], atol=1e-6, rtol=1e-6)
-    # nerfstudio rounds colours down on their way through floats.
-    assert (ours["points3D_rgb"].int() - theirs["points3D_rgb"].int()).abs().max() <= 1
-    assert ours["points3D_rgb"].dtype == torch.uint8
-
-
 def test_point_cloud_needs_no_open3d(still_life, load, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    assert len(load(still_life).train_dataparser_outputs.metadata["points3D_xyz"]) == 80
-
-
-def test_frame_of_the_capture_goes_to_the_model(still_life, load):
-    made = load(still_life)
-    transform, scale = made.train_dataset.metadata[DATASET_FRAME]
-    pose = torch.tensor(meta_of(still_life)["frames"][0]["transform_matrix"])
-    center = scale * (transform[:, :3] @ pose[:3, 3] + transform[:, 3])
-    distances = (made.train_dataset.cameras.camera_to_worlds[:, :, 3] - center).norm(dim=1)
-    assert distances.min() < 1e-5
-
-
-def test_missing_point_cloud(capture, load, edit):
-    (capture / "sparse_pc.ply").unlink()
-    with pytest.raises(DataError, match=r"sparse_pc\.ply does not exist; .*ply_file_path"):
-        load(capture)
-    edit(capture, ply_file_path=None)
-    assert "points3D_xyz" not in load(capture).train_dataparser_outputs.metadata
-
-
-@pytest.mark.parametrize(
-    ("file", "data", "advice"),
-    [
-        ("a.jpg", "", "has no transforms.json; make a capture of images with `sundae poses "),
-        ("sparse/0/cameras.bin", "", "it is in COLMAP layout: add `colmap --colmap-path sparse/0` to ns-train"),
-        ("colmap/sparse/0/cameras.txt", "", "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
-        ("walk.mp4", "walk.mp4", "is a file, not a capture; sundae poses"),
-        ("other", "gone", "correct data in the run's config.yml"),
-    ],
-)
-def test_what_is_no_capture_says_how_to_make_one_of_it(tmp_path, load, file, data, advice):
-    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / file).touch()
-    with pytest.raises(DataError, match=advice):
-        load(tmp_path / data)
+    outputs = load(still_life).train_dataparser_outputs
+    assert len(outputs.metadata["points3D_xyz"]) == 80
+    assert outputs.metadata["points3D_rgb"].dtype == torch.uint8
 
 
 def cameras(*, focal=20.0, mirrored=False, spread=1.0, outlier=0.0):
@@ -219,9 +168,8 @@ NAMES = [Path(f"{index}.png") for index in range(6)]
     ],
 )
 def test_cameras_that_cannot_be(options, cause):
-    with pytest.raises(DataError, match=cause) as caught:
+    with pytest.raises(DataError, match=f"^.*({cause}).*$"):
         check_cameras(cameras(**options), NAMES)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -239,32 +187,37 @@ def test_cameras_that_make_no_good_scene(options, cause, caplog):
     assert [bool(cause and re.search(cause, line)) for line in caplog.messages] == [True] * bool(cause)
 
 
+def changed(data, change, count):
+    """Change the first images of a capture."""
+    for path in sorted((data / "images").iterdir())[:count]:
+        with Image.open(path) as opened:
+            image = change(opened.convert("RGBA"))
+        image.save(path)
+
+
 def test_alpha_is_named(capture, load, capsys):
     load(capture).next_train(0)
     assert "alpha" not in capsys.readouterr().out
-    for path in sorted((capture / "images").iterdir())[:3]:
-        with Image.open(path) as image:
-            image.convert("RGBA").save(path)
+    changed(capture, lambda image: image, 3)
     made = load(capture)
     made.next_train(0)
     kept = sum(batch["image"].shape[-1] == 4 for batch in made.cached_train)
     assert 0 < kept < VIEWS
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"{kept} of {VIEWS} training images have an alpha channel" in shown
-    assert "empty space" in shown
+    assert f"{kept} of {VIEWS} training images have an alpha channel: what is transparent is trained to be" in shown
 
 
 @pytest.mark.parametrize("way", ["transparent", "masked", "transparent where it is not masked"])
 def test_images_that_show_nothing(capture, load, edit, way):
-    meta = meta_of(capture)
-    for path in sorted((capture / "images").iterdir()):
-        with Image.open(path) as opened:
-            image = opened.convert("RGBA")
+    def change(image):
         if way != "masked":
-            image.putalpha(Image.new("L", image.size, 0))
+            image.putalpha(0)
         if way.endswith("not masked"):
             image.putpixel((0, 0), (9, 9, 9, 255))
-        image.save(path)
+        return image
+
+    changed(capture, change, VIEWS + 2)
+    meta = meta_of(capture)
     if way != "transparent":
         mask = Image.new("L", (SIDE, SIDE), 0 if way == "masked" else 255)
         mask.putpixel((0, 0), 0)
@@ -273,9 +226,7 @@ def test_images_that_show_nothing(capture, load, edit, way):
     with pytest.raises(DataError, match=f"all {VIEWS} training images are fully transparent or masked"):
         load(capture).next_train(0)
     if way == "transparent":  # one image is enough
-        first = capture / meta["train_filenames"][0]
-        with Image.open(first) as opened:
-            opened.convert("RGB").save(first)
+        Image.new("RGB", (SIDE, SIDE)).save(capture / meta["train_filenames"][0])
         load(capture).next_train(0)
 
 
@@ -288,9 +239,8 @@ def test_a_question_without_a_terminal(still_life, monkeypatch):
 
     monkeypatch.setattr(ColmapDataParserConfig().__class__, "setup", ask)
     config = SundaeDatamanagerConfig(data=still_life, dataparser=ColmapDataParserConfig(downscale_factor=2))
-    with pytest.raises(DataError, match="start the command once in a terminal and answer y") as caught:
+    with pytest.raises(DataError, match="^.*start the command once in a terminal and answer y.*$"):
         config.setup(device="cpu", test_mode="val")
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -310,9 +260,8 @@ def test_a_question_without_a_terminal(still_life, monkeypatch):
 )
 def test_captures_and_options_that_cannot_be_used(capture, load, edit, edits, options, cause):
     edit(capture, **edits)
-    with pytest.raises((ConfigError, DataError), match=cause) as caught:
+    with pytest.raises((ConfigError, DataError), match=f"^.*({cause}).*$"):
         load(capture, **options).next_train(0)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("scaled", [True, False])

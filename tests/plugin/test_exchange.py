@@ -12,7 +12,6 @@ import torch
 from fields import normal_field
 from hypothesis import given
 from hypothesis import strategies as st
-from photographed import COUNT, batch_of, begin, image_of, update
 from splat_inputs import geometry
 from torch.nn import Parameter, ParameterDict
 
@@ -26,6 +25,7 @@ from sundae_ns.rasterize.interface import rasterize, select_backend
 from sundae_ns.rasterize.reference import project
 from sundae_ns.rasterize.types import Inputs
 from sundae_ns.scene.render import ColorSettings, GaussianSource
+from sundae_ns.train.exposure import ExposureCompensation
 from sundae_ns.train.state import Callback, TrainingState
 
 REFERENCE = select_backend("reference", "cpu")
@@ -56,13 +56,9 @@ def camera(rank, *, behind=False):
 
 def draw(source, camera):
     params = source.primitives(camera, COLORS, features=True)
-    inputs = Inputs(
-        *(params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid().squeeze(-1)),
-        torch.cat([params["colors"], params["features"]], dim=1),
-        camera,
-        absgrad=True,
-        render_depth=True,
-    )
+    shapes = params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid().squeeze(-1)
+    colors = torch.cat([params["colors"], params["features"]], dim=1)
+    inputs = Inputs(*shapes, colors, camera, absgrad=True, render_depth=True)
     shown = rasterize(inputs, backend=REFERENCE)
     if shown.info["means2d"].requires_grad:
         shown.info["means2d"].retain_grad()
@@ -144,13 +140,11 @@ class Halving(Callback):
 
 
 def shared(rank, state):
-    ranks, model = (
-        Ranks(rank, RANKS),
-        SimpleNamespace(state=state, train_callbacks=[], source=GaussianSource(state.gaussians)),
-    )
-    model.device = torch.device("cpu")
-    optimizers = SimpleNamespace(parameters={})
+    ranks, optimizers = Ranks(rank, RANKS), SimpleNamespace(parameters={})
+    model = SimpleNamespace(state=state, source=GaussianSource(state.gaussians), device="cpu")
+    model.train_callbacks = [ExposureCompensation(3, "on")]
     ranks.share(model, SimpleNamespace(rank=0), optimizers)
+    assert model.train_callbacks[0].total is _summed
     assert all(held[0] is state.gaussians[name] for name, held in optimizers.parameters.items())
     return ranks, model
 
@@ -218,24 +212,9 @@ def check_optimizers(rank):
     assert (group["lr"], group["betas"]) == (0.01, (0.9, 0.999))
 
 
-def check_gains_of_photos(rank):
-    """All ranks divide photos by the same gains, from what both have measured."""
-    gains, run = begin()
-    gains.total = _summed
-    for index in range(rank, COUNT, 2):
-        gains.observe(image_of(index), image_of(index) * (1.3 if index % 3 else 1.0), None, batch_of(index))
-    update(gains, run)
-    state = gains.state_dict()
-    assert state["counts"].tolist() == [1] * COUNT
-    expected = torch.tensor([1.3 if index % 3 else 1.0 for index in range(COUNT)]).log()
-    torch.testing.assert_close(state["measured"].mean(dim=1).float(), expected, rtol=1e-4, atol=1e-4)
-    assert state["gains"].std() > 0.05
-
-
 def checks(_):
     """The checks of each rank, in this order."""
-    every = (check_drawing, check_gathering, check_an_empty_shard, check_optimizers, check_gains_of_photos)
-    return {check.__name__: check for check in every}
+    return {check.__name__: check for check in (check_drawing, check_gathering, check_an_empty_shard, check_optimizers)}
 
 
 @pytest.fixture(scope="module")
@@ -275,8 +254,7 @@ def test_all_rendered_gaussians_may_be_seen(seed, shape):
 
 def test_nan_depth_is_not_seen():
     means = torch.tensor([[0.0, 0.0, 2.0], [torch.nan, 0.0, 2.0], [0.0, 0.0, torch.nan], [0.0, 0.0, 0.0]])
-    (seen,) = may_be_seen(
-        means, torch.full((4, 3), -2.3), torch.eye(4)[None], torch.eye(3)[None], torch.full((1, 2), 10.0)
-    )
-    assert seen.tolist()[0]
+    pose, K, size = torch.eye(4)[None], torch.eye(3)[None], torch.full((1, 2), 10.0)
+    (seen,) = may_be_seen(means, torch.full((4, 3), -2.3), pose, K, size)
+    assert seen[0]
     assert not seen[2:].any()

@@ -9,6 +9,7 @@ import torch
 import torchmetrics.image
 from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor
+from trial_runs import same
 
 from sundae_ns.core.camera import crop_image
 from sundae_ns.core.errors import BackendError, CheckpointError, ConfigError
@@ -38,18 +39,15 @@ def test_it_is_a_splatfacto_whose_groups_have_features_and_head(build):
     ],
 )
 def test_options_that_cannot_work(build, options, cause):
-    with pytest.raises(ConfigError, match=cause) as caught:
+    with pytest.raises(ConfigError, match=f"^.*({cause}).*$"):
         build(**options)
-    assert "\n" not in str(caught.value)
 
 
-def test_gsplat_without_cuda(build, training_of, monkeypatch):
+def test_gsplat_without_cuda_is_refused_before_the_first_step(build, training_of, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     model = build(rasterizer="gsplat")
-    with pytest.raises(BackendError, match="CUDA is not available") as caught:
+    with pytest.raises(BackendError, match="CUDA is not available[^\n]*$"):
         training_of(model)
-    assert "\n" not in str(caught.value)
-    assert build(rasterizer="auto").backend.name == "cpu"
 
 
 def saved(model, path):
@@ -57,74 +55,48 @@ def saved(model, path):
     return torch.load(path, weights_only=True)
 
 
-def test_round_trip_into_another_count_keeps_optimizers_alive(build, training_of, tmp_path):
-    source = training_of(build())
-    for step in range(5):
+@pytest.mark.parametrize("steps", [1, 5])
+def test_round_trip_into_another_count_keeps_optimizers_alive(build, training_of, tmp_path, steps):
+    """During densification, and after the prune."""
+    source, target = training_of(build()), training_of(build(n=25))
+    for step in range(steps):
         source.step(step)
-    state = saved(source.model, tmp_path / "a.pt")
-    assert source.model.num_points == 30
-
-    target = training_of(build(n=25))
+    assert source.model.num_points == (60 if steps == 1 else 30)
     held = dict(target.model.gauss_params.items())
-    target.model.load_state_dict(state)
-    for name, value in target.model.gauss_params.items():
-        assert value is held[name]
-        assert torch.equal(value, source.model.gauss_params[name])
-    assert target.model.step == 4
-    assert target.model.state.pruning == source.model.state.pruning
-    assert target.model.state.head_enabled
-    for (_, ours), (_, theirs) in zip(
-        target.model.head.named_parameters(),
-        source.model.head.named_parameters(),
-        strict=True,
-    ):
-        assert torch.equal(ours, theirs)
+    target.model.load_state_dict(saved(source.model, tmp_path / "a.pt"))
+    assert all(target.model.gauss_params[name] is value for name, value in held.items())
+    for name, value in source.model.state_dict().items():
+        if isinstance(value, Tensor):
+            assert torch.equal(target.model.state_dict()[name], value), name
+    assert target.model.step == steps - 1
+    same(target.model.state.running_states(), source.model.state.running_states())
+    assert target.model.state.head_enabled == source.model.state.head_enabled == (steps == 5)
     target.optimizers.load_optimizers(deepcopy({k: v.state_dict() for k, v in source.optimizers.optimizers.items()}))
     assert target.live()
-    torch.manual_seed(5)
-    expected = source.step(5)
-    torch.manual_seed(5)
-    found = target.step(5)
-    assert target.model.num_points == 30
-    for name, value in expected.items():
-        torch.testing.assert_close(found[name], value)
+    losses = []
+    for training in (source, target):
+        torch.manual_seed(5)
+        losses.append(training.step(steps))
+    torch.testing.assert_close(losses[1], losses[0])
     for name, value in target.model.gauss_params.items():
         torch.testing.assert_close(value, source.model.gauss_params[name])
 
 
-def test_state_of_densification_is_kept(build, training_of, tmp_path):
-    source = training_of(build())
-    source.step(0)
-    assert source.model.state.densification["grad2d"].any()
-    target = build(n=25)
-    target.load_state_dict(saved(source.model, tmp_path / "a.pt"))
-    assert torch.equal(target.state.densification["grad2d"], source.model.state.densification["grad2d"])
-    assert target.state.densification["scene_scale"] == source.model.state.densification["scene_scale"]
-
-
-def _stock(state):
-    return {k: v for k, v in state.items() if k.startswith("gauss_params.") and not k.endswith(".features")}
-
-
 @pytest.mark.parametrize(
-    ("options", "change", "cause"),
+    ("options", "cause"),
     [
-        ({}, _stock, "splatfacto checkpoint.*warm-start"),
-        ({"head": {"num_features": 1}}, None, "has num_features 1, the model 5"),
-        ({"head": {"mode": "off"}}, None, "has num_features 0, the model 5"),
-        ({"head": {"size": "compact"}}, None, "head"),
-        ({"head": {"mode": "features"}}, None, "head"),
-        ({"sh_degree": 2}, None, "features_rest"),
+        ({"head": {"mode": "off"}}, "has num_features 0, the model 5"),
+        ({"head": {"size": "compact"}}, "head"),
+        ({"head": {"mode": "features"}}, "head"),
+        ({"sh_degree": 2}, "features_rest"),
     ],
 )
-def test_other_checkpoints_are_refused_and_nothing_changes(build, options, change, cause):
-    state = build(n=25, **options).state_dict()
-    model = build()
+def test_other_checkpoints_are_refused_and_nothing_changes(build, options, cause):
+    state, model = build(n=25, **options).state_dict(), build()
     before = {name: value.detach().clone() for name, value in model.named_parameters()}
-    with pytest.raises(CheckpointError, match=cause) as caught:
-        model.load_state_dict(change(state) if change else state)
-    assert isinstance(caught.value, ValueError)
-    assert "\n" not in str(caught.value)
+    with pytest.raises(CheckpointError, match=f"{cause}[^\n]*$") as caught:
+        model.load_state_dict(state)
+    assert isinstance(caught.value, ValueError), "nerfstudio would catch a RuntimeError, and load what fits"
     assert all(torch.equal(value, before[name]) for name, value in model.named_parameters())
 
 
@@ -147,16 +119,11 @@ def test_continuous_pruning_and_densification_share_a_field(build, training_of):
         counts.append(model.num_points)
         if step > 3:
             assert training.live()
-        assert all(
-            len(value) == model.num_points
-            for value in model.state.densification.values()
-            if isinstance(value, Tensor) and value.ndim
-        )
-    assert [counts[step] for step in (4, 8, 12)] == [40, 40, 40]
-    assert max(counts) > 40
+        rows = [value for value in model.state.densification.values() if isinstance(value, Tensor) and value.ndim]
+        assert {len(value) for value in rows} <= {model.num_points}
     # The cap holds at every step, and between growing and culling; densification ends with the last prune.
-    assert 40 < model.state.pruning["peak"] <= 70
-    assert counts[12:] == [40, 40, 40]
+    assert 40 < max(counts) <= model.state.pruning["peak"] <= 70
+    assert [counts[step] for step in (4, 8, 12, 13, 14)] == [40] * 5
     assert model.state.head_enabled
 
 
@@ -200,9 +167,7 @@ def test_a_prune_merges_colours(build, training_of, datamanager):
     with torch.no_grad():
         model.gauss_params["features_dc"].mul_(4)
     assert model.state.gaussians.encoding == "logits"
-    harmonics = Gaussians(
-        {name: value.detach().clone() for name, value in model.state.gaussians.as_harmonics().items()}
-    )
+    harmonics = Gaussians({name: value.clone() for name, value in model.state.gaussians.as_harmonics().items()})
     count = model.num_points // 2
     expected = decide(harmonics, model.config.pruning, count, model.contribution(datamanager, count)).values
     training.act("pruning", 3)
@@ -221,8 +186,7 @@ def test_metrics_with_and_without_the_head(build, perturb, camera, batch, monkey
     assert all(type(value) is float for value in metrics.values())
     truth = batch()["image"].float() / 255
     for suffix, name in (("", "rgb"), ("_base", "base_rgb")):
-        mse = ((outputs[name] - truth) ** 2).mean()
-        assert metrics["psnr" + suffix] == pytest.approx(float(-10 * mse.log10()), abs=1e-4)
+        assert metrics["psnr" + suffix] == pytest.approx(float(psnr(outputs[name], truth)), abs=1e-4)
     assert metrics["psnr"] != metrics["psnr_base"]
     assert metrics["psnr_fitted"] > metrics["psnr"]
     assert images["img"].shape == (32, 80, 3)
@@ -241,8 +205,7 @@ def test_metrics_of_a_step_cost_nothing_until_they_are_looked_at(build, perturb,
     truth = crop_image(batch()["image"].float() / 255, outputs["window"])  # as mirrored as the picture
     del outputs  # what the picture was made from goes with it
     assert graph() is None
-    mse = ((rgb - truth) ** 2).mean()
-    assert float(metrics["psnr"]) == pytest.approx(float(-10 * mse.log10()), abs=1e-4)
+    assert float(metrics["psnr"]) == pytest.approx(float(psnr(rgb, truth)), abs=1e-4)
     assert metrics["psnr"] != metrics["psnr_base"]
     assert len(asked) == 2
 

@@ -67,8 +67,8 @@ def same(a, b):
 def test_the_viewer_finds_slider_and_menu():
     model, _ = build()
     found = dict(parse_object(SimpleNamespace(model=model), ViewerElement, "Custom Elements"))
-    assert found["Custom Elements/model/viewer_controls/keep_ratio"] is model.viewer_controls.keep_ratio
-    assert found["Custom Elements/model/viewer_controls/rule"] is model.viewer_controls.rule
+    for name in ("keep_ratio", "rule"):
+        assert found[f"Custom Elements/model/viewer_controls/{name}"] is getattr(model.viewer_controls, name)
     assert not list(model.viewer_controls.parameters())
     assert not [name for name in model.state_dict() if "viewer_controls" in name]
 
@@ -91,14 +91,19 @@ def test_the_slider_tells_what_fewer_primitives_lose():
 
 
 @pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("keep_ratio", [0.01, 0.1, 0.37, 0.99])
+@pytest.mark.parametrize("keep_ratio", [0.01, 0.37])
 def test_exactly_the_share_is_shown(rule, keep_ratio):
     model, _ = build()
     mask = shown(model, rule, keep_ratio)
     assert mask.shape == (N,)
     assert int(mask.sum()) == max(1, round(keep_ratio * N))
-    again = shown(build()[0], rule, keep_ratio)
-    assert torch.equal(mask, again)
+    assert torch.equal(mask, shown(build()[0], rule, keep_ratio))
+
+
+def image_of(model, source, background):
+    """The base colours of a source, over a background ``[H, W, 3]`` of one colour."""
+    settings = model.render_settings(training=False).without_head()
+    return render_view(source, model.camera_of(camera()), background[0, 0], settings)[0]["rgb"]
 
 
 PRUNES = [
@@ -109,27 +114,21 @@ PRUNES = [
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("options", PRUNES, ids=lambda options: options.get("score", "default"))
+@pytest.mark.parametrize("options", PRUNES)
 def test_what_is_shown_is_what_the_prune_leaves(options):
     model, cameras = build(**options)
     model.viewer_controls.keep_ratio.value = 0.2
     preview = as_the_viewer(model.viewer_controls.preview)
     seen = as_the_viewer(lambda: picture(model))
-    model.config.pruning.keep_ratio = 0.2
+    pruning, contribute = model.config.pruning, lambda count: model.contribution(cameras, count)
+    pruning.keep_ratio = 0.2
     optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in model.gauss_params.items()}
-    report = prune_when_due(
-        model.config.pruning,
-        Pruner(model.state.gaussians, optimizers),
-        dict(UNPRUNED),
-        model.config.pruning.prune_at,
-        lambda count: model.contribution(cameras, count),
-    )
+    pruner = Pruner(model.state.gaussians, optimizers)
+    report = prune_when_due(pruning, pruner, dict(UNPRUNED), pruning.prune_at, contribute)
     assert report["after"] == int(preview.decision.mask.sum()) == 18
     assert all(torch.equal(value, preview.gaussians[name]) for name, value in model.state.gaussians.items())
     # A merge and growth show in the picture too.
-    settings = model.render_settings(training=False).without_head()
-    left, _ = render_view(model.source, model.camera_of(camera()), seen["background"][0, 0], settings)
-    assert torch.equal(seen["rgb"], left["rgb"])
+    assert torch.equal(seen["rgb"], image_of(model, model.source, seen["background"]))
 
 
 def test_the_rules_of_the_menu_rank_by_what_they_say():
@@ -142,12 +141,8 @@ def test_the_rules_of_the_menu_rank_by_what_they_say():
     assert torch.equal(both, (both & high) | (both & low))
     assert int((both & high).sum()) == int((both & low).sum()) == 9
     # The share of the slider counts, whatever budget the run had.
-    for options in (
-        {"keep_ratio": None, "max_bytes": 900},
-        {"mode": "continuous", "target_gaussians": 7, "start": 20000},
-    ):
-        busy, _ = build(**{"stop": 20000, **options})
-        mask = shown(busy, "as configured", 0.2)
+    for options in ({"keep_ratio": None, "max_bytes": 900}, {"mode": "continuous", "target_gaussians": 7}):
+        mask = shown(build(start=20000, stop=20000, **options)[0], "as configured", 0.2)
         assert torch.equal(mask, masks["as configured"])
 
 
@@ -160,11 +155,8 @@ def test_a_crop_box_cuts_the_preview_too():
     seen = as_the_viewer(lambda: model.get_outputs_for_camera(camera(), half))
     rows = half.within(model.means).squeeze(-1)[preview.decision.mask]
     assert 0 < int(rows.sum()) < len(rows)
-    settings = model.render_settings(training=False).without_head()
-    expected, _ = render_view(
-        GaussianSource(preview.gaussians.rows(rows)), model.camera_of(camera()), seen["background"][0, 0], settings
-    )
-    assert torch.equal(seen["rgb"], expected["rgb"])
+    expected = image_of(model, GaussianSource(preview.gaussians.rows(rows)), seen["background"])
+    assert torch.equal(seen["rgb"], expected)
 
 
 @torch.no_grad()

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import copy
 import json
+import multiprocessing
 import os
 import re
 import shutil
 import signal
 import subprocess
 import sys
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -23,13 +23,14 @@ import pytest
 import torch
 import torch.distributed as dist
 from PIL import Image
-from torch.multiprocessing.spawn import ProcessExitedException
+from trial_runs import set_options, tidy
 
-from sundae_ns.core.errors import ConfigError, rank_ended, show_in_one_line
+from harness.still_life import write_still_life
+from sundae_ns.core.errors import NOTHING_SAVED, ConfigError, show_in_one_line
 from sundae_ns.io import checkpoint
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.plugin import distributed
-from sundae_ns.plugin.trainer import SundaeTrainer, SundaeTrainerConfig
+from sundae_ns.plugin.trainer import SundaeTrainer
 from sundae_ns.train import averaging
 
 RANKS = 2
@@ -69,7 +70,7 @@ def frozen(folder, name):
     config.steps_per_eval_image = 1000
     config.pipeline.datamanager.data = folder / "masked"
     model = config.pipeline.model
-    model.warm_start = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
+    model.warm_start = saved(folder, "train")
     model.evaluate_prune = False
     for group in config.optimizers.values():
         group["optimizer"].lr, group["scheduler"] = 0.0, None
@@ -80,17 +81,16 @@ def models(folder, name):
     return folder / name / "sundae-tiny" / "now" / "nerfstudio_models"
 
 
-def train(config, rank, ranks):
-    from nerfstudio.utils import profiler, writer
+def saved(folder, name, step=SAVED_AT):
+    return models(folder, name) / f"step-{step:09d}.ckpt"
 
+
+def train(config, rank, ranks):
     torch.manual_seed(config.machine.seed + rank)
     trainer = config.setup(local_rank=rank, world_size=ranks)
     trainer.setup()
     trainer.train()
-    writer.EVENT_WRITERS.clear()
-    writer.EVENT_STORAGE.clear()
-    writer.GLOBAL_BUFFER.clear()
-    profiler.PROFILER.clear()
+    tidy()
     return trainer
 
 
@@ -128,7 +128,7 @@ def check_few(rank, folder):
     model.pruning.keep_ratio = 1e-6
     train(config, rank, RANKS)
     config = frozen(folder, "few again")
-    config.load_checkpoint = models(folder, "few") / f"step-{RANKS - 1:09d}.ckpt"
+    config.load_checkpoint = saved(folder, "few", RANKS - 1)
     config.max_num_iterations = 2 * RANKS
     trainer = train(config, rank, RANKS)
     assert trainer.step == 3 * RANKS - 1
@@ -140,49 +140,32 @@ def checks(folder):
     return {check.__name__: partial(check, folder=folder) for check in (check_training, check_frozen, check_few)}
 
 
-@dataclass
-class HitTrainerConfig(SundaeTrainerConfig):
-    """A run whose rank 1 gets a signal."""
+def train_rank(rank, folder, name, send):
+    """Train from a checkpoint of two ranks; rank 1 sends a signal in the second of its batches."""
+    train_iteration = SundaeTrainer.train_iteration
 
-    _target: type = field(default_factory=lambda: HitTrainer)
-    hit: tuple[int, int] = (0, 0)
-    """Step and signal."""
+    def iteration(self, step):
+        if (rank, step) == (1, SAVED_AT + 3):
+            send()
+        return train_iteration(self, step)
 
-
-class HitTrainer(SundaeTrainer):
-    """Killed, as the system does when memory is short, or interrupted."""
-
-    def train_iteration(self, step):
-        at, number = self.config.hit
-        if step == at and dist.get_rank() == 1:
-            os.kill(os.getpid(), number)
-        return super().train_iteration(step)
-
-
-def train_rank(rank, meeting, config):
-    dist.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=RANKS)
+    SundaeTrainer.train_iteration = iteration
+    config = configured(folder, name)
+    config.load_checkpoint = saved(folder, "train")
+    dist.init_process_group("gloo", init_method=f"file://{folder}/meeting-{name}", rank=rank, world_size=RANKS)
     train(config, rank, RANKS)
     dist.destroy_process_group()
 
 
 def main(folder, name):
-    """Two ranks resume from a checkpoint, and one is killed; or one gets SIGINT, which ends this program."""
+    """Two ranks resume: one is killed, as the system does when memory is short, or a terminal sends Ctrl-C to all."""
     torch.set_num_threads(1)
-    config = HitTrainerConfig(**{k: v for k, v in vars(configured(folder, name)).items() if k != "_target"})
-    config.hit = (2, signal.SIGINT)
-    if name == "dies":
-        config.load_checkpoint = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
-        config.hit = (SAVED_AT + 5, signal.SIGKILL)
-    else:
-        sys.argv = ["ns-train"]
-        show_in_one_line()
-    try:  # forked ranks have imported nerfstudio; ns-train spawns them
-        start = torch.multiprocessing.start_processes
-        start(train_rank, (folder / f"meeting-{name}", config), nprocs=RANKS, start_method="fork")
-    except ProcessExitedException as error:
-        if name != "dies":
-            raise
-        (folder / "died.txt").write_text(str(rank_ended(error)))
+    sys.argv = ["ns-train"]
+    show_in_one_line()
+    distributed.forward_signals()
+    send = {"dies": lambda: os.kill(os.getpid(), signal.SIGKILL), "stops": lambda: os.killpg(0, signal.SIGINT)}[name]
+    # Forked ranks have imported nerfstudio; ns-train spawns them.
+    torch.multiprocessing.start_processes(train_rank, (folder, name, send), nprocs=RANKS, start_method="fork")
 
 
 if __name__ == "__main__":
@@ -196,8 +179,6 @@ if __name__ == "__main__":
 def folder(tmp_path_factory, run_ranks):
     """Runs of two ranks, trained once for all tests."""
     folder = tmp_path_factory.mktemp("ranks")
-    from harness.still_life import write_still_life  # not above: ranks import this file without pytest's paths
-
     write_still_life(folder / "scene", train_views=7, test_views=2, width=40, height=32, points=150)
     shutil.copytree(folder / "scene", folder / "masked")
     meta = json.loads((folder / "masked" / "transforms.json").read_text())
@@ -220,9 +201,7 @@ def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder):
     assert report["step"] == PRUNE_AT
     assert report["after"] == round(KEEP * report["before"])
     assert report["before"] > 150, "densification added nothing"
-    before, after = (
-        checkpoint.read(models(folder, "train") / f"step-{step:09d}.ckpt") for step in (SAVED_AT, STEPS - 1)
-    )
+    before, after = (checkpoint.read(saved(folder, "train", step)) for step in (SAVED_AT, STEPS - 1))
     assert len(after["pipeline"]["_model.gauss_params.means"]) == report["after"]
     n = len(before["pipeline"]["_model.gauss_params.means"])
     assert len(before["pipeline"]["_model._extra_state"]["running"]["densification"]["grad2d"]) == n
@@ -240,14 +219,14 @@ def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder):
 def test_the_prune_is_that_of_one_process(folder):
     """The same Gaussians of the same field stay, with the same values."""
     one = train(frozen(folder, "one"), 0, 1)
-    two = checkpoint.read(models(folder, "two") / f"step-{RANKS - 1:09d}.ckpt")["pipeline"]
+    two = checkpoint.read(saved(folder, "two", RANKS - 1))["pipeline"]
     for name, value in one.pipeline.model.gauss_params.items():
         assert torch.equal(value.detach(), two[f"_model.gauss_params.{name}"]), name
 
 
 def test_one_process_resumes_a_run_of_two(folder):
     config = configured(folder, "alone")
-    config.load_checkpoint = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
+    config.load_checkpoint = saved(folder, "train")
     config.max_num_iterations = PRUNE_AT - SAVED_AT + 1
     trainer = train(config, 0, 1)
     (report,) = json.loads((models(folder, "alone").parent / "prune.json").read_text())
@@ -256,70 +235,42 @@ def test_one_process_resumes_a_run_of_two(folder):
 
 
 def test_a_killed_rank_ends_all_with_one_line(folder):
-    """It resumes on two ranks first, from a checkpoint of two."""
     code, printed = forked.run(Path(__file__), folder, "dies")
-    assert code == 0, printed
-    line = (folder / "died.txt").read_text()
-    assert re.fullmatch(r"rank 1 ended \(killed by SIGKILL\).*--load-dir.*--machine\.num-devices", line)
-    assert not (models(folder, "dies") / f"step-{SAVED_AT + STEPS:09d}.ckpt").exists()
+    assert code == 1, printed
+    line = r"sundae: rank 1 ended \(killed by SIGKILL\).*--load-dir.*--machine\.num-devices"
+    assert re.fullmatch(line, printed.strip().splitlines()[-1])
+    assert not saved(folder, "dies", SAVED_AT + STEPS).exists()
 
 
-def test_ranks_stop_together_and_save_when_one_gets_a_signal(folder):
+def test_ranks_stop_together_and_save_after_a_signal_of_the_terminal(folder):
     code, printed = forked.run(Path(__file__), folder, "stops")
     assert code == 130, printed
     assert printed.count("--load-dir") == 1, "the first rank says how to resume"
-    # They agree after the seventeenth batch.
-    assert checkpoint.checkpoints(models(folder, "stops"))[-1].name == f"step-{17 * RANKS - 1:09d}.ckpt"
+    assert "Traceback" not in printed
+    # They agree after each sixteenth batch.
+    assert checkpoint.checkpoints(models(folder, "stops")) == [saved(folder, "stops", 16 * RANKS)]
 
 
-ON_CPUS = """
-import os, sys
-import torch
-import torch.distributed as dist
-import sundae_ns.plugin.distributed
-from nerfstudio.scripts import train
-from nerfstudio.utils import comms
-from sundae_ns.core.errors import show_in_one_line
-
-show_in_one_line()  # as the first import of our methods does
-
-def worker(rank, train_loop, ranks, _, __, url, config, *___):
-    torch.set_num_threads(1)
-    dist.init_process_group("gloo", init_method=url, world_size=ranks, rank=rank)
-    comms.LOCAL_PROCESS_GROUP = dist.new_group(list(range(ranks)))
-    train_loop(rank, ranks, config, rank)
-
-# nerfstudio starts several ranks on GPUs only.
-train._distributed_worker = worker
-sundae_ns.plugin.distributed.check_machine = lambda *_: None
-if __name__ == "__main__":
-    train.entrypoint()
-"""
-
-
-@pytest.mark.parametrize(
-    ("number", "whole_group", "after", "saves"),
-    [
-        # Ctrl-C reaches the ranks too.
-        pytest.param(signal.SIGINT, True, "left at", True, marks=pytest.mark.long),
-        (signal.SIGTERM, False, "Saving config", False),  # there are no ranks yet
-    ],
-)
-def test_signals_to_the_command_of_two_ranks(folder, tmp_path, number, whole_group, after, saves):
-    (tmp_path / "ns-train").write_text(ON_CPUS)
-    options = "--timestamp now --vis tensorboard --machine.num-devices 2 --machine.device-type cpu"
-    words = ["sundae-tiny", "--data", str(folder / "scene"), "--output-dir", str(tmp_path), *options.split()]
-    with forked.started(tmp_path / "ns-train", *words) as (process, output):
-        assert any(after in line for line in output)
-        (os.killpg if whole_group else os.kill)(process.pid, number)
-        said = output.read()
-        process.join()
-    assert process.exitcode == 128 + number
-    assert said.count("--load-dir") == (1 if saves else 0)
-    assert "Traceback" not in said
-    saved = list(tmp_path.glob("*/*/now/nerfstudio_models/step-*.ckpt"))
-    assert len(saved) == (1 if saves else 0)
-    # The output ended, so no rank is left that could write to it.
+def test_a_signal_to_the_command_ends_it_or_reaches_the_ranks(still_life, tmp_path, capsys, monkeypatch):
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    ranks, passed_on = [], []
+    monkeypatch.setattr(distributed, "passed_on", passed_on)
+    monkeypatch.setattr(multiprocessing, "active_children", lambda: ranks)
+    try:
+        config = configured(tmp_path, "signals")
+        config.pipeline.datamanager.data = still_life
+        config.print_to_terminal()
+        for number in before:
+            with pytest.raises(SystemExit) as ended:
+                signal.raise_signal(number)
+            assert ended.value.code == 128 + number
+        assert capsys.readouterr().err.count(NOTHING_SAVED) == 2
+        ranks.append(subprocess.Popen(["sleep", "60"]))
+        signal.raise_signal(signal.SIGINT)
+        assert (passed_on, ranks[0].wait()) == ([signal.SIGINT], -signal.SIGTERM)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @pytest.mark.parametrize(
@@ -337,8 +288,6 @@ def test_signals_to_the_command_of_two_ranks(folder, tmp_path, number, whole_gro
     ],
 )
 def test_what_several_ranks_cannot_do_is_refused_before_anything_is_written(tmp_path, monkeypatch, options, words):
-    from trial_runs import set_options
-
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     config = configured(tmp_path, "refused")
     config.machine.device_type = "cuda"
@@ -348,49 +297,19 @@ def test_what_several_ranks_cannot_do_is_refused_before_anything_is_written(tmp_
     assert not config.get_base_dir().exists()
 
 
-def test_one_process_is_left_as_it_is():
-    ranks, config = distributed.Ranks(), object()
-    assert ranks.configured(config) is config
-    assert ranks.agreed(15, 3) == 15
-    with ranks.whole() as first:
-        assert first
-
-
-def test_an_error_of_sundae_in_a_rank_keeps_its_message():
-    class Raised(Exception):
-        error_index = 1
-
-    text = "\n\n-- Process 1 terminated with the following error:\n"
-    text += "Traceback ...\nsundae_ns.core.errors.DataError: cause; mend\n"
-    assert str(rank_ended(Raised(text))) == "rank 1: cause; mend"
-    assert "rank 1 ended (ValueError: odd)" in str(rank_ended(Raised("Traceback ...\nValueError: odd")))
-
-
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 def test_ns_train_on_two_gpus(tmp_path):
     """The command of users; the run opens on one GPU like any other."""
     from nerfstudio.utils.eval_utils import eval_setup
 
-    from harness.still_life import write_still_life
-
     write_still_life(tmp_path / "scene", train_views=12, test_views=3, width=64, height=48, points=300)
-    options = {
-        "machine.num-devices": 2,
-        "data": tmp_path / "scene",
-        "output-dir": tmp_path,
-        "experiment-name": "gpus",
-        "timestamp": "now",
-        "max-num-iterations": 240,
-        "pipeline.model.pruning.prune-at": 120,
-        "pipeline.model.pruning.keep-ratio": KEEP,
-        "pipeline.model.warmup-length": 10,
-        "pipeline.model.refine-every": 30,
-        "viewer.quit-on-train-completion": True,
-    }
-    words = [str(word) for name, value in options.items() for word in (f"--{name}", value)]
-    program = [sys.executable, "-m", "nerfstudio.scripts.train"]
-    subprocess.run([*program, "sundae-tiny", *words], timeout=2 * LIMIT, check=True, cwd=tmp_path)
+    options = f"--machine.num-devices 2 --data {tmp_path}/scene --output-dir {tmp_path} --experiment-name gpus"
+    options += f" --timestamp now --max-num-iterations 240 --pipeline.model.pruning.keep-ratio {KEEP}"
+    options += " --pipeline.model.pruning.prune-at 120 --pipeline.model.warmup-length 10"
+    options += " --pipeline.model.refine-every 30 --viewer.quit-on-train-completion True"
+    program = [sys.executable, "-m", "nerfstudio.scripts.train", "sundae-tiny"]
+    subprocess.run([*program, *options.split()], timeout=2 * LIMIT, check=True, cwd=tmp_path)
     run = tmp_path / "gpus" / "sundae-tiny" / "now"
     (report,) = json.loads((run / "prune.json").read_text())
     assert report["after"] == round(KEEP * report["before"])

@@ -52,3 +52,7 @@ def bytes_of(data: Path) -> int:
 
 def meta_of(data: Path) -> dict[str, Any]:
     return json.loads((data / "transforms.json").read_text())
+
+
+def names_of(data: Path) -> list[str]:
+    return sorted(path.name for path in (data / "images").iterdir())
