@@ -200,9 +200,7 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor]) 
         rows = 1 if name.startswith(_PREFIX) else 0  # another number of Gaussians fits
         if len(theirs) < rows or theirs[rows:] != ours[rows:]:
             hint = ", such as its --pipeline.model.head.size" if name.startswith("networks.head.") else ""
-            raise CheckpointError(
-                f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {remedy}{hint}"
-            )
+            raise CheckpointError(f"{name} is {list(theirs)} in the file, {list(ours)} in the model; {remedy}{hint}")
     counts = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
     if len(counts) != 1 or counts[0] == 0:
         raise CheckpointError(f"the checkpoint has parameters of {counts} Gaussians; give another")

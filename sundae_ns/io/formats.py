@@ -15,16 +15,7 @@ from sundae_ns.core.gaussians import SPLAT_NAMES, Gaussians, Sanitised, sanitise
 from sundae_ns.io import checkpoint
 from sundae_ns.io.coordinates import Direction, recentred, similarity, upward
 from sundae_ns.io.gltf import read_glb, write_glb
-from sundae_ns.io.ply import (
-    MAX_SH_DEGREE,
-    UNMARKED,
-    Marks,
-    check_gaussians,
-    comments_of,
-    ply_marks,
-    read_ply,
-    write_ply,
-)
+from sundae_ns.io.ply import MAX_SH_DEGREE, Marks, check_gaussians, comments_of, ply_marks, read_ply, write_ply
 from sundae_ns.io.sog import METAS, read_sog, write_sog, write_streamed
 from sundae_ns.io.splat import read_gsplat, read_ksplat, read_splat
 from sundae_ns.io.spz import read_spz, write_spz
@@ -114,7 +105,7 @@ def read_gaussian_file(path: Path) -> tuple[Sanitised, Marks]:
     """
     kind = kind_of_gaussians(path)
     read = _READERS[kind](path) if kind in _READERS else (read_ply(path), ply_marks(path))
-    params, marks = read if isinstance(read, tuple) else (read, UNMARKED)
+    params, marks = read if isinstance(read, tuple) else (read, Marks())
     params["means"], offset = recentred(params["means"])
     if offset is not None:
         _log.warning("%s lies where float32 is too coarse; its coordinates are less %.10g %.10g %.10g", path, *offset)
@@ -194,7 +185,7 @@ def write_for_viewers(
     writable.
     """
     kind = path.suffix.lower()
-    gaussians, marks = _for_viewers(params, kind, marks or UNMARKED, upright)
+    gaussians, marks = _prepared(params, kind, marks or Marks(), upright)
     if kind == ".spz" and marks.offset is not None:
         _log.warning("%s cannot hold the offset of its coordinates; a .ply, .sog or .glb can", path)
     _WRITERS[kind](path, gaussians, marks)
@@ -203,13 +194,11 @@ def write_for_viewers(
 
 def write_levels(folder: Path, levels: Iterable[Mapping[str, Tensor]], marks: Marks, *, upright: bool = False) -> None:
     """Write levels of detail, the full one first, as streamed SOG; all else as :func:`write_for_viewers`."""
-    written = [_for_viewers(level, ".sog", marks, upright) for level in levels]
+    written = [_prepared(level, ".sog", marks, upright) for level in levels]
     write_streamed(folder, [gaussians for gaussians, _ in written], written[0][1])
 
 
-def _for_viewers(
-    params: Mapping[str, Tensor], kind: str, marks: Marks, upright: bool
-) -> tuple[dict[str, Tensor], Marks]:
+def _prepared(params: Mapping[str, Tensor], kind: str, marks: Marks, upright: bool) -> tuple[dict[str, Tensor], Marks]:
     """The Gaussians of a file of a kind, on the CPU, and its marks."""
     check_gaussians(params)
     gaussians = {name: value.detach().cpu() for name, value in sanitise(params).gaussians.as_harmonics().items()}

@@ -64,9 +64,8 @@ def test_a_wall_of_small_primitives_absorbs_as_much_light_after_merging():
     found = merge(params, torch.zeros(100, dtype=torch.long), torch.ones(100))
 
     def absorption(p):
-        return float(
-            (-torch.log1p(-p["opacities"].sigmoid().squeeze(1)) * mean_projected_area(p["scales"].exp())).sum()
-        )
+        depth = -torch.log1p(-p["opacities"].sigmoid().squeeze(1))
+        return float((depth * mean_projected_area(p["scales"].exp())).sum())
 
     assert absorption(found) == pytest.approx(absorption(params))
     assert float(found["scales"].exp().min()) == pytest.approx(1e-3)

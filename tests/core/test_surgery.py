@@ -10,16 +10,7 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from sundae_ns.core.errors import DataError
-from sundae_ns.core.surgery import (
-    check_wiring,
-    grow,
-    keep,
-    module_snapshot,
-    restore,
-    restore_module,
-    rewrite,
-    snapshot,
-)
+from sundae_ns.core.surgery import check_wiring, grow, keep, module_snapshot, restore, restore_module, rewrite, snapshot
 
 FIELD = normal_field(20, features=13)
 TRAINED = sorted(FIELD.keys() - {"quats"})

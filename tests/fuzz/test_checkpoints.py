@@ -48,10 +48,8 @@ def trainer():
     groups = made.pipeline._model.get_param_groups()
     made.optimizers = Optimizers({n: {"optimizer": FusedAdamConfig(), "scheduler": None} for n in groups}, groups)
     made.grad_scaler = GradScaler(enabled=False)
-    made.config = SimpleNamespace(
-        load_scheduler=True, save_only_latest_checkpoint=True, machine=SimpleNamespace(seed=0)
-    )
-    vars(made.config).update(dict.fromkeys(("load_dir", "load_step", "load_checkpoint")))
+    made.config = SimpleNamespace(**dict.fromkeys(("load_dir", "load_step", "load_checkpoint")))
+    vars(made.config).update(load_scheduler=True, save_only_latest_checkpoint=True, machine=SimpleNamespace(seed=0))
     return made
 
 

@@ -183,10 +183,7 @@ WRONG = {
     "four gigabytes of numbers": (_pickled(_call(b"torch\nFloatTensor", _GIGABYTES)), "more than .*FloatTensor"),
     "a storage of four gigabytes": (_pickled(_call(b"torch.storage\nUntypedStorage", _GIGABYTES)), "UntypedStorage"),
     "bytes that double": (_pickled(_call(b"_codecs\nencode", b"(" + _TEXT + _HEX + b"t")), "the codec hex"),
-    "a number of 2 GB": (
-        _pickled(b"cnumpy.core.multiarray\nscalar\n(", _2_GB, b"tR"),
-        "is not a nerfstudio checkpoint",
-    ),
+    "a number of 2 GB": (_pickled(b"cnumpy.core.multiarray\nscalar\n(", _2_GB, b"tR"), "not a nerfstudio checkpoint"),
     "missing": (lambda path: None, "does not exist"),
     "empty folder": (lambda path: path.mkdir(), "holds no checkpoint"),
     "no checkpoint": (lambda path: path.write_text("hello"), "is not a nerfstudio checkpoint"),

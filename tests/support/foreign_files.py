@@ -144,10 +144,7 @@ def write_gsplat(path: Path, gaussians: Mapping[str, Tensor], **others: object) 
 
 
 def write_checkpoint(
-    path: Path,
-    gaussians: Mapping[str, Tensor],
-    extra: Mapping[str, Any] = MappingProxyType({}),
-    **others: object,
+    path: Path, gaussians: Mapping[str, Tensor], extra: Mapping[str, Any] = MappingProxyType({}), **others: object
 ) -> None:
     """As nerfstudio's trainer after its first step; ``extra`` is further state of the pipeline."""
     state = {f"_model.gauss_params.{name}": value for name, value in gaussians.items()}

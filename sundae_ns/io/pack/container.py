@@ -212,9 +212,7 @@ def _front(meta: Mapping[str, Any]) -> bytes:
     """All bytes of a file before its sections."""
     header = json.dumps(meta, allow_nan=False, separators=(",", ":")).encode()
     if len(header) > MAX_HEADER:
-        raise PackError(
-            f"the header takes {len(header):,} bytes, but readers accept {MAX_HEADER:,}; give fewer cameras"
-        )
+        raise PackError(f"the header takes {len(header):,} bytes, readers accept {MAX_HEADER:,}; give fewer cameras")
     return _PREAMBLE.pack(MAGIC, VERSION, len(header), hashlib.sha256(header).digest()) + header
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from fields import random_field
-from hard_values import drifted, hard_values
+from hard_values import KINDS, drifted, hard_values
 from hypothesis import given
 from hypothesis import strategies as st
 from packed_scenes import full_scene
@@ -17,9 +17,7 @@ from sundae_ns.io.pack.codecs import HeadCodec, Sensitivity, estimated_bits
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.pack.packed_scene import PackedScene, fit_scene, read_scene, write_fitted, write_scene
 
-hard = given(
-    st.sampled_from(["normal", "constant", "huge", "tiny", "outliers"]), st.integers(1, 500), st.integers(0, 2**16)
-)
+hard = given(st.sampled_from(KINDS[:5]), st.integers(1, 500), st.integers(0, 2**16))
 
 
 @hard
