@@ -7,8 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 from fields import normal_points
-from hypothesis import given
-from hypothesis import strategies as st
 from prunes import PAPER, decide_share, draws, gaussians
 from torch.nn import Parameter
 
@@ -20,7 +18,6 @@ from sundae_ns.pruning.decision import Pruner, decide, prune_gaussians
 from sundae_ns.pruning.merge import gaussian_graph, voronoi_labels
 from sundae_ns.pruning.rule import band_rule, kept_count
 from sundae_ns.pruning.scores import response
-from sundae_ns.train.pruning import PruningConfig
 
 SHARE = 0.2
 UNTURNED = ("scales", "opacities", "features_dc", "features_rest")
@@ -217,35 +214,6 @@ def test_two_primitives_merge_into_one_and_one_alone_is_kept_without_a_graph():
     assert (one.kept, one.values) == (1, None)
 
 
-@given(
-    st.lists(st.tuples(st.integers(-2, 2), st.integers(-2, 2), st.integers(0, 1)), min_size=6, max_size=60),
-    st.integers(-60, 60),
-    st.floats(0.001, 1),
-    st.floats(0, 1),
-    st.sampled_from(list(RULES)),
-    st.integers(0, 2**31),
-)
-def test_any_cells_at_any_scale(cells, exponent, keep_ratio, gamma, name, seed):
-    params = gaussians(means=torch.tensor(cells, dtype=torch.float32) * 2.0**exponent, seed=seed)
-    config = replace(RULES[name], gamma=gamma, num_neighbors=5, seed=seed)
-    mask = decided(params, config, keep_ratio).mask
-    found = response(params, config)
-    assert (found[~found.isnan()] >= 0).all()
-    assert not found.isinf().any()
-    if config.selection == "band" and int(mask.sum()) <= int((~found.isnan()).sum()):
-        assert not found[mask].isnan().any()
-    # A shift by a whole number of cells is exact.
-    moved = {**params, "means": params["means"] + 64 * 2.0**exponent}
-    if config.signal == "positions" or name == "default":
-        assert torch.equal(decided(moved, config, keep_ratio).mask, mask)
-
-
-def test_the_schedule_that_comes_with_a_rule_is_ignored():
-    expected = decide_share(gaussians(), draws(), 0.25, torch.ones(60)).mask
-    for config in (PruningConfig(mode="off"), PruningConfig(mode="continuous", target_gaussians=10)):
-        assert torch.equal(decide_share(gaussians(), config, 0.25, torch.ones(60)).mask, expected)
-
-
 def test_the_band_rule_is_the_papers():
     given = draws(signal="positions", num_neighbors=7, seed=3)
     paper = replace(given, gamma=0.7, score="response", selection="band", edges="centres", redistribution="none")
@@ -281,12 +249,6 @@ def test_primitives_that_are_not_finite_are_dropped_and_do_not_count(value):
     assert everything.mask.nonzero().squeeze(1).tolist() == [i for i in range(60) if i not in (7, 8)]
 
 
-def test_a_contribution_is_needed_only_by_rules_that_use_it():
-    for rule in (PAPER, RULES["a function"]):
-        decide_share(gaussians(), rule)
-    decide_share(gaussians(), DEFAULT, 1.0)
-
-
 @pytest.mark.parametrize("rule", [DEFAULT, PAPER], ids=["merged", "plain"])
 def test_prune_leaves_what_the_decision_says_and_the_field_alone(rule):
     params = gaussians()
@@ -314,16 +276,15 @@ def test_invalid_input_raises_one_line():
         (ConfigError, "training views", lambda: decide_share(params, DEFAULT)),
         (ConfigError, "set redistribution to none", lambda: decide_share(params, draws(score="response"))),
         (DataError, r"shape \[59\] for 60", lambda: decide_share(params, DEFAULT, 0.1, torch.ones(59))),
-        (ConfigError, "keep_ratio", lambda: decide_share(params, DEFAULT, 0.0)),
         (ConfigError, "gamma", lambda: decide_share(params, draws(gamma=2.0))),
-        (ConfigError, "score is 'opacity': use one of detail-c", lambda: draws(score="opacity").validate()),
         (DataError, r"score has shape \[3\] for 60", lambda: decide(params, three, 6)),
-        (ConfigError, "num_neighbors is 0: use at least 1", lambda: draws(num_neighbors=0).validate()),
     ]
     for error, message, call in cases:
         with pytest.raises(error, match=message) as caught:
             call()
         assert "\n" not in str(caught.value)
+    decide_share(params, RULES["a function"])  # it needs no contribution, nor does a field of which all stays
+    decide_share(params, DEFAULT, 1.0)
 
 
 @pytest.mark.parametrize("bad", [[], [0, 5, 18], [*range(18)]])

@@ -17,8 +17,6 @@ from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.scene.initialization import from_points
 
 PAIRS = PruneRule()
-
-
 WEIGHTS = torch.linspace(0.1, 1, 300)
 
 
@@ -52,12 +50,6 @@ def test_labels_are_the_nearest_along_the_edges(monkeypatch):
     assert (component[found[joined]] == component[joined.numpy()]).all()
 
 
-def test_the_one_clone_that_is_kept_labels_all():
-    graph = build_graph(torch.zeros(100, 3), num_neighbors=4)
-    for stays in (0, 3, 50, 99):
-        assert (voronoi_labels(graph, torch.arange(100) == stays) == stays).all()
-
-
 def test_against_edges_the_nearest_wins_and_then_the_lowest_index():
     # Node 0 has no neighbour; it is the neighbour of 1, 2 and 3, and as near to 2 as to 3.
     weights = torch.tensor([[0.0], [0.5], [0.9], [0.9]])
@@ -69,10 +61,12 @@ def test_against_edges_the_nearest_wins_and_then_the_lowest_index():
     assert voronoi_labels(alone, torch.tensor([True, False, False])).tolist() == [0, 0, -1]
 
 
-def test_a_chain_has_one_label_over_many_hops_and_islands_have_none():
+def test_chains_and_clones_have_one_label_over_many_hops_and_islands_have_none():
     line = torch.cartesian_prod(torch.arange(50.0), torch.zeros(1), torch.zeros(1))
     graph = build_graph(torch.cat([line, line[:4] + 1e6]), num_neighbors=2)
     assert voronoi_labels(graph, torch.arange(54) == 0).tolist() == [0] * 50 + [-1] * 4
+    clones = build_graph(torch.zeros(100, 3), num_neighbors=4)
+    assert all((voronoi_labels(clones, torch.arange(100) == stays) == stays).all() for stays in (0, 50, 99))
 
 
 def test_appearance_keeps_labels_on_their_side_of_an_edge():

@@ -19,7 +19,8 @@ from splat_inputs import blending_weights, geometry, rasterize, rasterize_camera
 from torch import Tensor
 
 from sundae_ns.core.errors import BackendError
-from sundae_ns.rasterize.cpu import parallel
+from sundae_ns.rasterize.cpu import backend as cpu_backend
+from sundae_ns.rasterize.cpu import parallel, tiles
 from sundae_ns.rasterize.gsplat_backend import RecordableGsplat
 from sundae_ns.rasterize.gsplat_kernels import Capacity
 from sundae_ns.rasterize.interface import select_backend, spherical_harmonics
@@ -293,38 +294,6 @@ def test_gradients_of_some_inputs_by_some_outputs(wanted, output):
         assert deviation(ours, exact) < 1e-10  # measured: 1.5e-14
 
 
-@pytest.mark.parametrize("absgrad", [False, True])
-@pytest.mark.parametrize(
-    ("name", "device"),
-    [
-        ("reference", "cpu"),
-        ("cpu", "cpu"),
-        pytest.param("gsplat", "cuda", marks=pytest.mark.gpu),
-        pytest.param("reference", "cuda", marks=pytest.mark.gpu),
-    ],
-)
-def test_default_strategy_grows(name, device, absgrad):
-    backend = select_backend(name, device)
-    gsplat = pytest.importorskip("gsplat")
-    params = {name: torch.nn.Parameter(value.to(device)) for name, value in scene(50).items()}
-    optimizers = {name: torch.optim.Adam([param], 1e-3) for name, param in params.items()}
-    strategy = gsplat.DefaultStrategy(
-        absgrad=absgrad, refine_start_iter=0, refine_every=2, grow_grad2d=1e-7, refine_scale2d_stop_iter=10
-    )
-    strategy.check_sanity(params, optimizers)
-    state = strategy.initialize_state()
-    for step in (1, 2):
-        ours = splat(params, make_view(24, 24), backend, absgrad=absgrad)
-        strategy.step_pre_backward(params, optimizers, state, step, ours.info)
-        (ours.colors - 0.5).square().mean().backward()
-        strategy.step_post_backward(params, optimizers, state, step, ours.info)
-        if step == 1:
-            # One count per visible Gaussian and view.
-            assert torch.equal(state["count"] > 0, ours.radii > 0)
-            assert state["grad2d"].sum() > 0
-    assert params["means"].shape[0] > 50
-
-
 # ------------------------------------------------------------------------------------------------------------ harmonics
 
 
@@ -402,27 +371,16 @@ def test_a_gpu_matches_the_reference(name, opacity, antialiased, channels):
     bounds = (1e-5, 1e-4) if name == "reference" else (1e-4, 1e-3)
     if opacity > 0.35 and name != "reference" and is_gsplat_1_5():
         bounds = (3e-2, 2e-1)
-    compare({key: value.cpu() for key, value in ours.items()}, exact, *bounds)
-
-
-@pytest.mark.gpu
-def test_radii_and_weights_of_gsplat():
-    values, camera = crowd(0.33)
-    radii, weights = [], []
-    for backend, device, dtype in ((on_gpu("gsplat"), "cuda", F32), (REFERENCE, "cpu", F64)):
-        placed = {name: value.to(device, dtype) for name, value in values.items()}
-        radii.append(splat(placed, camera, backend).radii.cpu())
-        weights.append(blending_weights(**seen_by(camera, placed), backend=backend).cpu())
-    assert deviation(*weights) < 1e-5  # measured: 3.8e-7
-    ours, exact = radii
-    assert ours.shape == exact.shape
-    assert (exact > 0).any()
-    assert (exact == 0).any()
-    if is_gsplat_1_5():  # fits the radius to the opacity and to each axis, and culls invisible Gaussians
-        assert (ours <= (exact * 1.12).ceil() + 1).all()
+    ours = {key: value.cpu() for key, value in ours.items()}
+    compare(ours, exact, *bounds)
+    found, radii = ours["radii"], exact["radii"]
+    assert (radii > 0).any()
+    assert (radii == 0).any()
+    if name != "reference" and is_gsplat_1_5():  # fits them to opacity and axes, and culls what is invisible
+        assert (found <= (radii * 1.12).ceil() + 1).all()
     else:  # rounding up to whole pixels may turn float32 rounding into one pixel
-        assert (ours - exact).abs().max() <= 1
-        assert (ours != exact).float().mean() < 1e-2
+        assert (found - radii).abs().max() <= 1
+        assert (found != radii).float().mean() < 1e-2
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -499,6 +457,30 @@ def test_threads_that_rasterise_at_once(threads):
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(lambda _: render(*SMALL, F32, CPU), range(12)))
     assert all(torch.equal(value, other[name]) for other in together for name, value in alone.items())
+
+
+def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch):
+    """Full-screen Gaussians beside lines in one row of tiles: the lists of each region fit the limit."""
+    values, camera, regions, lists = scene(60), make_view(80, 52, turned=False), [], tiles.tile_lists
+    values["scales"][:], values["opacities"][:] = 3.0, -3.0
+    values["scales"][30:, 1:], values["quats"][30:], values["means"][30:, 1] = -7.0, torch.tensor([1.0, 0, 0, 0]), 0.01
+
+    def limited(*arguments):
+        for region in lists(*arguments):
+            regions.append(region)
+            yield region
+
+    once = render(values, camera, F32, CPU)
+    monkeypatch.setattr(tiles, "MOST_PAIRS", 400)
+    monkeypatch.setattr(cpu_backend, "tile_lists", limited)
+    compare(render(values, camera, F32, CPU), once, 0.0, 1e-5)
+    half = len(regions) // 2
+    assert len(regions) == 2 * half >= 10  # the backward pass makes them again
+    assert all(len(region.slots) <= 400 for region in regions)
+    drawn_tiles = torch.cat([torch.from_numpy(region.longest_first) for region in regions[:half]])
+    assert sorted(drawn_tiles.tolist()) == list(range(70))
+    monkeypatch.setattr(tiles, "MOST_PAIRS", 0)  # a tile is not cut
+    assert torch.equal(render(values, camera, F32, CPU)["image"], once["image"])
 
 
 def test_unsupported_dtypes_are_refused():

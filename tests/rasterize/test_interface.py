@@ -10,8 +10,6 @@ from splat_inputs import blending_weights, rasterize, rasterize_cameras, several
 from sundae_ns.core.errors import BackendError, ConfigError, DataError, MemoryExhaustedError
 from sundae_ns.rasterize import interface
 from sundae_ns.rasterize import types as limits
-from sundae_ns.rasterize.cpu import backend as backend_of_cpu
-from sundae_ns.rasterize.cpu import tiles
 from sundae_ns.rasterize.interface import select_backend, spherical_harmonics
 
 REFERENCE = select_backend("reference", "cpu")
@@ -169,68 +167,6 @@ def test_a_training_whose_lists_exceed_the_memory_is_refused(monkeypatch):
     monkeypatch.setattr(limits, "available_memory", lambda: 1_000_000)
     with pytest.raises(MemoryExhaustedError, match="pairs of a tile and a Gaussian take .* GB, but .* are available"):
         camera(1000, 64, 20.0, training=True)
-
-
-def test_an_image_of_many_pairs_is_blended_by_regions(monkeypatch):
-    """Full-screen Gaussians beside lines in one row of tiles: the lists of each region fit the limit."""
-    count, most, regions, lists = 60, 400, [], tiles.tile_lists
-
-    def limited(*arguments):
-        for region in lists(*arguments):
-            regions.append(region)
-            yield region
-
-    def drawn():
-        torch.manual_seed(0)
-        values = {
-            "means": torch.cat([torch.rand(count, 2) - 0.5, torch.full((count, 1), 2.0)], dim=1).requires_grad_(),
-            "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-            "scales": torch.cat([torch.full((30, 3), 20.0), torch.tensor([[20.0, 1e-3, 1e-3]]).repeat(30, 1)]),
-            "opacities": torch.full((count,), 0.05).requires_grad_(),
-            "colors": torch.rand(count, 3).requires_grad_(),
-        }
-        values["means"].data[30:, 1] = 0.01
-        K = torch.tensor([[64.0, 0, 40], [0, 64, 26], [0, 0, 1]])
-        ours = rasterize(
-            **values, viewmat=torch.eye(4), K=K, width=80, height=52, absgrad=True, backend=select_backend("cpu", "cpu")
-        )
-        (ours.colors * torch.rand(52, 80, 3) + ours.alpha).sum().backward()
-        grads = [values[name].grad for name in ("means", "opacities", "colors")]
-        return [ours.colors, ours.alpha, *grads, ours.info["means2d"].absgrad]
-
-    once = drawn()
-    monkeypatch.setattr(tiles, "MOST_PAIRS", most)
-    monkeypatch.setattr(backend_of_cpu, "tile_lists", limited)
-    image, alpha, *grads = drawn()
-    assert torch.equal(image, once[0])
-    assert torch.equal(alpha, once[1])
-    for ours, exact in zip(grads, once[2:], strict=True):
-        torch.testing.assert_close(ours, exact, rtol=1e-5, atol=1e-5)
-    half = len(regions) // 2
-    assert len(regions) == 2 * half >= 10  # the backward pass makes them again
-    assert all(len(region.slots) <= most for region in regions)
-    drawn_tiles = torch.cat([torch.from_numpy(region.longest_first) for region in regions[:half]])
-    assert sorted(drawn_tiles.tolist()) == list(range(70))
-    monkeypatch.setattr(tiles, "MOST_PAIRS", 0)  # a tile is not cut
-    assert torch.equal(drawn()[0], once[0])
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-def test_defaults_of_torch_do_not_matter(name):
-    shared, cameras = several_views()
-    first = dict(zip(("colors", "viewmat", "K"), (value[0] for value in cameras.values())))
-    view = {**shared, **first, "width": 9, "height": 7, "render_depth": True}
-    expected = rasterize(**view, backend=select_backend(name, "cpu"))
-    interface.numba_problem.cache_clear()
-    torch.set_default_dtype(torch.float64)
-    torch.set_default_device("meta")
-    try:
-        ours = rasterize(**view, backend=select_backend(name, "cpu"))
-    finally:
-        torch.set_default_dtype(torch.float32)
-        torch.set_default_device(None)
-    for value, same in ((ours.colors, expected.colors), (ours.depth, expected.depth), (ours.radii, expected.radii)):
-        assert torch.equal(value, same)
 
 
 def test_images_that_exceed_the_memory_are_refused(monkeypatch):

@@ -103,28 +103,20 @@ def test_compiles_without_a_cache_folder():
     assert parallel.compiled(made["double"])(4) == 8
 
 
-def test_a_notice_is_printed_for_long_compilation(monkeypatch, capsys):
+def test_a_notice_is_printed_once_for_long_compilation(monkeypatch, capsys):
     monkeypatch.setattr(parallel, "_noticed", [])
     monkeypatch.setattr(parallel, "_NOTICE_AFTER", 0.05)
-    monkeypatch.setattr(parallel, "_ready", set())
 
-    class Loop:
-        """As numba's: it counts the calls that found no code on disk."""
+    def printed(seconds, misses):
+        """What a loop prints whose compilation takes so long; as numba's, it counts calls that find no code on disk."""
 
-        def __init__(self, seconds, misses):
-            self.seconds, self.stats = seconds, SimpleNamespace(cache_misses={"types": misses} if misses else {})
+        def loop(begin, end):
+            time.sleep(seconds if begin == end else 0.0)
 
-        def __call__(self, begin, end):
-            time.sleep(self.seconds if begin == end else 0.0)
+        loop.stats = SimpleNamespace(cache_misses={"types": misses} if misses else {})
+        parallel.parallel_for(loop, 3)
+        return capsys.readouterr().err
 
-    slow = Loop(0.5, misses=1)
-    for quiet in (Loop(0.0, misses=1), Loop(0.5, misses=0)):
-        parallel.parallel_for(quiet, 3)
-        assert capsys.readouterr().err == ""
-    parallel.parallel_for(slow, 3)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "compiling" in line
-    parallel._ready.clear()
-    parallel.parallel_for(slow, 3)
-    parallel.parallel_for(slow, 3)
-    assert capsys.readouterr().err == ""
+    assert (printed(0.0, 1), printed(0.3, 0)) == ("", "")
+    assert printed(0.3, 1).count("compiling") == 1
+    assert printed(0.3, 1) == ""

@@ -1,6 +1,7 @@
 """A field that is right, photos of it by cameras on a ring, and the measurement of their gains."""
 
 import math
+from functools import cache
 from types import SimpleNamespace
 
 import torch
@@ -31,6 +32,7 @@ def begin(mode="on"):
     return gains, run
 
 
+@cache
 def image_of(index):
     """What the field shows of a view, dark enough that no photo is clipped."""
     return 0.1 + 0.4 * torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(index))

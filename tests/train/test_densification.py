@@ -18,28 +18,23 @@ def gaussians(n=N):
     return params, {name: Adam([value], lr=0.01) for name, value in params.items()}
 
 
-def test_the_highest_gradients_grow():
-    gradients = torch.tensor([0.9, 0.1, 0.8, 0.7, 0.0, 0.6])
-    radii = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.9, 0.0])
-    state = {"grad2d": gradients * 2, "count": torch.full((6,), 2.0), "radii": radii.clone()}
-    limit_growth(state, torch.ones(6, dtype=torch.bool), 2, threshold=0.5, radius=0.05)
-    assert (state["grad2d"] / 2 > 0.5).tolist() == [True, False, True, False, False, False]
-    assert state["grad2d"][1] == 0.2, "what would not grow is left alone"
-    assert (state["radii"] <= 0.05).all()
-
-
-def test_room_enough_changes_nothing():
-    gradients = torch.tensor([0.9, 0.1, 0.8, 0.7, 0.0, 0.6])
-    state = {"grad2d": gradients.clone(), "count": torch.ones(6), "radii": None}
-    limit_growth(state, torch.arange(6) % 2 == 0, 4, threshold=0.5, radius=0.05)
-    assert torch.equal(state["grad2d"], gradients)
-
-
-def test_one_that_is_duplicated_and_split_takes_two_places():
-    state = {"grad2d": torch.tensor([0.9, 0.8, 0.7]), "count": torch.ones(3), "radii": torch.tensor([0.9, 0.0, 0.9])}
-    limit_growth(state, torch.tensor([True, True, False]), 3, threshold=0.5, radius=0.05)
-    assert (state["grad2d"] > 0.5).tolist() == [True, True, False]
-    assert (state["radii"] > 0.05).tolist() == [True, False, False]
+@pytest.mark.parametrize(
+    ("gradients", "radii", "small", "capacity", "grown", "wide"),
+    [
+        ([0.9, 0.1, 0.8, 0.7, 0.0, 0.6], [0, 0, 0, 0, 0.9, 0], [1, 1, 1, 1, 1, 1], 2, [1, 0, 1, 0, 0, 0], [0] * 6),
+        ([0.9, 0.1, 0.8, 0.7, 0.0, 0.6], None, [1, 0, 1, 0, 1, 0], 4, [1, 0, 1, 1, 0, 1], None),
+        ([0.9, 0.8, 0.7], [0.9, 0, 0.9], [1, 1, 0], 3, [1, 1, 0], [1, 0, 0]),  # the first takes two places
+    ],
+    ids=["too many", "room enough", "duplicated and split"],
+)
+def test_the_highest_gradients_grow(gradients, radii, small, capacity, grown, wide):
+    sums = 2 * torch.tensor(gradients)
+    state = {"grad2d": sums.clone(), "count": torch.full_like(sums, 2.0), "radii": radii and torch.tensor(radii)}
+    limit_growth(state, torch.tensor(small) > 0, capacity, threshold=0.5, radius=0.05)
+    assert (state["grad2d"] / 2 > 0.5).tolist() == grown
+    assert radii is None or (state["radii"] > 0.05).tolist() == wide
+    rest = (torch.tensor(grown) > 0) | (sums <= 1)
+    assert torch.equal(state["grad2d"][rest], sums[rest]), "what would not grow is left alone"
 
 
 @pytest.mark.parametrize("wide", [False, True])

@@ -87,10 +87,9 @@ def test_both_train_the_same_field(both, options):
         assert moments.keys() == held.keys()
         if moments:
             assert float(moments["step"]) == float(held["step"])
-    for one in (usual.model, recorded.model):
-        assert (one.head is None) == (options.get("head") == {"mode": "off"})
-    networks = (list(one.head.parameters()) if one.head is not None else [] for one in (recorded.model, usual.model))
-    for weights, expected_weights in zip(*networks, strict=True):
+    heads = [one.head for one in (recorded.model, usual.model)]
+    assert [head is None for head in heads] == 2 * [options.get("head") == {"mode": "off"}]
+    for weights, expected_weights in zip(*(head.parameters() if head else () for head in heads), strict=True):
         # Adam moves a weight by its rate of 1e-3 wherever its gradient points, be it of the size of rounding. So one
         # in thousands may be that far off; all together must be near.
         torch.testing.assert_close(weights, expected_weights, rtol=2e-3, atol=1e-4)

@@ -15,7 +15,6 @@ from sundae_ns.plugin.datamanager import DATASET_FRAME
 from sundae_ns.train import initialize
 from sundae_ns.train.initialize import FEWEST_POINTS
 
-Capsys = pytest.CaptureFixture[str]
 N = 60  # Gaussians of a model that is built without a count
 
 
@@ -29,27 +28,31 @@ def colors_of(model, camera):
     return model.source.primitives(model.camera_of(camera), settings, features=False)["colors"].detach()
 
 
-@pytest.mark.parametrize("seed_points", [None, (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))])
-def test_without_a_sparse_cloud_points_are_random(build, training_of, seed_points, capsys):
-    model = build(seed_points=seed_points, num_random=40, random_scale=2.0)
-    assert model.num_points == 40
-    assert model.means.abs().max() <= 1
+def cloud(n):
+    return torch.rand(n, 3), torch.full((n, 3), 99, dtype=torch.uint8)
+
+
+RANDOM = {"num_random": 40, "random_scale": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("options", "count", "warning"),
+    [
+        ({"seed_points": None, **RANDOM}, 40, "no sparse point cloud"),
+        ({"seed_points": cloud(0), **RANDOM}, 40, "no sparse point cloud"),
+        ({"seed_points": cloud(FEWEST_POINTS - 1)}, FEWEST_POINTS - 1, f"only {FEWEST_POINTS - 1} sparse points"),
+        ({"pruning": {"mode": "continuous", "max_gaussians": 25}}, 25, "starting from 25 of them"),
+        ({"seed_points": cloud(FEWEST_POINTS)}, FEWEST_POINTS, None),
+    ],
+)
+def test_a_field_starts_from_the_cloud_or_random_points_and_warns(build, training_of, options, count, warning, capsys):
+    model = build(**options)
+    assert model.num_points == count
+    assert options.get("num_random") is None or model.means.abs().max() <= 1
     training_of(model)
-    assert "no sparse point cloud" in said(capsys)
-
-
-@pytest.mark.parametrize(("n", "warned"), [(FEWEST_POINTS - 1, True), (FEWEST_POINTS, False)])
-def test_who_has_hardly_any_points_hears_that_photos_do_not_overlap(build, training_of, n, warned, capsys):
-    model = build(seed_points=(torch.rand(n, 3), torch.full((n, 3), 99, dtype=torch.uint8)))
-    training_of(model)
-    assert (f"only {n} sparse points" in said(capsys)) == warned
-
-
-def test_a_cloud_above_the_cap_is_cut_before_the_first_step(build, training_of, capsys):
-    model = build(pruning={"mode": "continuous", "max_gaussians": 25})
-    assert model.num_points == 25
-    training_of(model)
-    assert "starting from 25 of them" in said(capsys)
+    printed = said(capsys)
+    assert (warning or "") in printed
+    assert ("Warning" in printed) == (warning is not None)
 
 
 def _ply(build, path, degree=1, **options):
@@ -64,7 +67,7 @@ def _frame():
     return torch.cat([turn, torch.tensor([[0.1], [0.2], [0.3]])], dim=1), 0.5
 
 
-def test_a_ply_of_the_capture_is_moved_into_the_model(build, tmp_path):
+def test_a_ply_of_the_capture_is_moved_into_the_model(build, training_of, tmp_path):
     params = _ply(build, tmp_path / "a.ply")
     model = build(warm_start=tmp_path / "a.ply", metadata={DATASET_FRAME: _frame()})
     expected = similarity(params, *_frame())
@@ -73,10 +76,6 @@ def test_a_ply_of_the_capture_is_moved_into_the_model(build, tmp_path):
     assert model.gauss_params["features"].shape == (N, 5)
     as_is = build(warm_start=tmp_path / "a.ply", warm_start_frame="model")
     torch.testing.assert_close(as_is.means.detach(), params["means"])
-
-
-def test_a_ply_of_the_capture_needs_to_know_the_way(build, training_of, tmp_path):
-    _ply(build, tmp_path / "a.ply")
     with pytest.raises(CheckpointError, match="warm-start-frame model") as caught:
         training_of(build(warm_start=tmp_path / "a.ply"))
     assert "\n" not in str(caught.value)
@@ -209,15 +208,19 @@ def test_the_field_starts_from_both_clouds(build, training_of, points, capsys):
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("options", "filled", "most"),
     [
-        {"dense_start_views": 3},  # the model has 4 training images
-        {"dense_start_views": 0},
-        {"random_init": True, "num_random": 60},
-        {"seed_points": None, "num_random": 60},
+        ({"dense_start_views": 3}, 100, 4),  # the model has 4 training images
+        ({"dense_start_views": 0}, 100, 4),
+        ({"random_init": True, "num_random": 60}, 100, 4),
+        ({"seed_points": None, "num_random": 60}, 100, 4),
+        ({}, 60, 3),
+        ({}, 61, 2),
     ],
 )
-def test_other_fields_stay_as_they_are(build, training_of, options):
+def test_other_fields_stay_as_they_are(build, training_of, monkeypatch, options, filled, most):
+    monkeypatch.setattr(initialize, "MOST_ON_CPU", most)
+    monkeypatch.setitem(initialize.FILLED, "cpu", filled)
     model = few(build, **options)
     before = model.means.detach().clone()
     training_of(model)
@@ -237,6 +240,7 @@ def test_a_resumed_run_goes_on_with_its_own_field(build, training_of):
 
 def test_more_points_than_wanted_are_thinned_evenly(build, training_of, monkeypatch):
     monkeypatch.setattr(FakeSweep, "most", 900)
+    monkeypatch.setattr(initialize, "MOST_ON_CPU", 3)
     monkeypatch.setitem(initialize.FILLED, "cpu", 60 + 90)
     model = few(build)
     training_of(model)
@@ -244,15 +248,6 @@ def test_more_points_than_wanted_are_thinned_evenly(build, training_of, monkeypa
     assert len(added) == 90
     # Each tenth of the row has a tenth of them.
     assert torch.histc(added, bins=9, min=5, max=8).tolist() == pytest.approx([10] * 9, abs=1)
-
-
-@pytest.mark.parametrize(("filled", "most", "swept"), [(60, 3, False), (61, 2, False), (100, 3, True)])
-def test_a_cpu_sweeps_few_views_of_a_sparse_cloud(build, training_of, monkeypatch, filled, most, swept):
-    monkeypatch.setattr(initialize, "MOST_ON_CPU", most)
-    monkeypatch.setitem(initialize.FILLED, "cpu", filled)
-    model = few(build)
-    training_of(model)
-    assert model.num_points == 60 + swept * FOUND
 
 
 def test_photos_are_the_training_images_with_their_views_and_masks(build, training_of, batch, camera):

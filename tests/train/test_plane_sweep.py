@@ -119,10 +119,3 @@ def test_what_says_nothing_gives_no_points(capture, name):
     assert points.shape == colours.shape
     assert len(points) <= 0.03 * 3 * SIDE * SIDE
     assert torch.isfinite(points).all()
-
-
-def test_sums_of_patches_are_those_of_pooling():
-    image = torch.rand(2, 1, 11, 9)
-    crop = plane_sweep.WINDOW
-    pooled = torch.nn.functional.avg_pool2d(image, crop, stride=1, padding=crop // 2) * crop**2
-    assert torch.allclose(plane_sweep._box(image), pooled, atol=1e-5)

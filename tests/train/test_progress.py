@@ -17,32 +17,33 @@ from sundae_ns.plugin.optimizer_configs import METRICS_EVENT, ProgressWriter
 from sundae_ns.train.progress import Interruption, TimeLeft, duration, loaded_run, long_on_cpu, resume_command
 
 
-def progress_writer(monkeypatch, events, length, *banner):
+@pytest.fixture
+def line_after(monkeypatch, capsys):
+    """Lines that are printed after a step, some seconds after the ones before; metrics are those of nerfstudio."""
+    events, clock = [{"name": "config", "event": {}, "step": 0}], [100.0]  # a resumed run begins with its configuration
     monkeypatch.setattr(writer, "GLOBAL_BUFFER", {})
-    monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": length})
+    monkeypatch.setattr(nerfstudio_configs, "GLOBAL_BUFFER", {"max_iter": 400})
     monkeypatch.setattr(nerfstudio_configs, "EVENT_STORAGE", events)
-    return ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10), *banner)
-
-
-def test_a_line_says_what_is_done_and_left(monkeypatch, capsys):
-    events = [
-        # A resumed run writes its configuration first.
-        {"name": "config", "event": {}, "step": 0},
-        {"name": "Train Iter (time)", "event": 0.25, "step": 159},
-        {"name": METRICS_EVENT, "event": {"psnr": 21.456, "gaussian_count": 12345}},
-    ]
-    made = progress_writer(monkeypatch, events, 400, ["Viewer at: somewhere"])
-    clock = [100.0]
     monkeypatch.setattr(nerfstudio_configs.time, "monotonic", lambda: clock[0])
-    made.write_stats_log(0)
-    made.write_stats_log(0)
-    clock[0] += 10
-    events[1]["step"] = 199
-    made.write_stats_log(0)
-    banner, first, line = capsys.readouterr().out.splitlines()
-    assert banner == "Viewer at: somewhere"
-    assert first == "160 (40.00%)  PSNR 21.46 dB  12,345 Gaussians", "the first step compiles"
-    assert line == "200 (50.00%)  50 s left at 250 ms a step  PSNR 21.46 dB  12,345 Gaussians"
+    made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10), ["Viewer at: somewhere"])
+
+    def lines(step, seconds, **metrics):
+        events[1:] = [{"name": "Train Iter (time)", "event": 0.25, "step": step}]
+        events.extend({"name": METRICS_EVENT, "event": metrics} for _ in range(bool(metrics)))
+        clock[0] += seconds
+        made.write_stats_log(0)
+        return capsys.readouterr().out.splitlines()
+
+    return lines
+
+
+def test_a_line_says_what_is_done_and_left(line_after):
+    assert line_after(150, 0) == ["Viewer at: somewhere"], "nothing is measured yet"
+    first = line_after(159, 0, psnr=21.456, gaussian_count=12345)
+    assert first == ["160 (40.00%)  PSNR 21.46 dB  12,345 Gaussians"], "the first step compiles"
+    assert line_after(160, 0) == []
+    (line,) = line_after(199, 10)
+    assert line == "200 (50.00%)  50 s left at 250 ms a step  PSNR 21.46 dB  12,345 Gaussians", "of the last metrics"
     assert percent_of(line) == 50, "sundae demo reads it"
 
 
@@ -66,23 +67,6 @@ def test_a_lasting_change_is_followed():
         now += 10 * (0.1 if done < 500 else 1.0)
         watch.update(done, 3000, now)
     assert watch.step_s == pytest.approx(1.0, rel=0.05)
-
-
-def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch, capsys):
-    monkeypatch.setattr(nerfstudio_configs, "LINE_EVERY", 0.0)
-    events = [{"name": "Train Iter (time)", "event": 2.0, "step": 0}]
-    made = progress_writer(monkeypatch, events, 4)
-    made.write_stats_log(0)
-    assert capsys.readouterr().out == "", "nothing is measured yet"
-    events.append({"name": METRICS_EVENT, "event": {"psnr": 20.0, "gaussian_count": 7}})
-    events[0]["step"] = 1
-    made.write_stats_log(1)
-    del events[1]
-    events[0]["step"] = 2
-    made.write_stats_log(2)
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["2", "3"]
-    assert lines[1].endswith("PSNR 20.00 dB  7 Gaussians")
 
 
 @pytest.mark.parametrize(
