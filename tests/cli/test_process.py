@@ -32,16 +32,9 @@ signal.pause()
 """
 
 
-@pytest.mark.parametrize(
-    ("code", "expected"),
-    [
-        ("pass", 0),
-        ("raise SystemExit(7)", 7),
-        ("import os; os.kill(os.getpid(), 9)", 137),
-    ],
-)
-def test_the_exit_code_is_the_command_s(code, expected):
-    assert run_command([sys.executable, "-c", code]) == expected
+def test_the_exit_code_is_the_command_s():
+    for code, expected in (("pass", 0), ("raise SystemExit(7)", 7), ("import os; os.kill(os.getpid(), 9)", 137)):
+        assert run_command([sys.executable, "-c", code]) == expected
 
 
 def test_the_command_gets_no_input():
@@ -68,8 +61,7 @@ def test_no_word_reaches_a_shell(tmp_path, monkeypatch):
 )
 def test_a_signal_reaches_the_whole_group_once(tmp_path, sent, passed_on):
     def interrupt():
-        while not (tmp_path / "ready").exists():
-            time.sleep(0.01)
+        wait_until((tmp_path / "ready").exists)
         os.kill(os.getpid(), sent)
 
     # Suites in the background inherit signals that are ignored.
@@ -83,17 +75,16 @@ def test_a_signal_reaches_the_whole_group_once(tmp_path, sent, passed_on):
     assert (tmp_path / "signals").read_text().split() == [str(int(passed_on))]
     assert signal.getsignal(sent) is before
     signal.signal(sent, inherited)
-    assert _ends(int((tmp_path / "grandchild").read_text()))
+    status = Path("/proc", (tmp_path / "grandchild").read_text(), "stat")
+    wait_until(lambda: not status.exists() or ") Z " in status.read_text())  # it ends, or waits for its parent
 
 
-def _ends(pid):
-    """Whether a process ends, or has ended and waits for its parent."""
-    for _ in range(1000):
-        status = Path("/proc", str(pid), "stat")
-        if not status.exists() or ") Z " in status.read_text():
-            return True
+def wait_until(condition):
+    for _ in range(3000):
+        if condition():
+            return
         time.sleep(0.01)
-    return False
+    pytest.fail("it never happens")
 
 
 PARENT = """
@@ -108,19 +99,11 @@ run_command(words) if sys.argv[3] == "shown" else run_logged(words, here / "log"
 @pytest.mark.parametrize("way", ["shown", "logged"])
 def test_a_command_ends_with_a_killed_process(tmp_path, way):
     parent = subprocess.Popen([sys.executable, "-c", PARENT, CHILD, tmp_path, way], stdout=subprocess.DEVNULL)
-    wait_for(tmp_path / "ready")
+    wait_until((tmp_path / "ready").exists)
     parent.kill()
     parent.wait()
-    wait_for(tmp_path / "signals")
+    wait_until((tmp_path / "signals").exists)
     assert (tmp_path / "signals").read_text().split() == [str(int(signal.SIGTERM))], "a training saves itself"
-
-
-def wait_for(path):
-    for _ in range(3000):
-        if path.exists():
-            return
-        time.sleep(0.01)
-    pytest.fail(f"there is no {path.name}")
 
 
 def test_a_command_that_is_not_installed():
@@ -148,12 +131,10 @@ def test_a_logged_training_shows_messages_and_the_schedule(tmp_path, capfd):
     log = tmp_path / "train.log"
     assert run_command([sys.executable, "-c", TRAINING], log) == 0
     _, *printed = capfd.readouterr().out.split(TRAINING)[-1].splitlines()
-    assert [line.split()[0] for line in printed] == ["60", "┏━━━┓", "┃", "┡━━━┩", "│", "└───┘", *SHOWN]
+    shown = ["60", "┏━━━┓", "┃", "┡━━━┩", "│", "└───┘", "[00:00:02]", "Warning:", "30"]
+    assert [line.split()[0] for line in printed] == shown
     assert "full_images_datamanager" in log.read_text(encoding="utf-8")
     assert "lr_scheduler" in log.read_text(encoding="utf-8")
-
-
-SHOWN = ["[00:00:02]", "Warning:", "30"]
 
 
 @pytest.mark.parametrize(("cause", "shown"), [("sundae: a is damaged; repair it", False), ("KeyError: 'a'", True)])

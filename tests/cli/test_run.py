@@ -1,6 +1,5 @@
 """``sundae run``: its steps, what is done again, and what is refused; integration/test_run.py trains."""
 
-import json
 import os
 import shlex
 import shutil
@@ -39,6 +38,8 @@ def test_photos_become_a_scene_and_a_report(commands, capsys):
     assert commands.option("--viewer.websocket-host", 1) == "127.0.0.1"
     for place in (1, 2, 3):
         assert commands.option("--data", place) == "out/capture"
+    assert started(commands, *OUT, "--keep", "20%", "--steps", "100") == []
+    assert capsys.readouterr().out.count(": done\n") == 5
 
 
 def test_the_options_of_poses_are_passed_on(commands, capsys):
@@ -81,19 +82,6 @@ def test_a_capture_in_colmap_layout_needs_no_poses(commands, capsys):
     assert "--load-dir" in commands.ran[0]
 
 
-def test_a_capture_of_blender_needs_no_poses(commands, capsys):
-    shutil.copytree("photos", "lego/train")
-    for path in Path("lego/train").iterdir():
-        path.rename(path.with_suffix(".png"))
-    for split in ("train", "val", "test"):
-        frames = [{"file_path": f"./train/{index}"} for index in range(PHOTOS)]
-        Path(f"lego/transforms_{split}.json").write_text(json.dumps({"frames": frames}))
-    assert run("lego", "-o", "out") == 0
-    assert commands.names == STEPS[1:]
-    assert capsys.readouterr().out.startswith("# capture in Blender layout: 8 training images, over white\n")
-    assert commands.ran[0][-1] == "blender-data"
-
-
 def test_a_size_and_a_quality(commands):
     started(commands, *OUT, "--max-mb", "2", "--quality", "best")
     pruning = config_of(commands.ran[1]).pipeline.model.pruning
@@ -117,16 +105,6 @@ def test_a_gpu_packs_with_a_fine_tune(commands, capsys):
         commands.gpu = gpu
         started(commands, "photos", "-o", out, *more)
         assert not any("--finetune" in words for words in commands.ran)
-
-
-# ---------------------------------------------------------------------------------------------- the same command again
-
-
-def test_what_is_done_is_skipped(commands, capsys):
-    assert started(commands) == STEPS
-    capsys.readouterr()
-    assert started(commands) == []
-    assert capsys.readouterr().out.count(": done\n") == 5
 
 
 def cut(path, size=None):
@@ -177,13 +155,19 @@ def test_a_step_that_fails_ends_with_its_code_and_is_repeated(commands, capsys, 
         started(commands, codes={step: code})
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert line.startswith(f"sundae: {name} {says} the same command ")
+    commands.silent, commands.codes = True, {}
+    assert f"{name} ended without its result" in refusal(capsys, *OUT)
+    commands.silent = False
     assert started(commands) == STEPS[STEPS.index(step) :]
 
 
 def test_an_interrupted_training_resumes(commands, capsys):
-    assert started(commands, *OUT, "--steps", "100", codes={"ns-train": 130}) == STEPS[:2]
-    assert "the same command continues here" in capsys.readouterr().err
+    assert started(commands, *OUT, "--steps", "100", codes={"ns-train": 137}) == STEPS[:2]
     first = commands.ran[1]
+    capsys.readouterr()
+    assert started(commands, *OUT, "--steps", "100", codes={"ns-train": 130}) == ["ns-train"]
+    assert "the same command continues here" in capsys.readouterr().err
+    assert commands.ran[0] == first, "there was no checkpoint"
     assert started(commands, *OUT, "--steps", "100") == STEPS[1:]
     # All else is the same, so that the run goes on in its folder.
     fresh, resumed = ["--max-num-iterations", "100"], ["--load-dir", f"{RUN}/nerfstudio_models"]
@@ -201,21 +185,11 @@ def test_a_fine_tune_ends_the_training_where_there_is_a_gpu(commands):
     assert commands.option("--load-dir", 0) == f"{RUN}/nerfstudio_models"
 
 
-def test_a_training_without_a_checkpoint_starts_anew(commands):
-    started(commands, *OUT, "--steps", "100", codes={"ns-train": 137})
-    first = commands.ran[1]
-    started(commands, *OUT, "--steps", "100")
-    assert commands.ran[0] == first
-
-
 def test_results_of_an_older_training_are_made_again(commands):
     started(commands)
     shutil.rmtree("out/runs")
     started(commands, codes={"ns-train": 1})
     assert started(commands) == STEPS[1:]
-
-
-# ------------------------------------------------------------------------------------------------------------ refusals
 
 
 def test_four_placed_photos_are_enough(commands, capsys):
@@ -228,11 +202,6 @@ def test_four_placed_photos_are_enough(commands, capsys):
     assert run("out/capture", "-o", "other") == 0
     commands.placed = 4
     assert started(commands, "photos", "-o", "enough") == STEPS
-
-
-def test_a_command_that_writes_nothing(commands, capsys):
-    commands.silent = True
-    assert "camera poses ended without its result" in refusal(capsys, *OUT)
 
 
 def test_other_or_damaged_settings_are_refused(commands, capsys):

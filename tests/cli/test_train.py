@@ -30,11 +30,14 @@ def test_the_printed_command_runs(commands, capsys, method):
     assert config.pipeline.model.pruning.keep_ratio == 0.05
 
 
-def test_what_is_not_given_is_the_method_s_own(commands):
+def test_what_is_not_given_is_the_method_s_own_and_its_run_is_packed(commands, capsys):
     assert train("scene") == 0
     *words, name = commands.ran[0]
     assert words == ["ns-train", "sundae", "--data", "scene", "--output-dir", "outputs", "--timestamp"]
     assert re.fullmatch(r"[\d_-]+", name), "its run is found by this name"
+    run = commands.run_folder(0)
+    assert commands.ran[1:] == [["sundae", "pack", str(run), "-o", str(run / "scene.sundae")]]
+    assert capsys.readouterr().out.splitlines()[-1] == shlex.join(commands.ran[1]), "the command is printed"
 
 
 def test_further_options_and_the_parser_of_a_capture(commands):
@@ -103,21 +106,18 @@ def test_a_run_that_another_one_has_resumed_or_that_is_trained_is_not_named(tmp_
     assert unfinished_run(out, "sundae", capture) is None
 
 
-def test_a_finished_training_is_packed(commands, capsys):
-    assert train("scene") == 0
-    (_, pack), run = commands.ran, commands.run_folder(0)
-    assert pack == ["sundae", "pack", str(run), "-o", str(run / "scene.sundae")]
-    assert capsys.readouterr().out.splitlines()[-1] == shlex.join(pack), "the command is printed"
-
-
-@pytest.mark.parametrize("given", [["--timestamp", "mine"], ["--timestamp=mine"]])
-def test_a_run_of_the_user_s_own_name_is_packed(commands, given):
+def test_a_run_of_the_user_s_own_name_is_packed_if_it_is_found(commands):
     commands.silent = True
     for name in ("other", "mine"):
         write_run(Path("outputs/scene/sundae", name), 99, capture=Path("scene"))
-    assert train("scene", "--", *given) == 0
-    assert [words[2] for words in commands.ran[1:]] == ["outputs/scene/sundae/mine"]
-    assert sum("--timestamp" in word for word in commands.ran[0]) == 1
+    for given in (["--timestamp", "mine"], ["--timestamp=mine"]):
+        commands.ran.clear()
+        assert train("scene", "--", *given) == 0
+        assert [words[2] for words in commands.ran[1:]] == ["outputs/scene/sundae/mine"]
+        assert sum("--timestamp" in word for word in commands.ran[0]) == 1
+    commands.ran.clear()
+    assert train("scene", "--", "--output-dir", "own") == 0
+    assert len(commands.ran) == 1
 
 
 @pytest.mark.parametrize(("failed", "last"), [(False, "--finetune"), (True, "scene.sundae")])
@@ -158,9 +158,3 @@ def test_what_ends_early_ends_the_command(commands, stage):
     commands.gpu, commands.codes = stage == "--finetune", {stage: 130}
     assert train("scene") == 130
     assert len(commands.ran) == (1 if stage == "ns-train" else 2)
-
-
-def test_a_run_that_is_not_found_is_not_packed(commands):
-    commands.silent = True
-    assert train("scene", "--", "--output-dir", "own") == 0
-    assert len(commands.ran) == 1

@@ -17,8 +17,7 @@ from packed_scenes import KINDS, write_kind
 from sundae_ns.cli import view as command
 from sundae_ns.core.errors import ConfigError
 
-SECONDS = 60
-"""Time limit of what takes milliseconds, so only a hang reaches it."""
+SECONDS = 60  # time limit of what takes milliseconds, so only a hang reaches it
 
 
 @contextmanager
@@ -87,9 +86,7 @@ def test_only_this_machine_by_name_is_answered():
             assert b"a scene" not in content
         assert status_of(port)[0] == 421
         assert status_of(port, f"localhost:{port}", f"evil.example:{port}")[0] == 421
-
-
-def test_on_the_default_port_browsers_name_no_port():
+    # On the default port browsers name no port.
     assert {"localhost", "127.0.0.1", "[::1]", "localhost:80"} <= command._hosts(80)
     assert "localhost" not in command._hosts(8080)
 

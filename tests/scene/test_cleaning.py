@@ -8,7 +8,7 @@ import torch
 
 import sundae_ns as sn
 from sundae_ns.core.errors import ConfigError, DataError
-from sundae_ns.scene.prune_scene import crop_mask, floater_mask, within
+from sundae_ns.scene.prune_scene import crop_mask, floater_mask
 
 VIEWS = tuple(sn.Camera.look_at((x, -4.0, 1.0), (0.0, 0.0, 0.0), fov=60, width=96, height=72) for x in (-2.0, 0.0, 2.0))
 
@@ -108,9 +108,3 @@ def test_an_empty_result_says_where_the_scene_is():
     broken.gaussians["means"][:] = math.nan
     with pytest.raises(DataError, match="no Gaussian is in the box"):
         sn.crop(broken, (0, 0, 0), (1, 1, 1))
-
-
-def test_masks_within_masks():
-    outer, inner = torch.tensor([True, False, True, True]), torch.tensor([False, True, True])
-    assert within(outer, inner).tolist() == [False, False, True, True]
-    assert within(None, inner) is inner

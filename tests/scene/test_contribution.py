@@ -13,8 +13,7 @@ from sundae_ns.pruning.scores import pixel_detail
 from sundae_ns.rasterize.interface import blending_weights, rasterize
 from sundae_ns.scene.render import GaussianSource, TrainingCamera, contribution, pass_inputs
 
-N = 60
-"""Gaussians of a model that is built without a count."""
+N = 60  # Gaussians of a model that is built without a count
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])

@@ -29,10 +29,10 @@ def looking(eyes, targets=None, up=(0.0, 0.0, 1.0)):
     return tuple(sn.Camera.look_at(eye, target, up, fov=50, width=40, height=30) for eye, target in pairs)
 
 
-def on_a_ring(n, radius=4.0):
+def on_a_ring(n):
     """In no order, some higher than others."""
     turns = [2 * math.pi * (7 * i % n) / n for i in range(n)]
-    return [(radius * math.cos(turn), radius * math.sin(turn), 0.5 * math.cos(3 * turn)) for turn in turns]
+    return [(4 * math.cos(turn), 4 * math.sin(turn), 0.5 * math.cos(3 * turn)) for turn in turns]
 
 
 def film(scene, **values):
@@ -93,15 +93,6 @@ def test_views_that_look_in_opposite_directions_are_turned_between():
     found = steps(cameras, 1.0)
     assert float(found.max()) < 3 * float(found.mean())
     check_upright(cameras)
-
-
-def test_views_that_see_nothing_make_a_path_too():
-    eyes = on_a_ring(9, radius=400.0)
-    outward = [(2 * x, 2 * y, z) for x, y, z in eyes]
-    cameras = film(ball(), cameras=looking(eyes, outward))
-    found = steps(cameras, 400.0)
-    assert float(found.max() / found.min()) < 1.5
-    assert min(float(camera.center.norm()) for camera in cameras) > 300
 
 
 def test_a_view_straight_down_is_passed_over():
