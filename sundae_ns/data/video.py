@@ -27,6 +27,7 @@ _CONVERT = "convert it to .mp4 (H.264)"
 # ones; transfers that no player shows as they are.
 _MATRICES, _UNSTATED = (1, 4, 5, 6, 7, 9), (0, 2, 3)
 _NOT_SHOWN = {8: "linear", 9: "logarithmic", 10: "logarithmic", 17: "cinema (SMPTE 428)"}
+_DOLBY = ("dvh1", "dvhe", "dva1", "dvav")  # Without a stated transfer (profile 5) their colours are of no standard
 
 
 def is_video(path: Path) -> bool:
@@ -92,6 +93,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
             video: Any = container.streams.best("video")
             if video is None:
                 raise DataError(f"{path} has no images; give a video")
+            if video.codec_context.codec_tag in _DOLBY and video.codec_context.color_trc in _UNSTATED:
+                raise DataError(f"{path} has colours of Dolby Vision alone, which are not read; convert it to BT.709")
             video.thread_type = "AUTO"
             video.codec_context.options = {"max_pixels": str(1 << 27)}
             yield container, video

@@ -267,7 +267,8 @@ class Trials(Callback):
             elif self._few_share is not None:  # of as many as there are at the prune
                 _warn_of_share(self._few_share, f"{num_views} training views are too few to compare counts")
             elif reason is not None:
-                self._keep_usual(run, reason)
+                _warn_of_share(USUAL_SHARE, reason)
+                self._set_count(run, 0)
             else:
                 self.coming["count"] = self._judges
         if self.decides_head and "head" not in progress.chosen:
@@ -487,7 +488,8 @@ class Trials(Callback):
         """Choose a count, and let the schedule prune to it."""
         progress = self.progress
         if not curve:
-            self._keep_usual(run, _MASKED)
+            _warn_of_share(USUAL_SHARE, _MASKED)
+            self._set_count(run, 0)
             return
         count, reason = self._count_of(curve)
         self._set_count(run, count)
@@ -508,14 +510,9 @@ class Trials(Callback):
             record["head"] = {"pays": progress.chosen["tenth"], "steps_per_trial": self._length, **figures}
         self._record(run, count=record)
 
-    def _keep_usual(self, run: TrainingRun, reason: str) -> None:
-        _warn_of_share(USUAL_SHARE, reason)
-        self._set_count(run, 0)
-
     def _set_count(self, run: TrainingRun, count: int) -> None:
         """End the trials of counts; with 0 the schedule keeps the usual share."""
-        self.progress.stage, self.progress.chosen["count"] = "", count
-        run.state.pruning[COUNT] = count
+        self.progress.stage, self.progress.chosen["count"], run.state.pruning[COUNT] = "", count, count
         self.end(run, "count")
         if not self.decides_head:
             self.enable_head(run.state, True)

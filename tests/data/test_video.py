@@ -22,7 +22,7 @@ def patches(width=192, height=64):
 
 
 def write_colours(
-    path, images, matrix=2, full=False, *, pixels="yuv420p", codec="libx264", transfer=2, turn=None, interlaced=False
+    path, images, matrix=2, full=False, *, pixels="yuv420p", codec="libx264", transfer=2, turn=None, tag=None, flags=0
 ):
     """Write a video of images, which are converted and marked by a matrix, a range and a transfer."""
     with av.open(str(path), "w") as container:
@@ -32,8 +32,8 @@ def write_colours(
         video.options = {"crf": "1", "x265-params": "log-level=0:crf=1"}
         coder = video.codec_context
         coder.colorspace, coder.color_range, coder.color_trc = matrix, 1 + full, transfer
-        if interlaced:
-            coder.flags |= 1 << 18 | 1 << 29
+        coder.flags |= flags
+        coder.codec_tag = tag or coder.codec_tag
         if turn is not None:
             video.set_display_rotation(turn[0], hflip=turn[1])
         options = {"dst_colorspace": matrix if matrix in (1, 5, 9) else 5, "dst_color_range": 1 + full}
@@ -113,7 +113,7 @@ def test_interlaced_frames_have_no_comb(tmp_path):
     for index, image in enumerate(images):
         for field in (0, 1):
             image[field::2, 48 * index + 24 * field :][:, :24] = 220
-    write_colours(path, images, 5, interlaced=True)
+    write_colours(path, images, 5, flags=1 << 18 | 1 << 29)
     frames = frames_from(path)
     assert len(frames) == 5
     for frame, image in zip(frames[1:-1], images[1:-1]):
@@ -194,6 +194,10 @@ REFUSED = {
     "ffconcat": (playlist("ffconcat version 1.0\nfile other.mp4\nfile other.mp4\n"), UNREADABLE),
     "SDP": (playlist("v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=x\r\nm=video 9 RTP/AVP 96\r\n"), UNREADABLE),
     "linear light": (lambda path: write_colours(path, 5 * [patches()], 1, transfer=8), "has linear light"),
+    "Dolby Vision 5": (
+        lambda path: write_colours(path, 5 * [patches()], pixels="yuv420p10le", codec="libx265", tag="dvh1"),
+        "has colours of Dolby Vision alone, .*to BT.709",
+    ),
     "YCgCo": (lambda path: write_colours(path, 5 * [patches()], 8), "has a colour matrix of number 8, .*to BT.709"),
 }
 
