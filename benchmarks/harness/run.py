@@ -20,8 +20,8 @@ from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeElapsedColum
 from harness.plan import Job, done_file, job_folder, jobs_of_shard
 from harness.results import Result, read_results, write_results
 from sundae_ns.cli.main import exit_with
-from sundae_ns.cli.options import check_folder
 from sundae_ns.cli.process import percent_of, run_logged
+from sundae_ns.cli.refusals import check_folder
 from sundae_ns.core.errors import ConfigError, StorageError, SundaeError, writing
 from sundae_ns.core.files import write_text
 from sundae_ns.core.tables import table

@@ -14,7 +14,8 @@ import tyro
 from rich.markup import escape
 
 from sundae_ns.cli.inputs import chosen_cameras, is_run
-from sundae_ns.cli.options import Flag, Maybe, Overwrite, check_folder, check_least, progress_bar
+from sundae_ns.cli.options import Flag, Maybe, Overwrite, progress_bar
+from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.files import write_files
 from sundae_ns.core.metrics import Lpips, Net, flip_available, lpips_weights
@@ -70,7 +71,7 @@ def compare(
     if first is not None and len(scenes) == 1 and not formats:
         raise ConfigError(f"{scenes[0]} is one scene; give another, --formats, or --data with a capture")
     from sundae_ns.report.measure import against_first, against_photos, csv_text, labels_of, markdown, measure
-    from sundae_ns.report.report_page import ShownRun, cameras_for_each, report_page, shown_views
+    from sundae_ns.report.report_page import ShownRun, report_page, shown_views
 
     repeats = (5 if photos else 0) if repeats is None else repeats
     options: dict[str, object] = {"-o": out, "--data": data, "--cameras": cameras, "--num-cameras": num_cameras}
@@ -102,7 +103,7 @@ def compare(
                 subject = opened(path)
                 progress.update(task, description=f"Measuring {escape(label)}", total=len(subject.truths))
                 measured = measured_by(subject, label=label, progress=partial(progress.advance, task))
-                views = [] if out is None else shown_views(subject, measured, cameras_for_each(len(scenes)))
+                views = [] if out is None else shown_views(subject, measured, len(scenes))
                 curve = read_count_curve(Path(measured.source)) if subject.file_bytes is None else None
                 done.append(ShownRun(measured, views, curve, subject.capture))
             except SundaeError as error:  # keep the measurements of the others

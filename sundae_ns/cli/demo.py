@@ -11,8 +11,9 @@ import torch
 import tyro
 from rich.console import Console
 
-from sundae_ns.cli.options import Overwrite, check_folder, check_least
+from sundae_ns.cli.options import Overwrite
 from sundae_ns.cli.process import quoted, run_command, word
+from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import writing
 from sundae_ns.core.files import write_bytes, write_text
 from sundae_ns.core.metrics import Lpips

@@ -8,31 +8,18 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from sundae_ns.cli.inputs import copies_rows, name_of, opened, prepared_page, reduced
-from sundae_ns.cli.options import (
-    Advanced,
-    Flag,
-    Maybe,
-    Out,
-    Plain,
-    Scene,
-    SceneDetails,
-    Wishes,
-    check_file,
-    check_folder,
-    check_suffix,
-    progress_bar,
-)
+from sundae_ns.cli.inputs import copies_rows, name_of, opened, prepared_page, print_cost, reduced
+from sundae_ns.cli.options import Advanced, Flag, Maybe, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
+from sundae_ns.cli.refusals import check_file, check_folder, check_suffix
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.gaussians import sh_degree
-from sundae_ns.io.formats import FORMATS
+from sundae_ns.io.formats import FORMATS, kind_of
 from sundae_ns.io.run_folder import files_of
 from sundae_ns.io.sog import STREAMED
 from sundae_ns.io.spz import clamped
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.load_save import save_for_viewers, save_levels
 from sundae_ns.scene.page import write_page
-from sundae_ns.scene.scene import Scene as Opened
 
 
 @dataclass(frozen=True)
@@ -77,11 +64,14 @@ def export(
     if page:
         if upright:
             raise ConfigError("a page turns the scene upright by itself; leave out --upright")
-        first = name_of(scene), *prepared_page(scene, wishes, advanced)
+        before = opened(scene, wishes, advanced, capture=True)
+        first = name_of(scene), *prepared_page(scene, wishes, advanced, before)
         second = () if beside is None else ((name_of(beside), *prepared_page(beside, Wishes(), SceneDetails())),)
         named = {name: link for name, _, link in (word.partition("=") for word in views)}
         size = write_page(out, first, *second, views=named)
         print(f"{out}: {size:,} bytes; {'open it in a browser' if out.suffix else 'serve it'}")
+        if kind_of(scene) != "packed" or first[1] is not before.scene:
+            print_cost(out if out.suffix else out / "scene.sundae", before, scene, wishes, advanced)
         return 0
     if beside is not None or views:
         raise ConfigError("only a page shows two scenes or named views; name it .html, or without a suffix")
@@ -90,14 +80,28 @@ def export(
         raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
     if advanced.start_view is not None or advanced.up is not None:
         raise ConfigError(f"{out.suffix or '.sog'} files hold neither a start view nor an up axis; leave them out")
-    left = reduced(opened(scene, wishes, advanced, capture=lod), scene, wishes, advanced, out=out)
+    before = opened(scene, wishes, advanced, capture=lod)
+    left = reduced(before, scene, wishes, advanced, out=out)
     if upright and not left.scene.in_model_frame:
         raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
     if lod:
-        return _write_levels(left.scene, out, upright)
+        from sundae_ns.plugin.distill import levels_of  # imports nerfstudio, which takes seconds
+
+        levels = [left.scene.to(fastest_device())]
+        with progress_bar() as bar:
+            task = bar.add_task("Levels of detail", total=None)
+            trained = levels_of(levels[0], left.scene.cameras, lambda i, n: bar.update(task, completed=i, total=n))
+            for level, psnr in trained:
+                print(f"{level.num_gaussians:,} Gaussians: {psnr:.2f} dB against the full scene, on cameras of no step")
+                levels.append(level)
+        save_levels(levels, out, upright=upright)
+        print(f"{out / STREAMED}: {levels[0].num_gaussians:,} Gaussians and {len(levels) - 1} levels below")
+        print_cost(out / STREAMED, before, scene, wishes, advanced, upright=upright)
+        return 0
     if copies:
         left.write(scene, out)
         print(f"{out}: {left.scene.num_gaussians:,} of {left.total:,} Gaussians")
+        print_cost(out, before, scene, wishes, advanced)
         return 0
     with Console(stderr=True).status(f"Writing {left.scene.num_gaussians:,} Gaussians"):  # a .sog takes minutes
         written = save_for_viewers(left.stated, out, upright=upright)
@@ -107,20 +111,7 @@ def export(
         print(f"clamped scales or colours of {beyond:,} Gaussians to the range of a .spz; a .sog has none")
     if degree < left.stated.gaussians.sh_degree:
         print(f"left out harmonics above SH degree {degree}, which {out.suffix} cannot store; .ply can")
-    return 0
-
-
-def _write_levels(scene: Opened, out: Path, upright: bool) -> int:
-    from sundae_ns.plugin.distill import levels_of  # imports nerfstudio, which takes seconds
-
-    levels = [scene.to(fastest_device())]
-    with progress_bar() as bar:
-        task = bar.add_task("Levels of detail", total=None)
-        trained = levels_of(levels[0], scene.cameras, lambda i, n: bar.update(task, completed=i, total=n))
-        for level, psnr in trained:
-            print(f"{level.num_gaussians:,} Gaussians: {psnr:.2f} dB against the full scene, on cameras of no step")
-            levels.append(level)
-    save_levels(levels, out, upright=upright)
-    size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
-    print(f"{out / STREAMED}: {scene.num_gaussians:,} Gaussians and {len(levels) - 1} levels below, {size:,} bytes")
+    exact = out.suffix.lower() in (".ply", ".glb") and degree == before.scene.gaussians.sh_degree
+    if not exact or before.scene.head is not None or wishes.cleans or wishes.reduces:
+        print_cost(out, before, scene, wishes, advanced, upright=upright)
     return 0

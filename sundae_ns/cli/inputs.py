@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -10,23 +11,23 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from rich.console import Console
 from torch import Tensor
 
 from sundae_ns.cli.options import SceneDetails, Wishes
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import DataError
+from sundae_ns.core.errors import DataError, SundaeError
 from sundae_ns.core.tables import MEGABYTE
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.io.config_file import check_run, find_config
-from sundae_ns.io.formats import kind_of
+from sundae_ns.io.formats import UPRIGHT, kind_of
 from sundae_ns.io.pack import container
-from sundae_ns.io.pack.config import PackConfig, scaled
+from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.ply import has_own_columns, keep_vertices
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.cameras import cameras_of, with_start
+from sundae_ns.scene.compose import transform
 from sundae_ns.scene.load_save import load, load_with_mask, write_scene
 from sundae_ns.scene.page import packed_of
 from sundae_ns.scene.prune_scene import PrunedScene, count_for_drop, crop_mask, floater_mask, prune_with_mask, within
@@ -43,7 +44,7 @@ class Left(NamedTuple):
     total: int  # Gaussians of the file
     form: Form | None = None  # of a file of a given size
     pruned: PrunedScene | None = None
-    cameras: Sequence[Camera] = ()  # by which it was pruned
+    cameras: Sequence[Camera] = ()  # those given or stored; of a pruned scene, those that decided
 
     @property
     def stated(self) -> Scene:
@@ -54,7 +55,7 @@ class Left(NamedTuple):
     @property
     def precision(self) -> PackConfig | None:
         """That of a packed file; None for the default."""
-        return None if self.form is None else scaled(PackConfig(), self.form.power)
+        return None if self.form is None else self.form.precision
 
     def write(self, source: Path, out: Path) -> int:
         """Write the scene; a .ply of a .ply keeps its properties and comments. Returns the bytes."""
@@ -67,23 +68,9 @@ class Left(NamedTuple):
         return out.stat().st_size
 
 
-def cleaned(scene: Scene, wishes: Wishes, cameras: Sequence[Camera]) -> Tensor:
-    """True for Gaussians in the box that do not float, bool ``[N]``; prints their numbers to stderr."""
-    mask = torch.ones(scene.num_gaussians, dtype=torch.bool, device=scene.device)
-    if wishes.crop is not None:
-        mask = crop_mask(scene, wishes.crop[:3], wishes.crop[3:])
-        print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
-    if wishes.remove_floaters:
-        floats = floater_mask(scene[mask], cameras, console=Console(stderr=True))
-        mask[mask.clone()] = ~floats
-        rule = "" if cameras else ", by their neighbours alone: no camera of the photographs is known"
-        print(f"removed {int(floats.sum()):,} floaters of {len(floats):,} Gaussians{rule}", file=sys.stderr)
-        if not bool(mask.any()):
-            raise DataError("all Gaussians float; leave out --remove-floaters")
-    return mask
-
-
-def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool = False) -> Left:
+def opened(
+    source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool = False, num_cameras: int | None = None
+) -> Left:
     """A scene before its wishes, upright and started as its details say; ``capture`` asks for cameras of a run."""
     rows = None
     if is_run(source) and (capture or wishes.remove_floaters or details.data is not None):
@@ -91,7 +78,8 @@ def opened(source: Path, wishes: Wishes, details: SceneDetails, *, capture: bool
     else:
         scene, rows = load_with_mask(source)
     scene = with_start(scene, details.start_view, details.up)
-    return Left(scene, rows, scene.num_gaussians if rows is None else len(rows))
+    cameras = chosen_cameras(scene, details.cameras, num_cameras)
+    return Left(scene, rows, scene.num_gaussians if rows is None else len(rows), cameras=cameras)
 
 
 def reduced(
@@ -104,10 +92,14 @@ def reduced(
     rule: PruneRule | None = None,
     num_cameras: int | None = None,
     target_drop: float | None = None,
+    config: PackConfig | None = None,
+    rounds: bool = True,
 ) -> Left:
-    """What the options leave of a scene; ``out`` is the file, of another one that is measured, to be written."""
-    scene, rows = left.scene, left.rows
-    cameras: Sequence[Camera] = ()
+    """What the options leave of a scene; ``out`` is the file, or one like it, to be written.
+
+    ``config`` is the precision of a pack, and ``rounds`` whether a size changes it.
+    """
+    scene, rows, cameras = left.scene, left.rows, left.cameras
     if details.no_head:
         scene = replace(scene, head=None)
     reduces = wishes.reduces or target_drop is not None
@@ -116,10 +108,16 @@ def reduced(
     with naming_full_memory(lambda: left.total):
         scene, rule = scene.to(fastest_device()), rule or PruneRule()
         rule = replace(rule, seed=details.seed or 0)
-        if reduces or wishes.remove_floaters:
-            cameras = chosen_cameras(scene, details.cameras, num_cameras)
-        if wishes.cleans:
-            mask = cleaned(scene, wishes, cameras)
+        if wishes.crop is not None:
+            mask = crop_mask(scene, wishes.crop[:3], wishes.crop[3:])
+            print(f"{int(mask.sum()):,} of {len(mask):,} Gaussians are in the box", file=sys.stderr)
+            scene, rows = scene[mask], None if rows is None else within(rows, mask.cpu())
+        if wishes.remove_floaters:
+            mask = ~floater_mask(scene, cameras, console=Console(stderr=True))
+            why = "" if cameras else ", by their neighbours alone: no camera of the photographs is known"
+            print(f"removed {int((~mask).sum()):,} floaters of {len(mask):,} Gaussians{why}", file=sys.stderr)
+            if not bool(mask.any()):
+                raise DataError("all Gaussians float; leave out --remove-floaters")
             scene, rows = scene[mask], None if rows is None else within(rows, mask.cpu())
         left = left._replace(scene=scene, rows=rows)
         if not reduces:
@@ -141,7 +139,8 @@ def reduced(
             pruned = prune_with_mask(scene, wishes.keep, wishes.count, cameras, rule, progress=True)
             return after(pruned, None)
         most, suffix = int(wishes.max_mb * MEGABYTE), out.suffix.lower()
-        forms = forms_of(scene, suffix)[: 1 if copies_rows(source, out) else None]  # all columns of a .ply stay
+        # All columns of a .ply stay.
+        forms = forms_of(scene, suffix, config)[: 1 if copies_rows(source, out) or not rounds else None]
         return after(
             *prune_to_bytes(
                 scene,
@@ -165,9 +164,13 @@ def open_run(run: Path, **options: Any) -> Scene:
         return load_run(run, **options)
 
 
-def prepared_page(source: Path, wishes: Wishes, details: SceneDetails) -> tuple[Scene, bytes]:
+def prepared_page(
+    source: Path, wishes: Wishes, details: SceneDetails, before: Left | None = None
+) -> tuple[Scene, bytes]:
     """What the options leave of a scene, and the packed file that a page of it shows; a packed one stays as it is."""
-    left = reduced(opened(source, wishes, details, capture=True), source, wishes, details, out=Path("page.html"))
+    left = reduced(
+        before or opened(source, wishes, details, capture=True), source, wishes, details, out=Path("page.html")
+    )
     if kind_of(source) != "packed" or wishes.cleans or wishes.reduces or details.no_head:
         return left.stated, packed_of(left.stated, left.precision)
     packed = source.read_bytes()
@@ -176,6 +179,28 @@ def prepared_page(source: Path, wishes: Wishes, details: SceneDetails) -> tuple[
 
         packed = container.restated(packed, stated_start(left.scene))
     return left.scene, packed
+
+
+def print_cost(
+    file: Path, before: Left, source: Path, wishes: Wishes, details: SceneDetails, *, upright: bool = False
+) -> None:
+    """Print what a finished file costs, against the scene before its changes; of a box, within it."""
+    from sundae_ns.report.measure import cost_line
+
+    whole, name = replace(before.scene, cameras=tuple(before.cameras)), "the whole scene"
+    if wishes.crop is not None:
+        whole, name = whole[crop_mask(whole, wishes.crop[:3], wishes.crop[3:])], "the scene in the box"
+    if upright:
+        whole = transform(whole, UPRIGHT[:, :3])
+    logging.disable()  # of what reading the file warns, writing it has
+    try:
+        with Console(stderr=True).status("Measuring what it costs"):
+            line = cost_line(file, source, whole.to(fastest_device()), name, seed=details.seed or 0)
+    except SundaeError as error:
+        line = f"what this costs is not measured: {error}"
+    finally:
+        logging.disable(logging.NOTSET)
+    print(line)
 
 
 def name_of(path: Path) -> str:

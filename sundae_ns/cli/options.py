@@ -1,14 +1,12 @@
-"""Options that commands share, and the one place that decides whether a command may write its output."""
+"""Options that commands share."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
 import types
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 import tyro
@@ -16,7 +14,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from sundae_ns.core.errors import ConfigError, StorageError
+from sundae_ns.cli.refusals import check_exclusive, check_least
+from sundae_ns.core.errors import ConfigError
 
 T = TypeVar("T")
 SHORT = ConstructorRegistry()  # of options that may be left out: their help names the type, not None beside it
@@ -41,8 +40,8 @@ Scene = Annotated[
     Path,
     tyro.conf.Positional,
     tyro.conf.arg(
-        help="a packed scene, a run (its folder or config.yml), or a .ply, .spz, .sog, .glb, .splat, .ksplat or "
-        "gsplat's .pt."
+        help="a packed scene or its page (.html), a run (its folder or config.yml), or a .ply, .spz, .sog, "
+        "lod-meta.json, .glb, .splat, .ksplat or gsplat's .pt."
     ),
 ]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -151,79 +150,3 @@ def progress_bar() -> Progress:
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     shown, both = console.is_terminal, sys.stdout.isatty()  # stdout may be a file
     return Progress(*columns, console=console, transient=True, disable=not shown, redirect_stdout=both)
-
-
-def check_file(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> None:
-    """Raise ``StorageError`` for an output that is no file, that ``reads`` hold, or that exists; None reads nothing."""
-    _check_writable(out.parent)
-    if not out.exists():
-        return
-    if not out.is_file():
-        raise StorageError(f"{out} is {'a folder' if out.is_dir() else 'no regular file'}; name a file to write")
-    if any(_contains(path, out) for path in reads if path is not None):
-        raise StorageError(f"{out} belongs to what the command reads; choose another name")
-    if not overwrite:
-        raise StorageError(f"{out} exists; choose another name, or replace it with --overwrite")
-
-
-def check_folder(
-    out: Path, *, reads: Iterable[Path | None], overwrite: bool | None = None, outside: Path | None = None
-) -> None:
-    """As :func:`check_file`, for a folder that an input, ``outside``, must not hold; ``overwrite`` may be no option."""
-    if out.exists() and not out.is_dir():
-        raise StorageError(f"{out} is a file; choose another folder")
-    if outside is not None and _contains(outside, out):
-        raise StorageError(f"{out} lies in {outside}, which the command reads; choose another folder")
-    _check_writable(out)
-    if not out.exists():
-        return
-    if any(_contains(out, path) for path in reads if path is not None):
-        raise StorageError(f"{out} holds what the command reads; choose another folder")
-    if not overwrite and any(out.iterdir()):
-        replaced = "" if overwrite is None else ", or replace its files with --overwrite"
-        raise StorageError(f"{out} holds files; choose another folder{replaced}")
-
-
-def _check_writable(folder: Path) -> None:
-    """Raise ``StorageError`` unless files can be made in a folder, or in the first one above that exists."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    if not folder.is_dir():
-        raise StorageError(f"{folder} is no folder; choose another")
-    try:
-        TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise StorageError(f"cannot write to {folder.absolute()} ({error.strerror}); choose another folder") from error
-
-
-def _contains(outer: Path, inner: Path) -> bool:
-    """Whether a path is or holds another one; links count as what they point to."""
-    return inner.resolve().is_relative_to(outer.resolve())
-
-
-def check_suffix(out: Path, suffixes: Iterable[str]) -> str:
-    """The suffix of an output in lower case; ``ConfigError`` for another one."""
-    suffix = out.suffix.lower()
-    if suffix not in suffixes:
-        raise ConfigError(f"{out} has no supported suffix; name it {', '.join(suffixes)}")
-    return suffix
-
-
-def check_least(**values: tuple[float | None, float]) -> None:
-    """Raise ``ConfigError`` for the first option that is given and below its limit: ``steps=(steps, 1)``."""
-    for name, (value, least) in values.items():
-        if value is not None and not value >= least:
-            raise ConfigError(f"{name.replace('_', '-')} is {value}; give at least {least}")
-
-
-def check_drop(decibels: float | None) -> None:
-    """Raise ``ConfigError`` for a loss of PSNR that is no positive number of dB."""
-    if decibels is not None and not 0 < decibels < 100:
-        raise ConfigError(f"target-drop is {decibels}; give a positive number of dB, 0.5 for half a decibel")
-
-
-def check_exclusive(**values: object) -> None:
-    """Raise ``ConfigError`` if more than one of the options is given."""
-    given = [f"--{name.replace('_', '-')}" for name, value in values.items() if value is not None]
-    if len(given) > 1:
-        raise ConfigError(f"{given[0]} and {given[1]} exclude each other; give one")

@@ -16,21 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import torch
 import tyro
 
-from sundae_ns.cli.inputs import Left, open_run, reduced
-from sundae_ns.cli.options import (
-    Advanced,
-    Flag,
-    Maybe,
-    Out,
-    Plain,
-    SceneDetails,
-    Wishes,
-    check_drop,
-    check_exclusive,
-    check_file,
-    check_least,
-    progress_bar,
-)
+from sundae_ns.cli.inputs import Left, chosen_cameras, open_run, print_cost, reduced
+from sundae_ns.cli.options import Advanced, Flag, Maybe, Out, Plain, SceneDetails, Wishes, progress_bar
+from sundae_ns.cli.refusals import check_drop, check_exclusive, check_file, check_least
 from sundae_ns.core.errors import ConfigError, SundaeError
 from sundae_ns.core.tables import MEGABYTE
 from sundae_ns.io.formats import PRIMITIVES, kind_of_gaussians
@@ -106,10 +94,12 @@ def pack(
         return Judge(run, data)
 
     scene = open_run(run, max_cameras=advanced.max_cameras, data=data) if kind is None else load(run)
-    left = Left(with_start(scene, advanced.start_view, advanced.up), None, scene.num_gaussians)
-    # A fine-tune shrinks the file; the search below gives its size.
-    roomy = None if wishes.max_mb is None else wishes.max_mb / (FINETUNED_SIZE if finetune else 1)
-    left = reduced(left, run, replace(wishes, max_mb=roomy), advanced, out=out.with_suffix(".sundae"))
+    scene = with_start(scene, advanced.start_view, advanced.up)
+    before = Left(scene, None, len(scene), cameras=chosen_cameras(scene, advanced.cameras, None))
+    # A fine-tune shrinks the file, and the search below rounds it to its size.
+    roomy = None if wishes.max_mb is None else wishes.max_mb / (FINETUNED_SIZE if tuned else 1)
+    more: dict[str, Any] = {"out": out.with_suffix(".sundae"), "config": precision, "rounds": not tuned}
+    left = reduced(before, run, replace(wishes, max_mb=roomy), advanced, **more)
     most = None if wishes.max_mb is None else int(wishes.max_mb * MEGABYTE)
     source = contents_of(left.stated)
     with progress_bar() as bar, redirect_stdout(StringIO()):  # nerfstudio's messages
@@ -119,7 +109,7 @@ def pack(
 
             packs.append(tune(run, source, config, finetune, data=data, progress=lambda _: bar.advance(task)))
         bar.update(task, description="Packing")
-        if most is not None or target_drop is not None:
+        if (tuned and most is not None) or target_drop is not None:
             from sundae_ns.plugin.tuned_packs import Search, best_pack
 
             # Starts from the source, because positions of a fitted pack are rounded.
@@ -130,7 +120,7 @@ def pack(
                 finetune = 0
             packs = [(best.scene, best.codecs)]  # both are compared already
         else:
-            packs.append(fit_scene(source, precision))
+            packs.append(fit_scene(source, left.precision or precision))
         report = write_fitted(out, *packs[0])
         bar.update(task, advance=1, description="Measuring")
         # Photos show what a box leaves out.
@@ -149,6 +139,8 @@ def pack(
         print(f"PSNR {psnr[0]:.2f} -> {psnr[1]:.2f} dB{shown}, before and after, on {views}")
         if not tuned and not wishes.cleans and torch.cuda.is_available():
             print(f"--finetune {FINETUNE_STEPS} makes it about 40% smaller")
+    else:
+        print_cost(out, before, run, wishes, advanced)
     return 0
 
 

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from sundae_ns.cli.main import STEP
-from sundae_ns.cli.options import Maybe, Out, Plain, Source, check_folder, check_least, progress_bar
+from sundae_ns.cli.options import Maybe, Out, Plain, Source, progress_bar
 from sundae_ns.cli.process import quoted, word
+from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import ConfigError, DataError, SundaeError, one_line
 
 if TYPE_CHECKING:

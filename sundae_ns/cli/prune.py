@@ -10,28 +10,13 @@ from typing import Any
 
 import tyro
 
-from sundae_ns.cli.inputs import chosen_cameras, opened, reduced, warn_if_few
-from sundae_ns.cli.options import (
-    Advanced,
-    Flag,
-    Maybe,
-    Out,
-    Plain,
-    Scene,
-    SceneDetails,
-    Wishes,
-    check_drop,
-    check_exclusive,
-    check_file,
-    check_suffix,
-    progress_bar,
-)
+from sundae_ns.cli.inputs import Left, opened, print_cost, reduced, warn_if_few
+from sundae_ns.cli.options import Advanced, Flag, Maybe, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
+from sundae_ns.cli.refusals import check_drop, check_exclusive, check_file, check_suffix
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.core.tables import MEGABYTE
 from sundae_ns.pruning.rule import PruneRule, ScoreName
 from sundae_ns.rasterize.interface import fastest_device
 from sundae_ns.scene.load_save import SUFFIXES, save
-from sundae_ns.scene.scene import Scene as Opened
 from sundae_ns.scene.virtual_cameras import virtual_cameras
 
 
@@ -92,28 +77,32 @@ def prune(
         wishes = dataclasses.replace(wishes, keep=0.1)
     check_file(out, reads=[source, advanced.cameras], overwrite=advanced.overwrite)
     advanced.rule.validate()
-    left = opened(source, wishes, advanced)
+    before = opened(source, wishes, advanced, num_cameras=advanced.num_cameras)
     if distill:
         whole = dataclasses.replace(wishes, keep=None, count=None)
-        return _distilled(reduced(left, source, whole, advanced, out=out).scene, out, wishes, advanced)
+        code = _distilled(reduced(before, source, whole, advanced, out=out), out, wishes, advanced)
+        if code == 0:
+            print_cost(out, before, source, wishes, advanced)
+        return code
     more: dict[str, Any] = {"rule": advanced.rule, "num_cameras": advanced.num_cameras, "target_drop": target_drop}
-    left = reduced(left, source, wishes, advanced, out=out, **more)
-    size = left.write(source, out)
-    print(f"{out}: {left.scene.num_gaussians:,} of {left.total:,} Gaussians, {size / MEGABYTE:.2f} MB")
+    left = reduced(before, source, wishes, advanced, out=out, **more)
+    left.write(source, out)
+    print(f"{out}: {left.scene.num_gaussians:,} of {left.total:,} Gaussians")
     if left.pruned is not None and left.pruned.seen is not None:
         print(f"{len(left.cameras)} cameras see {left.pruned.seen:.1%} of the Gaussians")
+    print_cost(out, before, source, wishes, advanced)
     return 0
 
 
-def _distilled(scene: Opened, out: Path, wishes: Wishes, details: PruneDetails) -> int:
+def _distilled(left: Left, out: Path, wishes: Wishes, details: PruneDetails) -> int:
     """Train a smaller scene on images of the full one, and save it; its exit code."""
     from sundae_ns.plugin.distill import Distillation  # imports nerfstudio, which takes seconds
     from sundae_ns.train.progress import Interruption
 
-    warn_if_few(wishes.count, scene.num_gaussians)
-    scene, near = scene.to(fastest_device()), None
+    warn_if_few(wishes.count, left.scene.num_gaussians)
+    scene, near = left.scene.to(fastest_device()), None
     if details.cameras is not None:
-        near = chosen_cameras(scene, details.cameras, None) or virtual_cameras(scene, seed=details.seed or 0)
+        near = left.cameras or virtual_cameras(scene, seed=details.seed or 0)
     options: dict[str, Any] = {"keep": wishes.keep, "count": wishes.count, "cameras": near, "steps": details.steps}
     options |= {"seed": details.seed or 0, "head": not details.no_head, "progress": True}
     training, partial = Distillation(scene, **options), out.with_name(f"{out.name}.partial")
@@ -143,6 +132,4 @@ def _distilled(scene: Opened, out: Path, wishes: Wishes, details: PruneDetails) 
     print(f"{out}: {counts}, {'with' if result.head else 'without'} a head")
     if training.gain is not None:
         print(f"a head gained {training.gain:.2f} dB in its trial, on cameras that no step sees")
-    quality = f"{training.quality():.2f} dB against the full scene on {len(training.held_out)} cameras"
-    print(f"{quality} that no step sees; {out.stat().st_size:,} bytes")
     return 0

@@ -8,19 +8,8 @@ from PIL import Image
 from rich.console import Console
 
 from sundae_ns.cli.inputs import opened, reduced
-from sundae_ns.cli.options import (
-    Advanced,
-    Maybe,
-    Out,
-    Plain,
-    Scene,
-    SceneDetails,
-    Wishes,
-    check_file,
-    check_least,
-    check_suffix,
-    progress_bar,
-)
+from sundae_ns.cli.options import Advanced, Maybe, Out, Plain, Scene, SceneDetails, Wishes, progress_bar
+from sundae_ns.cli.refusals import check_file, check_least, check_suffix
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError
 from sundae_ns.core.files import replacing, write_image, write_video
@@ -77,7 +66,9 @@ def render(
         cameras = CameraFile([shown.start], None)
     else:
         cameras = CameraFile(list(shown.cameras) or [camera_in_front(shown)], None)
-    views = [_resized(each, width, even=video) for each in cameras.cameras]
+    views = [each if width is None else each.zoomed(width / each.width) for each in cameras.cameras]
+    if video:  # whose colours have half the size
+        views = [each._replace(width=each.width // 2 * 2, height=each.height // 2 * 2) for each in views]
     shown = shown.to(fastest_device())
 
     def rendered(camera: Camera) -> Image.Image:
@@ -98,9 +89,3 @@ def render(
     write_image(out, rendered(views[index]))
     print(f"{out}: {views[index].width} x {views[index].height} px")
     return 0
-
-
-def _resized(camera: Camera, width: int | None, *, even: bool) -> Camera:
-    """The camera with another width, and with even sides for a video, whose colours have half the size."""
-    camera = camera if width is None else camera.zoomed(width / camera.width)
-    return camera._replace(width=camera.width // 2 * 2, height=camera.height // 2 * 2) if even else camera

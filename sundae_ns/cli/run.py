@@ -13,9 +13,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from sundae_ns.cli.options import Out, Plain, Source, check_folder
+from sundae_ns.cli.options import Out, Plain, Source
 from sundae_ns.cli.poses import PoseOptions, check_poses
 from sundae_ns.cli.process import quoted, run_command, word
+from sundae_ns.cli.refusals import check_folder
 from sundae_ns.cli.train import FINETUNE_WORDS, TrainOptions, has_gpu, pack_run
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 from sundae_ns.core.files import put_aside, write_text

@@ -12,20 +12,9 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.options import (
-    Advanced,
-    Details,
-    Flag,
-    Maybe,
-    Out,
-    Plain,
-    Source,
-    Wishes,
-    check_folder,
-    check_least,
-    words_of,
-)
+from sundae_ns.cli.options import Advanced, Details, Flag, Maybe, Out, Plain, Source, Wishes, words_of
 from sundae_ns.cli.process import run_command, word
+from sundae_ns.cli.refusals import check_folder, check_least
 from sundae_ns.core.errors import STOPPED, ConfigError, DataError
 from sundae_ns.core.tables import MEGABYTE
 from sundae_ns.data.layouts import is_posed, no_transforms, posed_layout

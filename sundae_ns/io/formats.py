@@ -41,7 +41,7 @@ _WRITERS[".ply"] = lambda path, gaussians, marks: write_ply(path, gaussians, com
 _READERS |= {"splat": read_splat, "ksplat": read_ksplat, "gsplat": read_gsplat}
 # In nerfstudio and in gsplat's trainer, z points up; in a 3DGS .ply, -y does.
 _MODEL_UP, _PLY_UP = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
-_UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
+UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
 _log = logging.getLogger(__name__)
 
 
@@ -203,8 +203,8 @@ def _prepared(params: Mapping[str, Tensor], kind: str, marks: Marks, upright: bo
     check_gaussians(params)
     gaussians = {name: value.detach().cpu() for name, value in sanitise(params).gaussians.as_harmonics().items()}
     if upright and kind != ".glb":
-        gaussians = similarity(gaussians, _UPRIGHT, 1.0)
-        x, y, z = (_UPRIGHT[:, :3] @ torch.tensor(marks.up or _MODEL_UP)).tolist()
+        gaussians = similarity(gaussians, UPRIGHT, 1.0)
+        x, y, z = (UPRIGHT[:, :3] @ torch.tensor(marks.up or _MODEL_UP)).tolist()
         marks = marks._replace(in_model_frame=False, up=(x, y, z))
     if kind != ".ply":
         gaussians["features_rest"] = gaussians["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]

@@ -20,11 +20,13 @@ from torch import Tensor
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.gaussians import FEATURES, bytes_of
-from sundae_ns.core.metrics import Lpips, ViewQuality, quality_of
+from sundae_ns.core.metrics import MOST_PSNR, Lpips, ViewQuality, quality_of
 from sundae_ns.core.tables import MEGABYTE, number, table, without_nan
 from sundae_ns.core.timing import median_ms
 from sundae_ns.cuda.kernels import naming_full_memory
 from sundae_ns.head.head import bytes_of_module
+from sundae_ns.scene.compose import aligned
+from sundae_ns.scene.describe import bytes_at, held_out_cameras
 from sundae_ns.scene.frames import FrameReplay
 from sundae_ns.scene.load_save import load
 from sundae_ns.scene.render import GaussianSource, RenderSettings, compensate, draw, scale_plan
@@ -149,9 +151,9 @@ class Subject:
     @classmethod
     def of_file(cls, scene: Scene, path: Path, title: str, views: Sequence[tuple[Camera, Tensor]]) -> Subject:
         """A scene in cameras, with the images of another one, which gives the ``title``."""
-        facts, size = {"source": str(path), "scene": title}, path.stat().st_size if path.is_file() else None
+        facts = {"source": str(path), "scene": title}
         cameras, truths = [camera for camera, _ in views], [truth for _, truth in views]
-        given = (cameras, truths, [f"camera {i}" for i in range(len(views))], facts, title, size)
+        given = (cameras, truths, [f"camera {i}" for i in range(len(views))], facts, title, bytes_at(path))
         return cls(GaussianSource(scene.gaussians), scene.settings(), scene.background, *given)
 
     @torch.no_grad()
@@ -199,10 +201,27 @@ def against_first(path: Path, whole: Scene, cameras: Sequence[Camera]) -> Callab
     def subject(other: Path) -> Subject:
         if other == path:
             return Subject.of_file(full, path, path.name, [])
-        scene = replace(load(other), background_color=whole.background_color).to(full.device)
+        scene = replace(aligned(load(other), whole), background_color=whole.background_color).to(full.device)
         return Subject.of_file(resized(scene, 1 / size), other, path.name, views)
 
     return subject
+
+
+def cost_line(file: Path, source: Path, whole: Scene, name: str = "the whole scene", *, seed: int = 0) -> str:
+    """What a file costs: its bytes of those of its source, and its images against those of the ``whole`` scene.
+
+    At most 16 of the scene's cameras see both; without any, virtual ones that no prune of the ``seed`` sees.
+    """
+    given, views = whole.cameras, held_out_cameras(whole, whole.cameras, seed=seed)
+    opened = against_first(source, whole, views)
+    before, after = (measure(opened(path), visible=False, repeats=0) for path in (source, file))
+    values = [min(view.psnr, MOST_PSNR) for view in after.full.views]
+    by = f"{len(views)}{f' of {len(given)}' if len(given) > len(views) else ''} {'' if given else 'held-out '}cameras"
+    if given and views[0][2:] != given[0][2:]:
+        by += f" at {views[0].width} x {views[0].height} px"
+    sizes = f"{number(after.full.bytes / MEGABYTE, 2)} MB (of {number(before.full.bytes / MEGABYTE, 2)})"
+    figures = f"{fmean(values):.1f} dB, {number(after.full.mean('ssim'), 3)} against {name} on {by}"
+    return f"{sizes}; {figures}, worst {min(values):.1f}"
 
 
 def labels_of(paths: Sequence[Path]) -> list[str]:

@@ -70,11 +70,6 @@ def choose_cameras(qualities: Sequence[float], most: int) -> list[int]:
     return sorted(ranked[int(place)] for place in places)
 
 
-def cameras_for_each(runs: int) -> int:
-    """Most views of each run on a page of this number of runs."""
-    return min(MOST_VIEWS, max(MOST_ON_A_PAGE // max(runs, 1), 2))
-
-
 def error_map(rendering: Tensor, truth: Tensor, size: tuple[int, int] | None = None) -> Image.Image:
     """Mean absolute difference of the three channels as colours; equal images get the first colour everywhere.
 
@@ -93,8 +88,9 @@ def error_map(rendering: Tensor, truth: Tensor, size: tuple[int, int] | None = N
     return mapped
 
 
-def shown_views(subject: Subject, measured: Measured, most: int) -> list[ShownView]:
-    """At most ``most`` views of a scene; memory holds the images of one at a time at their full size."""
+def shown_views(subject: Subject, measured: Measured, runs: int) -> list[ShownView]:
+    """Some views of one of the ``runs`` on a page; memory holds the images of one at a time at their full size."""
+    most = min(MOST_VIEWS, max(MOST_ON_A_PAGE // runs, 2))
     full, base = measured.full.views, measured.base.views if measured.has_head else None
     views = []
     for i in choose_cameras([view.psnr for view in full], most):

@@ -206,7 +206,10 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     if not (1 <= count <= MOST_FRAMES and seconds > 0):
         length = f"{seconds:g} s and {frames_per_second:g} frames a second"
         raise ConfigError(f"a film of {length} is impossible; give 1 to {MOST_FRAMES:,} frames")
-    up = _up_of(scene)
+    up = np.array(scene.up or (0.0, 0.0, 1.0))
+    if scene.up is None and scene.cameras:
+        mean = torch.stack([camera.pose[:, 1] for camera in scene.cameras]).double().mean(dim=0)
+        up = np.array(unit(mean.tolist())) if float(mean.norm()) > 1e-3 else up
     cameras = [camera for camera in (scene.start, *scene.cameras) if camera is not None]
     lens = cameras[0] if cameras else Camera.from_fov(torch.eye(4), FOV, 1280, 720)
     poses = np.array([camera.pose.double().tolist() for camera in cameras]).reshape(-1, 3, 4)
@@ -222,14 +225,6 @@ def film_views(scene: Scene, *, seconds: float = 12.0, frames_per_second: float 
     lens = lens.zoomed(min(1280 / max(lens.width, lens.height), 1.0))
     intrinsics = [float(lens.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))]
     return [Camera.from_pose(pose, intrinsics, lens.width, lens.height) for pose in moved]
-
-
-def _up_of(scene: Scene) -> Array:
-    if scene.up is None and scene.cameras:
-        mean = torch.stack([camera.pose[:, 1] for camera in scene.cameras]).double().mean(dim=0)
-        if float(mean.norm()) > 1e-3:
-            return np.array(unit(mean.tolist()))
-    return np.array(scene.up or (0.0, 0.0, 1.0))
 
 
 def _circle(scene: Scene, up: Array) -> tuple[Array, Array]:

@@ -104,9 +104,7 @@ def merge(scenes: Iterable[Scene]) -> Scene:
         raise DataError("some scenes have survey coordinates and others not; give dataclasses.replace(scene, meta={})")
     degree, joined = max(scene.gaussians.sh_degree for scene in scenes), []
     for scene in scenes:
-        if scene.offset is not None and first.offset is not None and scene.offset != first.offset:
-            apart = numbers(scene.offset, "offset", (3,)) - numbers(first.offset, "offset", (3,))
-            scene = transform(dataclasses.replace(scene, meta={}), translation=apart)
+        scene = aligned(scene, first)
         gaussians = (scene.gaussians if len(encodings) == 1 else scene.gaussians.as_harmonics()).to(first.device)
         missing = (0, 0, 0, (degree + 1) ** 2 - 1 - gaussians["features_rest"].shape[1])
         joined.append((gaussians.replaced({"features_rest": pad(gaussians["features_rest"], missing)}), scene.cameras))
@@ -118,6 +116,14 @@ def merge(scenes: Iterable[Scene]) -> Scene:
         cameras=tuple(dict.fromkeys(camera for _, cameras in joined for camera in cameras)),  # parts share theirs
         up=first.up or next((scene.up for scene in scenes if scene.up), None),
     )
+
+
+def aligned(scene: Scene, other: Scene) -> Scene:
+    """The scene in the coordinates of another one, if they are survey coordinates with another offset."""
+    if scene.offset is None or scene.offset == other.offset:
+        return scene
+    apart = numbers(scene.offset, "offset", (3,)) - numbers(other.offset or (0, 0, 0), "offset", (3,))
+    return transform(dataclasses.replace(scene, meta={}), translation=apart)
 
 
 def _same(head: CompensationHead | None, other: CompensationHead | None) -> bool:

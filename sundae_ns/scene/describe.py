@@ -18,14 +18,16 @@ from torch import Tensor
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.gaussians import bytes_of, sanitise
 from sundae_ns.head.head import bytes_of_module
-from sundae_ns.io.formats import kind_of
+from sundae_ns.io.config_file import find_config
+from sundae_ns.io.formats import METAS, kind_of, kind_of_gaussians
 from sundae_ns.io.pack.container import read_header
 from sundae_ns.scene.cameras import spread
 from sundae_ns.scene.prune_scene import at_most, floater_mask, weights_in
 from sundae_ns.scene.scene import Scene
-from sundae_ns.scene.virtual_cameras import virtual_cameras
+from sundae_ns.scene.virtual_cameras import by_device, virtual_cameras
 
-HELD_OUT, PIXELS = 16, 1 << 20  # cameras that tell what a change costs, and most pixels of their images
+HELD_OUT = 16  # cameras that tell what a change costs
+PIXELS = {"cpu": 1 << 18, "cuda": 1 << 20}  # most of their images, by the device
 LOOKING = 64  # virtual cameras that tell what is seen of a scene without cameras
 _PRODUCER = re.compile(
     rb'"generator"\s*:\s*"([^"]{1,200})"|^comment ([^\r\n]* (?:by|from) [^\r\n]{1,200})', re.M | re.I
@@ -36,14 +38,15 @@ def held_out_cameras(scene: Scene, cameras: Sequence[Camera], count: int = HELD_
     """At most ``count`` cameras, evenly spaced among some; without any, virtual ones that no prune of the seed sees."""
     if not cameras:
         return virtual_cameras(scene, count, seed=seed + 1)
-    return [at_most(cameras[i], PIXELS) for i in spread(len(cameras), count)]
+    return [at_most(cameras[i], by_device(PIXELS, scene.device)) for i in spread(len(cameras), count)]
 
 
-def bytes_at(path: Path, scene: Scene) -> int:
-    """Bytes of the file of a scene; of a run, those of its Gaussians and its head in fp32."""
-    if path.is_file():
-        return path.stat().st_size
-    return bytes_of(scene.gaussians) + bytes_of_module(scene.head)
+def bytes_at(path: Path) -> int | None:
+    """Bytes of the file or the folder of a scene; None for a run, which holds more than that."""
+    if kind_of(path) is None and kind_of_gaussians(path) is None and find_config(path) is not None:
+        return None
+    files = (path.parent if path.name in METAS else path).rglob("*")
+    return sum(file.stat().st_size for file in {path, *files} if file.is_file())
 
 
 @torch.no_grad()
@@ -64,7 +67,7 @@ def describe(
     if path.is_file():  # a .sog holds its meta.json anywhere
         stated = _PRODUCER.search(path.read_bytes()[: None if kind_of(path) == "sog" else 1 << 16])
     return {
-        "bytes": bytes_at(path, scene),
+        "bytes": bytes_at(path) or bytes_of(scene.gaussians) + bytes_of_module(scene.head),
         "gaussians": scene.num_gaussians,
         "sh_degree": gaussians.sh_degree,
         "head": None if scene.head is None else scene.head.config.size,

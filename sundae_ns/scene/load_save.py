@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -20,7 +22,7 @@ from sundae_ns.io.formats import FORMATS, kind_of
 from sundae_ns.io.pack.config import PackConfig
 from sundae_ns.io.ply import Marks
 from sundae_ns.scene.cameras import is_frame
-from sundae_ns.scene.page import packed_of, write_page
+from sundae_ns.scene.page import packed_in, packed_of, write_page
 from sundae_ns.scene.render import degree_in_use
 from sundae_ns.scene.scene import Scene
 
@@ -35,9 +37,9 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     says how many.
 
     Args:
-        path: a ``.ply``, also a compressed one, a ``.spz``, ``.sog``, ``.glb``, ``.splat`` or ``.ksplat`` of any
-            program, a checkpoint of gsplat (``.pt``), a packed ``.sundae``, or a run of ``ns-train`` with sundae or
-            splatfacto: its folder, its ``config.yml`` or one of its checkpoints.
+        path: a ``.ply``, also a compressed one, a ``.spz``, ``.sog`` (a ``lod-meta.json`` too), ``.glb``, ``.splat`` or
+            ``.ksplat`` of any program, a checkpoint of gsplat (``.pt``), a packed ``.sundae`` or its page (``.html``),
+            or a run of ``ns-train`` with sundae or splatfacto: its folder, ``config.yml`` or one of its checkpoints.
         device: of the scene.
 
     Raises:
@@ -62,8 +64,19 @@ def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scen
         from sundae_ns.scene.packing import scene_of  # its decoder needs a compiler, which other files do not
 
         return scene_of(read_scene(path)).to(device), None
+    if path.suffix.lower() == ".html":
+        with TemporaryDirectory() as folder:
+            packed = Path(folder, f"{path.stem}.sundae")
+            packed.write_bytes(packed_in(path))
+            return load_with_mask(packed, device)
     if formats.kind_of_gaussians(path) is None:
-        return _of_run(path).to(device), None
+        config = find_config(path)
+        if config is None:
+            reason = "is no run" if path.exists() else "does not exist"
+            wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .glb, .splat, .ksplat or .pt file"
+            raise CheckpointError(f"{path} {formats.unread(path) or f'{reason}; {wanted}'}")
+        source = (path, checkpoint.read(path)) if path.suffix == ".ckpt" else checkpoint.read_newest(config.parent)
+        return scene_of_checkpoint(*source, config).to(device), None
     sanitised, marks = formats.read_gaussian_file(path)
     up = formats.up_of(path, sanitised.gaussians["means"], marks)
     facts: dict[str, Any] = {"antialiased": marks.antialiased, "in_model_frame": marks.in_model_frame, "up": up}
@@ -129,16 +142,6 @@ def _marks_of(scene: Scene) -> Marks:
     return Marks(scene.antialiased, scene.in_model_frame, scene.up, scene.offset)
 
 
-def _of_run(path: Path) -> Scene:
-    config = find_config(path)
-    if config is None:
-        reason = "is no run" if path.exists() else "does not exist"
-        wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .glb, .splat, .ksplat or .pt file"
-        raise CheckpointError(f"{path} {formats.unread(path) or f'{reason}; {wanted}'}")
-    source = (path, checkpoint.read(path)) if path.suffix == ".ckpt" else checkpoint.read_newest(config.parent)
-    return scene_of_checkpoint(*source, config)
-
-
 def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -> Scene:
     """The scene of a checkpoint with the contents ``loaded``, on the CPU; ``CheckpointError`` if they do not fit."""
     options = model_options(config)
@@ -154,7 +157,10 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))  # training did not reach the others
     gaussians["features_rest"] = gaussians["features_rest"][:, : (degree + 1) ** 2 - 1]
     gaussians = formats.usable(gaussians, source).gaussians
-    frame, upright = _frame_of(config.parent), orientation_of(config) in ("up", "vertical")  # by default z is up
+    frame, upright = None, orientation_of(config) in ("up", "vertical")  # by default z is up
+    with suppress(DataError, KeyError, TypeError, ValueError):
+        stated = read_json(config.parent / FRAME_FILE)
+        frame = {"transform": stated["transform"], "scale": float(stated["scale"])}
     return Scene(
         gaussians,
         head,
@@ -163,7 +169,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         trained_focal=(float(focal[0]), float(focal[1])) if head is not None and focal else None,
         up=(0.0, 0.0, 1.0) if upright else None,
         in_model_frame=True,
-        meta={"source": {"step": int(loaded["step"])}, **({} if frame is None else {"frame": frame})},
+        meta={"source": {"step": int(loaded["step"])}, **({"frame": frame} if is_frame(frame) else {})},
     )
 
 
@@ -181,13 +187,3 @@ def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path)
         if (head := CompensationHead.of_weights(config, weights)) is not None:
             return head
     raise CheckpointError(f"{source} has a head that does not fit its own config.yml; give another run")
-
-
-def _frame_of(run: Path) -> dict[str, Any] | None:
-    """Transform and scale from the capture's coordinates to the model's; None without a usable file."""
-    try:
-        stated = read_json(run / FRAME_FILE)
-        frame = {"transform": stated["transform"], "scale": float(stated["scale"])}
-    except (DataError, KeyError, TypeError, ValueError):
-        return None
-    return frame if is_frame(frame) else None

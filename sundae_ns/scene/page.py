@@ -20,7 +20,7 @@ from pathlib import Path
 from PIL import Image
 
 from sundae_ns.core.camera import Camera
-from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, writing
+from sundae_ns.core.errors import ConfigError, MemoryExhaustedError, PackError, reading, writing
 from sundae_ns.core.files import write_bytes, write_text
 from sundae_ns.core.values import whole
 from sundae_ns.io.pack.config import PackConfig
@@ -87,6 +87,13 @@ def write_page(path: Path, *shown: Shown, views: Mapping[str, View] | None = Non
         write_bytes(path / name, packed)
     write_text(path / "index.html", index)
     return sum((path / name).stat().st_size for name in (*files, "index.html"))
+
+
+def packed_in(page: Path) -> bytes:
+    """The packed file of the first scene in a page of one file; ``PackError`` if there is none."""
+    with reading(page, "a page with its scene", PackError, remedy="give the scene that it was made of"):
+        content = page.read_text(encoding="utf-8").partition('class="scene"')[2]
+        return base64.b64decode(content.partition(">")[2].partition("<")[0] or "none", validate=True)
 
 
 def _filled(shown: Sequence[Shown], views: Mapping[str, View], contents: Sequence[tuple[str, str]]) -> str:

@@ -79,16 +79,6 @@ def prune(
     return prune_with_mask(scene, keep, count, cameras, rule, progress=progress).scene
 
 
-def check_amount(keep: float | None, count: int | None) -> None:
-    """Raise ``ConfigError`` unless one of the two is given, and is in its range."""
-    if (keep is None) == (count is None):
-        raise ConfigError("prune needs either keep (a share) or count (a number of Gaussians); give one of them")
-    if keep is not None and not 0 < float(numbers(keep, "keep", ())) <= 1:
-        raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
-    if count is not None:
-        whole(count, "count")
-
-
 @torch.no_grad()
 def prune_with_mask(
     scene: Scene,
@@ -106,7 +96,12 @@ def prune_with_mask(
 
     ``weights`` ``[M]`` of the finite Gaussians, by :func:`weights_in`, and their ``graph`` are not computed again.
     """
-    check_amount(keep, count)
+    if (keep is None) == (count is None):
+        raise ConfigError("prune needs either keep (a share) or count (a number of Gaussians); give one of them")
+    if keep is not None and not 0 < float(numbers(keep, "keep", ())) <= 1:
+        raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
+    if count is not None:
+        whole(count, "count")
     rule, sanitised = rule or PruneRule(), sanitise(scene.gaussians)
     n = sanitised.gaussians.num_gaussians
     if keep is not None:

@@ -1,15 +1,17 @@
 """A scene in a file of a given size, by the number of Gaussians and by how exactly the file states them.
 
 What a file holds is a trade: more Gaussians, or more bits for each. So a few :class:`Form` are tried, each with as many
-Gaussians as fit, and the one whose images are nearest to those of the full scene is taken. Contributions and the graph
-are computed once. What is taken is then fitted, and counted or rounded to the size.
+Gaussians as fit by a sample, and the one whose images are nearest to those of the full scene is taken. Contributions
+and the graph are computed once. What is taken is then fitted, and rounded or counted to the size.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -19,36 +21,44 @@ from rich.console import Console
 
 from sundae_ns.core.camera import Camera
 from sundae_ns.core.errors import ConfigError
-from sundae_ns.core.gaussians import Gaussians, sanitise
+from sundae_ns.core.gaussians import Gaussians
+from sundae_ns.core.tables import MEGABYTE
 from sundae_ns.io.pack.config import COARSEST, FINEST, PackConfig, scaled
 from sundae_ns.pruning.merge import gaussian_graph
 from sundae_ns.pruning.rule import PruneRule
-from sundae_ns.scene.prune_scene import PrunedScene, at_most, prune_with_mask, weights_in, within
+from sundae_ns.scene.prune_scene import PrunedScene, at_most, prune_with_mask, weights_in
 from sundae_ns.scene.scene import Scene, measure, render
 from sundae_ns.scene.virtual_cameras import split, virtual_cameras
 
 SAMPLED = 64, 8192  # random Gaussians of two files, which tell the bytes of each more one
-LEAST, AIM = 0.97, 0.99  # shares of the size: what is near enough, and what each file aims at
-DB_PER_DOUBLING = 1.5  # by which candidates of slightly different sizes are compared
+LEAST, AIM = 0.97, 0.985  # shares of the size: what is near enough, and what each file aims at
+POWER_PER_HALVING = 2.2  # of the steps of a pack; the first guess of a search
 JUDGES, PIXELS = 8, 1 << 16  # cameras that compare candidates, and most pixels of their images
 MOST_FILES = 8  # of the last search
+_log = logging.getLogger(__name__)
 
 
 class Form(NamedTuple):
     """How a file states Gaussians."""
 
     degree: int  # Most SH degree
-    power: float = 0.0  # Steps of a pack: powers of two of the default ones
+    power: float = 0.0  # Steps of a pack: powers of two of those of the configuration
+    config: PackConfig = PackConfig()
+
+    @property
+    def precision(self) -> PackConfig:
+        """That of a pack."""
+        return scaled(self.config, self.power)
 
 
 Written = Callable[[PrunedScene, Form, Path], int]  # writes a scene in a form into a folder, and returns the bytes
 
 
-def forms_of(scene: Scene, suffix: str) -> list[Form]:
+def forms_of(scene: Scene, suffix: str, config: PackConfig | None = None) -> list[Form]:
     """Forms to choose from, the most exact first: packs have steps, other files a degree of harmonics."""
     degree = scene.gaussians.sh_degree
     if suffix in (".sundae", ".html"):
-        return [Form(degree, power) for power in (0.0, 0.75, 1.5)]
+        return [Form(degree, power, config or PackConfig()) for power in (0.0, 0.75, 1.5)]
     return [Form(each) for each in sorted({degree, min(degree, 1), 0}, reverse=True)]
 
 
@@ -68,16 +78,13 @@ def prune_to_bytes(
     *,
     progress: bool = False,
 ) -> tuple[PrunedScene, Form]:
-    """The scene and the form of a file of 97 to 100% of ``most`` bytes, less only where the whole scene is smaller.
+    """The scene and the form of a file of 97 to 100% of ``most`` bytes; of fewer, with a warning, if that is all.
 
-    ``cameras`` as for :func:`sundae_ns.prune`; every eighth compares the forms. ``ConfigError`` if hardly a Gaussian
-    fits.
+    The scene is finite. ``cameras`` as for :func:`sundae_ns.prune`; every eighth compares the forms. ``ConfigError`` if
+    hardly a Gaussian fits.
     """
-    sanitised = sanitise(scene.gaussians)
-    usable, n = dataclasses.replace(scene, gaussians=sanitised.gaussians), sanitised.gaussians.num_gaussians
+    n, packs = scene.num_gaussians, len({form.power for form in forms}) > 1
     order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(scene.device)
-    packs = len({form.power for form in forms}) > 1
-
     with TemporaryDirectory() as folder:
 
         def bytes_of(pruned: PrunedScene, form: Form) -> int:
@@ -85,7 +92,7 @@ def prune_to_bytes(
 
         def rows(count: int) -> PrunedScene:
             mask = torch.zeros(n, dtype=torch.bool, device=scene.device).index_fill_(0, order[:count], True)
-            return PrunedScene(usable[mask], within(sanitised.mask, mask))
+            return PrunedScene(scene[mask], mask)
 
         def sampled(form: Form) -> tuple[float, float]:
             """Bytes of no Gaussian, and of each."""
@@ -97,54 +104,50 @@ def prune_to_bytes(
         lines = [sampled(form) for form in forms]
         # Sparser Gaussians take more bytes each, so the whole scene takes at most about this.
         if lines[0][0] + n * lines[0][1] <= most and (size := bytes_of(whole := rows(n), forms[0])) <= most:
-            return whole, _rounded(whole, forms[0], size, most, bytes_of) if packs else forms[0]
+            form, size = _rounded(whole, forms[0], size, most, bytes_of) if packs else (forms[0], size)
+            if size < LEAST * most:
+                _log.warning("the whole scene takes %.2f MB, less than was asked for", size / MEGABYTE)
+            return whole, form
         counts = [min(n, int((AIM * most - fixed) / each)) for fixed, each in lines]
-        if max(counts) < 1:
+        possible = [i for i, count in enumerate(counts) if count > 0]
+        if not possible:
             raise ConfigError(f"a file without Gaussians has {lines[-1][0]:,.0f} bytes; give more than {most:,}")
-        given = cameras if cameras is not None else scene.cameras or virtual_cameras(usable)
-        weights, graph = None, gaussian_graph(usable.gaussians, rule) if rule.uses_graph and n > 1 else None
+        given = cameras if cameras is not None else scene.cameras or virtual_cameras(scene)
+        weights, graph = None, gaussian_graph(scene.gaussians, rule) if rule.uses_graph and n > 1 else None
         if rule.uses_contribution:
             console = Console(stderr=True) if progress else None
             middle = max(sorted(counts)[len(counts) // 2], 1)
-            weights = weights_in(usable, given, middle if rule.uses_detail else None, console)
+            weights = weights_in(scene, given, middle if rule.uses_detail else None, console)
 
-        def cut(count: int, fit: bool) -> PrunedScene:
-            options = {"weights": weights, "graph": graph, "progress": progress, "fit": fit}
-            pruned = prune_with_mask(usable, None, count, given, rule, **options)  # type: ignore[arg-type]
-            return pruned._replace(mask=within(sanitised.mask, pruned.mask))
+        @cache
+        def cut(count: int, fit: bool = False) -> PrunedScene:
+            options = {"progress": progress, "fit": fit, "weights": weights, "graph": graph}
+            return prune_with_mask(scene, None, count, given, rule, **options)  # type: ignore[arg-type]
 
-        judges = [at_most(camera, PIXELS) for camera in (split(given)[1] or list(given))[:JUDGES]]
-        images = [render(usable, camera).rgb for camera in judges]
-        tried: list[tuple[float, int, int]] = []  # worth, number of the form, bytes of each Gaussian
-        for i, form in enumerate(forms):
-            if counts[i] < 1:
-                continue
-            pruned = cut(counts[i], fit=False)
-            size = bytes_of(pruned, form)
-            shown = _as_packed(pruned.scene, form) if packs else stated(pruned.scene, form)
-            worth = measure(shown, images, judges).psnr + DB_PER_DOUBLING * min(math.log2(most / size), 1.0)
-            tried.append((worth, i, size))
-        _, best, size = max(tried)
-        (fixed, _), form, count = lines[best], forms[best], counts[best]
-        low, high, chosen = 0, n, None
-        for _ in range(MOST_FILES):
-            if not LEAST * most <= size <= most:
-                each = (size - fixed) / count
-                count = min(max(int((AIM * most - fixed) / each), low + 1, 1), high)
+        best = possible[0]
+        if len(possible) > 1:
+            judges = [at_most(camera, PIXELS) for camera in (split(given)[1] or list(given))[:JUDGES]]
+            images, as_read = [render(scene, camera).rgb for camera in judges], _as_packed if packs else stated
+            best = max(possible, key=lambda i: measure(as_read(cut(counts[i]).scene, forms[i]), images, judges).psnr)
+        fixed, form, count = lines[best][0], forms[best], counts[best]
+        if packs:
             pruned = cut(count, fit=True)
-            size = bytes_of(pruned, form)
-            if packs:
-                return pruned, _rounded(pruned, form, size, most, bytes_of)
-            if size <= most:
-                chosen, low = pruned, count
-                if size >= LEAST * most or count == n:
+            return pruned, _rounded(pruned, form, bytes_of(pruned, form), most, bytes_of)[0]
+        for fit in (False, True):  # a fit hardly changes the bytes, so it begins with a count that fits without
+            low, high, chosen = 0, n, None
+            for _ in range(MOST_FILES):
+                size = bytes_of(pruned := cut(count, fit), form)
+                if size <= most:
+                    low, chosen = count, pruned
+                else:
+                    high = count - 1
+                if LEAST * most <= size <= most or low >= high:
                     break
-            else:
-                high = count - 1
-            if low >= high:
-                break
-    if chosen is None:
-        raise ConfigError(f"a file of {count:,} Gaussians has {size:,} bytes; give more than {most:,}")
+                count = min(max(int(count * (AIM * most - fixed) / (size - fixed)), low + 1), high)
+            if chosen is None:
+                raise ConfigError(f"a file of {count:,} Gaussians has {size:,} bytes; give more than {most:,}")
+            count = low
+    assert chosen is not None
     return chosen, form
 
 
@@ -153,32 +156,29 @@ def _as_packed(scene: Scene, form: Form) -> Scene:
     from sundae_ns.io.pack.packed_scene import fit_scene  # its encoder needs a compiler, which other files do not
     from sundae_ns.scene.packing import contents_of
 
-    packed, codecs = fit_scene(contents_of(scene), scaled(PackConfig(), form.power))
+    packed, codecs = fit_scene(contents_of(scene), form.precision)
     gaussians = Gaussians(codecs.rounded(packed.gaussians), scene.gaussians.encoding)
     return dataclasses.replace(scene, gaussians=gaussians).to(scene.device)
 
 
 def _rounded(
     pruned: PrunedScene, form: Form, size: int, most: int, bytes_of: Callable[[PrunedScene, Form], int]
-) -> Form:
-    """The form with the finest steps of a pack whose file has at most ``most`` bytes."""
-    low, high, best = (form.power, COARSEST, None) if size > most else (FINEST, form.power, form)
-    if size > most and bytes_of(pruned, form._replace(power=COARSEST)) > most:
-        raise ConfigError(
-            f"a file of {pruned.scene.num_gaussians:,} Gaussians is larger; give more than {most:,} bytes"
-        )
-    power = form.power
+) -> tuple[Form, int]:
+    """The form with the finest steps of a pack whose file has at most ``most`` bytes, and its bytes."""
+    low, high, best, slope = FINEST, COARSEST, None, POWER_PER_HALVING
     for _ in range(MOST_FILES):
-        if LEAST * most <= size <= most:
-            break
-        # A bit less of each value, of about three.
-        guess = power + 3 * math.log2(size / (AIM * most))
-        power = guess if low < guess < high else (low + high) / 2
-        size = bytes_of(pruned, form._replace(power=power))
         if size <= most:
-            high, best = power, form._replace(power=power)
+            high, best = form.power, (form, size)
         else:
-            low = power
-        if high - low < 0.01:
+            low = form.power
+        if LEAST * most <= size <= most or high - low < 0.01:
             break
-    return best or form._replace(power=COARSEST)
+        guess = min(max(form.power + slope * math.log2(size / (AIM * most)), FINEST), COARSEST)
+        power, before = guess if low <= guess <= high and guess != form.power else (low + high) / 2, size
+        size = bytes_of(pruned, form._replace(power=power))
+        slope = max((power - form.power) / (math.log2(before / size) or 1.0), 0.5)
+        form = form._replace(power=power)
+    if best is None:
+        count = pruned.scene.num_gaussians
+        raise ConfigError(f"a file of {count:,} Gaussians has {size:,} bytes; give more than {most:,}")
+    return best

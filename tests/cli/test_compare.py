@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import pytest
 import torch
@@ -53,6 +54,35 @@ def test_formats_of_one_scene_are_one_table(folder, capsys):
     rows = {row["scene"]: row for row in rows_of(capsys.readouterr().out)}
     assert list(rows) == ["whole.ply", "whole.spz", "whole.sog", "whole.glb", "whole.sundae"]
     assert float(rows["whole.glb"]["PSNR, dB"]) > 90 > float(rows["whole.spz"]["PSNR, dB"]) > 25
+
+
+COSTS = {
+    "prune whole.sundae -o a.spz --keep 0.5": "against the whole scene on 3 cameras",
+    "prune whole.ply -o b.html --keep 0.5": "against the whole scene on 16 held-out cameras",
+    "prune whole.ply -o c.sundae --distill --steps 1 --no-head": "against the whole scene on 16 held-out cameras",
+    "export whole.ply -o d.ply --crop 0 0 0 1 1 0.5": "100.0 dB, 1.000 against the scene in the box on 16 held-out",
+    "export whole.ply -o e --cameras whole.sundae": "against the whole scene on 3 cameras",
+    "pack whole.ply -o f.sundae": "against the whole scene on 16 held-out cameras",
+    "export whole.sundae -o g.html": None,
+    "export whole.sundae -o g.ply": None,
+}
+
+
+@pytest.mark.usefixtures("short_distillation")
+def test_commands_say_what_a_change_costs(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    for words, expected in COSTS.items():
+        assert run(*words.split()) == 0
+        said = capsys.readouterr().out.splitlines()
+        assert (" MB (of " in said[-1]) == (expected is not None), words
+        assert expected is None or expected in said[-1], words
+        if words.startswith("prune whole.sundae"):
+            assert run("compare", "whole.sundae", "a.spz") == 0
+            row = rows_of(capsys.readouterr().out)[1]
+            figures = [float(row[name]) for name in ("MB", "PSNR, dB", "SSIM", "worst, dB")]
+            found = re.fullmatch(r"(.*) MB \(of .*\); (.*) dB, (.*) against .*, worst (.*)", said[-1])
+            assert [float(value) for value in found.groups()] == pytest.approx(figures, abs=0.051)
+    assert sn.load("b.html").num_gaussians == 150
 
 
 def test_info_says_what_a_file_holds(folder, capsys):

@@ -11,7 +11,7 @@ import torch
 from command_line import refusal, run
 
 import sundae_ns as sn
-from sundae_ns.cli.options import check_file, check_folder
+from sundae_ns.cli.refusals import check_file, check_folder
 from sundae_ns.core.errors import StorageError
 
 

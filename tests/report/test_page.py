@@ -20,10 +20,8 @@ from sundae_ns.report.report_page import (
     EXACT_SIDE,
     LARGEST_ERROR,
     LONGEST_SIDE,
-    MOST_ON_A_PAGE,
     MOST_VIEWS,
     ShownRun,
-    cameras_for_each,
     choose_cameras,
     error_map,
     report_page,
@@ -137,12 +135,6 @@ def test_other_views_are_evenly_spaced_between_them():
     assert set(np.diff(ranks)) == {13.0}
     qualities[31] = math.nan  # counts as worst
     assert choose_cameras(qualities, 2) == [31, qualities.index(299.0)]
-
-
-def test_a_page_of_many_runs_shows_fewer_views_of_each():
-    assert cameras_for_each(1) == MOST_VIEWS
-    assert all(runs * cameras_for_each(runs) <= MOST_ON_A_PAGE for runs in range(1, MOST_ON_A_PAGE // 2 + 1))
-    assert cameras_for_each(1000) == 2
 
 
 # ------------------------------------------------------------------------------------------------------- the error map
