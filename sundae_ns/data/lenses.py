@@ -57,16 +57,14 @@ def kind_of_model(model: Any, where: str) -> str:
     """The kind of lens of a ``camera_model``; ``DataError`` with the remedy for other projections."""
     if isinstance(model, str) and model in _KINDS:
         return _KINDS[model]
-    raise _refusal(str(model), where) or DataError(
-        f"{where}: camera_model is {model!r:.80}; use one of {', '.join(_KINDS)}"
-    )
+    raise _refusal(str(model), where, f"camera_model is {model!r:.80}; use one of {', '.join(_KINDS)}")
 
 
-def _refusal(model: str, where: str) -> DataError | None:
-    """The error for a projection that has a remedy of its own."""
+def _refusal(model: str, where: str, otherwise: str) -> DataError:
+    """The error for a projection, with a remedy of its own if there is one."""
     remedy = next((remedy for start, remedy in _REMEDIES.items() if model.startswith(start)), None)
-    what = f"{where}: camera model {model} is no lens that perspective images can be made of"
-    return DataError(f"{what}; {remedy}") if remedy else None
+    what = f"camera model {model} is no lens that perspective images can be made of; {remedy}"
+    return DataError(f"{where}: {what if remedy else otherwise}")
 
 
 def kind_of_frame(stated: Mapping[str, Any], where: str) -> str:
@@ -106,8 +104,7 @@ def colmap_lens(model: str, params: Sequence[float], where: str) -> tuple[tuple[
 
 
 def _unsupported(model: str, where: str) -> DataError:
-    unknown = DataError(f"{where}: nerfstudio does not support camera model {model}; {_UNDISTORT}")
-    return _refusal(model, where) or unknown
+    return _refusal(model, where, f"nerfstudio does not support camera model {model}; {_UNDISTORT}")
 
 
 def colmap_model(model: int | str, where: str) -> str:

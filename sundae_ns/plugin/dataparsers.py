@@ -375,29 +375,23 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     axis is mirrored, or a focal length belongs to no lens.
     """
     kinds = cameras.camera_type.flatten()
-    ratios = (cameras.fx / cameras.width.clamp_min(1)).flatten()
+    unknown = ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype))
+    if unknown.any():
+        i = _first(unknown)
+        what = f"{names[i].name} is of type {CameraType(int(kinds[i])).name}, which no perspective image can be made of"
+        raise DataError(f"the camera of {what}; cut its images into perspective ones, such as cube faces")
     mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
-    for flags, cause in (
-        (
-            ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype)),
-            "the camera of {name} is of type {kind}, which no perspective image can be made of; cut its images into "
-            "perspective ones, such as cube faces",
-        ),
-        (
-            mirrored,
-            "the pose of {name} mirrors an axis ({mirrored} of {count} poses do); negate one column of its rotation",
-        ),
-        (
-            (ratios < 0.01) | (ratios > 1000),  # views of 178 and of 0.06 degrees
-            "the focal length of {name} is {focal:.3g} px and the image is {width} px wide, which no lens has; give "
-            "the focal length in pixels",
-        ),
-    ):
-        if flags.any():
-            i = _first(flags)
-            kind, focal, width = CameraType(int(kinds[i])).name, float(cameras.fx[i]), int(cameras.width[i])
-            numbers = {"mirrored": int(mirrored.sum()), "count": len(names), "focal": focal, "width": width}
-            raise DataError(cause.format(name=names[i].name, kind=kind, **numbers))
+    if mirrored.any():
+        which = f"{names[_first(mirrored)].name} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses do)"
+        raise DataError(f"the pose of {which}; negate one column of its rotation")
+    ratios = (cameras.fx / cameras.width.clamp_min(1)).flatten()
+    strange = (ratios < 0.01) | (ratios > 1000)  # views of 178 and of 0.06 degrees
+    if strange.any():
+        i = _first(strange)
+        size = f"{float(cameras.fx[i]):.3g} px and the image is {int(cameras.width[i])} px wide"
+        raise DataError(
+            f"the focal length of {names[i].name} is {size}, which no lens has; give the focal length in pixels"
+        )
     centres = cameras.camera_to_worlds[:, :, 3]
     middle = centres.median(dim=0).values
     distances = (centres - middle).norm(dim=1)

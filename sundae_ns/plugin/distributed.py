@@ -47,7 +47,16 @@ HEAD = "compensation"  # Name of the head's optimizer: every rank holds a copy o
 
 def check_options(config: Any) -> None:
     """Raise ``ConfigError`` for the first option of a ``SundaeTrainerConfig`` that several ranks cannot use."""
-    check_machine(config.machine.num_devices, config.machine.device_type)
+    ranks, device_type = config.machine.num_devices, config.machine.device_type
+    if device_type != "cuda":
+        raise ConfigError(
+            f"--machine.num-devices {ranks} needs GPUs, and --machine.device-type is {device_type}; "
+            "give --machine.num-devices 1"
+        )
+    if ranks > (gpus := torch.cuda.device_count()):
+        raise ConfigError(
+            f"--machine.num-devices is {ranks} and there are {gpus} GPUs; give --machine.num-devices {max(gpus, 1)}"
+        )
     model, pruning = config.pipeline.model, config.pipeline.model.pruning
     counted = pruning.max_gaussians is not None or pruning.target_gaussians is not None
     for name, given in (
@@ -58,19 +67,6 @@ def check_options(config: Any) -> None:
     ):
         if given:
             raise ConfigError(f"{name} does not work on several GPUs; leave it out, or use --machine.num-devices 1")
-
-
-def check_machine(ranks: int, device_type: str) -> None:
-    """Raise ``ConfigError`` if the device type is not CUDA, or there are fewer GPUs than ranks."""
-    if device_type != "cuda":
-        raise ConfigError(
-            f"--machine.num-devices {ranks} needs GPUs, and --machine.device-type is {device_type}; "
-            "give --machine.num-devices 1"
-        )
-    if ranks > (gpus := torch.cuda.device_count()):
-        raise ConfigError(
-            f"--machine.num-devices is {ranks} and there are {gpus} GPUs; give --machine.num-devices {max(gpus, 1)}"
-        )
 
 
 def forward_signals() -> None:

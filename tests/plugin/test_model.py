@@ -1,6 +1,5 @@
 """The model: what it is to nerfstudio, its checkpoints, prunes and metrics."""
 
-import re
 import weakref
 from copy import deepcopy
 
@@ -119,31 +118,18 @@ def test_continuous_pruning_and_densification_share_a_field(build, training_of):
         counts.append(model.num_points)
         if step > 3:
             assert training.live()
-        rows = [value for value in model.state.densification.values() if isinstance(value, Tensor) and value.ndim]
-        assert {len(value) for value in rows} <= {model.num_points}
-    # The cap holds at every step, and between growing and culling; densification ends with the last prune.
-    assert 40 < max(counts) <= model.state.pruning["peak"] <= 70
-    assert [counts[step] for step in (4, 8, 12, 13, 14)] == [40] * 5
-    assert model.state.head_enabled
-
-
-def test_continuous_pruning_merges_and_leaves_adam_in_order(build, training_of, capsys):
-    model = build(pruning={"mode": "continuous", "start": 4, "stop": 10, "every": 4}, stop_split_at=9, **GROWTH)
-    training = training_of(model)
-    training.train_callbacks["densification"].strategy.pause_refine_after_reset = 0
-    for step in range(13):
-        training.step(step)
-        assert training.live() or step < 4
         assert all(value.isfinite().all() for value in model.gauss_params.values())
         if model.state.pruning["pruned_at"] == step:
             scales = model.gauss_params["scales"]
             direction = training.optimizers.optimizers["scales"].state[scales]["exp_avg"]
             # What was merged starts without one, and what stayed as it is keeps its own.
             assert 0 < int((direction == 0).all(dim=1).sum()) < model.num_points
-    counts = [tuple(map(int, pair)) for pair in re.findall(r"kept (\d+) of (\d+)", capsys.readouterr().out)]
-    assert len(counts) == 2
-    assert all(after == round(before / 2) for after, before in counts)
-    assert counts[0][1] > N
+        rows = [value for value in model.state.densification.values() if isinstance(value, Tensor) and value.ndim]
+        assert {len(value) for value in rows} <= {model.num_points}
+    # The cap holds at every step, and between growing and culling; densification ends with the last prune.
+    assert 40 < max(counts) <= model.state.pruning["peak"] <= 70
+    assert [counts[step] for step in (4, 8, 12, 13, 14)] == [40] * 5
+    assert model.state.head_enabled
 
 
 @pytest.mark.parametrize("prune_at", [0, 4])

@@ -149,17 +149,9 @@ def test_a_config_is_written_into_a_folder_of_its_own(tmp_path):
         config.save_config()
 
 
-@pytest.mark.parametrize(
-    ("error", "kind", "cause"),
-    [
-        (OSError(28, "No space left on device"), StorageError, "cannot write to the run's folder .*disk is full"),
-        (DataError("a picture; mend it"), DataError, "a picture; mend it"),
-        (ConnectionResetError(104, "reset"), ConnectionResetError, "reset"),
-    ],
-)
-def test_faults_while_training(tmp_path, monkeypatch, error, kind, cause):
+def test_a_fault_while_training_is_named_and_ends_the_viewer(tmp_path, monkeypatch):
     def fail(_):
-        raise error
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Trainer, "train", fail)
     made = SundaeTrainer.__new__(SundaeTrainer)
@@ -168,7 +160,7 @@ def test_faults_while_training(tmp_path, monkeypatch, error, kind, cause):
     machine = viewer.render_statemachines[0] = RenderStateMachine(viewer, 1.0, None)
     machine.start()
     made.viewer_state = viewer
-    with pytest.raises(kind, match=cause):
+    with pytest.raises(StorageError, match="cannot write to the run's folder .*disk is full"):
         made.train()
     assert not machine.is_alive(), "a thread that renders when Python exits aborts the process"
 
