@@ -38,9 +38,6 @@ def test_missing_kernels_are_reported_once(caplog):
     assert caplog.text.count("it is slow, on cuda: NVRTC fails") == 1
 
 
-# ---------------------------------------------------------------------------------------------------------------- Adam
-
-
 def test_adam_follows_torch():
     """Over gradients of all sizes, with vanishing ones, and with a rate that changes."""
     n, betas = 1000, (0.9, 0.999)
@@ -73,8 +70,6 @@ def test_a_skipped_step_of_adam_changes_nothing():
     adam.adam(update, rate, torch.zeros(()), betas=(0.9, 0.999), eps=1e-8)
     assert (tensors[0] != before[0]).all()
 
-
-# ---------------------------------------------------------------------------------------------------------------- loss
 
 SIZES = [(11, 11), (11, 300), (12, 43), (26, 42), (27, 43), (64, 97)]
 
@@ -205,21 +200,16 @@ def test_the_loss_on_a_gpu(size):
         assert "_Loss" not in type(elsewhere.grad_fn).__name__
 
 
-# --------------------------------------------------------------------------------------------------------- plane sweep
-
-
 def reduced(height, width, x, device="cpu"):
     """A view from ``x`` along the z axis, a little turned, of random blobs."""
     generator = torch.Generator().manual_seed(height)
     image = torch.nn.functional.interpolate(
         torch.rand(1, 3, height // 3, width // 3, generator=generator), (height, width), mode="bilinear"
     )[0]
-    angle = torch.tensor(0.1 * x)
-    viewmat = torch.eye(4)
-    viewmat[0, 0], viewmat[0, 2], viewmat[2, 0], viewmat[2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
-    viewmat[0, 3], viewmat[1, 3] = -x, 0.1 * x
+    eye, target = (x, -0.1 * x, 0.0), (0.9 * x, -0.1 * x, 1.0)
+    camera = Camera.look_at(eye, target, (0.0, -1.0, 0.0), fov=40.0, width=width, height=height)
     K = torch.tensor([[1.1 * width, 0, width / 2 + 1], [0, 1.2 * width, height / 2], [0, 0, 1]])
-    camera = Camera(viewmat.to(device), K.to(device), width, height, 1.1 * width)
+    camera = camera._replace(K=K).to(device)
     return plane_sweep._reduced(Photo(camera, image.permute(1, 2, 0).contiguous().to(device), None), 1000)
 
 

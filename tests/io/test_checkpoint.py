@@ -122,14 +122,6 @@ def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path, extra, store
         refused(read_gaussians, path, stored, CheckpointError)
 
 
-@pytest.mark.parametrize("inside", [".", "nerfstudio_models"])
-def test_newest_of_a_folder(tmp_path, inside):
-    (tmp_path / inside).mkdir(exist_ok=True)
-    write_checkpoint(tmp_path / inside / "step-000000999.ckpt", small_field(3))
-    write_checkpoint(tmp_path / inside / "step-000029999.ckpt", FIELD)
-    assert torch.equal(read_gaussians(tmp_path)[0]["means"], FIELD["means"])
-
-
 def _saved(content):
     return lambda path: torch.save(content, path)
 
