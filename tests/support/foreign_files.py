@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 import zstandard
+from gsply.writer import write_compressed
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sundae_ns.core.gaussians import SH_C0
 from sundae_ns.io.ply import write_ply
 
-_CHUNK = 256
 _STORED = Path(__file__).parents[1] / "io" / "foreign"
 
 
@@ -71,53 +71,12 @@ def write_splat(path: Path, gaussians: Mapping[str, Tensor]) -> None:
     path.write_bytes(rows.tobytes())
 
 
-def _word(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    word = np.zeros(len(shares), np.uint32)
-    for column, width in zip(shares.T, bits, strict=True):
-        level = np.rint(np.clip(column, 0, 1) * ((1 << width) - 1)).astype(np.uint32)
-        word = (word << np.uint32(width)) | level
-    return word
-
-
-def write_compressed_ply(path: Path, gaussians: Mapping[str, Tensor], *, old: bool = False, comment: str = "") -> None:
-    """As SuperSplat writes it; ``old`` ones have no bounds of colours."""
-    n, chunks = len(gaussians["means"]), []
-    vertex = np.zeros(n, [(f"packed_{name}", "<u4") for name in ("position", "rotation", "scale", "color")])
-    colors = colors_of(gaussians).numpy()
-    for first in range(0, n, _CHUNK):
-        rows, bounds = slice(first, first + _CHUNK), {}
-        blocks = {"": gaussians["means"].numpy(), "scale_": gaussians["scales"].numpy(), "color": colors}
-        for kind, values in blocks.items():
-            axes = "rgb" if kind == "color" else "xyz"
-            low, high = values[rows].min(axis=0), values[rows].max(axis=0)
-            if kind == "color" and old:
-                low, high = np.zeros(3), np.ones(3)
-            names = [f"{kind.removeprefix('color')}{axis}" for axis in axes]
-            if not (kind == "color" and old):
-                bounds |= {f"min_{name}": value for name, value in zip(names, low, strict=True)}
-                bounds |= {f"max_{name}": value for name, value in zip(names, high, strict=True)}
-            shares = (values[rows] - low) / np.where(high > low, high - low, 1)
-            if kind == "color":
-                alphas = gaussians["opacities"][rows].sigmoid().numpy()
-                vertex["packed_color"][rows] = _word(np.concatenate([shares, alphas], axis=1), (8, 8, 8, 8))
-            else:
-                vertex["packed_position" if kind == "" else "packed_scale"][rows] = _word(shares, (11, 10, 11))
-        chunks.append(bounds)
-    quats = gaussians["quats"].numpy()
-    largest = np.abs(quats).argmax(axis=1)
-    positive = quats * np.sign(quats[np.arange(n), largest])[:, None]
-    others = positive[np.arange(4) != largest[:, None]].reshape(n, 3) * math.sqrt(0.5) + 0.5
-    vertex["packed_rotation"] = _word(np.concatenate([largest[:, None] / 3, others], axis=1), (2, 10, 10, 10))
-    table = np.array([tuple(chunk.values()) for chunk in chunks], [(name, "<f4") for name in chunks[0]])
-    elements = [PlyElement.describe(table, "chunk"), PlyElement.describe(vertex, "vertex")]
-    rest = gaussians["features_rest"].numpy()
-    if rest.shape[1]:
-        levels = np.floor((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8).transpose(0, 2, 1).reshape(n, -1)
-        sh = np.zeros(n, [(f"f_rest_{i}", "u1") for i in range(levels.shape[1])])
-        for i, name in enumerate(sh.dtype.names or ()):
-            sh[name] = levels[:, i]
-        elements.append(PlyElement.describe(sh, "sh"))
-    PlyData(elements, byte_order="<", comments=[comment] if comment else []).write(str(path))
+def write_compressed_ply(path: Path, gaussians: Mapping[str, Tensor]) -> None:
+    """As SuperSplat writes it, by ``gsply``."""
+    columns = {name: value.numpy() for name, value in gaussians.items()}
+    colors = columns["features_dc"], columns["features_rest"]
+    geometry = (columns[name] for name in ("means", "scales", "quats"))
+    write_compressed(path, *geometry, columns["opacities"][:, 0], *colors)
 
 
 def write_colored_ply(path: Path, gaussians: Mapping[str, Tensor], dtype: str = "u1", most: float = 255) -> None:
