@@ -27,14 +27,15 @@ def scene(n=400):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The scene as ``.ply`` with a property of its own and a broken Gaussian, and as ``.sundae``."""
+    """The scene as ``.ply`` with a property and an element of its own and a broken Gaussian, and as ``.sundae``."""
     folder = tmp_path_factory.mktemp("scenes")
     sn.save(scene(), folder / "packed.sundae")
     sn.save(scene(), folder / "plain.ply")
     rows = vertices(folder / "plain.ply")[[0, *range(401)]]
     rows["x"][0] = np.nan
     wider = append_fields(rows, "mine", np.arange(402, dtype="f4"), usemask=False)
-    PlyData([PlyElement.describe(wider, "vertex")]).write(folder / "a.ply")
+    other = PlyElement.describe(np.array([(7,)], [("number", "<i4")]), "extra")
+    PlyData([PlyElement.describe(wider, "vertex"), other], comments=["by another program"]).write(folder / "a.ply")
     return folder
 
 
@@ -82,6 +83,12 @@ def test_prune_keeps_a_share_of_what_remains(folder, tmp_path, capsys):
     assert f"{len(found)} of 402 Gaussians" in capsys.readouterr().out
     assert run("prune", folder / "a.ply", "-o", tmp_path / "b.ply", "--keep", 1, "--remove-floaters", *INSIDE) == 0
     assert np.array_equal(vertices(tmp_path / "b.ply")["mine"], inside)
+    words = ("--redistribution", "none", "--score", "response", "--selection", "band")
+    assert run("prune", folder / "a.ply", "-o", tmp_path / "d.ply", "--keep", 0.25, *words) == 0
+    whole = PlyData.read(tmp_path / "d.ply")
+    assert (whole.comments, whole["extra"].data["number"].tolist()) == (["by another program"], [7])
+    assert len(kept := whole["vertex"].data) == 100
+    assert np.array_equal(kept, before[kept["mine"].astype(int)]), "kept rows do not change"
     out = tmp_path / "c.sundae"
     assert run("prune", folder / "packed.sundae", "-o", out, "--count", 20, "--remove-floaters") == 0
     found = sn.load(out)

@@ -140,7 +140,13 @@ def test_the_oldest_driver_is_named(no_cuda, monkeypatch):
     assert check("CUDA") == (False, "this torch is built without CUDA", "pip install torch==2.11.0")
 
 
-def test_programs_and_packages(monkeypatch, tmp_path):
+def test_programs_packages_and_weights(monkeypatch, tmp_path):
+    path = tmp_path / "weights.pth"
+    monkeypatch.setattr(doctor, "lpips_weights", lambda: ("https://a", path))
+    works, _, remedy = check("LPIPS weights")
+    assert (works, remedy) == (False, f"curl --location --create-dirs --output {path} https://a")
+    path.touch()
+    assert check("LPIPS weights")[0]
     monkeypatch.setenv("PATH", str(tmp_path))
     assert check("ffmpeg") == (False, "not found, for ns-render", "apt-get install ffmpeg")
     (tmp_path / "ffmpeg").touch(mode=0o755)
@@ -156,15 +162,6 @@ def test_programs_and_packages(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pycolmap")
     assert "cannot be loaded (libgomp.so.1: cannot open" in check("pycolmap")[1]
-
-
-def test_the_weights_of_lpips(monkeypatch, tmp_path):
-    path = tmp_path / "weights.pth"
-    monkeypatch.setattr(doctor, "lpips_weights", lambda: ("https://a", path))
-    assert not check("LPIPS weights")[0]
-    assert check("LPIPS weights")[2] == f"curl --location --create-dirs --output {path} https://a"
-    path.touch()
-    assert check("LPIPS weights")[0]
 
 
 def test_the_report_lists_every_part_and_each_remedy(no_cuda, monkeypatch, capsys):

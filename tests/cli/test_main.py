@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -34,10 +35,7 @@ def test_what_a_newcomer_types(words, code, says, capsys):
 
 
 def test_other_errors_are_not_hidden(monkeypatch):
-    def broken(*_):
-        raise ZeroDivisionError
-
-    monkeypatch.setattr("sundae_ns.cli.doctor.parts", broken)
+    monkeypatch.setattr("sundae_ns.cli.doctor.parts", Mock(side_effect=ZeroDivisionError))
     with pytest.raises(ZeroDivisionError):
         main(["doctor"])
 

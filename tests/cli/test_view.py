@@ -1,6 +1,5 @@
 """``sundae view``."""
 
-import http.client
 import socket
 import struct
 import threading
@@ -9,6 +8,7 @@ import urllib.error
 import urllib.request
 import webbrowser
 from contextlib import contextmanager
+from unittest.mock import Mock
 
 import pytest
 from command_line import run
@@ -61,31 +61,27 @@ def test_the_server_has_one_page_and_listens_on_this_machine_only():
             command.serve("", port)
 
 
-def status_of(port, *hosts):
-    """Status and content of an answer to a request with these headers ``Host``."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=SECONDS)
-    connection.putrequest("GET", "/", skip_host=True)
-    for host in hosts:
-        connection.putheader("Host", host)
-    connection.endheaders()
-    answer = connection.getresponse()
-    found = answer.status, answer.read()
-    connection.close()
-    return found
+def answer_to(port, *hosts):
+    """Status and content of the answer to a request with these headers ``Host``."""
+    with connect(port) as client:
+        headers = "".join(f"Host: {host}\r\n" for host in hosts)
+        client.sendall(f"GET / HTTP/1.0\r\n{headers}\r\n".encode())
+        head, _, content = client.makefile("rb").read().partition(b"\r\n\r\n")
+    return int(head.split()[1]), content
 
 
 def test_only_this_machine_by_name_is_answered():
     """Another site whose name resolves to 127.0.0.1 must not read the scene."""
     with served("a scene") as port:
         for host in ("127.0.0.1", "localhost", "[::1]", "LocalHost"):
-            assert status_of(port, f"{host}:{port}") == (200, b"a scene")
+            assert answer_to(port, f"{host}:{port}") == (200, b"a scene")
         wrong = ["evil.example", f"evil.example:{port}", "localhost", f"localhost:{port + 1}", f"127.0.0.1:{port}0", ""]
         for hosts in ([host] for host in [*wrong, f"localhost:{port}.evil.example", f"user@localhost:{port}"]):
-            status, content = status_of(port, *hosts)
+            status, content = answer_to(port, *hosts)
             assert status == 421, hosts
             assert b"a scene" not in content
-        assert status_of(port)[0] == 421
-        assert status_of(port, f"localhost:{port}", f"evil.example:{port}")[0] == 421
+        assert answer_to(port)[0] == 421
+        assert answer_to(port, f"localhost:{port}", f"evil.example:{port}")[0] == 421
     # On the default port browsers name no port.
     assert {"localhost", "127.0.0.1", "[::1]", "localhost:80"} <= command._hosts(80)
     assert "localhost" not in command._hosts(8080)
@@ -129,11 +125,7 @@ def test_view_opens_the_page(opens, tmp_path, monkeypatch, capsys):
     packed = write_kind(tmp_path / "a.sundae", KINDS["no head, degree 3"])
     opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
-
-    def serve(server):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", serve)
+    monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", Mock(side_effect=KeyboardInterrupt))
     assert run("view", packed, *([] if opens else ["--no-open-browser"])) == 0
     (line,) = capsys.readouterr().out.strip().splitlines()
     assert len(opened) == opens

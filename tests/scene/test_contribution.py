@@ -1,6 +1,7 @@
 """What each Gaussian contributes to the training pictures."""
 
 import sys
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -74,12 +75,7 @@ def test_weights_by_detail_are_those_of_an_image_and_a_second_pass(masked):
 
 def test_a_prune_weighs_detail_for_the_count_that_it_keeps(build, training_of, monkeypatch):
     training = training_of(build(pruning={"mode": "continuous", "start": 3, "stop": 3, "target_gaussians": 15}))
-    asked = []
-
-    def spy(image, cells):
-        asked.append(cells)
-        return pixel_detail(image, cells)
-
+    spy = Mock(side_effect=pixel_detail)
     monkeypatch.setattr(sys.modules[contribution.__module__], "pixel_detail", spy)
     counts = []
     for step in range(6):
@@ -87,4 +83,4 @@ def test_a_prune_weighs_detail_for_the_count_that_it_keeps(build, training_of, m
         counts.append(training.model.num_points)
     assert counts == [60, 60, 60, 15, 15, 15]
     # All Gaussians are visible in each of three views, and 15 of them stay.
-    assert asked == [15.0] * 3
+    assert [call.args[1] for call in spy.call_args_list] == [15.0] * 3

@@ -1,6 +1,7 @@
 """Prunes of scenes: the refit of a pruned field, the count for a loss, and memory."""
 
 import math
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -76,18 +77,13 @@ def test_a_refit_that_diverges_is_dropped(monkeypatch):
 
 @pytest.mark.usefixtures("short_prunes")
 def test_large_views_are_rendered_small(monkeypatch):
+    full, spy = scene(), Mock(side_effect=module._blended)
     monkeypatch.setattr(module, "REFIT_PIXELS", 24 * 24)
-    full, sizes = scene(), set()
-    images = module._blended
-
-    def spy(gaussians, cameras, settings):
-        sizes.update((camera.width, camera.height) for camera in cameras)
-        return images(gaussians, cameras, settings)
-
     monkeypatch.setattr(module, "_blended", spy)
     cameras = [*sn.virtual_cameras(full, 2, size=96), *sn.virtual_cameras(full, 1, size=12)]
     refit(pruned(full), full.gaussians, cameras, full.settings())
-    assert sizes == {(24, 24), (12, 12)}
+    rendered = [camera for call in spy.call_args_list for camera in call.args[1]]
+    assert {(camera.width, camera.height) for camera in rendered} == {(24, 24), (12, 12)}
 
 
 def test_images_are_those_of_the_renderer():

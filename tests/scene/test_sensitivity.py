@@ -38,25 +38,20 @@ def scene():
 
 
 @torch.no_grad()
-def image(scene, camera):
-    settings = dataclasses.replace(scene.settings(), training=True)
-    found = render_view(GaussianSource(scene.gaussians), camera, scene.background, settings, depth=False)[0]["rgb"]
-    return found.double()
+def images(scene, cameras):
+    source, settings = GaussianSource(scene.gaussians), dataclasses.replace(scene.settings(), training=True)
+    views = [render_view(source, camera, scene.background, settings, depth=False)[0]["rgb"] for camera in cameras]
+    return torch.stack(views).double()
 
 
-def changed(scene, cameras, parameters, size):
-    """Mean squared change of images by random changes of parameters, for a change of length 1 of each number."""
-    before = [value.detach().clone() for value in parameters]
-    images = [image(scene, camera) for camera in cameras]
-    total, tries = 0.0, 8
+def changed(scene, cameras, value, size=1e-3, tries=8):
+    """Mean squared change of images by random changes of a parameter, for a change of length 1 of each number."""
+    before, old = images(scene, cameras), value.detach().clone()
+    total = 0.0
     for _ in range(tries):
-        for value, old in zip(parameters, before, strict=True):
-            value.data = old + size * torch.randn_like(old)
-        total += sum(
-            float((image(scene, camera) - old).square().sum()) for camera, old in zip(cameras, images, strict=True)
-        )
-    for value, old in zip(parameters, before, strict=True):
-        value.data = old
+        value.data = old + size * torch.randn_like(old)
+        total += float((images(scene, cameras) - before).square().sum())
+    value.data = old
     return total / tries / size**2
 
 
@@ -64,13 +59,13 @@ def test_predicted_changes_are_those_of_images(scene):
     torch.manual_seed(1)
     seen = cameras(8, turn=6.28)
     found = sensitivity_of(scene, seen)
-    measured = changed(scene, seen, [scene.gaussians["features"]], 1e-3)
+    measured = changed(scene, seen, scene.gaussians["features"])
     assert float(found.rows["features"].trace()) == pytest.approx(measured, rel=0.35)
     assert scene.head is not None
     weights = dict(scene.head.named_parameters())
     for name in ("net.encoder.0.2.weight", "net.encoder.3.0.weight", "net.out.weight"):
         predicted = float(found.head[name].sum()) * weights[name][0, 0].numel()
-        assert predicted == pytest.approx(changed(scene, seen, [weights[name]], 1e-3), rel=0.35), name
+        assert predicted == pytest.approx(changed(scene, seen, weights[name]), rel=0.35), name
     again = sensitivity_of(scene, seen)
     assert all(torch.equal(found.rows[name], again.rows[name]) for name in found.rows)
     assert all(torch.equal(found.head[name], again.head[name]) for name in found.head)
